@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: MIT
+"""The emitter's beam and the two ears as tables over direction and frequency.
+
+Head frame: x forward, y left, z up. Azimuth counts from straight ahead, positive to the left;
+elevation is positive up. Ear 0 is the left one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import j1
+
+from sononerf.config import EarSettings
+
+SPEED = 343.0  # m/s; the beam's width follows it so weakly that temperature is left out
+GRID_DEG = 2.0
+WIDTH_FREQUENCY = 50e3  # Hz, where an ear is as wide as its setting says
+NOTCH_MIDDLE = 60e3  # Hz, at elevation 0
+NOTCH_RISE = 30e3  # Hz, from elevation 0 to straight up
+NOTCH_WIDTH = 8e3  # Hz, standard deviation
+
+
+@dataclass(frozen=True, eq=False)
+class Ears:
+    """Real, non-negative gains of the beam and of each ear, and where they are.
+
+    Attributes
+    ----------
+    azimuth : (A,) float64, rad
+        Uniform from -pi to pi, both included.
+    elevation : (L,) float64, rad
+        Uniform from -pi/2 to pi/2, both included.
+    frequency : (F,) float64, Hz
+        Ascending.
+    beam : (F, L, A) float32
+        Gain of the emission.
+    ears : (E, F, L, A) float32
+        Gain of each ear.
+    emitter : (3,) float64, m
+        Head frame.
+    positions : (E, 3) float64, m
+        Of the ears, head frame.
+    """
+
+    azimuth: NDArray[np.float64]
+    elevation: NDArray[np.float64]
+    frequency: NDArray[np.float64]
+    beam: NDArray[np.float32]
+    ears: NDArray[np.float32]
+    emitter: NDArray[np.float64]
+    positions: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        grid = (len(self.frequency), len(self.elevation), len(self.azimuth))
+        if self.beam.shape != grid or self.ears.shape != (len(self.positions), *grid):
+            raise ValueError(
+                f"beam {self.beam.shape} and ears {self.ears.shape} do not fit the grid {grid} "
+                f"of {len(self.positions)} ears"
+            )
+
+    @cached_property
+    def _by_direction(self) -> NDArray[np.float32]:
+        """Beam, then ears, with frequency last: (1 + E, L A, F); one look-up is one row."""
+        tables = np.concatenate([self.beam[None], self.ears])
+        flat = tables.reshape(*tables.shape[:2], -1).transpose(0, 2, 1)
+        return np.ascontiguousarray(flat)
+
+
+def synthetic_ears(settings: EarSettings, frequency: ArrayLike) -> Ears:
+    r"""Tables of a piston-like emitter and of two mirrored, bat-like ears.
+
+    The beam is that of a piston of radius ``a`` in a small head,
+    :math:`|2 J_1(ka \sin\theta) / (ka \sin\theta)| (1 + \cos\theta) / 2`; radius 0 emits alike in
+    all directions. An ear hears best towards its axis, as a Gaussian of the angle from it whose
+    width falls with the square root of frequency (``width_deg`` at 50 kHz); a spectral notch
+    rises from 30 kHz (straight down) over 60 kHz to 90 kHz (straight up), so that elevation can
+    be told from the spectrum.
+
+    Parameters
+    ----------
+    settings : EarSettings
+        Places, axes, widths.
+    frequency : (F,) float, Hz
+        Ascending.
+
+    Returns
+    -------
+    ears : Ears
+        On a grid of 2 degrees.
+    """
+    f = np.asarray(frequency, dtype=np.float64)
+    azimuth = np.radians(np.linspace(-180.0, 180.0, round(360.0 / GRID_DEG) + 1))
+    elevation = np.radians(np.linspace(-90.0, 90.0, round(180.0 / GRID_DEG) + 1))
+    level = np.cos(elevation)[:, None]
+    directions = np.stack(
+        [
+            level * np.cos(azimuth),
+            level * np.sin(azimuth),
+            np.broadcast_to(np.sin(elevation)[:, None], (len(elevation), len(azimuth))),
+        ],
+        axis=-1,
+    )  # (L, A, 3)
+    notch_at = NOTCH_MIDDLE + NOTCH_RISE * elevation / (np.pi / 2.0)
+    off = (f[:, None] - notch_at) / NOTCH_WIDTH  # (F, L)
+    notch = 1.0 - settings.notch_depth * np.exp(-0.5 * off**2)
+    sides = (1.0, -1.0)
+    ears = [
+        _lobe(directions, side * settings.azimuth_deg, settings, f) * notch[:, :, None]
+        for side in sides
+    ]
+    left = np.asarray(settings.left, dtype=np.float64)
+    return Ears(
+        azimuth,
+        elevation,
+        f,
+        _beam(directions, settings.beam_radius, f).astype(np.float32),
+        np.stack(ears).astype(np.float32),
+        np.asarray(settings.emitter, dtype=np.float64),
+        np.stack([left * (1.0, side, 1.0) for side in sides]),
+    )
+
+
+def _beam(
+    directions: NDArray[np.float64], radius: float, frequency: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    if radius == 0.0:
+        return np.ones((len(frequency), *directions.shape[:2]))
+    forward = directions[..., 0]
+    sine = np.sqrt(np.clip(1.0 - forward**2, 0.0, None))
+    x = (2.0 * np.pi * radius / SPEED) * frequency[:, None, None] * sine
+    piston = np.abs(np.where(x > 1e-6, 2.0 * j1(x) / np.where(x > 1e-6, x, 1.0), 1.0))
+    # An unbaffled source fades towards its back, smoothly.
+    return piston * (1.0 + forward) / 2.0
+
+
+def _lobe(
+    directions: NDArray[np.float64],
+    azimuth_deg: float,
+    settings: EarSettings,
+    frequency: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(settings.elevation_deg)
+    axis = (
+        np.cos(elevation) * np.cos(azimuth),
+        np.cos(elevation) * np.sin(azimuth),
+        np.sin(elevation),
+    )
+    angle = np.arccos(np.clip(directions @ np.asarray(axis), -1.0, 1.0))
+    width = np.radians(settings.width_deg) * np.sqrt(WIDTH_FREQUENCY / frequency)
+    gain: NDArray[np.float64] = np.exp(-0.5 * (angle / width[:, None, None]) ** 2)
+    return gain
+
+
+def beam_gain(ears: Ears, directions_head: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gain of the emission towards directions, bilinear between the table's nodes.
+
+    Parameters
+    ----------
+    ears : Ears
+        Tables.
+    directions_head : (N, 3) float64
+        Unit vectors away from the emitter, head frame.
+
+    Returns
+    -------
+    gain : (N, F) float64
+        Linear, zero or more.
+    """
+    return _look_up(ears, 0, directions_head)
+
+
+def ear_gain(ears: Ears, ear: int, directions_head: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Gain of one ear for sound from directions, bilinear between the table's nodes.
+
+    Parameters
+    ----------
+    ears : Ears
+        Tables.
+    ear : int
+        0 left, 1 right.
+    directions_head : (N, 3) float64
+        Unit vectors from the ear to where the sound comes from, head frame.
+
+    Returns
+    -------
+    gain : (N, F) float64
+        Linear, zero or more.
+    """
+    return _look_up(ears, 1 + ear, directions_head)
+
+
+def _look_up(ears: Ears, table: int, directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    x, y, z = directions.T
+    column, across = _place(ears.azimuth, np.arctan2(y, x))
+    row, upward = _place(ears.elevation, np.arctan2(z, np.hypot(x, y)))
+    width = len(ears.azimuth)
+    values = ears._by_direction[table]
+    corner = row * width + column
+    gain: NDArray[np.float64] = (
+        values[corner] * ((1 - upward) * (1 - across))[:, None]
+        + values[corner + 1] * ((1 - upward) * across)[:, None]
+        + values[corner + width] * (upward * (1 - across))[:, None]
+        + values[corner + width + 1] * (upward * across)[:, None]
+    )
+    return gain
+
+
+def _place(
+    nodes: NDArray[np.float64], values: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Index of the node below, and the fraction of the way to the next."""
+    steps = (values - nodes[0]) / (nodes[-1] - nodes[0]) * (len(nodes) - 1)
+    steps = np.clip(steps, 0.0, len(nodes) - 1.0)
+    index = np.minimum(steps.astype(np.int64), len(nodes) - 2)
+    return index, steps - index

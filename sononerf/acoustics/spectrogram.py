@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: MIT
+"""From echo to spectrogram: short windows over range, magnitude without phase, compression."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.config import SpectrogramSettings
+
+
+def frequency_axis(settings: SpectrogramSettings) -> NDArray[np.float64]:
+    """Frequencies of the FFT's bins nearest to the two ends, and all between.
+
+    Parameters
+    ----------
+    settings : SpectrogramSettings
+        The analysis.
+
+    Returns
+    -------
+    frequency : (F,) float64, Hz
+        Ascending, ``sampling_rate / fft`` apart.
+
+    Examples
+    --------
+    >>> axis = frequency_axis(SpectrogramSettings())
+    >>> len(axis), float(axis[0]), float(axis[-1])
+    (47, 9765.625, 99609.375)
+    """
+    first, last = _bins(settings)
+    bins = np.arange(first, last + 1, dtype=np.float64)
+    return bins * (settings.sampling_rate / settings.fft)
+
+
+def _bins(settings: SpectrogramSettings) -> tuple[int, int]:
+    width = settings.sampling_rate / settings.fft
+    return round(settings.frequency_min / width), round(settings.frequency_max / width)
+
+
+def range_axis(settings: SpectrogramSettings, speed_of_sound: float) -> NDArray[np.float64]:
+    """Ranges of the analysis frames, ``c t / 2`` with t at the window's centre.
+
+    Parameters
+    ----------
+    settings : SpectrogramSettings
+        The analysis; frames start every ``hop`` samples from the emission on.
+    speed_of_sound : float, m/s
+        Of the medium.
+
+    Returns
+    -------
+    range : (R,) float64, m
+        Those within ``range_min`` to ``range_max``.
+
+    Raises
+    ------
+    ValueError
+        If no frame lies between the two.
+
+    Examples
+    --------
+    >>> len(range_axis(SpectrogramSettings(), 343.0))
+    875
+    """
+    first, last = _frames(settings, speed_of_sound)
+    centre = (
+        np.arange(first, last + 1, dtype=np.float64) * settings.hop + (settings.window - 1) / 2.0
+    )
+    return centre * (speed_of_sound / 2.0 / settings.sampling_rate)
+
+
+def _frames(settings: SpectrogramSettings, speed_of_sound: float) -> tuple[int, int]:
+    samples_per_metre = 2.0 * settings.sampling_rate / speed_of_sound
+    centre = (settings.window - 1) / 2.0
+    first = math.ceil((settings.range_min * samples_per_metre - centre) / settings.hop)
+    last = math.floor((settings.range_max * samples_per_metre - centre) / settings.hop)
+    first = max(first, 0)
+    if last < first:
+        raise ValueError(
+            f"no analysis frame lies between range_min {settings.range_min} m and range_max "
+            f"{settings.range_max} m; widen them, or shorten window and hop"
+        )
+    return first, last
+
+
+def echo_samples(settings: SpectrogramSettings, speed_of_sound: float) -> int:
+    """How many samples from the emission on the last analysis frame needs."""
+    return _frames(settings, speed_of_sound)[1] * settings.hop + settings.window
+
+
+def spectrogram(
+    echo: ArrayLike, settings: SpectrogramSettings, speed_of_sound: float
+) -> NDArray[np.float64]:
+    """Magnitude of the short-time Fourier transform on the range and frequency axes.
+
+    A symmetric Hamming window, unnormalised.
+
+    Parameters
+    ----------
+    echo : (E, S) float
+        Pressure from the emission on, at the sampling rate of the settings.
+    settings : SpectrogramSettings
+        The analysis.
+    speed_of_sound : float, m/s
+        Of the medium.
+
+    Returns
+    -------
+    magnitude : (E, R, F) float64
+        Linear.
+
+    Raises
+    ------
+    ValueError
+        If the echo ends before the last frame.
+    """
+    signal = np.asarray(echo, dtype=np.float64)
+    first, last = _frames(settings, speed_of_sound)
+    needed = echo_samples(settings, speed_of_sound)
+    if signal.shape[-1] < needed:
+        raise ValueError(
+            f"the echo has {signal.shape[-1]} samples, the last frame needs {needed}; "
+            "record longer or lower range_max"
+        )
+    frames = sliding_window_view(signal, settings.window, axis=-1)
+    frames = frames[..., first * settings.hop : last * settings.hop + 1 : settings.hop, :]
+    low, high = _bins(settings)
+    spectrum = np.fft.rfft(frames * np.hamming(settings.window), n=settings.fft, axis=-1)
+    magnitude: NDArray[np.float64] = np.abs(spectrum[..., low : high + 1])
+    return magnitude
+
+
+def compress(magnitude: ArrayLike, reference: float) -> NDArray[np.float64]:
+    """Decibels above a soft floor, ``20 log10(1 + magnitude / reference)``.
+
+    Parameters
+    ----------
+    magnitude : (...,) float
+        Linear, zero or more.
+    reference : float
+        Same unit; silence is 0 dB, a magnitude of the reference 6 dB.
+
+    Returns
+    -------
+    level_db : (...,) float64, dB
+        Zero or more.
+
+    Raises
+    ------
+    ValueError
+        If the reference is not above zero.
+    """
+    if not reference > 0.0:
+        raise ValueError(f"reference is {reference}, expected above 0")
+    level_db: NDArray[np.float64] = (20.0 / math.log(10.0)) * np.log1p(
+        np.asarray(magnitude, dtype=np.float64) / reference
+    )
+    return level_db

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: MIT
+"""A coarse mesh and three projections, each epoch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from sononerf import storage
+from sononerf.callbacks.epoch import EpochCallback
+from sononerf.errors import NumericalError
+from sononerf.module import EchoModule
+from sononerf.reconstruction.mesh import mesh_bytes
+from sononerf.reconstruction.projection import maximum_intensity_projections
+from sononerf.reconstruction.read_out import reconstruct
+from sononerf.render.projection import mip_image, mip_pngs
+
+
+class PreviewCallback(EpochCallback):
+    """Writes ``epochs/0001/`` and shows the projections in TensorBoard.
+
+    Parameters
+    ----------
+    folder : Path
+        The run.
+    every_epochs : int
+        How often.
+    voxels : int
+        Along the region's longest side.
+    directions : int
+        Spherical lattice for fields without lobes.
+    """
+
+    def __init__(self, folder: Path, *, every_epochs: int, voxels: int, directions: int) -> None:
+        self.folder = folder
+        self.every_epochs = every_epochs
+        self.voxels = voxels
+        self.directions = directions
+
+    def on_epoch(self, trainer: lightning.Trainer, module: EchoModule, epoch: int) -> None:
+        """Read the field out coarsely and write what is seen."""
+        if epoch % self.every_epochs or not trainer.is_global_zero:
+            return
+        target = self.folder / "epochs" / f"{epoch:04d}"
+        shown = {k: float(v) for k, v in trainer.callback_metrics.items()}
+        numbers = {"epoch": epoch, "step": module.global_step, **shown}
+        extent = float((module.field.region[1] - module.field.region[0]).max())
+        was_training = module.training
+        module.eval()
+        try:
+            with torch.inference_mode():
+                seen = reconstruct(
+                    module.field,
+                    spacing=max(extent / self.voxels, module.field.resolution / 2),
+                    directions=self.directions,
+                )
+        except NumericalError as error:
+            # An early field may hold no surface yet; that is news, not a fault.
+            storage.commit_json(target / "metrics.json", {**numbers, "no_surface": str(error)})
+            return
+        finally:
+            module.train(was_training)
+        storage.commit_bytes(target / "mesh.ply", mesh_bytes(seen.mesh, "ply"))
+        for axis, picture in mip_pngs(seen.volume).items():
+            storage.commit_bytes(target / f"mip_{axis}.png", picture)
+        storage.commit_json(target / "metrics.json", numbers)
+        if isinstance(trainer.logger, TensorBoardLogger):
+            for axis, projection in maximum_intensity_projections(seen.volume).items():
+                trainer.logger.experiment.add_image(
+                    f"mip/{axis}", mip_image(projection), module.global_step, dataformats="HWC"
+                )

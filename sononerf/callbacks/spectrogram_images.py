@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: MIT
+"""Measured, predicted and their difference in TensorBoard, each epoch."""
+
+from __future__ import annotations
+
+import lightning
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from sononerf.callbacks.epoch import EpochCallback
+from sononerf.data.range_slices import WholePoses
+from sononerf.module import EchoModule, decibels
+from sononerf.render.spectrogram import spectrogram_image
+
+
+class SpectrogramImages(EpochCallback):
+    """Shows the first validation pose.
+
+    Parameters
+    ----------
+    poses : WholePoses
+        The validation poses.
+    range_m, frequency_hz : (R,), (F,) float
+        Axes.
+    """
+
+    def __init__(
+        self, poses: WholePoses, range_m: torch.Tensor, frequency_hz: torch.Tensor
+    ) -> None:
+        self.poses = poses
+        self.range_m = range_m.double().numpy()
+        self.frequency_hz = frequency_hz.double().numpy()
+
+    def on_epoch(self, trainer: lightning.Trainer, module: EchoModule, epoch: int) -> None:
+        """Render one pose and show it."""
+        del epoch
+        if not trainer.is_global_zero or not isinstance(trainer.logger, TensorBoardLogger):
+            return
+        if not len(self.poses):
+            return
+        batch = trainer.strategy.batch_to_device(self.poses[0])
+        was_training = module.training
+        module.eval()
+        try:
+            with torch.inference_mode():
+                predicted = decibels(module(batch), module.reference)[0]
+        finally:
+            module.train(was_training)
+        measured = decibels(batch.spectrum, module.reference)[0]
+        picture = spectrogram_image(
+            measured.cpu().numpy(), predicted.cpu().numpy(), self.range_m, self.frequency_hz
+        )
+        trainer.logger.experiment.add_image(
+            "spectrogram", picture, module.global_step, dataformats="HWC"
+        )

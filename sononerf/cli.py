@@ -1,0 +1,309 @@
+# SPDX-License-Identifier: MIT
+"""The command line: parse, call one function of the experiment, print what was written.
+
+torch, lightning and pyvista are imported inside the commands, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sononerf import __version__
+from sononerf.errors import InputError, SettingsError, SonoNerfError
+
+app = typer.Typer(
+    name="sononerf",
+    help="Three-dimensional hearing: simulate echoes, fit a reflectivity field, predict, "
+    "reconstruct.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+class Accelerator(StrEnum):
+    """What to compute on."""
+
+    auto = "auto"
+    cpu = "cpu"
+    gpu = "gpu"
+
+
+class Split(StrEnum):
+    """Poses of an ensemble."""
+
+    test = "test"
+    val = "val"
+    train = "train"
+
+
+Config = Annotated[Path, typer.Argument(help="Settings file, such as configs/three_spheres.yaml.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[KEY=VALUE]...", help="Settings by dotted key, such as fit.epochs=5."),
+]
+Run = Annotated[Path, typer.Argument(help="Folder of a run.")]
+Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
+OnWhat = Annotated[Accelerator, typer.Option(help="What to compute on.")]
+
+
+def _print(text: str) -> None:
+    typer.echo(text, err=True)
+
+
+def _print_json(data: Any) -> None:
+    typer.echo(json.dumps(data, indent=2, allow_nan=False))
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"sononerf {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
+    ] = False,
+) -> None:
+    del version
+    logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
+
+
+@app.command()
+def scenes(
+    as_json: Json = False,
+    preview: Annotated[Path | None, typer.Option(help="Draw every scene into this folder.")] = None,
+) -> None:
+    """List the scenes that are installed, built-in and everyone's."""
+    from sononerf.experiment.scenes import describe_scenes, draw_scenes
+
+    rows = describe_scenes()
+    if preview is not None:
+        for path in draw_scenes(preview):
+            _print(f"wrote {path}")
+    if as_json:
+        _print_json({"scenes": rows})
+        return
+    for row in rows:
+        origin = f"{row['distribution']} {row['version']}"
+        typer.echo(f"{row['name']:16} {origin:24} {row['summary']}")
+
+
+@app.command()
+def simulate(
+    config: Config,
+    overrides: Overrides = None,
+    output: Annotated[
+        Path | None, typer.Option(help="The store; data/<scene>-<hash> by default.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; as many as cores by default.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler to use instead.")
+    ] = None,
+    preview: Annotated[
+        Path | None, typer.Option(help="Draw the scene with its poses into this folder.")
+    ] = None,
+) -> None:
+    """Simulate the echoes of a scene at all poses of an experiment."""
+    from sononerf.config import load_settings
+
+    settings = load_settings(config, overrides or ())
+    from sononerf.experiment.scenes import draw_ensemble
+    from sononerf.experiment.simulate import simulate as run
+    from sononerf.progress import Progress
+
+    if workers is not None and scheduler is not None:
+        raise SettingsError("--workers and --scheduler exclude each other; give one")
+    store = run(settings, output=output, workers=workers, scheduler=scheduler, progress=Progress())
+    _print(f"wrote {store.path} ({len(store)} poses)")
+    if preview is not None:
+        for path in draw_ensemble(settings, store, preview):
+            _print(f"wrote {path}")
+
+
+@app.command()
+def fit(
+    config: Config,
+    overrides: Overrides = None,
+    output: Annotated[
+        Path | None, typer.Option(help="The run's folder; runs/<config's name> by default.")
+    ] = None,
+    accelerator: OnWhat = Accelerator.auto,
+    devices: Annotated[int | None, typer.Option(min=1, help="How many devices.")] = None,
+    num_nodes: Annotated[int, typer.Option(min=1, help="How many machines.")] = 1,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the fit (fit.seed).")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes that simulate.")] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Move a run that is there aside.")
+    ] = False,
+) -> None:
+    """Simulate where needed, fit, predict the test poses, reconstruct and evaluate.
+
+    The same command goes on where an interrupted one stopped.
+    """
+    from sononerf.config import load_settings
+
+    extra = [] if seed is None else [f"fit.seed={seed}"]
+    settings = load_settings(config, [*(overrides or ()), *extra])
+    from sononerf.experiment.fit import fit as run
+    from sononerf.experiment.predict import predict as predict_run
+    from sononerf.experiment.reconstruct import evaluate as evaluate_run
+    from sononerf.experiment.reconstruct import reconstruct as reconstruct_run
+    from sononerf.progress import Progress
+
+    folder = output or Path("runs") / config.stem
+    progress = Progress()
+    done = run(
+        settings,
+        folder,
+        accelerator=accelerator.value,
+        devices=devices or "auto",
+        num_nodes=num_nodes,
+        overwrite=overwrite,
+        workers=workers,
+        progress=progress,
+    )
+    metrics = done.read_metrics()
+    if "baseline" in metrics:  # what is written last
+        _print(f"{folder}: is finished; --overwrite fits it anew")
+    else:
+        if settings.poses.heldout:
+            predict_run(folder, accelerator=accelerator.value, progress=progress)
+        reconstruct_run(folder, progress=progress)
+        metrics = evaluate_run(folder, progress=progress)
+    _summary(folder, metrics)
+
+
+def _summary(folder: Path, metrics: dict[str, Any]) -> None:
+    prediction = metrics.get("prediction") or {}
+    if prediction:
+        _print(
+            f"prediction of {prediction['poses']} held-out poses: {prediction['mae_db']:.2f} dB "
+            f"over all cells (mean spectrogram: {prediction['mean_predictor_mae_db']:.2f} dB)"
+            + _optional(prediction, "mae_db_active", "; {:.1f} dB over active cells")
+        )
+    geometry = metrics.get("geometry") or {}
+    if geometry:
+        scores = geometry["fscore"]
+        _print(
+            f"geometry: Chamfer {1000 * geometry['chamfer_m']:.2f} mm, F-score "
+            f"{scores['0.002']:.2f} at 2 mm and {scores['0.005']:.2f} at 5 mm, "
+            f"{geometry['components']} parts (true: {geometry['components_true']})"
+        )
+        other = (metrics.get("baseline") or {}).get("backprojection")
+        if other:
+            _print(
+                f"backprojection instead: Chamfer {1000 * other['chamfer_m']:.2f} mm, F-score "
+                f"{other['fscore']['0.002']:.2f} at 2 mm and {other['fscore']['0.005']:.2f} at 5 mm"
+            )
+    _print(f"mesh:        {folder / 'reconstruction' / 'mesh.ply'}")
+    _print(f"pictures:    {folder / 'reconstruction' / 'view.png'}, {folder / 'prediction'}")
+    _print(f"numbers:     {folder / 'metrics.json'}")
+    _print(f"TensorBoard: tensorboard --logdir {folder}")
+
+
+def _optional(values: dict[str, Any], key: str, template: str) -> str:
+    value = values.get(key)
+    return "" if value is None else template.format(value)
+
+
+@app.command()
+def predict(
+    run: Run,
+    split: Annotated[Split, typer.Option(help="Which poses of the ensemble.")] = Split.test,
+    poses: Annotated[
+        Path | None, typer.Option(help="CSV of your own poses: x,y,z,yaw,pitch,roll (m, degrees).")
+    ] = None,
+    output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
+    accelerator: OnWhat = Accelerator.auto,
+) -> None:
+    """Predict the spectrograms of poses that were never heard."""
+    from sononerf.experiment.predict import predict as predict_run
+    from sononerf.progress import Progress
+
+    folder = predict_run(
+        run,
+        split=split.value,
+        poses_csv=poses,
+        output=output,
+        accelerator=accelerator.value,
+        progress=Progress(),
+    )
+    _print(f"wrote {folder}")
+
+
+@app.command()
+def reconstruct(
+    run: Run,
+    spacing: Annotated[float | None, typer.Option(help="Voxel size in metres.")] = None,
+    level: Annotated[
+        str | None, typer.Option(help="Level of the surface: auto, or a number.")
+    ] = None,
+    output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
+) -> None:
+    """Read mesh, volume and projections out of a fitted field."""
+    import math
+    from typing import Literal
+
+    number: float | Literal["auto"] | None = "auto" if level == "auto" else None
+    if level is not None and level != "auto":
+        try:
+            number = float(level)
+        except ValueError:
+            raise SettingsError(f"--level: found {level!r}; give auto or a number") from None
+        if not math.isfinite(number):
+            raise SettingsError(f"--level: found {level!r}; give auto or a finite number")
+    if spacing is not None and not (math.isfinite(spacing) and spacing > 0):
+        raise SettingsError(f"--spacing: found {spacing}; give metres above zero")
+    from sononerf.experiment.reconstruct import reconstruct as reconstruct_run
+    from sononerf.progress import Progress
+
+    folder = reconstruct_run(run, spacing=spacing, level=number, output=output, progress=Progress())
+    _print(f"wrote {folder}")
+
+
+@app.command()
+def evaluate(run: Run, as_json: Json = False) -> None:
+    """Compare a run's mesh with the true scene, and show all its numbers."""
+    if not run.is_dir():
+        raise InputError(f"{run}: no run; make one with `sononerf fit`")
+    from sononerf.experiment.reconstruct import evaluate as evaluate_run
+    from sononerf.progress import Progress
+
+    metrics = evaluate_run(run, progress=Progress(quiet=as_json))
+    if as_json:
+        _print_json(metrics)
+    else:
+        _summary(run, metrics)
+
+
+def main() -> None:
+    """Run the command line and end with the exit code of what went wrong."""
+    try:
+        app()
+    except SonoNerfError as error:
+        for line in str(error).splitlines():
+            typer.echo(f"error: {line}", err=True)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        typer.echo("stopped", err=True)
+        sys.exit(130)
+    except BrokenPipeError:
+        # The reader of our output went away, as `head` does.
+        sys.stderr.close()
+        sys.exit(141)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,399 @@
+# SPDX-License-Identifier: MIT
+"""Typed settings: every name, its unit, its bounds, and the only home of its default.
+
+Precedence: default < YAML file < ``KEY=VALUE`` < a named option of the command line.
+SI units and radians inside; another unit is in the name.
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from sononerf.errors import SettingsError
+
+MAX_SETTINGS_BYTES = 1_000_000
+MAX_SETTINGS_DEPTH = 50
+
+Vector = tuple[float, float, float]
+Name = Annotated[str, Field(min_length=1)]
+Positive = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False
+    )
+
+
+class SceneSettings(_Section):
+    """What is ensonified: a scene's name and what its factory takes."""
+
+    name: Name
+    options: dict[str, Any] = {}
+
+
+class PoseSettings(_Section):
+    """Where the calls are made from; both test sets are drawn apart from the training spiral."""
+
+    count: Count = 400
+    validation: Annotated[int, Field(ge=0)] = 10
+    heldout: Annotated[int, Field(ge=0)] = 20
+    radius: Positive = 0.4
+    aim_jitter_deg: Annotated[float, Field(ge=0, le=90)] = 15.0
+    seed: Seed = 0
+
+
+class SimulationSettings(_Section):
+    """The echo simulator: rays per pose (after aiming), bounces, and the turn of the pattern."""
+
+    engine: Literal["rays"] = "rays"
+    rays: Annotated[int, Field(ge=100, le=100_000_000)] = 100_000
+    bounces: Annotated[int, Field(ge=1, le=10)] = 3
+    seed: Seed = 0
+    noise_floor_poses: Annotated[int, Field(ge=0)] = 20
+
+
+class AirSettings(_Section):
+    """The medium; the speed of sound is 343 m/s unless a temperature is set."""
+
+    temperature_c: Annotated[float, Field(ge=-20, le=50)] | None = None
+    relative_humidity: Annotated[float, Field(ge=0, le=1)] = 0.5
+    pressure_pa: Annotated[float, Field(ge=20_000, le=200_000)] = 101_325.0
+
+
+class EarSettings(_Section):
+    """Synthetic emitter and ears in the head frame (x forward, y left, z up)."""
+
+    emitter: Vector = (0.0, 0.0, -0.010)
+    left: Vector = (-0.010, 0.010, 0.005)  # the right ear is its mirror image
+    beam_radius: Annotated[float, Field(ge=0)] = 0.003
+    azimuth_deg: Annotated[float, Field(ge=-90, le=90)] = 25.0
+    elevation_deg: Annotated[float, Field(ge=-90, le=90)] = 10.0
+    width_deg: Annotated[float, Field(ge=5, le=180)] = 45.0
+    notch_depth: Annotated[float, Field(ge=0, lt=1)] = 0.8
+
+
+class CallSettings(_Section):
+    """What is emitted."""
+
+    kind: Literal["impulse"] = "impulse"
+
+
+class SpectrogramSettings(_Section):
+    """The analysis: a symmetric Hamming window, a hop, a padded FFT, and a crop in range."""
+
+    sampling_rate: Positive = 1e6
+    window: Annotated[int, Field(ge=8)] = 64
+    hop: Count = 4
+    fft: Annotated[int, Field(ge=8)] = 512
+    frequency_min: Positive = 10e3
+    frequency_max: Positive = 100e3
+    range_min: Positive = 0.15
+    range_max: Positive = 0.75
+    dynamic_range_db: Annotated[float, Field(gt=0, le=200)] = 60.0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> SpectrogramSettings:
+        if self.frequency_min >= self.frequency_max:
+            raise ValueError("frequency_min must lie below frequency_max")
+        if self.frequency_max > self.sampling_rate / 2:
+            raise ValueError("frequency_max must not exceed half the sampling_rate")
+        if self.range_min >= self.range_max:
+            raise ValueError("range_min must lie below range_max")
+        if self.fft < self.window:
+            raise ValueError("fft must be at least window")
+        return self
+
+
+class DataSettings(_Section):
+    """Where the ensemble lies and how it is streamed."""
+
+    store: Path | None = None
+    workers: Annotated[int, Field(ge=0, le=64)] = 0
+    memory_bytes: Count = 2_000_000_000
+
+
+class RegionSettings(_Section):
+    """The box that is fitted and read out; found from the echoes where it is not set."""
+
+    lower: Vector | None = None
+    upper: Vector | None = None
+
+    @model_validator(mode="after")
+    def _box(self) -> RegionSettings:
+        if (self.lower is None) != (self.upper is None):
+            raise ValueError("lower and upper are set together or not at all")
+        if self.lower is not None and self.upper is not None:
+            if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
+                raise ValueError("lower must lie below upper on every axis")
+        return self
+
+
+class FieldSettings(_Section):
+    """The reflectivity field by the name of its entry point, and what its factory takes."""
+
+    kind: Name = "grid"
+    options: dict[str, Any] = {}
+
+
+class RendererSettings(_Section):
+    """The renderer by the name of its entry point, and what its factory takes."""
+
+    kind: Name = "profile"
+    options: dict[str, Any] = {}
+
+
+class FitSettings(_Section):
+    """The fit: how long, on what, how fast."""
+
+    epochs: Count = 10
+    steps_per_epoch: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    max_steps: Count | None = None
+    batch_poses: Count = 6
+    batch_slices: Count = 512
+    batch_frequencies: Annotated[int, Field(ge=1)] | Literal["all"] = 6
+    learning_rate: Positive | None = None  # the field's own where it is not set
+    schedule: Literal["cool", "staircase"] = "cool"
+    final_rate_factor: Annotated[float, Field(gt=0, le=1)] = 0.1
+    staircase_factor: Annotated[float, Field(gt=0, le=1)] = 0.97
+    staircase_epochs: Count = 10
+    loss: Literal["l1", "l2", "l1_4l2"] = "l1"
+    silent_weight: Annotated[float, Field(ge=0)] = 1.0
+    gradient_clip: Positive | None = None
+    seed: Seed = 0
+    checkpoint_seconds: Positive = 60.0
+    patience_epochs: Count | None = None
+
+
+class PreviewSettings(_Section):
+    """The coarse mesh and projections that each epoch leaves."""
+
+    every_epochs: Count = 1
+    voxels: Annotated[int, Field(ge=8, le=512)] = 48  # along the region's longest side
+
+
+class ReconstructionSettings(_Section):
+    """The read-out of the finished field."""
+
+    spacing: Positive | None = None  # from the field's own resolution where it is not set
+    level: Annotated[float, Field(ge=0)] | Literal["auto"] = "auto"
+    method: Literal["auto", "oriented", "isosurface"] = "auto"
+    directions: Annotated[int, Field(ge=6)] = 100
+
+
+class Settings(_Section):
+    """One experiment, whole."""
+
+    scene: SceneSettings
+    poses: PoseSettings = PoseSettings()
+    simulation: SimulationSettings = SimulationSettings()
+    air: AirSettings = AirSettings()
+    ears: EarSettings = EarSettings()
+    call: CallSettings = CallSettings()
+    spectrogram: SpectrogramSettings = SpectrogramSettings()
+    data: DataSettings = DataSettings()
+    region: RegionSettings = RegionSettings()
+    field: FieldSettings = FieldSettings()
+    renderer: RendererSettings = RendererSettings()
+    fit: FitSettings = FitSettings()
+    preview: PreviewSettings = PreviewSettings()
+    reconstruction: ReconstructionSettings = ReconstructionSettings()
+
+    def plain(self) -> dict[str, Any]:
+        """Return the settings as plain data, ready for YAML, JSON and checkpoints."""
+        return self.model_dump(mode="json")
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """YAML that refuses duplicate keys and reads ``3e-3`` as the number it is."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str):
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} is no text", key_node.start_mark
+                )
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} stands twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep=deep)
+
+
+# YAML 1.1 reads 3e-3 as text, 010 as eight, 12:30 as 750 and `on` as true; YAML 1.2's core
+# schema does not.
+_StrictLoader.yaml_implicit_resolvers = {}
+for _tag, _pattern, _first in (
+    ("null", r"^(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
+    ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", list("tTfF")),
+    ("int", r"^[-+]?(?:0|[1-9][0-9]*)$", list("-+0123456789")),
+    (
+        "float",
+        r"^[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$",
+        list("-+0123456789."),
+    ),
+):
+    _StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
+
+
+def _parse_yaml(text: str, where: str) -> Any:
+    depth = 0
+    try:
+        for event in yaml.parse(text, Loader=_StrictLoader):
+            if isinstance(event, yaml.AliasEvent):
+                raise SettingsError(f"{where}: YAML aliases are not accepted; write the value out")
+            if isinstance(event, yaml.CollectionStartEvent):
+                depth += 1
+                if depth > MAX_SETTINGS_DEPTH:
+                    raise SettingsError(f"{where}: nested deeper than {MAX_SETTINGS_DEPTH} levels")
+            elif isinstance(event, yaml.CollectionEndEvent):
+                depth -= 1
+        return yaml.load(text, Loader=_StrictLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"{where}:{mark.line + 1}:{mark.column + 1}" if mark else where
+        problem = getattr(error, "problem", None) or "is no YAML"
+        raise SettingsError(f"{place}: {problem}") from None
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read one settings file as plain data.
+
+    Raises
+    ------
+    SettingsError
+        If the file is missing, not UTF-8, too large, or no YAML mapping.
+    """
+    try:
+        if path.stat().st_size > MAX_SETTINGS_BYTES:
+            raise SettingsError(f"{path}: larger than {MAX_SETTINGS_BYTES} bytes; no settings file")
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        near = difflib.get_close_matches(
+            path.name, [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
+        )
+        hint = f"; did you mean {path.parent / near[0]}?" if near else ""
+        raise SettingsError(f"{path}: no such settings file{hint}") from None
+    except UnicodeDecodeError:
+        raise SettingsError(f"{path}: not UTF-8 text; save it as UTF-8") from None
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read ({error.strerror})") from None
+    data = _parse_yaml(text, str(path))
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise SettingsError(f"{path}: holds {type(data).__name__}, expected `section:` lines")
+    return data
+
+
+def apply_override(data: dict[str, Any], assignment: str) -> None:
+    """Set one dotted ``KEY=VALUE`` in ``data``, in place.
+
+    Raises
+    ------
+    SettingsError
+        If the text is no assignment or runs through a value that is no section.
+    """
+    key, equals, value = assignment.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise SettingsError(
+            f"{assignment!r}: expected KEY=VALUE with a dotted key, such as fit.epochs=5"
+        )
+    node = data
+    for part in parts[:-1]:
+        child = node.setdefault(part, {})
+        if not isinstance(child, dict):
+            raise SettingsError(f"{key}: {part} is a value, not a section")
+        node = child
+    node[parts[-1]] = _parse_yaml(value, key)
+
+
+def _model_at(model: type[BaseModel], path: Iterable[str | int]) -> type[BaseModel] | None:
+    for part in path:
+        info = model.model_fields.get(str(part))
+        if info is None or not (
+            isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel)
+        ):
+            return None
+        model = info.annotation
+    return model
+
+
+def describe_faults(
+    error: ValidationError, model: type[BaseModel], source: str, prefix: str = ""
+) -> str:
+    """Turn pydantic's faults into one line each: source, dotted key, what is wrong, a way out."""
+    lines: dict[str, None] = {}
+    for fault in error.errors():
+        location = [
+            part
+            for part in fault["loc"]
+            if not (isinstance(part, str) and re.search(r"constrained|literal|\[", part))
+        ]
+        # A union reports one fault per member, with the member's type as last part.
+        if location and location[-1] in ("int", "float", "none", "str"):
+            location = location[:-1]
+        key = ".".join([*([prefix] if prefix else []), *(str(part) for part in location)])
+        if fault["type"] == "extra_forbidden":
+            parent = _model_at(model, location[:-1])
+            known = list(parent.model_fields) if parent else []
+            near = difflib.get_close_matches(str(location[-1]), known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+            lines[f"{source}: {key}: unknown key; {hint}"] = None
+        elif fault["type"] == "missing":
+            lines[f"{source}: {key}: missing; set it, e.g. {key}=..."] = None
+        elif fault["type"] == "value_error":
+            message = fault["msg"].removeprefix("Value error, ")
+            lines[f"{source}: {key + ': ' if key else ''}{message}"] = None
+        else:
+            message = fault["msg"][0].lower() + fault["msg"][1:]
+            found = repr(fault["input"])
+            found = found if len(found) < 80 else found[:77] + "..."
+            lines[f"{source}: {key}: found {found}; {message}"] = None
+    return "\n".join(lines)
+
+
+def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
+    """Check plain data against the settings.
+
+    Raises
+    ------
+    SettingsError
+        One line per fault, naming ``source``, the dotted key and what is allowed.
+    """
+    try:
+        return Settings.model_validate(dict(data))
+    except ValidationError as error:
+        raise SettingsError(describe_faults(error, Settings, source)) from None
+
+
+def load_settings(path: Path, overrides: Iterable[str] = ()) -> Settings:
+    """Read a settings file and lay ``KEY=VALUE`` assignments over it.
+
+    Raises
+    ------
+    SettingsError
+        If the file cannot be read or any key or value is not allowed.
+    """
+    data = read_yaml(path)
+    for assignment in overrides:
+        apply_override(data, assignment)
+    return validate_settings(data, str(path))
+
+
+def dump_yaml(settings: Settings) -> str:
+    """Return the settings, whole, as YAML text that :func:`load_settings` reads back."""
+    return str(yaml.safe_dump(settings.plain(), sort_keys=False, allow_unicode=True))

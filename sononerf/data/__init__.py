@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The ensemble store, its range slices, and how they are streamed."""

@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: MIT
+"""How an ensemble lies on disk: zarr v3 arrays whose every file goes through the one write path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import zarr
+from numpy.typing import ArrayLike, NDArray
+from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
+from zarr.core.buffer import Buffer
+from zarr.storage import LocalStore
+
+from sononerf import storage
+from sononerf.errors import InputError, NumericalError
+
+EARS = 2
+SPECTROGRAM = "spectrogram"
+CRC_BYTES = 4
+SPLITS = {"train": 0, "val": 1, "test": 2}
+
+AXES: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
+    # name: type, dimension names, sizes after the first
+    "position": ("float64", ("pose", "world"), (3,)),
+    "rotation": ("float64", ("pose", "world", "head"), (3, 3)),
+    "split": ("int8", ("pose",), ()),
+    "range": ("float64", ("range",), ()),
+    "frequency": ("float64", ("frequency",), ()),
+}
+
+
+class DurableStore(LocalStore):
+    """zarr's local store, whose own writing is not fsynced, with every write committed."""
+
+    def _commit(self, key: str, value: Buffer) -> None:
+        self._check_writable()
+        storage.commit_bytes(self.root / key, value.to_bytes())
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Commit one key."""
+        self._commit(key, value)
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """Commit one key unless it is there."""
+        if not (self.root / key).exists():
+            self._commit(key, value)
+
+    def set_sync(self, key: str, value: Buffer) -> None:
+        """Commit one key, for the zarr versions that write without a loop."""
+        self._commit(key, value)
+
+
+def chunk_path(root: Path, name: str, index: tuple[int, ...]) -> Path:
+    """Return the file of one chunk; all chunks of an array lie in one folder."""
+    return root / name / ".".join(["c", *map(str, index)])
+
+
+def _create(
+    root: Path,
+    name: str,
+    *,
+    shape: tuple[int, ...],
+    chunks: tuple[int, ...],
+    dtype: str,
+    dimensions: tuple[str, ...],
+) -> Any:
+    packed = name == SPECTROGRAM
+    return zarr.create_array(
+        store=DurableStore(root / name),
+        shape=shape,
+        chunks=chunks,
+        dtype=dtype,
+        # A chunk that is lost must not read as silence.
+        fill_value=np.nan if packed else 0,
+        serializer=BytesCodec(endian="little"),
+        compressors=[ZstdCodec(level=3), Crc32cCodec()] if packed else [Crc32cCodec()],
+        filters=None,
+        # Flat names: one folder to fsync instead of one per dimension.
+        chunk_key_encoding={"name": "default", "separator": "."},
+        dimension_names=dimensions,
+        config={"write_empty_chunks": True},
+        overwrite=True,
+    )
+
+
+def checked_axes(**given: ArrayLike) -> dict[str, NDArray[Any]]:
+    """Return axes in the types that are stored, by the names of :data:`AXES`.
+
+    Raises
+    ------
+    InputError
+        If shapes do not fit one another, or a split is unknown.
+    NumericalError
+        If a value is NaN or infinite.
+    """
+    axes: dict[str, NDArray[Any]] = {}
+    for name, (dtype, dims, sizes) in AXES.items():
+        raw = np.asarray(given[name], dtype=np.float64)
+        if raw.ndim != len(dims) or raw.shape[1:] != sizes or not raw.size:
+            raise InputError(f"{name}: shape {raw.shape}, expected ({dims[0]}, *{sizes})")
+        if not np.isfinite(raw).all():
+            raise NumericalError(f"{name}: holds NaN or infinite values")
+        axes[name] = raw.astype(dtype)
+    if not np.isin(given["split"], list(SPLITS.values())).all():
+        raise InputError("split: expected 0 (train), 1 (validation) or 2 (test)")
+    lengths = [len(axes[name]) for name in ("position", "rotation", "split")]
+    if len(set(lengths)) > 1:
+        raise InputError(f"position, rotation and split differ in length: {lengths}")
+    return axes
+
+
+def create_arrays(root: Path, axes: dict[str, NDArray[Any]]) -> None:
+    """Write the axes whole and declare the spectrogram, all before the group that shows them.
+
+    Parameters
+    ----------
+    root : Path
+        The ensemble's folder.
+    axes : dict of array
+        By the names of :data:`AXES`.
+
+    Raises
+    ------
+    StorageError
+        If a file cannot be written.
+    """
+    for name, values in axes.items():
+        dtype, dimensions, _ = AXES[name]
+        array = _create(
+            root, name, shape=values.shape, chunks=values.shape, dtype=dtype, dimensions=dimensions
+        )
+        array[...] = values
+    size = (EARS, len(axes["range"]), len(axes["frequency"]))
+    _create(
+        root,
+        SPECTROGRAM,
+        shape=(len(axes["position"]), *size),
+        chunks=(1, *size),
+        dtype="float32",
+        dimensions=("pose", "ear", "range", "frequency"),
+    )
+
+
+def _open_array(
+    root: Path, name: str, group: Any, dtype: str, dims: tuple[str, ...], sizes: tuple[int, ...]
+) -> Any:
+    """Return one array of the group if it is what we write; nothing is read of it yet."""
+    path = root / name
+    try:
+        array = group.get(name)
+    except Exception as error:  # damaged metadata raises whatever its parser met first
+        raise InputError(f"{path}: damaged ({type(error).__name__}: {error})") from error
+    if not isinstance(array, zarr.Array):
+        raise InputError(f"{path}: missing; simulate or fetch the ensemble again")
+    metadata = array.metadata.to_dict()
+    codecs = [codec["name"] for codec in metadata["codecs"]]
+    packed = name == SPECTROGRAM
+    expected = ["bytes", "zstd", "crc32c"] if packed else ["bytes", "crc32c"]
+    chunks = (1, *array.shape[1:]) if packed else array.shape
+    found = {
+        "type": (str(array.dtype), dtype),
+        "dimension names": (tuple(array.metadata.dimension_names or ()), dims),
+        "shape": (array.shape[-len(sizes) :] if sizes else (), sizes),
+        "number of dimensions": (array.ndim, len(dims)),
+        "chunks": (array.chunks, chunks),
+        "codecs": (codecs, expected),
+        "big-endian": (metadata["codecs"][0].get("configuration") == {"endian": "big"}, False),
+        "chunk names": (
+            metadata["chunk_key_encoding"],
+            {"name": "default", "configuration": {"separator": "."}},
+        ),
+        "fill value": (bool(np.isnan(array.fill_value)), packed),
+    }
+    for what, (is_there, wanted) in found.items():
+        if is_there != wanted:
+            raise InputError(f"{path}: {what} {is_there}, expected {wanted}")
+    if min(array.shape) < 1:
+        raise InputError(f"{path}: empty (shape {array.shape})")
+    return array
+
+
+def read_axes(root: Path, group: Any) -> tuple[dict[str, NDArray[Any]], Any]:
+    """Check every array against what :func:`create_arrays` writes and read the axes.
+
+    Parameters
+    ----------
+    root : Path
+        The ensemble's folder.
+    group : zarr.Group
+        Its opened group.
+
+    Returns
+    -------
+    axes : dict of array
+        By the names of :data:`AXES`.
+    spectrogram : zarr.Array
+        (P, E, R, F) float32, not read.
+
+    Raises
+    ------
+    InputError
+        If one is missing, damaged, or does not fit the others.
+    """
+    axes = {}
+    for name, (dtype, dims, sizes) in AXES.items():
+        array = _open_array(root, name, group, dtype, dims, sizes)
+        chunk = chunk_path(root, name, (0,) * array.ndim)
+        size = chunk.stat().st_size if chunk.is_file() else 0
+        # Also bounds what is read: a declared size that no file backs costs no memory.
+        if size != array.nbytes + CRC_BYTES:
+            raise InputError(f"{chunk}: {size} bytes, expected {array.nbytes + CRC_BYTES}")
+        try:
+            axes[name] = np.asarray(array[...])
+        except Exception as error:  # zarr's codecs raise their own kinds
+            raise InputError(f"{chunk}: damaged ({error})") from error
+    poses = {len(axes[name]) for name in ("position", "rotation", "split")}
+    if len(poses) > 1:
+        raise InputError(f"{root}: position, rotation and split differ in length: {sorted(poses)}")
+    shape = (len(axes["position"]), EARS, len(axes["range"]), len(axes["frequency"]))
+    dims = ("pose", "ear", "range", "frequency")
+    return axes, _open_array(root, SPECTROGRAM, group, "float32", dims, shape)

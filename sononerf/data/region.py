@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: MIT
+"""Where something can be, judged from sound and silence alone."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from sononerf.acoustics.ears import Ears
+from sononerf.data.store import EnsembleStore
+from sononerf.errors import NumericalError
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+HEARD_DB = 6.0
+"""A range is heard where any cell of it reaches this, 60 dB below the loudest being zero."""
+WITNESS_GAIN = 0.1
+"""A pose is a witness of the places towards which its gain is at least this part of the best."""
+SILENT_SHARE = 0.25
+"""A place is empty where more than this share of its witnesses heard their first echo behind it.
+
+Not zero: a flat face answers only from straight ahead, and some pose hears what stands behind."""
+HEARD_SHARE = 0.005
+"""A place is empty where fewer than this share of its witnesses heard anything at its range."""
+AGREEMENT = 0.6
+"""A place is taken where the sound from its range is this part of the best place's, or more."""
+UNEXPLAINED_SHARE = 0.02
+"""The search for more places ends when only this share of the sound is not explained."""
+ROUNDS = 6
+WINDOW_REACH = 0.006
+"""One echo sounds this far in range, in metres: half of the analysis window."""
+LOOKS = 4
+COARSE = 28
+"""Cells along the longest side of each look."""
+CHUNK = 2048
+
+
+class Evidence(NamedTuple):
+    """What the poses say about places."""
+
+    possible: Mask  # (N,)
+    energy: Array  # (N,) mean share of a pose's sound that comes from the place's range
+
+
+class EchoEvidence:
+    """What the training poses say about places.
+
+    Parameters
+    ----------
+    store : EnsembleStore
+        A sealed ensemble; only its training poses are looked at.
+    ears : Ears
+        Gains and places of emitter and ears.
+    most : int
+        How many poses are asked at most, evenly spread over the training poses.
+
+    Raises
+    ------
+    NumericalError
+        If no pose heard anything.
+    """
+
+    def __init__(self, store: EnsembleStore, ears: Ears, *, most: int = 400) -> None:
+        indices = np.asarray(store.indices("train"))
+        indices = indices[np.linspace(0, len(indices) - 1, min(most, len(indices))).astype(int)]
+        self.range = np.asarray(store.range, dtype=np.float64)
+        self.step = float(self.range[1] - self.range[0])
+        threshold = float(store.attributes["reference"]) * (10 ** (HEARD_DB / 20) - 1)
+        loudest, power = [], []
+        for index in indices:
+            spectrogram = store.read_pose(int(index))
+            loudest.append(spectrogram.max(axis=(0, 2)))
+            power.append((spectrogram**2).sum(axis=(0, 2)))
+        self.heard = np.stack(loudest) >= threshold  # (P, R)
+        if not self.heard.any():
+            raise NumericalError("no pose received an echo; check scene, poses and range limits")
+        total = np.stack(power) * self.heard
+        self.power = total / total.sum(axis=1, keepdims=True).clip(1e-30)
+        silent = ~self.heard.any(axis=1)
+        # Who hears nothing at all tells nothing about what lies in front.
+        self.first = np.where(silent, -np.inf, self.range[self.heard.argmax(axis=1)])
+        self.last = self.range[self.heard.shape[1] - 1 - self.heard[:, ::-1].argmax(axis=1)]
+        self.rotations = np.asarray(store.rotations)[indices]
+        # Emitter and ears lie about a centimetre apart: half way between them, the mean of the
+        # ranges to both ears is met within a fraction of a millimetre.
+        head = (ears.emitter + ears.positions.mean(axis=0)) / 2
+        self.sources = np.asarray(store.positions)[indices] + self.rotations @ head
+        gain = (ears.beam[None] * ears.ears).max(axis=(0, 1))  # (L, A)
+        self.gain = gain / gain.max()
+
+    def about(self, points: Array, tolerance: float, sound: Array | None = None) -> Evidence:
+        """Return which places may hold something, and how much sound comes from their range.
+
+        Parameters
+        ----------
+        points : (N, 3) float, m
+            Places, world frame.
+        tolerance : float, m
+            How far a place speaks for its surroundings.
+        sound : (P, R) float or None
+            The sound that is looked at; all of it where None.
+        """
+        reach = int(np.ceil(tolerance / self.step))
+        heard = ndimage.maximum_filter1d(self.heard, 2 * reach + 1, axis=1, mode="constant")
+        power = ndimage.maximum_filter1d(
+            self.power if sound is None else sound, 2 * reach + 1, axis=1, mode="constant"
+        )
+        parts = [
+            self._about(points[start : start + CHUNK], tolerance, heard, power)
+            for start in range(0, len(points), CHUNK)
+        ]
+        return Evidence(
+            np.concatenate([part.possible for part in parts]),
+            np.concatenate([part.energy for part in parts]),
+        )
+
+    def _about(self, points: Array, tolerance: float, heard: Mask, power: Array) -> Evidence:
+        distance, row, within = self._rows(points)
+        witness = self._witnesses(points, distance)
+        pose = np.arange(len(self.sources))[:, None]
+        count = witness.sum(axis=0)
+        silent = (witness & (distance + tolerance < self.first[:, None])).sum(axis=0)
+        meets = witness & within
+        sounding = (meets & heard[pose, row]).sum(axis=0)
+        energy = (meets * power[pose, row]).sum(axis=0) / np.maximum(count, 1)
+        possible = (
+            (count > 0)
+            & (silent <= SILENT_SHARE * count)
+            & (sounding >= np.maximum(2.0, HEARD_SHARE * count))
+        )
+        return Evidence(possible, energy)
+
+    def _rows(self, points: Array) -> tuple[Array, NDArray[np.int64], Mask]:
+        """Return each pose's distance to each place, and the range slice it falls in, (P, N)."""
+        squared = (
+            (self.sources**2).sum(1)[:, None] - 2 * self.sources @ points.T + (points**2).sum(1)
+        )
+        distance = np.sqrt(squared.clip(1e-12))
+        row = np.round((distance - self.range[0]) / self.step).astype(np.int64)
+        within = (row >= 0) & (row < len(self.range))
+        return distance, row.clip(0, len(self.range) - 1), within
+
+    def _witnesses(self, points: Array, distance: Array) -> Mask:
+        local = [
+            (self.rotations[:, :, axis] @ points.T)
+            - (self.rotations[:, :, axis] * self.sources).sum(1)[:, None]
+            for axis in range(3)
+        ]
+        rows, columns = self.gain.shape
+        azimuth = np.arctan2(local[1], local[0])
+        elevation = np.arcsin((local[2] / distance).clip(-1, 1))
+        row = np.round((elevation / np.pi + 0.5) * (rows - 1)).astype(np.int64)
+        column = np.round((azimuth / (2 * np.pi) + 0.5) * (columns - 1)).astype(np.int64)
+        return np.asarray(self.gain[row, column] >= WITNESS_GAIN)
+
+    def box(self, margin: float = 0.01) -> Array:
+        """Return the box around all that is needed to explain the echoes, (2, 3) m.
+
+        Raises
+        ------
+        NumericalError
+            If the poses leave no place possible.
+        """
+        # A flight along a line or on one side still looks as far ahead as it hears.
+        ahead = self.sources + self.rotations[:, :, 0] * self.last[:, None]
+        ends = np.concatenate((self.sources, ahead))
+        lower, upper = ends.min(axis=0), ends.max(axis=0)
+        for _ in range(LOOKS):  # coarse to fine
+            spacing = float((upper - lower).max()) / COARSE
+            axes = [
+                np.arange(a + spacing / 2, b + spacing / 2, spacing)
+                for a, b in zip(lower, upper, strict=True)
+            ]
+            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+            kept = points[self.needed(points, spacing * np.sqrt(3) / 2)]
+            if not len(kept):
+                raise NumericalError(
+                    "the echoes leave no place where something could be; set region.lower and "
+                    "region.upper, or check the poses"
+                )
+            lower, upper = kept.min(axis=0) - spacing / 2, kept.max(axis=0) + spacing / 2
+        return np.stack((lower - margin, upper + margin))
+
+    def needed(self, points: Array, tolerance: float) -> Mask:
+        """Return the places that explain the sound, the best focused first.
+
+        Places out in the open lie at the range of *some* echo of many poses, but the echoes
+        do not agree there. So the places where they agree best are taken, what they explain is
+        taken out of the sound, and the rest is looked at anew, until little is left: a weak or
+        hidden part is found in the sound that the loud ones cannot explain.
+        """
+        unexplained = self.power.copy()
+        keep = np.zeros(len(points), dtype=bool)
+        for _ in range(ROUNDS):
+            evidence = self.about(points, tolerance, unexplained)
+            energy = np.where(evidence.possible, evidence.energy, 0.0)
+            if energy.max() <= 0:
+                break
+            keep |= energy >= AGREEMENT * energy.max()
+            unexplained = np.where(self._covered(points[keep], tolerance), 0.0, self.power)
+            if unexplained.sum() <= UNEXPLAINED_SHARE * self.power.sum():
+                break
+        return keep
+
+    def _covered(self, points: Array, tolerance: float) -> Mask:
+        """Return which range slices of each pose the places explain, (P, R)."""
+        covered = np.zeros_like(self.heard)
+        for start in range(0, len(points), CHUNK):
+            _, row, within = self._rows(points[start : start + CHUNK])
+            pose = np.broadcast_to(np.arange(len(row))[:, None], row.shape)
+            covered[pose[within], row[within]] = True
+        reach = int(np.ceil((tolerance + WINDOW_REACH) / self.step))
+        covered = ndimage.maximum_filter1d(covered, 2 * reach + 1, axis=1, mode="constant")
+        return np.asarray(covered)

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: MIT
+"""What can go wrong, each kind with the exit code that the command line ends with."""
+
+from __future__ import annotations
+
+
+class SonoNerfError(Exception):
+    """A fault that the user can read in one line: what, where, what is allowed, what to do."""
+
+    exit_code = 1
+
+
+class SettingsError(SonoNerfError):
+    """Wrong usage or settings; may hold several lines, one per fault."""
+
+    exit_code = 2
+
+
+class InputError(SonoNerfError):
+    """A bad input file or plugin."""
+
+    exit_code = 3
+
+
+class StorageError(SonoNerfError):
+    """Storage is full, read-only, or failing."""
+
+    exit_code = 4
+
+
+class NumericalError(SonoNerfError):
+    """NaN, no echo, no surface."""
+
+    exit_code = 5
+
+
+class ResourceError(SonoNerfError):
+    """Not enough memory, or a device that is not there."""
+
+    exit_code = 6
+
+
+class LockedError(SonoNerfError):
+    """Another process works in the same folder."""
+
+    exit_code = 7
+
+
+class IncompatibleError(SonoNerfError):
+    """Artefacts, settings or versions that do not fit together."""
+
+    exit_code = 8
+
+
+class StoppedError(SonoNerfError):
+    """Stopped by a signal, with everything saved; the same command goes on."""
+
+    def __init__(self, signal_number: int, message: str = "") -> None:
+        super().__init__(message or "stopped; the same command goes on where it stopped")
+        self.exit_code = 128 + signal_number

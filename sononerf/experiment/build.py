@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: MIT
+"""Settings into field, renderer and module."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sononerf import plugins
+from sononerf.acoustics.air import air_absorption, speed_of_sound
+from sononerf.acoustics.ears import synthetic_ears
+from sononerf.acoustics.spectrogram import frequency_axis, range_axis
+from sononerf.config import Settings
+from sononerf.data.region import EchoEvidence
+from sononerf.data.store import EnsembleStore
+from sononerf.errors import InputError
+from sononerf.field.field import Field
+from sononerf.module import EchoModule
+from sononerf.renderer.renderer import Acquisition, Possible, Renderer
+from sononerf.simulation.simulator import DEFAULT_SPEED, DEFAULT_TEMPERATURE
+
+
+def _tensor(values: NDArray[np.floating]) -> Tensor:
+    return torch.as_tensor(np.asarray(values), dtype=torch.float32)
+
+
+def acquisition(settings: Settings) -> Acquisition:
+    """Return what a renderer has to know of how the spectra came to be."""
+    air, analysis = settings.air, settings.spectrogram
+    temperature = air.temperature_c
+    speed = DEFAULT_SPEED if temperature is None else speed_of_sound(temperature)
+    frequency = frequency_axis(analysis)
+    ears = synthetic_ears(settings.ears, frequency)
+    absorption = air_absorption(
+        frequency,
+        temperature_c=DEFAULT_TEMPERATURE if temperature is None else temperature,
+        relative_humidity=air.relative_humidity,
+        pressure=air.pressure_pa,
+    )
+    return Acquisition(
+        frequency=_tensor(frequency),
+        range=_tensor(range_axis(analysis, speed)),
+        window=torch.hamming_window(analysis.window, periodic=False),
+        sampling_rate=analysis.sampling_rate,
+        speed_of_sound=speed,
+        absorption=_tensor(absorption) * (math.log(10.0) / 20.0),
+        beam=_tensor(ears.beam),
+        ears=_tensor(ears.ears),
+        emitter=_tensor(ears.emitter),
+        ear_positions=_tensor(ears.positions),
+    )
+
+
+def echo_region(settings: Settings, store: EnsembleStore) -> tuple[Tensor, Possible]:
+    """Return the box that is fitted, from the settings or the echoes, and what is possible in it.
+
+    Returns
+    -------
+    region : (2, 3) float, m
+        Lower and upper corner.
+    possible : callable
+        Which places the echoes leave possible.
+    """
+    ears = synthetic_ears(settings.ears, frequency_axis(settings.spectrogram))
+    evidence = EchoEvidence(store, ears, most=200)
+    set_region = settings.region
+    if set_region.lower is not None and set_region.upper is not None:
+        box = np.asarray((set_region.lower, set_region.upper))
+    else:
+        box = evidence.box()
+
+    def possible(places: Tensor, tolerance: float) -> Tensor:
+        needed = evidence.needed(places.double().cpu().numpy(), tolerance)
+        if not needed.any():
+            needed[:] = True  # the box is right by the user's word
+        return torch.as_tensor(needed, device=places.device)
+
+    return _tensor(box), possible
+
+
+def field_and_renderer(settings: Settings, region: Tensor) -> tuple[Field, Renderer]:
+    """Return an unfitted field and its renderer.
+
+    Raises
+    ------
+    SettingsError
+        If a kind or an option is not known.
+    InputError
+        If a plugin returns something else.
+    """
+    known = acquisition(settings)
+    make_field = plugins.load(plugins.FIELDS, settings.field.kind)
+    options = plugins.check_options(
+        make_field, settings.field.options, where="field.options", given=2
+    )
+    torch.manual_seed(settings.fit.seed)
+    field = make_field(region, known.frequency, **options)
+    make_renderer = plugins.load(plugins.RENDERERS, settings.renderer.kind)
+    options = plugins.check_options(
+        make_renderer, settings.renderer.options, where="renderer.options", given=2
+    )
+    renderer = make_renderer(region, known, **options)
+    for made, kind, name in (
+        (field, Field, settings.field.kind),
+        (renderer, Renderer, settings.renderer.kind),
+    ):
+        if not isinstance(made, kind):
+            raise InputError(
+                f"{name!r} makes a {type(made).__name__}, expected a sononerf {kind.__name__}"
+            )
+    return field, renderer
+
+
+def check_plugins(settings: Settings) -> None:
+    """Refuse unknown kinds and options before anything expensive."""
+    region = torch.tensor([[-0.05] * 3, [0.05] * 3])
+    field_and_renderer(settings, region)
+
+
+def module_for(
+    settings: Settings,
+    field: Field,
+    renderer: Renderer,
+    *,
+    reference: float,
+    possible: Possible | None = None,
+    total_steps: int = 1,
+    steps_per_epoch: int = 1,
+) -> EchoModule:
+    """Return the LightningModule around field and renderer."""
+    fit = settings.fit
+    return EchoModule(
+        field,
+        renderer,
+        reference=reference,
+        dynamic_range_db=settings.spectrogram.dynamic_range_db,
+        possible=possible,
+        learning_rate=fit.learning_rate or field.learning_rate,
+        total_steps=total_steps,
+        steps_per_epoch=steps_per_epoch,
+        schedule=fit.schedule,
+        final_rate_factor=fit.final_rate_factor,
+        staircase_factor=fit.staircase_factor,
+        staircase_epochs=fit.staircase_epochs,
+        loss=fit.loss,
+        silent_weight=fit.silent_weight,
+        seed=fit.seed,
+    )

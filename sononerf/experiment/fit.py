@@ -1,0 +1,275 @@
+# SPDX-License-Identifier: MIT
+"""Fit a field to an ensemble; go on where an interrupted fit stopped."""
+
+from __future__ import annotations
+
+import logging
+import resource
+import sys
+import time
+import warnings
+from pathlib import Path
+
+import lightning
+import torch
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from sononerf import storage
+from sononerf.callbacks.checkpoint import CheckpointCallback
+from sononerf.callbacks.preview import PreviewCallback
+from sononerf.callbacks.progress import ProgressCallback
+from sononerf.callbacks.spectrogram_images import SpectrogramImages
+from sononerf.checkpoint_io import DurableCheckpointIO
+from sononerf.config import Settings
+from sononerf.data.datamodule import EchoDataModule
+from sononerf.data.store import EnsembleStore
+from sononerf.errors import NumericalError, ResourceError, StoppedError
+from sononerf.experiment.build import check_plugins, echo_region, field_and_renderer, module_for
+from sononerf.experiment.run_folder import RunFolder
+from sononerf.experiment.simulate import simulate
+from sononerf.module import EchoModule
+from sononerf.progress import Progress
+from sononerf.weights import save_weights
+
+
+def quiet_lightning() -> None:
+    """Leave out Lightning's advertising and hints about what we do on purpose."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    for pattern in (
+        r".*does not have many workers.*",  # the ensemble lies in memory
+        r".*GPU available but not used.*",  # the user chose
+        r".*resumed from a checkpoint that ended before the epoch.*",  # ours go by the step
+        r".*\.*Checkpoint directory .* exists and is not empty.*",
+        r".*`max_epochs` was not set.*",
+    ):
+        warnings.filterwarnings("ignore", message=pattern)
+
+
+def require_accelerator(accelerator: str) -> None:
+    """Refuse a GPU that is not there.
+
+    Raises
+    ------
+    ResourceError
+        If ``gpu`` was asked for and there is none.
+    """
+    if accelerator == "gpu" and not (
+        torch.cuda.is_available() or torch.backends.mps.is_available()
+    ):
+        raise ResourceError("no GPU that torch can use; take --accelerator cpu, or auto")
+
+
+def fit(
+    settings: Settings,
+    path: Path,
+    *,
+    accelerator: str = "auto",
+    devices: int | str = "auto",
+    num_nodes: int = 1,
+    overwrite: bool = False,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> RunFolder:
+    """Simulate where needed, fit, and keep the fitted field.
+
+    The same call goes on where an interrupted one stopped; a finished run is left as it is.
+
+    Parameters
+    ----------
+    settings : Settings
+        The experiment.
+    path : Path
+        The run's folder.
+    accelerator : {"auto", "cpu", "gpu"}
+        What to fit on.
+    devices : int or "auto"
+        How many.
+    num_nodes : int
+        How many machines.
+    overwrite : bool
+        Move a folder that is there aside.
+    workers : int or None
+        Processes that simulate.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    run : RunFolder
+        With ``model.safetensors`` and ``model.json``.
+
+    Raises
+    ------
+    SonoNerfError
+        Each kind as its name says; :class:`StoppedError` after a signal, with all saved.
+    """
+    progress = progress or Progress(quiet=True)
+    run = RunFolder(path)
+    require_accelerator(accelerator)
+    check_plugins(settings)
+    if overwrite:
+        aside = run.move_aside()
+        if aside:
+            progress.say(f"moved the old run to {aside}")
+    storage.probe_writable(path)
+    with storage.lock(path):
+        run.begin(settings)
+        if run.is_fitted:
+            return run
+        started = time.monotonic()
+        store = simulate(settings, workers=workers, progress=progress)
+        simulated = time.monotonic() - started
+        run.write_provenance(
+            echo_hash=store.attributes["echo_hash"], threads=torch.get_num_threads()
+        )
+        run.write_metrics("cost", {"simulate_s": simulated}, merge=True)
+        _fit(settings, run, store, accelerator, devices, num_nodes, progress)
+    return run
+
+
+def _length(settings: Settings, per_pass: int) -> tuple[int, int]:
+    """Return steps per epoch and steps in all."""
+    steps = settings.fit.steps_per_epoch
+    per_epoch = per_pass if steps == "auto" else steps
+    total = per_epoch * settings.fit.epochs
+    if settings.fit.max_steps is not None:
+        total = min(total, settings.fit.max_steps)
+    return min(per_epoch, total), total
+
+
+def _fit(
+    settings: Settings,
+    run: RunFolder,
+    store: EnsembleStore,
+    accelerator: str,
+    devices: int | str,
+    num_nodes: int,
+    progress: Progress,
+) -> None:
+    quiet_lightning()
+    started = time.monotonic()
+    region, possible = echo_region(settings, store)
+    corners = (1000 * region).round().int().tolist()
+    progress.say(f"region {corners[0]} to {corners[1]} mm")
+    field, renderer = field_and_renderer(settings, region)
+    options = settings.fit
+    data = EchoDataModule(
+        store,
+        whole_poses=renderer.whole_poses,
+        batch=options.batch_poses if renderer.whole_poses else options.batch_slices,
+        batch_frequencies=(
+            None if options.batch_frequencies == "all" else options.batch_frequencies
+        ),
+        seed=options.seed,
+        workers=settings.data.workers,
+        memory_bytes=settings.data.memory_bytes,
+    )
+    per_epoch, total = _length(settings, data.stream().batches_per_pass)
+    module = module_for(
+        settings,
+        field,
+        renderer,
+        reference=float(store.attributes["reference"]),
+        possible=possible,
+        total_steps=total,
+        steps_per_epoch=per_epoch,
+    )
+    keeper = CheckpointCallback(run.path, options.checkpoint_seconds)
+    resumed = _resume(run, data)
+    if not resumed:
+        run.clear_previews()
+    with progress.task("fitting", total) as task, keeper.watching():
+        trainer = lightning.Trainer(
+            accelerator=accelerator,
+            devices=devices,
+            num_nodes=num_nodes,
+            max_epochs=-1,
+            max_steps=total,
+            val_check_interval=per_epoch,
+            check_val_every_n_epoch=None,
+            limit_val_batches=1.0 if len(store.indices("val")) else 0,
+            num_sanity_val_steps=0,
+            gradient_clip_val=options.gradient_clip,
+            logger=TensorBoardLogger(run.path, name="tensorboard", version=""),
+            callbacks=[
+                ProgressCallback(task),
+                PreviewCallback(
+                    run.path,
+                    every_epochs=settings.preview.every_epochs,
+                    voxels=settings.preview.voxels,
+                    directions=settings.reconstruction.directions,
+                ),
+                SpectrogramImages(data.whole("val"), renderer.range, renderer.frequency),
+                keeper,
+            ],
+            plugins=[DurableCheckpointIO()],
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            use_distributed_sampler=False,
+            log_every_n_steps=10,
+            default_root_dir=run.path,
+        )
+        trainer.fit(module, data, ckpt_path=run.checkpoint if resumed else None, weights_only=True)
+    if keeper.stopped_by is not None and trainer.global_step < total:
+        raise StoppedError(
+            keeper.stopped_by,
+            f"stopped at step {trainer.global_step} of {total}; the same command goes on",
+        )
+    _finish(settings, run, store, module, time.monotonic() - started, trainer)
+
+
+def _resume(run: RunFolder, data: EchoDataModule) -> bool:
+    previous = run.checkpoint.with_name(f"{run.checkpoint.name}.previous")
+    if not run.checkpoint.is_file() and not previous.is_file():
+        return False
+    step = DurableCheckpointIO().load_checkpoint(run.checkpoint)["global_step"]
+    data.sampler.start = int(step)
+    return True
+
+
+def _finish(
+    settings: Settings,
+    run: RunFolder,
+    store: EnsembleStore,
+    module: EchoModule,
+    seconds: float,
+    trainer: lightning.Trainer,
+) -> None:
+    bad = [n for n, p in module.named_parameters() if not bool(p.isfinite().all())]
+    if bad:
+        raise NumericalError(f"the fitted {bad[0]} is not finite; lower fit.learning_rate")
+    if not trainer.is_global_zero:
+        return
+    state = {f"field.{k}": v for k, v in module.field.state_dict().items()}
+    state |= {f"renderer.{k}": v for k, v in module.renderer.state_dict().items()}
+    run.write_metrics(
+        "cost",
+        {
+            "fit_s": run.read_metrics().get("cost", {}).get("fit_s_before", 0.0) + seconds,
+            "steps": trainer.global_step,
+            "points_evaluated": int(module.renderer.points_evaluated),
+            "parameters": sum(p.numel() for p in module.parameters()),
+            "device": str(trainer.strategy.root_device.type),
+            "peak_memory_bytes": peak_memory_bytes(),
+        },
+        merge=True,
+    )
+    save_weights(
+        run.path,
+        state,
+        {
+            "settings": settings.plain(),
+            "reference": float(store.attributes["reference"]),
+            "echo_hash": store.attributes["echo_hash"],
+        },
+    )
+
+
+def peak_memory_bytes() -> int:
+    """Return the greatest resident memory of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(peak if sys.platform == "darwin" else peak * 1024)

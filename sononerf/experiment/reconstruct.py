@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: MIT
+"""Read a fitted field out to files, and compare it with the true scene."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import trimesh
+
+from sononerf import storage
+from sononerf.errors import NumericalError, SonoNerfError
+from sononerf.experiment.predict import Fitted, load_fitted, store_of
+from sononerf.experiment.run_folder import RunFolder
+from sononerf.progress import Progress
+from sononerf.reconstruction.baseline import backprojection, best_level_surface
+from sononerf.reconstruction.mesh import MeshFormat, mesh_bytes
+from sononerf.reconstruction.metrics import geometry_metrics
+from sononerf.reconstruction.read_out import reconstruct as read_out
+from sononerf.reconstruction.volume import vti_bytes
+from sononerf.render.mesh import mesh_png, side_by_side_png
+from sononerf.render.projection import mip_pngs
+from sononerf.scene import load_scene
+
+FORMATS: tuple[MeshFormat, ...] = ("ply", "stl", "glb")
+BASELINE_VOXELS = 64
+"""Along the region's longest side; finer than the window's length in any scene of ours."""
+
+
+def reconstruct(
+    path: Path,
+    *,
+    spacing: float | None = None,
+    level: float | Literal["auto"] | None = None,
+    output: Path | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write mesh, volume, projections and a view.
+
+    Parameters
+    ----------
+    path : Path
+        A fitted run.
+    spacing : float or None, m
+        Voxel size; the settings' where None.
+    level : float, "auto" or None
+        Level of the surface; the settings' where None.
+    output : Path or None
+        Folder of the results; ``RUN/reconstruction`` where None.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    folder : Path
+    """
+    progress = progress or Progress(quiet=True)
+    started = time.monotonic()
+    fitted = load_fitted(path)
+    folder = output or path / "reconstruction"
+    storage.probe_writable(folder)
+    options = fitted.settings.reconstruction
+    with progress.task("reconstructing", 1000) as task, torch.inference_mode():
+        found = read_out(
+            fitted.module.field,
+            spacing=spacing or options.spacing,
+            level=options.level if level is None else level,
+            method=options.method,
+            directions=options.directions,
+            progress=lambda done, total: task.advance(1000 * done // total - task.done),
+        )
+    for kind in FORMATS:
+        storage.commit_bytes(folder / f"mesh.{kind}", mesh_bytes(found.mesh, kind))
+    storage.commit_bytes(folder / "volume.vti", vti_bytes(found.volume))
+    for axis, picture in mip_pngs(found.volume).items():
+        storage.commit_bytes(folder / f"mip_{axis}.png", picture)
+    truth = true_mesh(fitted)
+    view = mesh_png(found.mesh) if truth is None else side_by_side_png(truth, found.mesh)
+    storage.commit_bytes(folder / "view.png", view)
+    storage.commit_json(
+        folder / "read_out.json",
+        {"method": found.method, "level": found.level, "spacing_m": found.volume.spacing},
+    )
+    if output is None:
+        RunFolder(path).write_metrics(
+            "cost", {"reconstruct_s": time.monotonic() - started}, merge=True
+        )
+    return folder
+
+
+def true_mesh(fitted: Fitted) -> trimesh.Trimesh | None:
+    """Return the scene's own surface; None where the scene is not installed here."""
+    try:
+        return load_scene(fitted.settings.scene.name, fitted.settings.scene.options).mesh
+    except SonoNerfError:
+        return None
+
+
+def evaluate(path: Path, *, progress: Progress | None = None) -> dict[str, Any]:
+    """Compare a reconstruction with the true scene, and the backprojection baseline likewise.
+
+    Parameters
+    ----------
+    path : Path
+        A run that was reconstructed.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    metrics : dict
+        All of ``metrics.json``.
+    """
+    progress = progress or Progress(quiet=True)
+    run = RunFolder(path)
+    fitted = load_fitted(path)
+    folder = path / "reconstruction"
+    if not (folder / "mesh.ply").is_file():
+        reconstruct(path, progress=progress)
+    truth = true_mesh(fitted)
+    geometry: dict[str, Any] | None = None
+    baseline: dict[str, Any] = {"backprojection": None, "voxels": None}
+    if truth is not None:
+        with progress.task("evaluating", 2) as task:
+            mesh = trimesh.load_mesh(folder / "mesh.ply", file_type="ply")
+            level = storage.read_json(folder / "read_out.json")["level"]
+            geometry = {**geometry_metrics(mesh, truth), "level": level}
+            task.advance()
+            baseline["backprojection"] = _backprojection(fitted, truth)
+            task.advance()
+    run.write_metrics("geometry", geometry or {})
+    run.write_metrics("baseline", baseline)
+    return run.read_metrics()
+
+
+def _backprojection(fitted: Fitted, truth: trimesh.Trimesh) -> dict[str, Any] | None:
+    store = store_of(fitted)
+    train = store.indices("train")
+    lower, upper = (corner.double().numpy() for corner in fitted.module.field.region)
+    renderer = fitted.module.renderer
+    volume = backprojection(
+        (store.read_pose(int(index)) for index in train),
+        store.positions[train],
+        store.rotations[train],
+        store.range,
+        lower,
+        upper,
+        float((upper - lower).max()) / BASELINE_VOXELS,
+        emitter_offset=renderer.emitter.double().numpy(),
+        ear_offsets=renderer.ear_positions.double().numpy(),
+    )
+    try:
+        mesh, level = best_level_surface(volume, truth)
+    except NumericalError:
+        return None
+    return {**geometry_metrics(mesh, truth), "level": level}

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""What a run's folder holds, and which of it is whose."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import shutil
+from pathlib import Path
+from typing import Any
+
+from sononerf import __version__, storage
+from sononerf.config import Settings, dump_yaml, read_yaml, validate_settings
+from sononerf.errors import IncompatibleError, InputError
+
+METRICS_SCHEMA = 1
+FREE_KEYS = ("data", "fit.checkpoint_seconds")
+"""What may change between two calls of one run: it moves no number."""
+RECORDED = ("torch", "lightning", "numpy", "scipy", "trimesh", "embreex", "zarr")
+
+
+def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in data.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, dict) and value:
+            flat.update(_flat(value, f"{name}."))
+        else:
+            flat[name] = value
+    return flat
+
+
+def differing_keys(old: Settings, new: Settings) -> list[str]:
+    """Return the dotted keys in which two experiments differ, without those that move nothing."""
+    first, second = _flat(old.plain()), _flat(new.plain())
+    return [
+        key
+        for key in sorted(first.keys() | second.keys())
+        if first.get(key) != second.get(key)
+        and not any(key == free or key.startswith(f"{free}.") for free in FREE_KEYS)
+    ]
+
+
+class RunFolder:
+    """One run on disk.
+
+    Parameters
+    ----------
+    path : Path
+        Its folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config = path / "config.yaml"
+        self.metrics = path / "metrics.json"
+        self.checkpoint = path / "checkpoints" / "last.ckpt"
+
+    def open(self) -> Settings:
+        """Return the settings of a run that is there.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        if not self.config.is_file():
+            raise InputError(f"{self.path}: no run (no config.yaml); make one with `sononerf fit`")
+        return validate_settings(read_yaml(self.config), str(self.config))
+
+    def begin(self, settings: Settings) -> None:
+        """Write the settings of a new run, or make sure that an old one has the same.
+
+        Raises
+        ------
+        IncompatibleError
+            If the folder holds a run of other settings.
+        InputError
+            If the folder holds something else.
+        """
+        if self.config.is_file():
+            different = differing_keys(self.open(), settings)
+            if different:
+                raise IncompatibleError(
+                    f"{self.path}: holds a run of other settings ({', '.join(different[:5])}"
+                    f"{', ...' if len(different) > 5 else ''}); choose another --output, or "
+                    "--overwrite to move it aside"
+                )
+            return
+        foreign = [p.name for p in self.path.iterdir() if not p.name.startswith(".")]
+        if foreign:
+            raise InputError(
+                f"{self.path}: holds {sorted(foreign)[0]!r} and is no run; choose another --output"
+            )
+        storage.commit_text(self.config, dump_yaml(settings))
+
+    def move_aside(self) -> Path | None:
+        """Rename the folder so that a new run can take its place; nothing is deleted."""
+        if not self.path.exists():
+            return None
+        number = 1
+        while (aside := self.path.with_name(f"{self.path.name}.old-{number}")).exists():
+            number += 1
+        self.path.rename(aside)
+        return aside
+
+    @property
+    def is_fitted(self) -> bool:
+        """Whether the fit came to its end."""
+        return (self.path / "model.json").is_file()
+
+    def read_metrics(self) -> dict[str, Any]:
+        """Return what ``metrics.json`` holds so far."""
+        if not self.metrics.is_file():
+            return {"schema": METRICS_SCHEMA}
+        metrics = storage.read_json(self.metrics)
+        if not isinstance(metrics, dict):
+            raise InputError(f"{self.metrics}: holds no metrics; remove it and evaluate again")
+        return metrics
+
+    def write_metrics(self, section: str, values: dict[str, Any], *, merge: bool = False) -> None:
+        """Replace one section of ``metrics.json``; the others are left as they are."""
+        metrics = self.read_metrics()
+        if merge:
+            values = {**metrics.get(section, {}), **values}
+        storage.commit_json(self.metrics, {**metrics, "schema": METRICS_SCHEMA, section: values})
+
+    def write_provenance(self, **facts: Any) -> None:
+        """Record what the run was made with; no names of people, machines or folders."""
+        storage.commit_json(
+            self.path / "provenance.json",
+            {
+                "sononerf": __version__,
+                "python": platform.python_version(),
+                "system": platform.system(),
+                "machine": platform.machine(),
+                "cores": os.cpu_count(),
+                "packages": {
+                    name: importlib.metadata.version(name) for name in RECORDED if _has(name)
+                },
+                **facts,
+            },
+        )
+
+    def clear_previews(self) -> None:
+        """Remove the previews of a fit that starts anew."""
+        shutil.rmtree(self.path / "epochs", ignore_errors=True)
+
+
+def _has(name: str) -> bool:
+    try:
+        importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True

@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: MIT
+"""From settings to a sealed ensemble of echoes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf import __version__, storage
+from sononerf.acoustics.spectrogram import compress
+from sononerf.config import Settings
+from sononerf.data.store import EnsembleStore
+from sononerf.errors import IncompatibleError, NumericalError
+from sononerf.geometry.poses import Poses
+from sononerf.progress import Progress
+from sononerf.reconstruction.prediction import mae_db
+from sononerf.scene import Scene, load_scene
+from sononerf.simulation.ensemble import check_poses, ensemble_poses, simulate_ensemble
+from sononerf.simulation.simulator import Simulator
+
+REFERENCE_RATIO = 1e-3
+"""The reported decibels start 60 dB below the greatest magnitude of the training poses."""
+ECHO_SECTIONS = ("poses", "simulation", "air", "ears", "call", "spectrogram")
+MOST_WORKERS = 8
+WORTH_WORKERS = 64
+"""Fewer poses than this are simulated before other processes have even started."""
+
+
+def echo_hash(settings: Settings, scene: Scene) -> str:
+    """Return a hash of all that the echoes depend on."""
+    plain = settings.plain()
+    digest = hashlib.sha256()
+    digest.update(json.dumps([plain[name] for name in ECHO_SECTIONS], sort_keys=True).encode())
+    digest.update(np.ascontiguousarray(scene.mesh.vertices, dtype="<f8").tobytes())
+    digest.update(np.ascontiguousarray(scene.mesh.faces, dtype="<i8").tobytes())
+    digest.update(repr(scene.material).encode())
+    return digest.hexdigest()
+
+
+def store_path(settings: Settings, scene: Scene, output: Path | None) -> Path:
+    """Return where the ensemble lies: as asked for, as set, or by its hash under ``data/``."""
+    chosen = output or settings.data.store
+    return chosen or Path("data") / f"{settings.scene.name}-{echo_hash(settings, scene)[:12]}"
+
+
+def simulate(
+    settings: Settings,
+    *,
+    output: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> EnsembleStore:
+    """Simulate what is missing of an ensemble, and seal it.
+
+    Parameters
+    ----------
+    settings : Settings
+        The experiment.
+    output : Path or None
+        The store; ``data/<scene>-<hash>`` where None.
+    workers : int or None
+        Processes; as many as there are cores, at most 8, where None.
+    scheduler : str or None
+        Address of a Dask scheduler to use instead.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    store : EnsembleStore
+        Complete; opened for reading.
+
+    Raises
+    ------
+    InputError
+        If scene or poses are no good.
+    NumericalError
+        If no pose hears anything.
+    StorageError
+        If the store cannot be written.
+    IncompatibleError
+        If the folder holds another ensemble.
+    """
+    progress = progress or Progress(quiet=True)
+    scene = load_scene(settings.scene.name, settings.scene.options)
+    path = store_path(settings, scene, output)
+    wanted = echo_hash(settings, scene)
+    if (path / "zarr.json").is_file():
+        store = EnsembleStore.open(path)
+        if store.attributes.get("echo_hash") != wanted:
+            raise IncompatibleError(
+                f"{path}: holds echoes of other settings; choose another --output"
+            )
+        if "reference" in store.attributes and not store.missing():
+            return store
+    poses, split = ensemble_poses(settings)
+    simulator = Simulator.from_settings(scene, settings)
+    head = np.concatenate((simulator.ears.emitter[None], simulator.ears.positions))
+    check_poses(scene, poses, offsets=head)
+    storage.probe_writable(path)
+    with storage.lock(path):
+        store = EnsembleStore.create(
+            path,
+            poses_positions=poses.positions,
+            poses_rotations=poses.rotations,
+            split=split,
+            range=simulator.range,
+            frequency=simulator.frequency,
+            attributes=_attributes(settings, wanted, simulator),
+        )
+        _fill(store, simulator, poses, settings, workers, scheduler, progress)
+        store.seal()
+    return EnsembleStore.open(path)
+
+
+def _attributes(settings: Settings, wanted: str, simulator: Simulator) -> dict[str, object]:
+    plain = settings.plain()
+    return {
+        "echo_hash": wanted,
+        "origin": "simulated",
+        "scene": plain["scene"],
+        "settings": {name: plain[name] for name in ECHO_SECTIONS},
+        "speed_of_sound": simulator.speed_of_sound,
+        "units": {
+            "spectrogram": "linear magnitude, sound pressure over that of the call at 1 m",
+            "position": "m",
+            "range": "m",
+            "frequency": "Hz",
+        },
+        "sononerf": __version__,
+    }
+
+
+def _fill(
+    store: EnsembleStore,
+    simulator: Simulator,
+    poses: Poses,
+    settings: Settings,
+    workers: int | None,
+    scheduler: str | None,
+    progress: Progress,
+) -> None:
+    missing = store.missing()
+    if workers is None:
+        cores = min(len(os.sched_getaffinity(0)), MOST_WORKERS)
+        workers = cores if len(missing) >= WORTH_WORKERS else 1
+    test = store.indices("test")[: settings.simulation.noise_floor_poses]
+    again: dict[int, NDArray[np.float32]] = {}
+    seed = settings.simulation.seed
+    with progress.task("simulating", len(missing) + len(test)) as task:
+        # The second simulation of the test poses goes first where it can share the processes.
+        def keep(index: int, spectrogram: NDArray[np.float32]) -> None:
+            if index < len(poses):
+                store.write_pose(index, spectrogram)
+            else:
+                again[int(test[index - len(poses)])] = spectrogram
+            task.advance()
+
+        both = Poses(
+            np.concatenate((poses.positions, poses.positions[test])),
+            np.concatenate((poses.rotations, poses.rotations[test])),
+        )
+        # A pose's seed is a function of its number, so the second time has other rays.
+        extra = range(len(poses), len(poses) + len(test))
+        simulate_ensemble(
+            simulator,
+            both,
+            [*missing, *extra],
+            keep,
+            seed=seed,
+            workers=workers,
+            scheduler=scheduler,
+        )
+    loudest = max(float(store.read_pose(int(i)).max()) for i in store.indices("train"))
+    if loudest <= 0.0:
+        raise NumericalError(
+            f"no pose received an echo between {settings.spectrogram.range_min} and "
+            f"{settings.spectrogram.range_max} m; check poses.radius, the scene's size and the "
+            "range limits"
+        )
+    reference = loudest * REFERENCE_RATIO
+    noise: dict[str, float | None] = {"noise_floor_mae_db": None, "noise_floor_mae_db_active": None}
+    if len(test):
+        first = compress(np.stack([store.read_pose(int(i)) for i in test]), reference)
+        second = compress(np.stack([again[int(i)] for i in test]), reference)
+        noise["noise_floor_mae_db"] = mae_db(first, second)
+        noise["noise_floor_mae_db_active"] = mae_db(first, second, active=True)
+    store.update_attributes(reference=reference, **noise)

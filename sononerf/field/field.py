@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: MIT
+"""What every reflectivity field promises."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import max_pool3d
+
+
+def sphere_directions(count: int, like: Tensor) -> Tensor:
+    """Return a Fibonacci lattice of unit vectors, (count, 3), of ``like``'s type and device."""
+    k = torch.arange(count, dtype=like.dtype, device=like.device) + 0.5
+    z = 1.0 - 2.0 * k / count
+    azimuth = k * (math.pi * (3.0 - math.sqrt(5.0)))
+    ring = (1.0 - z * z).clamp_min(0.0).sqrt()
+    return torch.stack((ring * azimuth.cos(), ring * azimuth.sin(), z), dim=-1)
+
+
+class Field(nn.Module):
+    """Pressure reflectivity per frequency of a place, towards a direction; zero outside a box.
+
+    Parameters
+    ----------
+    region : (2, 3) float, m
+        Lower and upper corner of the box, world frame.
+    frequency : (F,) float, Hz
+        Frequencies of the answer.
+    """
+
+    region: Tensor
+    frequency: Tensor
+    occupancy: Tensor
+    cell: Tensor
+    learning_rate: float = 1e-3
+    """What Adam starts with where the settings name no rate."""
+    knows_directions: bool = False
+    """Whether lobes are explicit, so that the oriented read-out is the better one."""
+
+    def __init__(self, region: Tensor, frequency: Tensor) -> None:
+        super().__init__()
+        self.register_buffer("region", region.clone())
+        self.register_buffer("frequency", frequency.clone())
+        self.register_buffer("occupancy", torch.ones(1, 1, 1, dtype=torch.bool))
+        self.register_buffer("cell", (region[1] - region[0]).clone() * 2)
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        # The fit finds out what is occupied, and how finely; a loaded map replaces ours whole.
+        if prefix + "occupancy" in state_dict:
+            self.occupancy = torch.zeros_like(state_dict[prefix + "occupancy"])
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    @torch.no_grad()
+    def keep(self, places: Tensor, spacing: float) -> None:
+        """Be zero from now on wherever none of the places is near.
+
+        Parameters
+        ----------
+        places : (N, 3) float, m
+            Vertices of a lattice that may hold something.
+        spacing : float, m
+            Of that lattice.
+        """
+        cell = self.resolution
+        size = ((self.region[1] - self.region[0]) / cell).ceil().long() + 1
+        near = self.region.new_zeros([int(n) for n in size])
+        index = ((places - self.region[0]) / cell).round().long()
+        index = index.clamp_min(0).minimum(size - 1)
+        near[index[:, 0], index[:, 1], index[:, 2]] = 1.0
+        reach = math.ceil(spacing / cell / 2 - 1e-6) if spacing > 1.001 * cell else 0
+        if reach:
+            near = max_pool3d(near[None, None], 2 * reach + 1, 1, reach)[0, 0]
+        self.occupancy = near > 0
+        self.cell = torch.full_like(self.cell, cell)
+
+    @property
+    def resolution(self) -> float:
+        """Spacing in metres that resolves the field."""
+        raise NotImplementedError
+
+    def forward(self, positions: Tensor, directions: Tensor) -> Tensor:
+        """Return the reflectivity.
+
+        Differentiable in the parameters.
+
+        Parameters
+        ----------
+        positions : (..., 3) float, m
+            Places, world frame.
+        directions : (..., 3) float
+            Unit vectors from each place to the emitter, world frame.
+
+        Returns
+        -------
+        reflectivity : (..., F) float or complex
+            Pressure reflectivity; zero outside the region.
+        """
+        raise NotImplementedError
+
+    def select(self, positions: Tensor, directions: Tensor, bins: Tensor | None) -> Tensor:
+        """Return the reflectivity at some of the frequencies.
+
+        Parameters
+        ----------
+        positions : (N, 3) float, m
+            Places, world frame.
+        directions : (..., N, 3) float
+            Unit vectors to the emitter, for any number of poses at once.
+        bins : (B,) int or None
+            Which frequencies; all where None.
+
+        Returns
+        -------
+        reflectivity : (..., N, B) float or complex
+        """
+        response: Tensor = self(positions.expand(directions.shape), directions)
+        return response if bins is None else response[..., bins]
+
+    def inside(self, positions: Tensor) -> Tensor:
+        """Return which places lie in the region, (...,) bool."""
+        within = ((positions >= self.region[0]) & (positions <= self.region[1])).all(dim=-1)
+        size = torch.tensor(self.occupancy.shape, device=positions.device)
+        index = ((positions - self.region[0]) / self.cell).round().long()
+        index = index.clamp_min(0).minimum(size - 1)
+        return within & self.occupancy[index[..., 0], index[..., 1], index[..., 2]]
+
+    @torch.no_grad()
+    def oriented(self, positions: Tensor, directions: int) -> tuple[Tensor, Tensor]:
+        """Return each place's energy over all directions and the axis it reflects along.
+
+        Parameters
+        ----------
+        positions : (N, 3) float, m
+            Places, world frame.
+        directions : int
+            Size of the spherical lattice that is summed over.
+
+        Returns
+        -------
+        energy : (N,) float
+            Mean over directions of the power summed over frequencies.
+        axis : (N, 3) float
+            Unit vector, the energy-weighted mean direction; zero where there is none.
+        """
+        lattice = sphere_directions(directions, positions)
+        energy = positions.new_zeros(positions.shape[0])
+        moment = torch.zeros_like(positions)
+        for direction in lattice:
+            response = self.select(positions, direction.expand(positions.shape), None)
+            power = response.abs().square().sum(dim=-1)
+            energy += power / directions
+            moment += power[:, None] * direction / directions
+        length = moment.norm(dim=-1, keepdim=True)
+        return energy, torch.where(length > 0, moment / length.clamp_min(1e-30), 0.0)
+
+    @torch.no_grad()
+    def loudness(self, positions: Tensor, directions: int) -> Tensor:
+        """Return the paper's volume: magnitudes summed over directions and frequencies, (N,).
+
+        References
+        ----------
+        .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, equations 18 and 19.
+        """
+        total = positions.new_zeros(positions.shape[0])
+        for direction in sphere_directions(directions, positions):
+            total += self.select(positions, direction.expand(positions.shape), None).abs().sum(-1)
+        return total

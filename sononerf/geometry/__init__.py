@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Poses, directions, surfaces and ray casting."""

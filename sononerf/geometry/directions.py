@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: MIT
+"""Sets of unit vectors that cover the sphere, or a cap of it, evenly."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+# Turning by the golden section of a circle never lets two neighbouring rings line up.
+GOLDEN_TURN = (math.sqrt(5.0) - 1.0) / 2.0
+
+
+def fibonacci_sphere(count: int) -> NDArray[np.float64]:
+    """Return unit vectors on a spiral from +z to -z, each standing for the same solid angle.
+
+    Parameters
+    ----------
+    count : int
+        How many, one or more.
+
+    Returns
+    -------
+    directions : (D, 3) float64
+        Unit vectors.
+
+    Raises
+    ------
+    ValueError
+        If ``count`` is below one.
+
+    Examples
+    --------
+    >>> abs(fibonacci_sphere(100).mean(axis=0)).max() < 0.01
+    np.True_
+    """
+    return fibonacci_cap(count, axis=(0.0, 0.0, 1.0), half_angle=math.pi, offset=(0.5, 0.0))
+
+
+def fibonacci_cap(
+    count: int, *, axis: ArrayLike, half_angle: float, offset: tuple[float, float]
+) -> NDArray[np.float64]:
+    """Return unit vectors on a spiral that fills the cap around an axis; equal areas, stratified.
+
+    Parameters
+    ----------
+    count : int
+        How many, one or more.
+    axis : (3,) float
+        The cap's middle; any length but zero.
+    half_angle : float, rad
+        From the axis to the cap's rim, 0 to pi.
+    offset : (2,) float, 1
+        Two numbers in [0, 1): the first shifts every direction within its ring's area, the
+        second turns the whole pattern about the axis. (0.5, 0) is the centred pattern.
+
+    Returns
+    -------
+    directions : (D, 3) float64
+        Unit vectors.
+
+    Raises
+    ------
+    ValueError
+        If ``count`` is below one, the axis has no length, or the angle is outside 0 to pi.
+    """
+    return CapSpiral(count, axis, half_angle, offset).directions()
+
+
+@dataclass(frozen=True, eq=False)
+class CapSpiral:
+    """The pattern of :func:`fibonacci_cap`, which can be made denser where that is needed.
+
+    In the coordinates (share of the cap's area, turn about the axis) the spiral is a lattice, so
+    the parallelogram between neighbours is a cell of it, and cells can be divided evenly.
+
+    Attributes
+    ----------
+    count : int
+        How many directions.
+    axis : (3,) float
+        The cap's middle; any length but zero.
+    half_angle : float, rad
+        From the axis to the cap's rim, 0 to pi.
+    offset : (2,) float, 1
+        Shift within the ring's area, and turn of the whole pattern.
+    rotation : (3, 3) float, optional
+        Turns the finished pattern, the axis with it.
+    """
+
+    count: int
+    axis: ArrayLike
+    half_angle: float
+    offset: tuple[float, float]
+    rotation: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        if self.count < 1:
+            raise ValueError(f"count is {self.count}, expected one or more")
+        if not 0.0 < self.half_angle <= math.pi:
+            raise ValueError(f"half_angle is {self.half_angle}, expected above 0 and at most pi")
+
+    @property
+    def solid_angle(self) -> float:
+        """What one direction stands for, in sr."""
+        return 2.0 * math.pi * self._depth / self.count
+
+    @property
+    def _depth(self) -> float:
+        # 1 - cos(half_angle), written so that a narrow cap keeps its digits
+        return 2.0 * math.sin(self.half_angle / 2.0) ** 2
+
+    def directions(self) -> NDArray[np.float64]:
+        """Return the unit vectors (D, 3), from the axis outwards."""
+        return self._at(*self._lattice(np.arange(self.count, dtype=np.float64)))
+
+    def neighbourhood(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return directions' indices together with those of their four neighbours, sorted."""
+        near, far = _cell_steps(self._ring(index), self._depth / self.count)
+        around = np.concatenate([index, index - near, index + near, index - far, index + far])
+        return np.unique(around[(around >= 0) & (around < self.count)])
+
+    def divided(self, index: NDArray[np.int64], split: int) -> NDArray[np.float64]:
+        """Divide the cells of some directions into ``split**2`` cells each.
+
+        Parameters
+        ----------
+        index : (N,) int64
+            Of the directions.
+        split : int
+            Into how many parts along each side.
+
+        Returns
+        -------
+        directions : (N * split**2, 3) float64
+            Middles of the new cells; a new one stands for ``solid_angle / split**2``.
+        """
+        share, turn = self._lattice(index.astype(np.float64))
+        near, far = _cell_steps(self._ring(index), self._depth / self.count)
+        steps = (np.arange(split) + 0.5) / split - 0.5
+        for step in (near, far):
+            across = np.mod(step * GOLDEN_TURN + 0.5, 1.0) - 0.5
+            along = step / self.count
+            share = share.reshape(len(index), -1, 1) + along[:, None, None] * steps
+            turn = turn.reshape(len(index), -1, 1) + across[:, None, None] * steps
+        return self._at(share.ravel(), turn.ravel())
+
+    def _lattice(
+        self, index: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        return (index + self.offset[0]) / self.count, index * GOLDEN_TURN + self.offset[1]
+
+    def _ring(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Sine of the angle from the axis."""
+        drop = self._depth * (index + self.offset[0]) / self.count
+        return np.sqrt(drop * (2.0 - drop))
+
+    def _at(self, share: NDArray[np.float64], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+        drop = self._depth * share  # 1 - cos(angle from the axis)
+        # A cell may reach over the axis, or over the far pole, to the other side.
+        over = (drop < 0.0) | (drop > 2.0)
+        drop = np.where(drop > 2.0, 4.0 - drop, np.abs(drop))
+        turn = 2.0 * math.pi * np.mod(turn + 0.5 * over, 1.0)
+        ring = np.sqrt(drop * (2.0 - drop))
+        frame = _frame(self.axis)
+        middle, side, up = frame if self.rotation is None else frame @ self.rotation.T
+        return (
+            (1.0 - drop)[:, None] * middle
+            + (ring * np.cos(turn))[:, None] * side
+            + (ring * np.sin(turn))[:, None] * up
+        )
+
+
+def _cell_steps(
+    ring: NDArray[np.float64], depth: float
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the steps in index to the two neighbours that span the most compact cell.
+
+    They are neighbouring Fibonacci numbers, which two depends on the distance from the axis; the
+    cells they span have the same area everywhere.
+    """
+    numbers = [1, 1]
+    while len(numbers) < 40:
+        numbers.append(numbers[-1] + numbers[-2])
+    step = np.array(numbers[1:], dtype=np.float64)
+    across = 2.0 * math.pi * (np.mod(step * GOLDEN_TURN + 0.5, 1.0) - 0.5)
+    square = (depth * step / np.maximum(ring, 1e-12)[:, None]) ** 2 + (ring[:, None] * across) ** 2
+    best = (square[:, :-1] + square[:, 1:]).argmin(axis=1)
+    return step[best].astype(np.int64), step[best + 1].astype(np.int64)
+
+
+def _frame(axis: ArrayLike) -> NDArray[np.float64]:
+    """Return the axis as a unit vector and two that are square to it."""
+    middle = np.asarray(axis, dtype=np.float64)
+    length = np.linalg.norm(middle)
+    if not length > 0.0:
+        raise ValueError(f"axis is {middle}, expected a vector with a length")
+    middle = middle / length
+    helper = np.zeros(3)
+    helper[np.argmin(np.abs(middle))] = 1.0
+    side = np.cross(helper, middle)
+    side /= np.linalg.norm(side)
+    return np.stack([middle, side, np.cross(middle, side)])

@@ -1,0 +1,280 @@
+# SPDX-License-Identifier: MIT
+"""Poses: where the head is, and where it looks.
+
+World frame: metres, right-handed, z up. Head frame: x forward, y left, z up. A rotation takes
+head to world, ``R = Rz(yaw) Ry(pitch) Rx(roll)``, so positive pitch looks *down*.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.errors import InputError
+from sononerf.geometry.directions import fibonacci_sphere
+
+CSV_COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
+
+
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """Positions and orientations of the head.
+
+    Attributes
+    ----------
+    positions : (P, 3) float64, m
+        World frame.
+    rotations : (P, 3, 3) float64
+        Head to world.
+    """
+
+    positions: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        positions = np.asarray(self.positions, dtype=np.float64)
+        rotations = np.asarray(self.rotations, dtype=np.float64)
+        if positions.ndim != 2 or positions.shape[1] != 3:
+            raise ValueError(f"positions have shape {positions.shape}, expected (P, 3)")
+        if rotations.shape != (len(positions), 3, 3):
+            raise ValueError(
+                f"rotations have shape {rotations.shape}, expected ({len(positions)}, 3, 3)"
+            )
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "rotations", rotations)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+    def __getitem__(self, index: int | slice | ArrayLike) -> Poses:
+        """Return the chosen poses; one index gives poses of length one."""
+        if isinstance(index, (int, np.integer)):
+            index = [int(index)]
+        elif not isinstance(index, slice):
+            index = np.asarray(index)
+        return Poses(self.positions[index], self.rotations[index])
+
+
+def rotation_from_euler(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> NDArray[np.float64]:
+    """Rotation matrices from yaw, pitch and roll.
+
+    Parameters
+    ----------
+    yaw, pitch, roll : (...,) float, rad
+        Turns about z, y and x; positive pitch looks down.
+
+    Returns
+    -------
+    rotations : (..., 3, 3) float64
+        Head to world, ``Rz(yaw) Ry(pitch) Rx(roll)``.
+
+    Examples
+    --------
+    >>> down = rotation_from_euler(0.0, math.pi / 6, 0.0)
+    >>> [round(float(part), 3) for part in down @ [1.0, 0.0, 0.0]]
+    [0.866, 0.0, -0.5]
+    """
+    yaw, pitch, roll = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (yaw, pitch, roll)))
+    sy, cy = np.sin(yaw), np.cos(yaw)
+    sp, cp = np.sin(pitch), np.cos(pitch)
+    sr, cr = np.sin(roll), np.cos(roll)
+    rows = [
+        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+        [-sp, cp * sr, cp * cr],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def euler_from_rotation(
+    rotations: ArrayLike,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Yaw, pitch and roll of rotation matrices; looking straight up or down, yaw is 0.
+
+    Parameters
+    ----------
+    rotations : (..., 3, 3) float
+        Head to world.
+
+    Returns
+    -------
+    yaw, pitch, roll : (...,) float64, rad
+        Pitch from -pi/2 to pi/2.
+    """
+    r = np.asarray(rotations, dtype=np.float64)
+    level = np.hypot(r[..., 0, 0], r[..., 1, 0])
+    pitch = np.arctan2(-r[..., 2, 0], level)
+    # There, only yaw minus or plus roll is known; all of it is given to roll.
+    upright = level < 1e-9
+    yaw = np.where(upright, 0.0, np.arctan2(r[..., 1, 0], r[..., 0, 0]))
+    roll = np.where(
+        upright,
+        np.arctan2(-r[..., 1, 2], r[..., 1, 1]),
+        np.arctan2(r[..., 2, 1], r[..., 2, 2]),
+    )
+    return yaw, pitch, roll
+
+
+def look_at(positions: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
+    """Level rotations that look from positions at a target.
+
+    Parameters
+    ----------
+    positions : (..., 3) float, m
+        World frame.
+    target : (3,) or (..., 3) float, m
+        What is looked at.
+
+    Returns
+    -------
+    rotations : (..., 3, 3) float64
+        Head to world, roll 0; straight up or down, yaw is 0.
+
+    Raises
+    ------
+    ValueError
+        If a position is the target.
+    """
+    forward = np.asarray(target, np.float64) - np.asarray(positions, np.float64)
+    length = np.linalg.norm(forward, axis=-1)
+    if not (length > 0.0).all():
+        raise ValueError("a position is the target itself; there is no direction to look in")
+    level = np.hypot(forward[..., 0], forward[..., 1])
+    yaw = np.where(level > 1e-9 * length, np.arctan2(forward[..., 1], forward[..., 0]), 0.0)
+    return rotation_from_euler(yaw, -np.arctan2(forward[..., 2], level), 0.0)
+
+
+def _aimed(
+    positions: NDArray[np.float64], aim_jitter: float, generator: np.random.Generator
+) -> Poses:
+    """Look at the origin, then off it by two random turns about the head's own y and z."""
+    about_y, about_z = aim_jitter * generator.standard_normal((2, len(positions)))
+    turned = look_at(positions, np.zeros(3)) @ rotation_from_euler(about_z, about_y, 0.0)
+    return Poses(positions, look_at(np.zeros_like(positions), turned[:, :, 0]))
+
+
+def sphere_poses(
+    count: int, *, radius: float, aim_jitter: float, generator: np.random.Generator
+) -> Poses:
+    """Poses on a spiral around the origin that look at it, each a little off.
+
+    Parameters
+    ----------
+    count : int
+        How many.
+    radius : float, m
+        Distance from the origin.
+    aim_jitter : float, rad
+        Standard deviation of the two turns about the head's own y and z axes.
+    generator : numpy.random.Generator
+        Draws the turns.
+
+    Returns
+    -------
+    poses : Poses
+        Level (roll 0), ``count`` of them.
+    """
+    return _aimed(radius * fibonacci_sphere(count), aim_jitter, generator)
+
+
+def random_sphere_poses(
+    count: int, *, radius: float, aim_jitter: float, generator: np.random.Generator
+) -> Poses:
+    """Poses as :func:`sphere_poses` makes them, but at uniformly random places.
+
+    Parameters
+    ----------
+    count : int
+        How many; none is allowed.
+    radius : float, m
+        Distance from the origin.
+    aim_jitter : float, rad
+        Standard deviation of the two turns about the head's own y and z axes.
+    generator : numpy.random.Generator
+        Draws places and turns.
+
+    Returns
+    -------
+    poses : Poses
+        Level (roll 0), ``count`` of them.
+    """
+    places = generator.standard_normal((count, 3))
+    places /= np.linalg.norm(places, axis=1, keepdims=True)
+    return _aimed(radius * places, aim_jitter, generator)
+
+
+def read_pose_csv(path: Path) -> Poses:
+    """Read poses from a table with the header ``x,y,z,yaw,pitch,roll`` (m, degrees).
+
+    Parameters
+    ----------
+    path : Path
+        The columns may stand in any order; others are not allowed.
+
+    Returns
+    -------
+    poses : Poses
+        One per row.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or anything in it is no finite number, naming file, line
+        and column.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    try:
+        reader = csv.reader(io.StringIO(text), strict=True)
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise InputError(f"{path}: no CSV table ({error})") from None
+    header = [cell.strip() for cell in rows[0][1]] if rows else []
+    if sorted(header) != sorted(CSV_COLUMNS):
+        raise InputError(
+            f"{path}:1: the header is {','.join(header) or 'missing'!r}, "
+            f"expected {','.join(CSV_COLUMNS)}"
+        )
+    if len(rows) < 2:
+        raise InputError(f"{path}: no poses below the header")
+    values = np.array([_csv_row(path, line, header, row) for line, row in rows[1:]])
+    columns = dict(zip(header, values.T, strict=True))
+    angles = (np.radians(columns[name]) for name in ("yaw", "pitch", "roll"))
+    positions = np.stack([columns[name] for name in ("x", "y", "z")], axis=1)
+    return Poses(positions, rotation_from_euler(*angles))
+
+
+def _csv_row(path: Path, line: int, header: list[str], row: list[str]) -> list[float]:
+    if len(row) != len(header):
+        raise InputError(f"{path}:{line}: {len(row)} columns, expected {len(header)}")
+    numbers = []
+    for name, cell in zip(header, row, strict=True):
+        try:
+            number = float(cell)
+        except ValueError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise InputError(
+                f"{path}:{line}: column {name} is {cell!r}, expected a finite number; "
+                "metres and degrees with a decimal point"
+            )
+        numbers.append(number)
+    return numbers
+
+
+def write_pose_csv(poses: Poses) -> str:
+    """Return the text of a table that :func:`read_pose_csv` reads back (m, degrees)."""
+    yaw, pitch, roll = (np.degrees(angle) for angle in euler_from_rotation(poses.rotations))
+    table = np.column_stack([poses.positions, yaw, pitch, roll])
+    lines = [",".join(CSV_COLUMNS), *(",".join(repr(float(v)) for v in row) for row in table)]
+    return "\n".join(lines) + "\n"

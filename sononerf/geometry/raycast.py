@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: MIT
+"""Rays against a triangle mesh: what they hit first, and what sees what."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from sononerf.geometry.surface import corner_normals
+
+try:
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+except ImportError:  # no wheels for Linux on ARM nor Windows on ARM
+    EmbreeScene = None
+
+# Of the mesh's size. Single precision puts a point up to 1e-7 sizes off its triangle, on either
+# side; without a lift half of all reflected rays hit the triangle they start from.
+LIFT = 4e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What rays hit first; one row per ray that hits anything.
+
+    Attributes
+    ----------
+    ray : (H,) int64
+        Index of the ray, ascending.
+    points : (H, 3) float64, m
+        On the triangle.
+    normals : (H, 3) float64
+        Smooth unit normals, as the mesh is oriented.
+    triangle : (H,) int64
+        Index of the triangle.
+    distance : (H,) float64, m
+        Along the ray.
+    """
+
+    ray: NDArray[np.int64]
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    triangle: NDArray[np.int64]
+    distance: NDArray[np.float64]
+
+
+class _Engine(Protocol):
+    """What searches triangles, in coordinates of about unit size."""
+
+    def first(
+        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
+    ) -> NDArray[np.int64]: ...
+
+    def blocked(
+        self, origins: NDArray[np.float64], spans: NDArray[np.float64]
+    ) -> NDArray[np.bool_]: ...
+
+
+class _EmbreeEngine:
+    """Embree: millions of rays a second, single precision, processes only (it holds the GIL)."""
+
+    def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+        self._scene = EmbreeScene()
+        TriangleMesh(self._scene, vertices.astype(np.float32), faces.astype(np.int32))
+
+    def first(
+        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        found = self._scene.run(
+            origins.astype(np.float32), directions.astype(np.float32), query="INTERSECT"
+        )
+        return np.asarray(found, dtype=np.int64)
+
+    def blocked(
+        self, origins: NDArray[np.float64], spans: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        # Distances count in lengths of the direction, so 1 is the target. Asked for more output
+        # than this, the occlusion query returns uninitialised memory.
+        found = self._scene.run(
+            origins.astype(np.float32),
+            spans.astype(np.float32),
+            dists=np.ones(len(origins), np.float32),
+            query="OCCLUDED",
+        )
+        return np.asarray(found) == 0
+
+
+class _VtkEngine:
+    """VTK's cell locator: everywhere, and some thirty times slower."""
+
+    def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+        import pyvista as pv
+        from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
+
+        self._locator = vtkStaticCellLocator()
+        self._locator.SetDataSet(pv.PolyData.from_regular_faces(vertices, faces))
+        self._locator.BuildLocator()
+        self._reach = 2.0 * float(np.linalg.norm(vertices, axis=1).max())
+
+    def _search(self, start: Any, end: Any) -> int:
+        from vtkmodules.vtkCommonCore import reference
+        from vtkmodules.vtkCommonDataModel import vtkGenericCell
+
+        # VTK writes into these; its stubs call them plain numbers.
+        cell: Any = reference(-1)
+        position: Any = reference(0.0)
+        part: Any = reference(0)
+        place, within = [0.0] * 3, [0.0] * 3
+        found = self._locator.IntersectWithLine(
+            start, end, 0.0, position, place, within, part, cell, vtkGenericCell()
+        )
+        return int(cell) if found else -1
+
+    def first(
+        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        reach = self._reach + np.linalg.norm(origins, axis=1, keepdims=True)
+        ends = origins + reach * directions
+        return np.array([self._search(a, b) for a, b in zip(origins, ends, strict=True)], np.int64)
+
+    def blocked(
+        self, origins: NDArray[np.float64], spans: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        ends = origins + spans
+        return np.array([self._search(a, b) >= 0 for a, b in zip(origins, ends, strict=True)], bool)
+
+
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    product: NDArray[np.float64] = np.einsum("nd,nd->n", a, b)
+    return product
+
+
+class RayCaster:
+    """Rays against one mesh. Cannot be pickled; send the mesh and build it anew.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        At least one triangle.
+
+    Attributes
+    ----------
+    face_normals : (T, 3) float64
+        Unit normals of the flat triangles; of one without area, zero.
+    lift : float, m
+        How far above its triangle a ray starts from a hit.
+    """
+
+    def __init__(self, mesh: trimesh.Trimesh) -> None:
+        lower, upper = np.asarray(mesh.bounds)
+        self._middle = (lower + upper) / 2.0
+        self._size = float(np.linalg.norm(upper - lower))
+        self.lift = LIFT * self._size
+        faces = np.asarray(mesh.faces, dtype=np.int64)
+        vertices = np.asarray(mesh.vertices, dtype=np.float64)
+        self._corners = vertices[faces]  # (T, 3, 3)
+        self._normals = corner_normals(mesh)  # (T, 3, 3)
+        ab = self._corners[:, 1] - self._corners[:, 0]
+        ac = self._corners[:, 2] - self._corners[:, 0]
+        sides = np.cross(ab, ac)
+        area = np.linalg.norm(sides, axis=1, keepdims=True)
+        solid = np.where(area > 0.0, area, np.inf)
+        self.face_normals = sides / solid
+        # Products with these are the weights of the second and third corner.
+        self._second = np.cross(ac, self.face_normals) / solid
+        self._third = np.cross(self.face_normals, ab) / solid
+        # Single precision counts from the origin: far from it, millimetres would be lost.
+        scaled = (vertices - self._middle) / self._size
+        self._engine: _Engine = (
+            _VtkEngine(scaled, faces) if EmbreeScene is None else _EmbreeEngine(scaled, faces)
+        )
+
+    def first_hit(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
+        """Return what each ray hits first; rays that hit nothing are left out.
+
+        Parameters
+        ----------
+        origins : (N, 3) float64, m
+            Where the rays start.
+        directions : (N, 3) float64
+            Unit vectors.
+
+        Returns
+        -------
+        hits : Hits
+            Points and distances in double precision, from the triangles' planes.
+        """
+        found = self._engine.first((origins - self._middle) / self._size, directions)
+        ray = np.flatnonzero(found >= 0)
+        triangle = found[ray]
+        start, along = origins[ray], directions[ray]
+        anchor, flat = self._corners[triangle, 0], self.face_normals[triangle]
+        slope = _dot(along, flat)
+        # A ray along the plane meets it nowhere; it is then moved onto the triangle below.
+        slope = np.where(np.abs(slope) > 1e-12, slope, np.inf)
+        distance = _dot(anchor - start, flat) / slope
+        points = start + distance[:, None] * along
+        offset = points - anchor
+        second, third = _dot(offset, self._second[triangle]), _dot(offset, self._third[triangle])
+        weights = np.stack([1.0 - second - third, second, third], axis=1)
+        off = np.flatnonzero(weights.min(axis=1) < -1e-4)
+        if len(off):
+            inside = np.clip(weights[off], 0.0, None)
+            weights[off] = inside / inside.sum(axis=1, keepdims=True)
+            points[off] = np.einsum("nc,ncd->nd", weights[off], self._corners[triangle[off]])
+            distance[off] = _dot(points[off] - start[off], along[off])
+        normals = np.einsum("nc,ncd->nd", weights, self._normals[triangle])
+        length = np.sqrt(_dot(normals, normals))
+        normals /= np.where(length > 0.0, length, 1.0)[:, None]
+        return Hits(ray, points, normals, triangle, distance)
+
+    def visible(
+        self,
+        points: NDArray[np.float64],
+        targets: NDArray[np.float64],
+        *,
+        normals: NDArray[np.float64] | None = None,
+    ) -> NDArray[np.bool_]:
+        """Whether nothing stands between points and targets.
+
+        Parameters
+        ----------
+        points : (N, 3) float64, m
+            On the surface or off it.
+        targets : (N, 3) or (3,) float64, m
+            What is looked for.
+        normals : (N, 3) float64, optional
+            Where points lie on the surface: unit normals of their triangles, on the side from
+            which they are seen. The points are lifted along them, or else towards the targets.
+
+        Returns
+        -------
+        visible : (N,) bool
+            True where the line is free.
+        """
+        spans = np.broadcast_to(targets, points.shape) - points
+        if normals is None:
+            length = np.linalg.norm(spans, axis=1, keepdims=True)
+            normals = spans / np.where(length > 0.0, length, 1.0)
+        lifted = points + self.lift * normals
+        spans = np.broadcast_to(targets, points.shape) - lifted
+        return ~self._engine.blocked((lifted - self._middle) / self._size, spans / self._size)

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: MIT
+"""The LightningModule: field, renderer, loss and metrics. It writes no file."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import lightning
+import torch
+from torch import Tensor
+from torchmetrics import MeanMetric
+
+from sononerf.data.range_slices import RangeSlices, seed_of
+from sononerf.errors import NumericalError
+from sononerf.field.field import Field
+from sononerf.renderer.renderer import Possible, Renderer
+
+REPORT_RANGE_DB = 60.0
+"""The decibels of every reported figure start this far below the loudest training pose."""
+ACTIVE_DB = 3.0
+"""A cell is active where measurement or prediction reaches this."""
+
+
+def decibels(magnitude: Tensor, reference: float) -> Tensor:
+    """Compress: 20 log10(1 + m / m0), in dB; zero for silence."""
+    return 20.0 * torch.log10(1.0 + magnitude / reference)
+
+
+class EchoModule(lightning.LightningModule):
+    """Fits a field through a renderer.
+
+    Parameters
+    ----------
+    field : Field
+        What is learned.
+    renderer : Renderer
+        How it is heard.
+    reference : float
+        Magnitude m0 of the reported decibels.
+    dynamic_range_db : float
+        How far below the loudest cell the fit's own compression starts.
+    possible : callable or None
+        Which places the echoes leave possible.
+    learning_rate : float
+        What Adam starts with.
+    total_steps, steps_per_epoch : int
+        Length of the fit.
+    schedule : {"cool", "staircase"}
+        Constant for one half, then falling to ``final_rate_factor``; or times
+        ``staircase_factor`` every ``staircase_epochs``.
+    loss : {"l1", "l2", "l1_4l2"}
+        On compressed spectra, 1 being the full dynamic range.
+    silent_weight : float
+        Weight of cells that are silent in the measurement, beside 1.
+    seed : int
+        All random numbers of a step come from the seed and the step.
+    """
+
+    def __init__(
+        self,
+        field: Field,
+        renderer: Renderer,
+        *,
+        reference: float,
+        dynamic_range_db: float,
+        possible: Possible | None,
+        learning_rate: float,
+        total_steps: int,
+        steps_per_epoch: int,
+        schedule: Literal["cool", "staircase"] = "cool",
+        final_rate_factor: float = 0.1,
+        staircase_factor: float = 0.97,
+        staircase_epochs: int = 10,
+        loss: Literal["l1", "l2", "l1_4l2"] = "l1",
+        silent_weight: float = 1.0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.field = field
+        self.renderer = renderer
+        self.reference = reference
+        self.dynamic_range_db = dynamic_range_db
+        self.fit_reference = reference * 10 ** ((REPORT_RANGE_DB - dynamic_range_db) / 20)
+        self.possible = possible
+        self.learning_rate = learning_rate
+        self.total_steps = total_steps
+        self.steps_per_epoch = steps_per_epoch
+        self.schedule = schedule
+        self.final_rate_factor = final_rate_factor
+        self.staircase_factor = staircase_factor
+        self.staircase_epochs = staircase_epochs
+        self.loss = loss
+        self.silent_weight = silent_weight
+        self.seed = seed
+        self.mae = MeanMetric()
+        self.mae_active = MeanMetric()
+
+    @property
+    def epoch_done(self) -> int:
+        """How many of our epochs are complete."""
+        return self.global_step // self.steps_per_epoch
+
+    def forward(self, batch: RangeSlices) -> Tensor:
+        """Render a batch: (P, E, R, B) linear magnitude."""
+        magnitude: Tensor = self.renderer(
+            self.field, batch.position, batch.rotation, batch.rows, batch.bins
+        )
+        return magnitude
+
+    def training_step(self, batch: RangeSlices, batch_index: int) -> Tensor:
+        """Return the loss of one batch."""
+        del batch_index
+        step = self.global_step
+        torch.manual_seed(seed_of(self.seed, 3, step))
+        if self.renderer.prepare(self.field, self.possible, step):
+            with torch.no_grad():
+                self.renderer.calibrate(self(batch), batch.spectrum)
+        loss = self._loss(self(batch), batch.spectrum)
+        self.log("train/loss", loss, prog_bar=True, batch_size=len(batch.pose))
+        return loss
+
+    def _loss(self, predicted: Tensor, measured: Tensor) -> Tensor:
+        target = decibels(measured, self.fit_reference)
+        error = (decibels(predicted, self.fit_reference) - target) / self.dynamic_range_db
+        if self.loss == "l1":
+            cost = error.abs()
+        elif self.loss == "l2":
+            cost = 0.5 * error.square()
+        else:
+            cost = error.abs() + 4.0 * error.square()
+        if self.silent_weight != 1.0:
+            silent = (target < ACTIVE_DB) & (decibels(predicted, self.fit_reference) < ACTIVE_DB)
+            weight = torch.where(silent, self.silent_weight, 1.0)
+            return (cost * weight).sum() / weight.sum()
+        return cost.mean()
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Stop before a gradient that is no number reaches the parameters."""
+        del optimizer
+        bad = [n for n, p in self.named_parameters() if p.grad is not None]
+        finite = torch.stack(
+            [p.grad.isfinite().all() for p in self.parameters() if p.grad is not None]
+        )
+        if not bool(finite.all()):
+            name = bad[int((~finite).nonzero()[0])]
+            raise NumericalError(
+                f"the gradient of {name} is not finite at step {self.global_step}; "
+                "the last checkpoint is sound; lower fit.learning_rate and start anew"
+            )
+
+    def validation_step(self, batch: RangeSlices, batch_index: int) -> None:
+        """Gather the error over the validation poses, in the decibels of every report."""
+        del batch_index
+        predicted = decibels(self(batch), self.reference)
+        measured = decibels(batch.spectrum, self.reference)
+        error = (predicted - measured).abs()
+        active = (predicted >= ACTIVE_DB) | (measured >= ACTIVE_DB)
+        self.mae.update(error)
+        if bool(active.any()):
+            self.mae_active.update(error[active])
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the error over the validation poses."""
+        self.log("val/mae_db", self.mae.compute(), prog_bar=True)
+        if self.mae_active.update_count:
+            self.log("val/mae_db_active", self.mae_active.compute(), prog_bar=True)
+        self.mae.reset()
+        self.mae_active.reset()
+
+    def predict_step(self, batch: RangeSlices, batch_index: int) -> Tensor:
+        """Return the linear magnitude of a batch."""
+        del batch_index
+        return self(batch)
+
+    def _rate(self, step: int) -> float:
+        if self.schedule == "staircase":
+            stairs = step // (self.staircase_epochs * self.steps_per_epoch)
+            return float(self.staircase_factor**stairs)
+        late = max(0.0, 2.0 * step / max(1, self.total_steps) - 1.0)
+        return float(self.final_rate_factor**late)
+
+    def configure_optimizers(self) -> Any:
+        """Return Adam and the schedule, counted in steps."""
+        optimizer = torch.optim.Adam(self.parameters(), lr=self.learning_rate)
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, self._rate)
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+        }

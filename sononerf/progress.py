@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: MIT
+"""How long work is shown: a bar in a terminal, plain lines elsewhere; always on stderr."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+from rich.progress import Progress as Bars
+
+LINE_SECONDS = 10.0
+"""Plain lines come at most this often."""
+
+
+class Task:
+    """One piece of work that is counted."""
+
+    def __init__(self, what: str, total: int, bars: Bars | None, quiet: bool) -> None:
+        self.what, self.total, self.done, self.note = what, total, 0, ""
+        self._bars, self._quiet = bars, quiet
+        self._id = bars.add_task(what, total=total, note="") if bars else None
+        self._started = self._last = time.monotonic()
+
+    def advance(self, count: int = 1, note: str | None = None) -> None:
+        """Count on; ``note`` stands behind the bar until the next one."""
+        self.done += count
+        if note is not None:
+            self.note = note
+        if self._bars is not None and self._id is not None:
+            self._bars.update(self._id, completed=self.done, note=self.note)
+        elif not self._quiet and time.monotonic() - self._last >= LINE_SECONDS:
+            self._line()
+
+    def _line(self) -> None:
+        self._last = time.monotonic()
+        seconds = self._last - self._started
+        text = f"{self.what}: {self.done} of {self.total}, {seconds:.0f} s {self.note}"
+        print(text.rstrip(), file=sys.stderr, flush=True)  # noqa: T201
+
+    def finish(self) -> None:
+        """Say in a plain line how it ended, if any line was said before or it took long."""
+        if self._bars is None and not self._quiet and time.monotonic() - self._started > 2.0:
+            self._line()
+
+
+class Progress:
+    """Shows tasks one after the other.
+
+    Parameters
+    ----------
+    quiet : bool
+        Show nothing, as inside libraries and tests.
+    """
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self.quiet = quiet
+        self.console = Console(stderr=True, highlight=False)
+
+    def say(self, text: str) -> None:
+        """Print one line on stderr."""
+        if not self.quiet:
+            self.console.print(text, markup=False, soft_wrap=True)
+
+    @contextmanager
+    def task(self, what: str, total: int) -> Iterator[Task]:
+        """Count a piece of work of ``total`` parts."""
+        if self.quiet or not self.console.is_terminal:
+            task = Task(what, total, None, self.quiet)
+            yield task
+            task.finish()
+            return
+        columns = (
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+        )
+        with Bars(*columns, console=self.console) as bars:
+            yield Task(what, total, bars, quiet=False)

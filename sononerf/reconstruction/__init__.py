@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""From a field to volumes, meshes and numbers."""

@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: MIT
+"""How close predicted spectrograms are to measured ones, in decibels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.errors import NumericalError
+
+# Decibels from silence to the loudest: the scale of PSNR and SSIM.
+RANGE_DB = 60.0
+# Poses held in memory at once.
+CHUNK_POSES = 8
+# Side of the window over which SSIM compares; smaller pictures have none.
+SSIM_WINDOW = 11
+
+
+def _checked(measured: ArrayLike, predicted: ArrayLike) -> tuple[Any, Any]:
+    a, b = np.asanyarray(measured), np.asanyarray(predicted)
+    if a.shape != b.shape:
+        raise ValueError(f"measured {a.shape} and predicted {b.shape} differ in shape")
+    if not a.size:
+        raise ValueError(f"measured has shape {a.shape}: nothing to compare")
+    return a, b
+
+
+def _chunks(
+    measured: NDArray[np.floating], predicted: NDArray[np.floating]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    for start in range(0, len(measured), CHUNK_POSES):
+        a, b = (
+            np.asarray(spectrograms[start : start + CHUNK_POSES], dtype=np.float64)
+            for spectrograms in (measured, predicted)
+        )
+        for name, values in (("measured", a), ("predicted", b)):
+            if not np.isfinite(values).all():
+                pose = start + int(np.argwhere(~np.isfinite(values))[0][0])
+                raise NumericalError(f"the {name} spectrogram {pose} holds values not finite")
+        yield a, b
+
+
+def _mae(
+    measured: NDArray[np.floating], predicted: NDArray[np.floating], active_db: float
+) -> tuple[float, float | None]:
+    """Mean absolute error over all cells, and over active ones; None where none is active."""
+    total = active_total = 0.0
+    active_count = 0
+    for a, b in _chunks(measured, predicted):
+        error = np.abs(a - b)
+        active = (a >= active_db) | (b >= active_db)
+        total += float(error.sum())
+        active_total += float(error[active].sum())
+        active_count += int(active.sum())
+    return total / measured.size, active_total / active_count if active_count else None
+
+
+def mae_db(
+    a: ArrayLike, b: ArrayLike, *, active: bool = False, active_db: float = 3.0
+) -> float | None:
+    """Mean absolute difference of two sets of spectrograms.
+
+    Parameters
+    ----------
+    a, b : (P, ...) float, dB
+        Spectrograms.
+    active : bool
+        Whether only those cells count that reach ``active_db`` in either.
+    active_db : float, dB
+        What makes a cell active.
+
+    Returns
+    -------
+    error : float or None, dB
+        None where no cell is active.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or nothing is there.
+    NumericalError
+        If a value is not finite.
+    """
+    first, second = _checked(a, b)
+    return _mae(first, second, active_db)[1 if active else 0]
+
+
+def prediction_metrics(
+    measured_db: ArrayLike,
+    predicted_db: ArrayLike,
+    *,
+    mean_db: ArrayLike,
+    active_db: float = 3.0,
+) -> dict[str, float | None]:
+    """Compare predicted spectrograms with measured ones.
+
+    Parameters
+    ----------
+    measured_db, predicted_db : (P, E, R, F) float, dB
+        0 dB is silence; arrays mapped from a file are read a few poses at a time.
+    mean_db : (E, R, F) float, dB
+        Mean spectrogram of the training poses: what knowing nothing of the pose predicts.
+    active_db : float, dB
+        A cell is active where the measured or the judged spectrogram reaches this.
+
+    Returns
+    -------
+    metrics : dict
+        ``mae_db``, ``mae_db_active``, ``mean_predictor_mae_db``, ``mean_predictor_mae_db_active``,
+        ``log_spectral_distance_db`` (root mean square over frequency, mean over the rest),
+        ``psnr_db`` and ``ssim`` (range 60 dB), ``pearson``. None where a figure does not exist:
+        nothing active, a perfect match's PSNR, pictures too small for SSIM, no variation.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit.
+    NumericalError
+        If a value is not finite.
+    """
+    measured, predicted = _checked(measured_db, predicted_db)
+    mean = np.asarray(mean_db, dtype=np.float64)
+    if measured.ndim != 4:
+        raise ValueError(f"measured has shape {measured.shape}, expected (P, E, R, F)")
+    if mean.shape != measured.shape[1:]:
+        raise ValueError(f"mean_db has shape {mean.shape}, expected {measured.shape[1:]}")
+    error, active_error = _mae(measured, predicted, active_db)
+    expected = np.broadcast_to(mean, measured.shape)
+    mean_error, mean_active_error = _mae(measured, expected, active_db)
+    return {
+        "mae_db": error,
+        "mae_db_active": active_error,
+        "mean_predictor_mae_db": mean_error,
+        "mean_predictor_mae_db_active": mean_active_error,
+        "log_spectral_distance_db": _log_spectral_distance(measured, predicted),
+        **_image_metrics(measured, predicted),
+    }
+
+
+def _log_spectral_distance(
+    measured: NDArray[np.floating], predicted: NDArray[np.floating]
+) -> float:
+    total = sum(
+        float(np.sqrt(((a - b) ** 2).mean(axis=-1)).sum()) for a, b in _chunks(measured, predicted)
+    )
+    return total * measured.shape[-1] / measured.size
+
+
+def _image_metrics(
+    measured: NDArray[np.floating], predicted: NDArray[np.floating]
+) -> dict[str, float | None]:
+    import torch
+    from torchmetrics.image import PeakSignalNoiseRatio, StructuralSimilarityIndexMeasure
+    from torchmetrics.regression import PearsonCorrCoef
+
+    psnr = PeakSignalNoiseRatio(data_range=RANGE_DB)
+    ssim = StructuralSimilarityIndexMeasure(data_range=RANGE_DB)
+    pearson = PearsonCorrCoef().set_dtype(torch.float64)
+    large = min(measured.shape[2:]) >= SSIM_WINDOW
+    perfect = True
+    lowest, highest = np.full(2, np.inf), np.full(2, -np.inf)
+    for a, b in _chunks(measured, predicted):
+        one, two = torch.from_numpy(a), torch.from_numpy(b)
+        psnr.update(two, one)
+        if large:
+            ssim.update(two, one)
+        pearson.update(two.flatten(), one.flatten())
+        perfect &= bool((a == b).all())
+        lowest = np.minimum(lowest, [a.min(), b.min()])
+        highest = np.maximum(highest, [a.max(), b.max()])
+    varies = bool((highest - lowest > 1e-6).all())
+    return {
+        "psnr_db": None if perfect else float(torch.as_tensor(psnr.compute())),
+        "ssim": float(torch.as_tensor(ssim.compute())) if large else None,
+        "pearson": float(torch.as_tensor(pearson.compute())) if varies else None,
+    }

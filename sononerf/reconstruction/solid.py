@@ -1,0 +1,329 @@
+# SPDX-License-Identifier: MIT
+"""A mesh as the solid union of its bodies: its outer surface, its volume, its parts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from sononerf.errors import NumericalError
+from sononerf.reconstruction.columns import crossings, inside_intervals
+from sononerf.reconstruction.parts import split_parts, submesh
+
+# Lines across the bounding box on each axis that measure volumes: 1e-4 of a ball's volume.
+LINES = 401
+# Rejection keeps what lies outside; after so many rounds there is no outer surface to be found.
+MAX_ROUNDS = 100
+
+
+def polydata(mesh: trimesh.Trimesh) -> Any:
+    """Return a mesh as pyvista's PolyData."""
+    import pyvista
+
+    faces = np.asarray(mesh.faces)
+    threes = np.full((len(faces), 1), 3, dtype=faces.dtype)
+    return pyvista.PolyData(np.asarray(mesh.vertices), np.hstack([threes, faces]).ravel())
+
+
+def signed_distance(points: NDArray[np.float64], mesh: trimesh.Trimesh) -> NDArray[np.float64]:
+    """Return the exact distance of points (N, 3) to a mesh, (N,) m, negative inside."""
+    import pyvista
+
+    if not len(points):
+        return np.zeros(0)
+    cloud = pyvista.PolyData(np.asarray(points, dtype=np.float64))
+    distances = cloud.compute_implicit_distance(polydata(mesh))["implicit_distance"]
+    return np.asarray(distances, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """The bodies of a mesh, taken together.
+
+    Parameters
+    ----------
+    bodies : list of Trimesh
+        Parts that are closed, facing outward.
+    sheets : list of Trimesh
+        Parts that are open.
+    """
+
+    bodies: list[trimesh.Trimesh]
+    sheets: list[trimesh.Trimesh]
+
+    @property
+    def parts(self) -> list[trimesh.Trimesh]:
+        """All parts, closed ones first."""
+        return [*self.bodies, *self.sheets]
+
+    @property
+    def closed(self) -> bool:
+        """Whether every part is closed, so that there is an inside."""
+        return bool(self.bodies) and not self.sheets
+
+    def contains(
+        self, points: NDArray[np.float64], *, other_than: int | None = None
+    ) -> NDArray[np.bool_]:
+        """Return whether points (N, 3) lie inside any body, one of them perhaps left out."""
+        inside = np.zeros(len(points), bool)
+        for index, body in enumerate(self.bodies):
+            if index == other_than:
+                continue
+            low, high = body.bounds
+            near = np.flatnonzero(((points > low) & (points < high)).all(axis=1) & ~inside)
+            inside[near] = signed_distance(points[near], body) < 0
+        return inside
+
+
+def _merged(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    if not len(mesh.faces):
+        raise NumericalError("the mesh is empty: it has no triangle")
+    if not np.isfinite(mesh.vertices).all():
+        raise NumericalError("the mesh has vertices that are not finite")
+    if mesh.is_watertight:
+        return mesh
+    # STL and many others store each triangle's corners apart; closed is closed only once merged.
+    merged = trimesh.Trimesh(mesh.vertices, mesh.faces, process=True, validate=False)
+    a, b, c = np.asarray(merged.faces).T
+    merged.update_faces((a != b) & (b != c) & (c != a))
+    if not len(merged.faces):
+        raise NumericalError("the mesh has no triangle with an area")
+    return merged
+
+
+def solid_from_mesh(mesh: trimesh.Trimesh, *, drop_cavities: bool) -> Solid:
+    """Take a mesh apart into its bodies.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        Closed bodies, which may overlap, and open sheets.
+    drop_cavities : bool
+        Whether the walls of closed hollows, which no sound reaches, are left out. A body that faces
+        inward and is no hollow is turned inside out either way.
+
+    Raises
+    ------
+    NumericalError
+        If the mesh is empty or not finite.
+    """
+    bodies, cavities, sheets = [], [], []
+    for part in split_parts(_merged(mesh)):
+        if not part.is_watertight:
+            sheets.append(part)
+        elif part.volume < 0:
+            cavities.append(part)
+        else:
+            bodies.append(part)
+    outer = Solid(list(bodies), [])
+    for part in cavities:
+        if outer.contains(np.asarray(part.vertices[:1])).all() and bodies:
+            if not drop_cavities:
+                bodies.append(part)
+        else:
+            part.invert()
+            bodies.append(part)
+    return Solid(bodies, sheets)
+
+
+def outer_surface(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return the outer surface of the solid union of a mesh's closed bodies.
+
+    Triangles whose centroid lies inside another body are left out, so that where two bodies meet
+    the seam is true to one triangle: refine coarse bodies that overlap. Sheets stay, except inside
+    a body; the walls of hollows go.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        Closed bodies, which may overlap, and open sheets.
+
+    Returns
+    -------
+    mesh : Trimesh
+        A new mesh, open along the seams.
+
+    Raises
+    ------
+    NumericalError
+        If the mesh is empty or not finite.
+    """
+    return outer_surface_of(solid_from_mesh(mesh, drop_cavities=True))
+
+
+def outer_surface_of(solid: Solid) -> trimesh.Trimesh:
+    """Return the outer surface of a solid; see :func:`outer_surface`."""
+    kept = []
+    for index, part in enumerate(solid.parts):
+        hidden = solid.contains(np.asarray(part.triangles_center), other_than=index)
+        if not hidden.all():
+            kept.append(submesh(part, ~hidden) if hidden.any() else part)
+    if not kept:
+        # Two bodies in the very same place hide one another.
+        kept = [solid.parts[0]]
+    return trimesh.util.concatenate(kept)
+
+
+def sample_surface(
+    mesh: trimesh.Trimesh, count: int, generator: np.random.Generator
+) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+    """Draw points uniformly by area; returns points (count, 3) m and their triangles (count,)."""
+    cumulative = np.cumsum(np.asarray(mesh.area_faces, dtype=np.float64))
+    if not len(cumulative) or not cumulative[-1] > 0:
+        raise NumericalError("the mesh has no area to draw points from")
+    face = np.searchsorted(cumulative, generator.random(count) * cumulative[-1], side="right")
+    face = np.minimum(face, len(cumulative) - 1)
+    u, v = generator.random((2, count))
+    flip = u + v > 1
+    u, v = np.where(flip, 1 - u, u), np.where(flip, 1 - v, v)
+    a, b, c = np.asarray(mesh.triangles)[face].transpose(1, 0, 2)
+    return a + u[:, None] * (b - a) + v[:, None] * (c - a), face
+
+
+def sample_outer_surface(
+    mesh: trimesh.Trimesh, count: int, seed: int = 0
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Draw points uniformly by area from the outer surface of a solid union.
+
+    Points inside another body are thrown away one by one, so that the seams are exact.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        Closed bodies, which may overlap, and open sheets.
+    count : int
+        Number of points.
+    seed : int
+        The same seed draws the same points.
+
+    Returns
+    -------
+    points : (count, 3) float, m
+        On the outer surface.
+    normals : (count, 3) float
+        Unit normals of the triangles they lie on.
+
+    Raises
+    ------
+    NumericalError
+        If the mesh is empty, not finite, or has no outer surface.
+    """
+    return sample_solid(solid_from_mesh(mesh, drop_cavities=True), count, seed)
+
+
+def sample_solid(
+    solid: Solid, count: int, seed: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Draw points from the outer surface of a solid; see :func:`sample_outer_surface`."""
+    generator = np.random.default_rng(seed)
+    whole = trimesh.util.concatenate(solid.parts)
+    owner = np.repeat(np.arange(len(solid.parts)), [len(part.faces) for part in solid.parts])
+    boxes = np.array([body.bounds for body in solid.bodies]).reshape(-1, 2, 3)
+    normals = np.asarray(whole.face_normals)
+    found: list[tuple[NDArray[np.float64], NDArray[np.intp]]] = []
+    missing = count
+    for _ in range(MAX_ROUNDS):
+        points, face = sample_surface(whole, max(1000, missing), generator)
+        keep = np.ones(len(points), bool)
+        for index, (body, (low, high)) in enumerate(zip(solid.bodies, boxes, strict=True)):
+            near = np.flatnonzero(
+                ((points > low) & (points < high)).all(axis=1) & (owner[face] != index) & keep
+            )
+            keep[near] = signed_distance(points[near], body) >= 0
+        found.append((points[keep], face[keep]))
+        missing -= int(keep.sum())
+        if missing <= 0:
+            points = np.concatenate([p for p, _ in found])[:count]
+            face = np.concatenate([f for _, f in found])[:count]
+            return points, normals[face]
+    raise NumericalError("the mesh has no outer surface: every body lies inside another")
+
+
+def count_parts(solid: Solid, *, min_area_fraction: float = 0.01) -> int:
+    """Count the connected parts of the union; bodies that overlap or touch are one part.
+
+    Parts with less than ``min_area_fraction`` of the largest part's area are not counted.
+    """
+    parts = solid.parts
+    boxes = np.array([part.bounds for part in parts])
+    joined = [
+        (i, j)
+        for i in range(len(parts))
+        for j in range(i + 1, len(parts))
+        if (boxes[i, 0] <= boxes[j, 1]).all()
+        and (boxes[j, 0] <= boxes[i, 1]).all()
+        and _overlap(solid, i, j)
+    ]
+    rows, columns = np.array(joined, dtype=np.intp).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(rows), bool), (rows, columns)), shape=(len(parts),) * 2)
+    labels = connected_components(graph, directed=False)[1]
+    areas = np.bincount(labels, weights=[part.area for part in parts])
+    return int((areas > min_area_fraction * areas.max()).sum())
+
+
+def _overlap(solid: Solid, i: int, j: int) -> bool:
+    """Return whether two parts' surfaces cross, or one lies inside the other."""
+    first, second = solid.parts[i], solid.parts[j]
+    for inner, outer, index in ((first, second, j), (second, first, i)):
+        if index < len(solid.bodies):
+            low, high = outer.bounds
+            corners = np.asarray(inner.vertices)
+            near = corners[((corners >= low) & (corners <= high)).all(axis=1)]
+            if (signed_distance(near, outer) < 0).any():
+                return True
+    # Triangles may cross though no corner lies inside; only those near both can.
+    low = np.maximum(first.bounds[0], second.bounds[0])
+    high = np.minimum(first.bounds[1], second.bounds[1])
+    near_both = []
+    for part in (first, second):
+        triangles = np.asarray(part.triangles)
+        near_box = (triangles.min(axis=1) <= high) & (triangles.max(axis=1) >= low)
+        near_both.append(submesh(part, near_box.all(axis=1)))
+    if not all(len(part.faces) for part in near_both):
+        return False
+    one, two = (polydata(part) for part in near_both)
+    return bool(one.collision(two, contact_mode=1)[1])
+
+
+def volumes(first: Solid, second: Solid) -> tuple[float, float, float]:
+    """Return the volumes of two unions and of what they share, in m³.
+
+    Exact lengths along 401 x 401 parallel lines across the bounding box.
+    """
+    both = [trimesh.util.concatenate(solid.bodies) for solid in (first, second)]
+    low = np.min([mesh.bounds[0] for mesh in both], axis=0)
+    high = np.max([mesh.bounds[1] for mesh in both], axis=0)
+    step = (high - low)[1:] / LINES
+    rows, columns = (low[axis] + step[axis - 1] * (np.arange(LINES) + 0.5) for axis in (1, 2))
+    stretches = [
+        inside_intervals(
+            crossings(np.asarray(mesh.vertices), np.asarray(mesh.faces), rows, columns)
+        )
+        for mesh in both
+    ]
+    cell = float(step[0] * step[1])
+    one, two = (cell * float((stop - start).sum()) for _, start, stop in stretches)
+    return one, two, cell * _shared_length(*stretches)
+
+
+Stretches = tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]
+
+
+def _shared_length(first: Stretches, second: Stretches) -> float:
+    """Return the total length that lies in a stretch of both."""
+    line = np.concatenate([first[0], first[0], second[0], second[0]])
+    depth = np.concatenate([first[1], first[2], second[1], second[2]])
+    change = np.concatenate(
+        [sign * np.ones(len(part[0])) for part in (first, second) for sign in (1, -1)]
+    )
+    order = np.lexsort((depth, line))
+    level = np.cumsum(change[order])[:-1]
+    gaps = np.diff(depth[order])
+    # Stretches of one solid never overlap, so a level of two means that both are there.
+    return float(gaps[level > 1.5].sum())

@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: MIT
+"""A field read out on a regular grid of voxels, in metres and the world frame."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.errors import NumericalError, ResourceError
+
+# The value itself and the copies that an iso-surface takes, measured.
+BYTES_PER_VOXEL = 80
+
+
+@dataclass(frozen=True, eq=False)
+class Volume:
+    """Values on a regular grid.
+
+    Parameters
+    ----------
+    values : (X, Y, Z) float
+        One value per voxel.
+    origin : (3,) float, m
+        Centre of voxel [0, 0, 0], world frame.
+    spacing : float, m
+        Distance between the centres of neighbouring voxels, equal on all axes.
+
+    Raises
+    ------
+    ValueError
+        If the shapes or the spacing are wrong.
+    """
+
+    values: NDArray[np.floating]
+    origin: NDArray[np.float64]
+    spacing: float
+
+    def __post_init__(self) -> None:
+        origin = np.asarray(self.origin, dtype=np.float64)
+        values = np.asarray(self.values)
+        if values.ndim != 3 or not values.size:
+            raise ValueError(f"values: shape {values.shape}, expected (X, Y, Z) with no empty axis")
+        if origin.shape != (3,) or not np.isfinite(origin).all():
+            raise ValueError(f"origin: {origin!r}, expected three finite numbers")
+        if not (np.isfinite(self.spacing) and self.spacing > 0):
+            raise ValueError(f"spacing: {self.spacing!r} m, expected a positive number")
+        object.__setattr__(self, "values", values)
+        object.__setattr__(self, "origin", origin)
+        object.__setattr__(self, "spacing", float(self.spacing))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Number of voxels along x, y and z."""
+        x, y, z = self.values.shape
+        return x, y, z
+
+    @property
+    def upper(self) -> NDArray[np.float64]:
+        """Centre of the last voxel, (3,) m."""
+        return self.origin + self.spacing * (np.asarray(self.shape) - 1)
+
+    def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return the voxels' centres along each axis: (X,), (Y,), (Z,) m."""
+        x, y, z = (
+            start + self.spacing * np.arange(count)
+            for start, count in zip(self.origin, self.shape, strict=True)
+        )
+        return x, y, z
+
+    def points(self) -> NDArray[np.float64]:
+        """Return the voxels' centres, (X*Y*Z, 3) m, in the order of ``values.ravel()``."""
+        return _centres(self.axes(), 0, self.values.size)
+
+    def with_values(self, values: NDArray[np.floating]) -> Volume:
+        """Return a volume on the same grid with other values, (X, Y, Z)."""
+        if np.shape(values) != self.shape:
+            raise ValueError(f"values: shape {np.shape(values)}, expected {self.shape}")
+        return Volume(values, self.origin, self.spacing)
+
+
+def _centres(axes: tuple[NDArray[np.float64], ...], start: int, stop: int) -> NDArray[np.float64]:
+    shape = tuple(len(axis) for axis in axes)
+    indices = np.unravel_index(np.arange(start, stop), shape)
+    return np.stack([axis[index] for axis, index in zip(axes, indices, strict=True)], axis=1)
+
+
+def _box(lower: ArrayLike, upper: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+    if low.shape != (3,) or high.shape != (3,) or not np.isfinite([low, high]).all():
+        raise ValueError(f"box {lower!r} to {upper!r}: expected three finite numbers each, in m")
+    if not (low < high).all():
+        raise ValueError(f"box {low.tolist()} to {high.tolist()}: lower must lie below upper")
+    return low, high
+
+
+def grid_shape(lower: ArrayLike, upper: ArrayLike, spacing: float) -> tuple[int, int, int]:
+    """Return how many voxels cover a box, so that the outermost centres lie on it or beyond.
+
+    Raises
+    ------
+    ValueError
+        If the box is empty or the spacing is not positive.
+    """
+    low, high = _box(lower, upper)
+    if not (np.isfinite(spacing) and spacing > 0):
+        raise ValueError(f"spacing: {spacing!r} m, expected a positive number")
+    # The small number keeps 0.3 / 0.1 from asking for a fourth interval.
+    x, y, z = (int(np.ceil(n - 1e-9)) + 1 for n in (high - low) / spacing)
+    return x, y, z
+
+
+def estimated_bytes(
+    lower: ArrayLike, upper: ArrayLike, spacing: float, *, bytes_per_voxel: int = BYTES_PER_VOXEL
+) -> int:
+    """Return the memory that a grid over a box takes, in bytes."""
+    x, y, z = grid_shape(lower, upper, spacing)
+    return x * y * z * bytes_per_voxel
+
+
+def available_memory() -> int | None:
+    """Return the memory that can still be taken, in bytes; None where the system does not say."""
+    free: list[int] = []
+    meminfo = Path("/proc/meminfo")
+    if meminfo.is_file():
+        for line in meminfo.read_text(encoding="ascii").splitlines():
+            if line.startswith("MemAvailable:"):
+                free.append(int(line.split()[1]) * 1024)
+    else:
+        try:
+            free.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+        except (AttributeError, ValueError, OSError):
+            return None
+    # A container may be held to less than the machine has.
+    limit, used = Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
+    if limit.is_file() and used.is_file():
+        bound = limit.read_text(encoding="ascii").strip()
+        if bound != "max":
+            free.append(int(bound) - int(used.read_text(encoding="ascii")))
+    return max(0, min(free)) if free else None
+
+
+def check_memory(
+    lower: ArrayLike, upper: ArrayLike, spacing: float, *, bytes_per_voxel: int = BYTES_PER_VOXEL
+) -> None:
+    """Refuse a grid that would not fit in memory, before anything is computed.
+
+    Raises
+    ------
+    ResourceError
+        With the bytes needed, the bytes free, and the finest spacing that fits.
+    """
+    needed = estimated_bytes(lower, upper, spacing, bytes_per_voxel=bytes_per_voxel)
+    free = available_memory()
+    if free is None or needed <= free:
+        return
+    fits = float(spacing)
+    while estimated_bytes(lower, upper, fits, bytes_per_voxel=bytes_per_voxel) > max(
+        free, 8 * bytes_per_voxel
+    ):
+        fits *= 1.02
+    raise ResourceError(
+        f"spacing {spacing:.4g} m: the grid needs {needed:,} bytes and {free:,} are free; "
+        f"the finest spacing that fits is {fits:.4g} m"
+    )
+
+
+def grid_over(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Volume:
+    """Return a volume of zeros whose voxel centres cover a box, centred on it.
+
+    Parameters
+    ----------
+    lower, upper : (3,) float, m
+        Opposite corners of the box.
+    spacing : float, m
+        Distance between voxel centres.
+
+    Returns
+    -------
+    volume : Volume
+        float64 zeros; the outermost centres lie on the box or less than one spacing beyond.
+
+    Raises
+    ------
+    ValueError
+        If the box is empty or the spacing is not positive.
+    ResourceError
+        If the grid would not fit in memory.
+    """
+    shape = grid_shape(lower, upper, spacing)
+    check_memory(lower, upper, spacing)
+    low, high = _box(lower, upper)
+    origin = (low + high) / 2 - spacing * (np.asarray(shape) - 1) / 2
+    return Volume(np.zeros(shape), origin, spacing)
+
+
+def volume_from_function(
+    function: Callable[[NDArray[np.float64]], ArrayLike],
+    lower: ArrayLike,
+    upper: ArrayLike,
+    spacing: float,
+    *,
+    chunk: int = 65_536,
+    progress: Callable[[int, int], None] | None = None,
+) -> Volume:
+    """Evaluate a function at every voxel, so many at a time that memory stays bounded.
+
+    A position does not depend on the chunk that it falls into, so that a function of the position
+    alone gives the same volume whatever ``chunk`` is.
+
+    Parameters
+    ----------
+    function : callable
+        Maps positions (N, 3) m to values (N,).
+    lower, upper : (3,) float, m
+        Opposite corners of the box.
+    spacing : float, m
+        Distance between voxel centres.
+    chunk : int
+        Greatest N.
+    progress : callable, optional
+        Called with the voxels done and the voxels in all, after each chunk.
+
+    Returns
+    -------
+    volume : Volume
+        The values, float64.
+
+    Raises
+    ------
+    ValueError
+        If the box, the spacing, the chunk, or the shape that the function returns is wrong.
+    ResourceError
+        If the grid would not fit in memory.
+    NumericalError
+        If a value is not finite.
+    """
+    if chunk < 1:
+        raise ValueError(f"chunk: {chunk}, expected 1 or more")
+    volume = grid_over(lower, upper, spacing)
+    axes, flat, total = volume.axes(), volume.values.reshape(-1), volume.values.size
+    for start in range(0, total, chunk):
+        stop = min(start + chunk, total)
+        points = _centres(axes, start, stop)
+        values = np.asarray(function(points), dtype=np.float64)
+        if values.shape != (stop - start,):
+            raise ValueError(
+                f"function: returned shape {values.shape} for {stop - start} points; "
+                "expected one value per point"
+            )
+        if not np.isfinite(values).all():
+            where = points[np.flatnonzero(~np.isfinite(values))[0]]
+            raise NumericalError(
+                f"the field is not finite at {np.round(where, 4).tolist()} m; the fit has diverged"
+            )
+        flat[start:stop] = values
+        if progress is not None:
+            progress(stop, total)
+    return volume
+
+
+def require_finite(volume: Volume) -> None:
+    """Refuse a volume that holds NaN or infinity.
+
+    Raises
+    ------
+    NumericalError
+        With the number of voxels that are not finite.
+    """
+    faulty = volume.values.size - int(np.isfinite(volume.values).sum())
+    if faulty:
+        raise NumericalError(
+            f"{faulty} of {volume.values.size} voxels are not finite; the fit has diverged"
+        )
+
+
+def vti_bytes(volume: Volume, name: str = "reflectivity") -> bytes:
+    """Return a VTK image file (``.vti``) that ParaView and 3D Slicer open, in metres.
+
+    Parameters
+    ----------
+    volume : Volume
+        Stored as float32, x fastest, as VTK has it.
+    name : str
+        Name of the values inside the file; letters, digits and underscores.
+
+    Returns
+    -------
+    data : bytes
+        The file, the same for the same volume.
+
+    Raises
+    ------
+    ValueError
+        If the name holds anything else.
+    """
+    if not name.isidentifier():
+        raise ValueError(f"name: {name!r}, expected letters, digits and underscores")
+    data = np.asarray(volume.values, dtype="<f4").tobytes(order="F")
+    extent = " ".join(f"0 {count - 1}" for count in volume.shape)
+    origin = " ".join(repr(float(x)) for x in volume.origin)
+    head = (
+        '<?xml version="1.0"?>\n'
+        '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" '
+        'header_type="UInt64">\n'
+        f'  <ImageData WholeExtent="{extent}" Origin="{origin}" '
+        f'Spacing="{" ".join([repr(volume.spacing)] * 3)}">\n'
+        f'    <Piece Extent="{extent}">\n'
+        f'      <PointData Scalars="{name}">\n'
+        f'        <DataArray type="Float32" Name="{name}" format="appended" offset="0"/>\n'
+        "      </PointData>\n"
+        "    </Piece>\n"
+        "  </ImageData>\n"
+        '  <AppendedData encoding="raw">\n'
+        "   _"
+    )
+    length = np.asarray([len(data)], dtype="<u8").tobytes()
+    tail = "\n  </AppendedData>\n</VTKFile>\n"
+    return head.encode("ascii") + length + data + tail.encode("ascii")

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Pictures: the only place that draws."""

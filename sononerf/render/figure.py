@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: MIT
+"""Figures and pixels as PNG files; the same picture gives the same bytes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+STYLE = {
+    "font.family": "DejaVu Sans",  # comes with matplotlib, so pictures look alike everywhere
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.labelsize": 9,
+    "axes.linewidth": 0.6,
+    "xtick.labelsize": 8,
+    "ytick.labelsize": 8,
+    "image.interpolation": "nearest",
+    "image.origin": "lower",
+}
+
+
+def png_from_pixels(pixels: NDArray[np.uint8]) -> bytes:
+    """Return pixels (H, W, 3) as a PNG file."""
+    buffer = io.BytesIO()
+    Image.fromarray(pixels).save(buffer, format="PNG")
+    return buffer.getvalue()
+
+
+@contextmanager
+def figure(
+    width: float,
+    height: float,
+    dpi: int,
+    *,
+    layout: Literal["constrained", "compressed"] = "constrained",
+) -> Iterator[Any]:
+    """Open a figure of so many inches in our style; draw in the block, then take its pixels."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    with matplotlib.rc_context(STYLE):
+        drawn = Figure(figsize=(width, height), dpi=dpi, layout=layout, facecolor="white")
+        FigureCanvasAgg(drawn)
+        yield drawn
+
+
+def pixels_from_figure(drawn: Any) -> NDArray[np.uint8]:
+    """Return a figure's pixels, (H, W, 3)."""
+    drawn.canvas.draw()
+    return np.array(drawn.canvas.buffer_rgba(), dtype=np.uint8)[..., :3]

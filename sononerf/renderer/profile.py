@@ -1,0 +1,271 @@
+# SPDX-License-Identifier: MIT
+"""What the ear really measures: a fine range profile seen through the analysis window."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field as Option
+from torch import Tensor, nn
+
+from sononerf.field.field import Field
+from sononerf.renderer.renderer import Acquisition, Possible, Renderer, look_up
+
+
+class _Deposit(torch.autograd.Function):
+    """Add values to bins; the gradient is a plain gather."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, index: Tensor, size: int) -> Tensor:
+        ctx.save_for_backward(index)
+        return values.new_zeros(size).scatter_add_(0, index.reshape(-1), values.reshape(-1))
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        (index,) = ctx.saved_tensors
+        return gradients[0][index], None, None
+
+
+class ProfileRenderer(Renderer):
+    r"""Power of a fine range profile, seen through the squared analysis window.
+
+    .. math::
+        S_e(f, r)^2 = n_f^2 + g^2 \sum_i W(r - r_i)\, |\rho(x_i, u_i, f)|^2
+        \frac{B(f)^2 E_e(f)^2 e^{-2 \alpha_f (d_i + d_i^e)}}{(d_i\, d_i^e)^2}
+
+    The sum runs over the vertices of a lattice that are still alive. Each is deposited, linearly
+    between two bins, at :math:`r_i = (d_i + d_i^e) / 2`, emitter and ear at their true places,
+    so both ears hear it at their own time. Spreading and absorption are known physics and stay
+    out of the field. Summing power ignores interference between glints inside one window.
+
+    Parameters
+    ----------
+    region : (2, 3) float, m
+        Lower and upper corner of the box that holds the field.
+    acquisition : Acquisition
+        How the measured spectra came to be.
+    oversampling : int
+        Bins of the profile per range slice.
+    points : int
+        How many places a step evaluates at most; more are drawn by their running energy.
+    uniform : float
+        Share of the drawn places that are drawn uniformly.
+    start : int
+        How many places the first lattice may have. It is as often twice as coarse as the field
+        as that takes, and is refined around what is alive.
+    prune_every : int
+        Steps between two looks at which places are alive, and whether the lattice is refined;
+        0 never does.
+    prune_below : float
+        Places weaker than this part of the strongest in their surroundings are dropped.
+    surroundings : float, m
+        How far "surroundings" reaches.
+    """
+
+    lattice: Tensor
+    alive: Tensor
+    energy: Tensor
+    kernel: Tensor
+    spacing: Tensor
+    absorption: Tensor
+
+    def __init__(
+        self,
+        region: Tensor,
+        acquisition: Acquisition,
+        *,
+        oversampling: Annotated[int, Option(ge=1, le=16)] = 2,
+        points: Annotated[int, Option(ge=1)] = 100_000,
+        uniform: Annotated[float, Option(gt=0, le=1)] = 0.4,
+        start: Annotated[int, Option(ge=1)] = 12_000,
+        prune_every: Annotated[int, Option(ge=0)] = 100,
+        prune_below: Annotated[float, Option(ge=0, lt=1)] = 1e-5,
+        surroundings: Annotated[float, Option(gt=0)] = 0.03,
+    ) -> None:
+        super().__init__(region, acquisition)
+        self.points, self.uniform, self.start = points, uniform, start
+        self.prune_every, self.prune_below = prune_every, prune_below
+        self.surroundings = surroundings
+        self.oversampling = oversampling
+        step = float(acquisition.range[1] - acquisition.range[0])
+        self.bin = step / oversampling
+        per_sample = acquisition.speed_of_sound / acquisition.sampling_rate / 2
+        half = (len(acquisition.window) - 1) / 2
+        reach = math.floor(half * per_sample / self.bin)
+        offsets = torch.arange(-reach, reach + 1) * self.bin / per_sample + half
+        left = offsets.floor().long().clamp(0, len(acquisition.window) - 2)
+        part = offsets - left
+        window = acquisition.window
+        window = window[left] * (1 - part) + window[left + 1] * part
+        self.register_buffer("kernel", window.square().float()[None, None])
+        self.first = float(acquisition.range[0]) - reach * self.bin
+        self.bins = (len(acquisition.range) - 1) * oversampling + 2 * reach + 1
+        self.register_buffer("absorption", acquisition.absorption.clone())
+        self.log_spectrum = nn.Parameter(torch.zeros(len(acquisition.frequency)))
+        self.log_noise = nn.Parameter(torch.full((len(acquisition.frequency),), -16.0))
+        self.register_buffer("lattice", torch.zeros(0, 3))
+        self.register_buffer("alive", torch.zeros(0, dtype=torch.bool))
+        self.register_buffer("energy", torch.zeros(0))
+        self.register_buffer("spacing", torch.zeros(()))
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        # The lattice's size is found by the fit, so a loaded one replaces ours whole.
+        for name in ("lattice", "alive", "energy"):
+            if prefix + name in state_dict:
+                setattr(self, name, torch.zeros_like(state_dict[prefix + name]))
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    @torch.no_grad()
+    def prepare(self, field: Field, possible: Possible | None, step: int) -> bool:
+        """Lay the lattice at the first step; drop what has no energy and refine every so often."""
+        if not len(self.lattice):
+            self._lay(field, possible)
+            return True
+        if not self.prune_every or not step or step % self.prune_every:
+            return False
+        self._prune(field)
+        field.keep(self.lattice[self.alive], float(self.spacing))
+        if float(self.spacing) > 1.5 * field.resolution:
+            self._refine()
+            field.keep(self.lattice, float(self.spacing))
+            return True
+        return False
+
+    def _lay(self, field: Field, possible: Possible | None) -> None:
+        spacing = field.resolution
+        while True:
+            places = lattice_over(self.region, spacing)
+            if possible is not None:
+                places = places[possible(places, spacing * math.sqrt(3) / 2)]
+            if len(places) <= self.start:
+                break
+            spacing *= 2
+        self._replace(places, spacing)
+        field.keep(self.lattice, spacing)
+
+    def _refine(self) -> None:
+        """Halve the spacing around what is alive."""
+        half = float(self.spacing) / 2
+        cell = ((self.lattice[self.alive] - self.region[0]) / half).round().long()
+        steps = torch.arange(-1, 2, device=cell.device)
+        around = torch.cartesian_prod(steps, steps, steps)
+        size = ((self.region[1] - self.region[0]) / half + 1e-3).floor().long() + 1
+        cells = (cell[:, None] + around).reshape(-1, 3)
+        cells = cells[((cells >= 0) & (cells < size)).all(dim=1)].unique(dim=0)
+        self._replace(self.region[0] + cells * half, half)
+
+    def _replace(self, places: Tensor, spacing: float) -> None:
+        self.lattice = places
+        self.alive = places.new_ones(len(places), dtype=torch.bool)
+        self.energy = places.new_ones(len(places))
+        self.spacing = self.spacing.new_tensor(spacing)
+
+    def _prune(self, field: Field) -> None:
+        energy = field.oriented(self.lattice[self.alive], 32)[0]
+        self.energy = torch.zeros_like(self.energy).masked_scatter(self.alive, energy)
+        # The strongest of the surroundings, judged on coarse cubes and their neighbours, so
+        # that far and weak parts are not starved by a loud one.
+        cell = ((self.lattice - self.region[0]) / self.surroundings).long().clamp_min(0)
+        size = (cell.amax(0) + 1).tolist()
+        flat = (cell[:, 2] * size[1] + cell[:, 1]) * size[0] + cell[:, 0]
+        most = self.energy.new_zeros(size[0] * size[1] * size[2])
+        most = most.scatter_reduce(0, flat, self.energy, "amax").reshape(1, 1, *size[::-1])
+        most = F.max_pool3d(most, 3, 1, 1).reshape(-1)[flat]
+        self.alive = self.alive & (self.energy > self.prune_below * most)
+
+    def _draw(self) -> tuple[Tensor, Tensor | None]:
+        """Return the places of this step and, where they are a sample, their weights."""
+        index = self.alive.nonzero()[:, 0]
+        if not self.training or len(index) <= self.points:
+            return index, None
+        energy = self.energy[index]
+        share = (1 - self.uniform) * energy / energy.sum() + self.uniform / len(index)
+        drawn = torch.multinomial(share, self.points, replacement=True)
+        return index[drawn], 1.0 / (share[drawn] * self.points)
+
+    def forward(
+        self,
+        field: Field,
+        position: Tensor,
+        rotation: Tensor,
+        rows: Tensor,
+        bins: Tensor | None = None,
+    ) -> Tensor:
+        """Render; see the base class. Differentiable in the field, gain, spectrum and noise."""
+        index, weight = self._draw()
+        if bins is None:
+            bins = torch.arange(len(self.frequency), device=self.frequency.device)
+        power = self._profile(field, self.lattice[index], weight, position, rotation, bins)
+        heard = F.conv1d(
+            power.reshape(-1, 1, self.bins), self.kernel, stride=self.oversampling
+        ).reshape(*power.shape[:-1], -1)  # (P, E, B, R)
+        gain = (2 * (self.log_gain + self.log_spectrum[bins])).exp()
+        noise = (2 * self.log_noise[bins]).exp()
+        heard = heard * gain[:, None] + noise[:, None]
+        heard = heard.transpose(-1, -2)  # (P, E, R, B)
+        if rows.shape[1] != len(self.range):
+            heard = heard.gather(
+                2, rows[:, None, :, None].expand(-1, heard.shape[1], -1, heard.shape[3])
+            )
+        return heard.clamp_min(1e-24).sqrt()
+
+    def _profile(
+        self,
+        field: Field,
+        places: Tensor,
+        weight: Tensor | None,
+        position: Tensor,
+        rotation: Tensor,
+        bins: Tensor,
+    ) -> Tensor:
+        """Return the power in fine range bins, (P, E, B, K)."""
+        sources = position[:, None] + torch.einsum(
+            "pij,ej->pei", rotation, torch.cat((self.emitter[None], self.ear_positions))
+        )  # (P, 1 + E, 3): emitter, then ears
+        rays = places - sources[:, :, None]  # (P, 1 + E, N, 3)
+        length = rays.square().sum(-1).clamp_min(1e-12).sqrt()
+        unit = rays / length[..., None]
+        head = torch.einsum("pij,peni->penj", rotation, unit)
+        response = field.select(places, -unit[:, 0], bins)  # (P, N, B)
+        squared = response.abs().square() if response.is_complex() else response.square()
+        self.points_evaluated += squared.shape[0] * squared.shape[1]
+        beam = look_up(self.beam[bins], head[:, 0]).square()
+        loss = -2 * self.absorption[bins] * (length[:, 0] + length[:, 1:].mean(1))[..., None]
+        common = squared * beam * loss.exp()
+        spread = (length[:, :1] * length[:, 1:]).square().reciprocal()  # (P, E, N)
+        if weight is not None:
+            spread = spread * weight
+        place = ((length[:, :1] + length[:, 1:]) / 2 - self.first) / self.bin
+        left = place.floor()
+        part = place - left
+        audible = (left >= 0) & (left < self.bins - 1)
+        left = left.long().clamp(0, self.bins - 2)
+        count, ears, width = len(position), len(self.ears), len(bins)
+        rows = torch.arange(count * ears * width, device=left.device).reshape(count, ears, width)
+        profiles = places.new_zeros(count * ears * width * self.bins)
+        for ear in range(ears):
+            gain = look_up(self.ears[ear, bins], head[:, 1 + ear]).square()
+            echo = common * gain * (spread * audible)[:, ear, :, None]  # (P, N, B)
+            index = rows[:, ear, None] * self.bins + left[:, ear, :, None]
+            near = echo * (1 - part[:, ear, :, None])
+            profiles = profiles + _Deposit.apply(near, index, len(profiles))
+            profiles = profiles + _Deposit.apply(echo - near, index + 1, len(profiles))
+        return profiles.reshape(count, ears, width, self.bins)
+
+
+def lattice_over(region: Tensor, spacing: float) -> Tensor:
+    """Return the vertices of a cubic lattice over a box, (N, 3), from its lower corner."""
+    steps = [
+        region[0, a]
+        + spacing
+        * torch.arange(
+            math.floor(float(region[1, a] - region[0, a]) / spacing + 1e-6) + 1,
+            dtype=region.dtype,
+            device=region.device,
+        )
+        for a in range(3)
+    ]
+    return torch.stack(torch.meshgrid(*steps, indexing="ij"), dim=-1).reshape(-1, 3)

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: MIT
+"""What every renderer promises, and the head that it listens with."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from sononerf.field.field import Field
+
+Possible = Callable[[Tensor, float], Tensor]
+"""Takes places (N, 3) and how far each speaks for its surroundings, in m; returns (N,) bool."""
+
+
+@dataclass(frozen=True)
+class Acquisition:
+    """How the measured spectra came to be: what a renderer has to know, as plain tensors.
+
+    Parameters
+    ----------
+    frequency : (F,) float, Hz
+        Frequencies.
+    range : (R,) float, m
+        Ranges of the slices, evenly spaced.
+    window : (W,) float
+        Analysis window, one value per sample.
+    sampling_rate : float, Hz
+        Of the window.
+    speed_of_sound : float, m/s
+        In the air.
+    absorption : (F,) float, Np/m
+        Amplitude loss of the air.
+    beam : (F, L, A) float
+        Gain of the emission over elevation and azimuth, head frame, both ends included.
+    ears : (E, F, L, A) float
+        Gain of each ear, likewise.
+    emitter : (3,) float, m
+        Place of the emitter in the head frame.
+    ear_positions : (E, 3) float, m
+        Places of the ears in the head frame.
+    """
+
+    frequency: Tensor
+    range: Tensor
+    window: Tensor
+    sampling_rate: float
+    speed_of_sound: float
+    absorption: Tensor
+    beam: Tensor
+    ears: Tensor
+    emitter: Tensor
+    ear_positions: Tensor
+
+
+def look_up(table: Tensor, directions: Tensor) -> Tensor:
+    """Interpolate gains over directions, bilinearly.
+
+    Not differentiable in ``directions`` where they are fixed places and poses.
+
+    Parameters
+    ----------
+    table : (C, L, A) float
+        Gains over elevation (-90 to 90 degrees) and azimuth (-180 to 180), both ends included.
+    directions : (..., 3) float
+        Unit vectors in the head frame (x forward, y left, z up).
+
+    Returns
+    -------
+    gains : (..., C) float
+    """
+    x, y, z = directions.unbind(-1)
+    azimuth = torch.atan2(y, x) / math.pi
+    elevation = torch.asin(z.clamp(-1.0, 1.0)) * (2 / math.pi)
+    grid = torch.stack((azimuth, elevation), dim=-1).reshape(1, 1, -1, 2)
+    read = F.grid_sample(table[None], grid, align_corners=True, padding_mode="border")
+    return read[0, :, 0].T.reshape(*directions.shape[:-1], table.shape[0])
+
+
+class Renderer(nn.Module):
+    """A field, poses and ranges in; the magnitude that both ears hear out.
+
+    Parameters
+    ----------
+    region : (2, 3) float, m
+        Lower and upper corner of the box that holds the field.
+    acquisition : Acquisition
+        How the measured spectra came to be.
+    """
+
+    whole_poses: bool = True
+    """Whether a batch is whole poses (all ranges) or single range slices of many poses."""
+
+    region: Tensor
+    frequency: Tensor
+    range: Tensor
+    beam: Tensor
+    ears: Tensor
+    emitter: Tensor
+    ear_positions: Tensor
+    points_evaluated: Tensor
+
+    def __init__(self, region: Tensor, acquisition: Acquisition) -> None:
+        super().__init__()
+        self.register_buffer("region", region.clone())
+        for name in ("frequency", "range", "beam", "ears", "emitter", "ear_positions"):
+            self.register_buffer(name, getattr(acquisition, name).clone())
+        self.log_gain = nn.Parameter(torch.zeros(()))
+        self.register_buffer("points_evaluated", torch.zeros((), dtype=torch.long))
+
+    def prepare(self, field: Field, possible: Possible | None, step: int) -> bool:
+        """Choose where the field is evaluated next; called before each training step.
+
+        Parameters
+        ----------
+        field : Field
+            What is rendered.
+        possible : callable or None
+            Which places the echoes leave possible; asked once, at the first step.
+        step : int
+            Number of the training step.
+
+        Returns
+        -------
+        changed : bool
+            Whether the gain no longer fits, so that :meth:`calibrate` has to follow.
+        """
+        del field, possible
+        return step == 0
+
+    @torch.no_grad()
+    def calibrate(self, predicted: Tensor, measured: Tensor) -> None:
+        """Set the gain so that prediction and measurement have the same energy."""
+        ratio = measured.square().sum() / predicted.square().sum().clamp_min(1e-30)
+        self.log_gain.add_(0.5 * ratio.clamp_min(1e-30).log())
+
+    def forward(
+        self,
+        field: Field,
+        position: Tensor,
+        rotation: Tensor,
+        rows: Tensor,
+        bins: Tensor | None = None,
+    ) -> Tensor:
+        """Render.
+
+        Parameters
+        ----------
+        field : Field
+            What is rendered.
+        position : (P, 3) float, m
+            Where the head is.
+        rotation : (P, 3, 3) float
+            Head to world.
+        rows : (P, R) int
+            Which range slices of each pose.
+        bins : (B,) int or None
+            Which frequencies; all where None.
+
+        Returns
+        -------
+        magnitude : (P, E, R, B) float
+            Linear.
+        """
+        raise NotImplementedError

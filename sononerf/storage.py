@@ -1,0 +1,385 @@
+# SPDX-License-Identifier: MIT
+"""The one write path: a file is there whole, old or new, or it is not there.
+
+Every file goes through :func:`commit`, whatever wrote it; what must grow line by line goes
+through :func:`append_line`. POSIX only: durability rests on ``rename``, on the ``fsync`` of
+folders and on ``flock``.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import re
+import shutil
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from sononerf.errors import InputError, LockedError, NumericalError, StorageError
+
+_LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<pid>\d+)(?:-\d+)?\.tmp", re.DOTALL)
+_LOCK_NAME = ".lock"
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
+_WAYS_OUT = {
+    errno.ENOSPC: "the disk is full; free space, then give the same command again",
+    errno.EDQUOT: "the quota is used up; free space, then give the same command again",
+    errno.EFBIG: "the file would pass the size limit; raise it (ulimit -f)",
+    errno.EROFS: "the file system is read-only; choose another folder with --output",
+    errno.EACCES: "permission denied; change its permissions or choose another folder",
+    errno.EPERM: "not permitted; change its permissions or choose another folder",
+    errno.ENOTDIR: "a part of the path is a file; choose another folder",
+    errno.EIO: "the disk reports an input/output error; check the disk, choose another folder",
+    errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
+}
+
+
+def storage_error(what: str, path: Path, error: OSError) -> StorageError:
+    """Return one line for an operating system's refusal: what, which path, why, what to do."""
+    reason = error.strerror or str(error)
+    way_out = _WAYS_OUT.get(error.errno or 0, f"{reason}; check the path and the disk")
+    return StorageError(f"{path}: {what}: {way_out}")
+
+
+def temporary_beside(path: Path) -> Path:
+    """Return the name, beside ``path``, under which this thread writes before it renames."""
+    owner = str(os.getpid())
+    if threading.current_thread() is not threading.main_thread():
+        owner += f"-{threading.get_native_id()}"
+    return path.with_name(f".{path.name}.{owner}.tmp")
+
+
+def sync_folder(folder: Path) -> None:
+    """Make the names in a folder durable; without it a rename may not survive a power cut."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _make_folder(folder: Path) -> None:
+    missing = []
+    current = folder
+    while not current.is_dir():
+        missing.append(current)
+        if current.parent == current:
+            break
+        current = current.parent
+    for new in reversed(missing):
+        with suppress(FileExistsError):  # another process was faster
+            os.mkdir(new)  # noqa: PTH102 - the fault tests replace the calls of `os`
+        sync_folder(new.parent)
+    if missing and not folder.is_dir():
+        raise NotADirectoryError(errno.ENOTDIR, "not a folder", str(folder))
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder and its parents, durably; nothing happens where it is there already.
+
+    Raises
+    ------
+    StorageError
+        If it cannot be created.
+    """
+    try:
+        _make_folder(folder)
+    except OSError as error:
+        raise storage_error("cannot create the folder", folder, error) from error
+
+
+def _keep(path: Path, previous: Path) -> None:
+    if not path.exists():
+        return
+    aside = temporary_beside(previous)
+    aside.unlink(missing_ok=True)
+    try:
+        os.link(path, aside)  # a link, so that `path` is never away
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        # Away for an instant, yet never lost.
+        os.replace(path, previous)  # noqa: PTH105
+        return
+    try:
+        os.replace(aside, previous)  # noqa: PTH105
+    finally:
+        # A rename leaves both names where both were one file already.
+        aside.unlink(missing_ok=True)
+
+
+def commit(
+    path: Path, writer: Callable[[BinaryIO], object], *, previous: Path | None = None
+) -> None:
+    """Write a file so that, whatever happens, its old or its new content is there, whole.
+
+    The content goes to a temporary file beside the target, is flushed and fsynced, takes the
+    target's name, and the folder is fsynced. Missing folders are created.
+
+    Parameters
+    ----------
+    path : Path
+        The target.
+    writer : callable
+        Writes the content to the binary file it is given.
+    previous : Path, optional
+        A name in the same folder under which the replaced content is kept.
+
+    Raises
+    ------
+    StorageError
+        If the file cannot be written; the old one is then untouched, the temporary one gone.
+    """
+    temporary = temporary_beside(path)
+    try:
+        _make_folder(path.parent)
+        try:
+            with open(temporary, "wb") as file:  # noqa: PTH123 - see `_make_folder`
+                writer(file)
+                file.flush()
+                os.fsync(file.fileno())
+            if previous is not None:
+                _keep(path, previous)
+            os.replace(temporary, path)  # noqa: PTH105
+            sync_folder(path.parent)
+        except BaseException:
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise storage_error("cannot be written", path, error) from error
+
+
+def commit_bytes(path: Path, data: bytes | memoryview) -> None:
+    """Commit bytes; see :func:`commit`."""
+    commit(path, lambda file: file.write(data))
+
+
+def commit_text(path: Path, text: str) -> None:
+    """Commit text as UTF-8, line ends as they are; see :func:`commit`."""
+    commit_bytes(path, text.encode())
+
+
+def _plain(value: Any) -> Any:
+    """Turn NumPy's scalars and arrays into plain numbers and lists without importing NumPy."""
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is no plain data")
+
+
+def to_json(data: Any, *, indent: int | None = None, sort_keys: bool = False) -> str:
+    """Return plain data, NumPy's scalars and arrays as JSON text.
+
+    Raises
+    ------
+    ValueError
+        If a number is NaN or infinite; JSON knows neither.
+    TypeError
+        If something is no plain data.
+    """
+    return json.dumps(
+        data,
+        indent=indent,
+        sort_keys=sort_keys,
+        allow_nan=False,
+        ensure_ascii=False,
+        default=_plain,
+        separators=(",", ":") if indent is None else None,
+    )
+
+
+def commit_json(path: Path, data: Any) -> None:
+    """Commit plain data as JSON; see :func:`commit`.
+
+    Raises
+    ------
+    NumericalError
+        If a number is NaN or infinite; the old file is then untouched.
+    StorageError
+        If the file cannot be written.
+    """
+    try:
+        text = to_json(data, indent=2)
+    except ValueError as error:
+        raise NumericalError(f"{path}: not written: a value is NaN or infinite") from error
+    commit_text(path, text + "\n")
+
+
+def read_json(path: Path) -> Any:
+    """Read a JSON file.
+
+    Raises
+    ------
+    InputError
+        If it is missing, unreadable, or no JSON.
+    """
+    try:
+        return json.loads(path.read_bytes().decode())
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such file") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: damaged, or no JSON ({error})") from None
+
+
+def append_line(path: Path, text: str) -> None:
+    """Append one line of text to a file, durably; the file is created where there is none.
+
+    A line that a crash tore is closed first, so that it swallows none that follows. Readers
+    tell torn lines by a checksum of their own.
+
+    Raises
+    ------
+    StorageError
+        If it cannot be written.
+    """
+    try:
+        is_new = not path.exists()
+        descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
+        try:
+            size = os.fstat(descriptor).st_size
+            is_torn = size > 0 and os.pread(descriptor, 1, size - 1) != b"\n"
+            data = (("\n" if is_torn else "") + text + "\n").encode()
+            if os.write(descriptor, data) != len(data):
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+        if is_new:
+            sync_folder(path.parent)
+    except OSError as error:
+        raise storage_error("cannot be appended to", path, error) from error
+
+
+def remove_file(path: Path) -> None:
+    """Remove a file, durably; nothing happens where there is none.
+
+    Raises
+    ------
+    StorageError
+        If it cannot be removed.
+    """
+    try:
+        path.unlink(missing_ok=True)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise storage_error("cannot be removed", path, error) from error
+
+
+def _is_alive(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        return True
+    return True
+
+
+def clean_leftovers(folder: Path) -> None:
+    """Remove what dead processes left half-written in a folder: ``.<name>.<pid>.tmp``."""
+    if not folder.is_dir():
+        return
+    with os.scandir(folder) as entries:
+        left = [Path(entry.path) for entry in entries if _LEFTOVER.fullmatch(entry.name)]
+    for path in left:
+        match = _LEFTOVER.fullmatch(path.name)
+        if match is None or _is_alive(int(match["pid"])):
+            continue
+        # Leftovers cost space, nothing else: one that cannot go is no reason to stop.
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                path.unlink()
+
+
+def probe_writable(folder: Path) -> None:
+    """Create a folder and prove that files can be written there, before anything expensive.
+
+    Raises
+    ------
+    StorageError
+        If it cannot be created or written; nothing is left behind then.
+    """
+    created = []
+    current = folder
+    while not current.exists() and current.parent != current:
+        created.append(current)
+        current = current.parent
+    probe = folder / ".probe"
+    try:
+        commit_bytes(probe, b"sononerf\n" * 512)
+        remove_file(probe)
+    except BaseException:
+        with suppress(OSError):
+            probe.unlink(missing_ok=True)
+        for new in created:
+            with suppress(OSError):
+                new.rmdir()
+        raise
+
+
+def _take(path: Path) -> int | None:
+    """Open and lock a lock file; return its descriptor, or None where another holds it."""
+    while True:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # Its last owner removes it on leaving: what we locked may be a name no more.
+            with suppress(FileNotFoundError):
+                if path.stat().st_ino == os.fstat(descriptor).st_ino:
+                    return descriptor
+        except BlockingIOError:
+            os.close(descriptor)
+            return None
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+
+
+@contextmanager
+def lock(folder: Path) -> Iterator[None]:
+    """Hold a folder against other processes; the kernel lets go when the process dies.
+
+    Raises
+    ------
+    LockedError
+        If another process holds it; the message names its process and start.
+    StorageError
+        If the lock file cannot be written.
+    """
+    make_folder(folder)
+    path = folder / _LOCK_NAME
+    try:
+        descriptor = _take(path)
+    except OSError as error:
+        raise storage_error("cannot be locked", path, error) from error
+    if descriptor is None:
+        owner = ""
+        with suppress(OSError, UnicodeDecodeError):
+            owner = path.read_text(encoding="utf-8").strip()
+        raise LockedError(
+            f"{folder}: in use by {owner or 'another process'}; wait for it to end, "
+            "or choose another folder with --output"
+        )
+    try:
+        started = time.strftime("%Y-%m-%d %H:%M:%S")
+        owner = f"process {os.getpid()} on {socket.gethostname()} since {started}\n"
+        os.ftruncate(descriptor, 0)
+        os.pwrite(descriptor, owner.encode(), 0)
+        yield
+    finally:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
+        os.close(descriptor)

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: MIT
+import numpy as np
+import pytest
+from scipy.interpolate import RegularGridInterpolator
+
+from sononerf.acoustics.ears import Ears, beam_gain, ear_gain, synthetic_ears
+from sononerf.config import EarSettings
+from sononerf.geometry.directions import fibonacci_sphere
+
+FREQUENCY = np.array([10e3, 40e3, 60e3, 100e3])
+
+
+@pytest.fixture(scope="module")
+def ears():
+    return synthetic_ears(EarSettings(), FREQUENCY)
+
+
+def direction(azimuth_deg, elevation_deg):
+    a, e = np.radians(azimuth_deg), np.radians(elevation_deg)
+    return np.array([[np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)]])
+
+
+def test_grid_holds_both_ends_of_both_axes(ears):
+    assert ears.beam.shape == (4, 91, 181)
+    assert ears.ears.shape == (2, 4, 91, 181)
+    np.testing.assert_allclose(np.degrees(ears.azimuth[[0, 90, -1]]), [-180, 0, 180])
+    np.testing.assert_allclose(np.degrees(ears.elevation[[0, 45, -1]]), [-90, 0, 90], atol=1e-12)
+    np.testing.assert_array_equal(ears.ears[..., 0], ears.ears[..., -1])
+
+
+def test_right_ear_is_the_left_ones_mirror_image(ears):
+    np.testing.assert_allclose(ears.ears[0], ears.ears[1][:, :, ::-1], rtol=1e-6)
+    np.testing.assert_allclose(ears.positions[0] * [1, -1, 1], ears.positions[1])
+    assert ears.positions[0, 1] > 0.0  # ear 0 is the left one
+
+
+def test_left_ear_hears_best_on_its_axis(ears):
+    # 10 kHz lies 30 kHz and more from the notch at any elevation near the axis.
+    row, column = np.unravel_index(ears.ears[0, 0].argmax(), (91, 181))
+    assert np.degrees(ears.azimuth[column]) == pytest.approx(25.0, abs=1.01)
+    assert np.degrees(ears.elevation[row]) == pytest.approx(10.0, abs=1.01)
+    assert ears.ears.min() >= 0.0
+    assert ears.ears.max() <= 1.0
+
+
+def test_width_of_an_ear_at_50_kilohertz():
+    ears = synthetic_ears(EarSettings(azimuth_deg=0, elevation_deg=0, notch_depth=0), [50e3, 200e3])
+    gain = ear_gain(ears, 0, np.concatenate([direction(44, 0), direction(0, -44)]))
+    expected = np.exp(-0.5 * (44 / 45) ** 2 * np.array([1.0, 4.0]))
+    np.testing.assert_allclose(gain, np.stack([expected, expected]), rtol=1e-5)
+
+
+@pytest.mark.parametrize(("elevation_deg", "notch"), [(0.0, 60e3), (60.0, 80e3), (-60.0, 40e3)])
+def test_notch_rises_with_elevation(elevation_deg, notch):
+    frequency = np.arange(20e3, 110e3, 500.0)
+    deep, flat = (
+        ear_gain(
+            synthetic_ears(EarSettings(notch_depth=d), frequency), 0, direction(0, elevation_deg)
+        )
+        for d in (0.8, 0.0)
+    )
+    ratio = (deep / flat)[0]
+    assert frequency[ratio.argmin()] == pytest.approx(notch, abs=1.0)
+    assert ratio.min() == pytest.approx(0.2, rel=1e-4)
+
+
+def test_beam_has_the_pistons_null_where_the_book_says():
+    # First null of a piston: ka sin(theta) = 3.8317.
+    radius = 3.8317 * 343.0 / (2 * np.pi * 100e3) / np.sin(np.radians(40.0))
+    ears = synthetic_ears(EarSettings(beam_radius=radius), [100e3])
+    gain = beam_gain(ears, np.concatenate([direction(0, 0), direction(40, 0), direction(0, 40)]))
+    assert gain[0, 0] == pytest.approx(1.0, abs=1e-6)
+    np.testing.assert_allclose(gain[1:, 0], 0.0, atol=1e-4)
+
+
+def test_no_radius_emits_alike_in_all_directions():
+    ears = synthetic_ears(EarSettings(beam_radius=0.0), FREQUENCY)
+    np.testing.assert_array_equal(ears.beam, 1.0)
+
+
+def test_look_up_equals_scipys_interpolator(ears):
+    directions = np.concatenate([fibonacci_sphere(500), -np.eye(3), np.eye(3)])
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    elevation = np.arcsin(directions[:, 2])
+    places = np.stack([elevation, azimuth], axis=1)
+    for table, found in (
+        (ears.beam, beam_gain(ears, directions)),
+        (ears.ears[0], ear_gain(ears, 0, directions)),
+        (ears.ears[1], ear_gain(ears, 1, directions)),
+    ):
+        oracle = RegularGridInterpolator((ears.elevation, ears.azimuth), np.moveaxis(table, 0, -1))
+        np.testing.assert_allclose(found, oracle(places), atol=1e-6)
+
+
+def test_shapes_are_checked(ears):
+    with pytest.raises(ValueError, match="do not fit the grid"):
+        Ears(
+            ears.azimuth,
+            ears.elevation,
+            ears.frequency[:2],
+            ears.beam,
+            ears.ears,
+            ears.emitter,
+            ears.positions,
+        )

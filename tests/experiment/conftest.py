@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: MIT
+"""An experiment that takes less than a second, and its echoes."""
+
+from __future__ import annotations
+
+import pytest
+
+from sononerf.callbacks import preview, spectrogram_images
+from sononerf.config import validate_settings
+from sononerf.experiment.simulate import simulate
+
+TINY = {
+    "scene": {"name": "sphere", "options": {"radius": 0.02}},
+    "poses": {"count": 8, "validation": 2, "heldout": 2},
+    "simulation": {"rays": 500, "noise_floor_poses": 1},
+    "spectrogram": {"range_min": 0.34, "range_max": 0.45},
+    "field": {"options": {"finest": 0.01, "levels": 2}},
+    # Lattices are sampled, pruned and refined within few steps, so that all of a fit's state moves.
+    "renderer": {"options": {"prune_every": 3, "points": 300, "start": 200}},
+    "fit": {"epochs": 3, "steps_per_epoch": 4, "batch_poses": 2, "batch_frequencies": 2},
+    "preview": {"voxels": 8},
+}
+
+
+def tiny_settings(store=None, **sections):
+    data = {name: {**TINY.get(name, {}), **values} for name, values in sections.items()}
+    where = {} if store is None else {"data": {"store": str(store)}}
+    return validate_settings({**TINY, **where, **data}, "tiny")
+
+
+@pytest.fixture(scope="session")
+def echoes(tmp_path_factory):
+    """The store of the tiny experiment."""
+    path = tmp_path_factory.mktemp("echoes") / "store"
+    simulate(tiny_settings(), output=path, workers=1)
+    return path
+
+
+@pytest.fixture
+def tiny(echoes):
+    """Settings of the tiny experiment, section by section with changes."""
+    return lambda **sections: tiny_settings(echoes, **sections)
+
+
+@pytest.fixture
+def without_pictures(monkeypatch):
+    """Pictures take nine tenths of a tiny fit and have tests of their own."""
+    monkeypatch.setattr(preview, "mip_pngs", lambda volume: {})
+    monkeypatch.setattr(preview, "maximum_intensity_projections", lambda volume: {})
+    monkeypatch.setattr(
+        spectrogram_images.SpectrogramImages, "on_epoch", lambda self, trainer, module, epoch: None
+    )

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: MIT
+import math
+
+import pytest
+import torch
+
+from sononerf.field.field import sphere_directions
+from sononerf.field.fourier import FourierField
+from sononerf.geometry.poses import rotation_from_euler
+
+REGION = torch.tensor([[-0.1] * 3, [0.1] * 3], dtype=torch.float64)
+FREQUENCY = torch.linspace(10e3, 100e3, 47, dtype=torch.float64)
+
+
+def fourier(inputs="direction", frequencies=3, **options):
+    torch.manual_seed(0)
+    return FourierField(REGION, FREQUENCY[:frequencies], inputs=inputs, **options).double()
+
+
+def places_in(count, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.rand(count, 3, generator=generator, dtype=torch.float64) * 0.2 - 0.1
+
+
+BOTH = pytest.mark.parametrize("inputs", ["direction", "angles"])
+
+
+def test_the_published_code_has_546324_parameters():
+    """544,990 in layers and 1,334 in what batch normalisation amounts to."""
+    field = fourier("angles", 47)
+    assert sum(p.numel() for p in field.parameters()) == 546_324
+    layers = [m for m in field.modules() if isinstance(m, torch.nn.Linear)]
+    assert sum(p.numel() for m in layers for p in m.parameters()) == 544_990
+    # 155 values in, 411 after the first skip, 356 after the second, 94 out.
+    assert [m.in_features for m in layers] == [155, 256, 256, 256, 411, 256, 356, 256, 128]
+    assert layers[-1].out_features == 94
+
+
+def test_the_paper_has_about_half_a_million():
+    field = fourier("direction", 47)
+    layers = [m for m in field.modules() if isinstance(m, torch.nn.Linear)]
+    assert layers[0].in_features == 180  # six inputs, 30 sines each
+    assert 480_000 < sum(p.numel() for p in field.parameters()) < 600_000
+
+
+@BOTH
+def test_shape_and_type(inputs, device):
+    field = fourier(inputs, octaves=3, width=8).to(device)
+    places = places_in(6).reshape(2, 3, 3).to(device)
+    directions = sphere_directions(6, places).reshape(2, 3, 3)
+    response = field(places, directions)
+    assert response.shape == (2, 3, 3)
+    assert (response.device, response.dtype) == (places.device, torch.complex128)
+    assert field(places, directions[0, 0]).shape == (2, 3, 3)
+    assert field.select(places[0], directions, torch.tensor([1], device=device)).shape == (2, 3, 1)
+    single = field.float()(places.float(), directions.float())
+    assert single.dtype == torch.complex64
+
+
+@BOTH
+def test_gradients(inputs):
+    field = fourier(inputs, 2, octaves=2, width=8)
+    places = torch.cat((places_in(3), places_in(1) + 1))
+    directions = sphere_directions(4, REGION)
+    names = [name for name, _ in field.named_parameters()]
+
+    def response(*values):
+        state = dict(zip(names, values, strict=True))
+        return torch.func.functional_call(field, state, (places, directions))
+
+    assert torch.autograd.gradcheck(response, tuple(field.parameters()), fast_mode=True)
+
+
+def assert_sines(found, numbers, base, count):
+    """Compare with sin(base^k pi x); the frequencies are kept in single precision."""
+    for row, x in zip(found.reshape(len(numbers), count).tolist(), numbers, strict=True):
+        for k, value in enumerate(row):
+            phase = base**k * math.pi * x
+            assert value == pytest.approx(math.sin(phase), abs=(k + 4) * 2**-24 * abs(phase))
+
+
+@BOTH
+def test_the_layers_see_the_stated_sines(inputs):
+    field = fourier(inputs, octaves=30, width=8)
+    seen = {}
+    field.trunk[0].register_forward_pre_hook(lambda _, given: seen.update(first=given[0]))
+    field.branch[0].register_forward_pre_hook(lambda _, given: seen.update(skip=given[0]))
+    field.head[0].register_forward_pre_hook(lambda _, given: seen.update(last=given[0]))
+    # Looking along yaw 40°, pitch 25° (down); the direction to the emitter is the reverse.
+    yaw, pitch = math.radians(40), math.radians(25)
+    look = torch.as_tensor(rotation_from_euler(yaw, pitch, 0.0)[:, 0])
+    place = [0.01, -0.02, 0.03]
+    field(torch.tensor([place], dtype=torch.float64), -look[None])
+    numbers = place + ([pitch, yaw] if inputs == "angles" else (-look).tolist())
+    first = seen["first"][0]
+    if inputs == "angles":
+        assert first[:5].tolist() == pytest.approx(numbers)
+        assert_sines(first[5:], numbers, math.sqrt(2), 30)
+        assert_sines(seen["last"][0, 8:], numbers, 2.0, 20)
+    else:
+        assert_sines(first, numbers, math.sqrt(2), 30)
+        assert torch.equal(seen["last"][0, 8:], first)
+    assert torch.equal(seen["skip"][0, 8:], first)
+
+
+@BOTH
+def test_zero_outside_the_region_and_where_not_kept(inputs):
+    field = fourier(inputs, octaves=3, width=8)
+    places, directions = places_in(50), sphere_directions(50, REGION)
+    inside = field(places, directions)
+    assert (inside.abs() > 0).all()
+    mixed = torch.cat((places + 0.3, places))
+    response = field(mixed, directions.repeat(2, 1))
+    assert response[:50].abs().max() == 0
+    torch.testing.assert_close(response[50:], inside)
+    assert field(places + 0.3, directions).abs().max() == 0
+    field.keep(places[:1], field.resolution)
+    assert (field(places, directions).abs().amax(-1) > 0).tolist()[:1] == [True]
+    assert int((field(places, directions).abs().amax(-1) > 0).sum()) < 5
+
+
+def test_the_scale_multiplies_positions_alone():
+    field = fourier(octaves=3, width=8, scale=2.0)
+    plain = fourier(octaves=3, width=8)
+    plain.load_state_dict(field.state_dict())
+    places, directions = places_in(5) / 2, sphere_directions(5, REGION)
+    torch.testing.assert_close(field(places, directions), plain(2 * places, directions))
+
+
+def test_order_changes_nothing_and_resolution_is_a_hundredth():
+    field = fourier(octaves=3, width=8)
+    places, directions = places_in(20), sphere_directions(20, REGION)
+    whole = field(places, directions)
+    torch.testing.assert_close(field(places.flip(0), directions.flip(0)), whole.flip(0))
+    assert field.resolution == pytest.approx(0.002)
+
+
+def test_weights_are_read_back():
+    field = fourier(octaves=3, width=8)
+    field.keep(places_in(3), field.resolution)
+    torch.manual_seed(1)
+    other = FourierField(REGION, FREQUENCY[:3], octaves=3, width=8).double()
+    other.load_state_dict(field.state_dict())
+    places, directions = places_in(20), sphere_directions(20, REGION)
+    assert torch.equal(other(places, directions), field(places, directions))

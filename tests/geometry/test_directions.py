@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from sononerf.geometry.directions import CapSpiral, fibonacci_cap, fibonacci_sphere
+
+
+def test_sphere_averages_are_those_of_the_sphere():
+    directions = fibonacci_sphere(2000)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-12)
+    # Mean of x is 0 and of x x^T is 1/3; a spiral of 2000 comes as near as about 1/2000.
+    np.testing.assert_allclose(directions.mean(axis=0), 0.0, atol=5e-4)
+    np.testing.assert_allclose(directions.T @ directions / 2000, np.eye(3) / 3, atol=5e-4)
+
+
+@pytest.mark.parametrize("half_angle", [1e-3, 0.3, 2.5, math.pi])
+def test_cap_has_equal_areas_up_to_its_rim(half_angle):
+    axis = np.array([1.0, -2.0, 0.5])
+    directions = fibonacci_cap(4001, axis=axis, half_angle=half_angle, offset=(0.5, 0.2))
+    to_axis = np.linalg.norm(np.cross(directions, axis / np.linalg.norm(axis)), axis=1)
+    angle = np.arctan2(to_axis, directions @ axis / np.linalg.norm(axis))
+    assert angle.max() < half_angle
+    # Half of the area of a cap lies within the angle of half its height.
+    middle = 2.0 * math.asin(math.sin(half_angle / 2.0) / math.sqrt(2.0))
+    assert (angle < middle).sum() in (2000, 2001)
+
+
+def test_offset_shifts_and_turns_the_whole_pattern():
+    plain = fibonacci_cap(50, axis=(0, 0, 1), half_angle=0.4, offset=(0.5, 0.0))
+    turned = fibonacci_cap(50, axis=(0, 0, 1), half_angle=0.4, offset=(0.5, 0.25))
+    shifted = fibonacci_cap(50, axis=(0, 0, 1), half_angle=0.4, offset=(0.9, 0.0))
+    np.testing.assert_allclose(turned[:, 2], plain[:, 2], atol=1e-12)
+    phase = np.arctan2(turned[:, 1], turned[:, 0]) - np.arctan2(plain[:, 1], plain[:, 0])
+    np.testing.assert_allclose(np.mod(phase, 2 * np.pi), np.pi / 2, atol=1e-9)
+    assert (shifted[:, 2] < plain[:, 2]).all()
+
+
+def test_divided_cells_tile_the_sphere_evenly():
+    spiral = CapSpiral(3000, (1.0, 2.0, 3.0), math.pi, (0.3, 0.7))
+    divided = spiral.divided(np.arange(3000), 3)
+    assert divided.shape == (27000, 3)
+    np.testing.assert_allclose(divided.T @ divided / 27000, np.eye(3) / 3, atol=3e-4)
+    nearest = cKDTree(divided).query(divided, k=2)[0][:, 1] * math.sqrt(27000)
+    # A square lattice on the sphere has sqrt(4 pi) = 3.5. Where cells change their shape some
+    # overlap; of random points 63 % would lie closer than 2.
+    assert (nearest < 2.0).mean() < 0.1
+    assert np.median(nearest) > 3.0
+
+
+def test_divided_cells_lie_around_their_direction():
+    spiral = CapSpiral(10_000, (0.0, 0.0, 1.0), 0.3, (0.5, 0.5))
+    index = np.array([17, 900, 9000])
+    parts = spiral.divided(index, 4).reshape(3, 16, 3)
+    middle = spiral.directions()[index]
+    distance = np.linalg.norm(parts - middle[:, None], axis=2)
+    assert distance.max() < 1.2 * math.sqrt(spiral.solid_angle)
+    np.testing.assert_allclose(
+        parts.mean(axis=1), middle, atol=0.06 * math.sqrt(spiral.solid_angle)
+    )
+
+
+def test_solid_angles_add_up_to_the_cap():
+    spiral = CapSpiral(123, (1.0, 0.0, 0.0), 0.5, (0.5, 0.0))
+    assert 123 * spiral.solid_angle == pytest.approx(2 * np.pi * (1 - math.cos(0.5)))
+
+
+def test_neighbourhood_holds_the_nearest_four():
+    spiral = CapSpiral(10_000, (0.0, 0.0, 1.0), 0.3, (0.5, 0.5))
+    found = spiral.neighbourhood(np.array([5000]))
+    directions = spiral.directions()
+    nearest = cKDTree(directions).query(directions[5000], k=5)[1]
+    assert set(nearest) == set(found)
+
+
+def test_rotation_turns_the_pattern():
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    plain = CapSpiral(20, (1.0, 0.5, 0.0), 0.5, (0.5, 0.1))
+    turned = CapSpiral(20, (1.0, 0.5, 0.0), 0.5, (0.5, 0.1), turn)
+    np.testing.assert_allclose(turned.directions(), plain.directions() @ turn.T, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"count": 0}, "count is 0"),
+        ({"half_angle": 0.0}, "half_angle"),
+        ({"half_angle": 3.2}, "half_angle"),
+        ({"axis": (0.0, 0.0, 0.0)}, "axis"),
+    ],
+)
+def test_faults_are_refused(arguments, match):
+    good = {"count": 5, "axis": (0.0, 0.0, 1.0), "half_angle": 1.0, "offset": (0.5, 0.0)}
+    with pytest.raises(ValueError, match=match):
+        fibonacci_cap(**{**good, **arguments})

@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: MIT
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sononerf.errors import InputError
+from sononerf.geometry.poses import (
+    Poses,
+    euler_from_rotation,
+    look_at,
+    random_sphere_poses,
+    read_pose_csv,
+    rotation_from_euler,
+    sphere_poses,
+    write_pose_csv,
+)
+
+
+def test_rotation_equals_scipys():
+    angles = np.random.default_rng(0).uniform(-1.5, 1.5, (20, 3))
+    expected = Rotation.from_euler("ZYX", angles).as_matrix()
+    np.testing.assert_allclose(rotation_from_euler(*angles.T), expected, atol=1e-14)
+
+
+def test_positive_pitch_looks_down_and_positive_yaw_left():
+    np.testing.assert_allclose(
+        rotation_from_euler(0.0, np.pi / 2, 0.0)[:, 0], [0, 0, -1], atol=1e-12
+    )
+    np.testing.assert_allclose(
+        rotation_from_euler(np.pi / 2, 0.0, 0.0)[:, 0], [0, 1, 0], atol=1e-12
+    )
+
+
+def test_euler_angles_come_back():
+    generator = np.random.default_rng(1)
+    yaw, roll = generator.uniform(-3.1, 3.1, (2, 100))
+    pitch = generator.uniform(-1.55, 1.55, 100)
+    for found, given in zip(
+        euler_from_rotation(rotation_from_euler(yaw, pitch, roll)), (yaw, pitch, roll), strict=True
+    ):
+        np.testing.assert_allclose(found, given, atol=1e-10)
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
+def test_straight_up_or_down_yaw_is_zero_and_the_rotation_the_same(pitch):
+    rotation = rotation_from_euler(0.7, pitch, 0.2)
+    yaw, found_pitch, roll = euler_from_rotation(rotation)
+    assert yaw == 0.0
+    np.testing.assert_allclose(rotation_from_euler(yaw, found_pitch, roll), rotation, atol=1e-9)
+
+
+def test_look_at_looks_there_and_is_level():
+    positions = np.random.default_rng(2).normal(size=(50, 3))
+    target = np.array([0.1, 0.2, -0.3])
+    rotations = look_at(positions, target)
+    forward = (target - positions) / np.linalg.norm(target - positions, axis=1, keepdims=True)
+    np.testing.assert_allclose(rotations[:, :, 0], forward, atol=1e-12)
+    np.testing.assert_allclose(rotations[:, 2, 1], 0.0, atol=1e-12)  # the left ear's axis is level
+    assert (rotations[:, 2, 2] >= 0.0).all()  # and nobody flies head down
+
+
+def test_look_at_straight_down_has_no_yaw():
+    yaw, pitch, roll = euler_from_rotation(look_at([0.0, 0.0, 2.0], np.zeros(3)))
+    assert (yaw, roll) == (0.0, 0.0)
+    assert pitch == pytest.approx(np.pi / 2)
+
+
+def test_look_at_the_own_place_is_refused():
+    with pytest.raises(ValueError, match="target"):
+        look_at(np.zeros((1, 3)), np.zeros(3))
+
+
+def test_sphere_poses_without_jitter_look_at_the_origin():
+    poses = sphere_poses(30, radius=0.4, aim_jitter=0.0, generator=np.random.default_rng(0))
+    np.testing.assert_allclose(np.linalg.norm(poses.positions, axis=1), 0.4)
+    np.testing.assert_allclose(poses.rotations[:, :, 0], -poses.positions / 0.4, atol=1e-12)
+
+
+@pytest.mark.parametrize("draw", [sphere_poses, random_sphere_poses])
+def test_jitter_has_its_standard_deviation_about_both_axes_and_no_roll(draw):
+    poses = draw(4000, radius=1.0, aim_jitter=0.1, generator=np.random.default_rng(3))
+    straight = look_at(poses.positions, np.zeros(3))
+    forward = np.einsum("pji,pj->pi", straight, poses.rotations[:, :, 0])
+    # 4000 draws give a standard deviation to about 1.1 %; four times that.
+    assert np.std(np.arctan2(forward[:, 1], forward[:, 0])) == pytest.approx(0.1, rel=0.045)
+    assert np.std(np.arcsin(forward[:, 2])) == pytest.approx(0.1, rel=0.045)
+    np.testing.assert_allclose(poses.rotations[:, 2, 1], 0.0, atol=1e-12)
+
+
+def test_random_poses_fill_the_sphere_and_follow_the_generator():
+    one, two = (
+        random_sphere_poses(2000, radius=2.0, aim_jitter=0.1, generator=np.random.default_rng(5))
+        for _ in range(2)
+    )
+    np.testing.assert_array_equal(one.rotations, two.rotations)
+    unit = one.positions / 2.0
+    np.testing.assert_allclose(unit.T @ unit / 2000, np.eye(3) / 3, atol=0.03)
+
+
+def test_indexing_gives_poses():
+    poses = sphere_poses(9, radius=1.0, aim_jitter=0.1, generator=np.random.default_rng(0))
+    assert len(poses[3]) == 1
+    np.testing.assert_array_equal(poses[3].rotations[0], poses.rotations[3])
+    assert len(poses[2:5]) == 3
+    np.testing.assert_array_equal(poses[np.array([7, 1])].positions, poses.positions[[7, 1]])
+
+
+def test_shapes_are_checked():
+    with pytest.raises(ValueError, match=r"positions have shape \(3,\)"):
+        Poses(np.zeros(3), np.eye(3)[None])
+    with pytest.raises(ValueError, match="rotations have shape"):
+        Poses(np.zeros((2, 3)), np.eye(3)[None])
+
+
+def test_table_comes_back(tmp_path):
+    poses = random_sphere_poses(20, radius=0.4, aim_jitter=0.3, generator=np.random.default_rng(0))
+    path = tmp_path / "poses.csv"
+    path.write_text(write_pose_csv(poses), encoding="utf-8")
+    found = read_pose_csv(path)
+    np.testing.assert_array_equal(found.positions, poses.positions)
+    np.testing.assert_allclose(found.rotations, poses.rotations, atol=1e-14)
+
+
+def test_table_is_in_degrees_in_any_order_of_columns(tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_bytes("\ufeffroll,x,y,z,yaw,pitch\r\n0, 1,2,3,90,30\r\n\r\n".encode())
+    poses = read_pose_csv(path)
+    np.testing.assert_array_equal(poses.positions, [[1, 2, 3]])
+    np.testing.assert_allclose(poses.rotations[0, :, 0], [0, np.cos(np.pi / 6), -0.5], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("", r"poses\.csv:1: the header is 'missing'"),
+        ("x,y,z,yaw,pitch\n1,2,3,4,5\n", r"poses\.csv:1: the header"),
+        ("x,y,z,yaw,pitch,roll\n", "no poses"),
+        ("x,y,z,yaw,pitch,roll\n0,0,0,0,0,0\n0,nan,0,0,0,0\n", r"poses\.csv:3: column y is 'nan'"),
+        ("x,y,z,yaw,pitch,roll\n0,0,0,left,0,0\n", r"poses\.csv:2: column yaw is 'left'"),
+        ("x,y,z,yaw,pitch,roll\n0,0,0,0,0\n", r"poses\.csv:2: 5 columns, expected 6"),
+        ("x,y,z,yaw,pitch,roll\n0,0,0,0,0,inf\n", r"poses\.csv:2: column roll is 'inf'"),
+        ('x,y,z,yaw,pitch,roll\n"0,0,0,0,0\n', "no CSV table"),
+    ],
+)
+def test_faults_of_a_table_name_the_place(tmp_path, text, match):
+    path = tmp_path / "poses.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=match):
+        read_pose_csv(path)
+
+
+def test_unreadable_tables_are_named(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        read_pose_csv(tmp_path / "none.csv")
+    (tmp_path / "latin.csv").write_bytes(b"x,y,z\xe4")
+    with pytest.raises(InputError, match="UTF-8"):
+        read_pose_csv(tmp_path / "latin.csv")

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+import numpy as np
+import pytest
+import trimesh
+
+from sononerf.geometry import raycast
+from sononerf.geometry.directions import fibonacci_cap, fibonacci_sphere
+from sononerf.geometry.raycast import RayCaster
+
+
+def shoot(caster, origin, directions):
+    return caster.first_hit(np.broadcast_to(origin, directions.shape), directions)
+
+
+def test_distance_to_a_plate_is_exact():
+    plate = trimesh.creation.box((0.01, 2.0, 2.0))
+    plate.apply_translation([1.005, 0.0, 0.0])
+    directions = fibonacci_cap(5000, axis=(1, 0, 0), half_angle=0.7, offset=(0.5, 0.0))
+    hits = shoot(RayCaster(plate), np.zeros(3), directions)
+    assert len(hits.ray) == 5000
+    np.testing.assert_allclose(hits.distance, 1.0 / directions[:, 0], atol=1e-12)
+    np.testing.assert_allclose(hits.points[:, 0], 1.0, atol=1e-12)
+    np.testing.assert_allclose(hits.normals, [[-1, 0, 0]] * 5000, atol=1e-12)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
+@pytest.mark.parametrize("shift", [0.0, 1e3])
+def test_sphere_is_the_same_at_any_scale_and_place(scale, shift):
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    mesh.apply_scale(scale)
+    mesh.apply_translation([shift * scale, 0.0, 0.0])
+    origin = np.array([(shift + 3.0) * scale, 0.1 * scale, 0.0])
+    directions = fibonacci_cap(5000, axis=(-1, 0, 0), half_angle=0.3, offset=(0.5, 0.0))
+    hits = shoot(RayCaster(mesh), origin, directions)
+    assert len(hits.ray) == 5000
+    outward = (hits.points - [shift * scale, 0, 0]) / scale
+    radius = np.linalg.norm(outward, axis=1)
+    # A chord of an icosphere of this fineness lies at most 1.2e-3 radii inside.
+    assert radius.max() <= 1.0 + 1e-9
+    assert radius.min() > 1.0 - 1.3e-3
+    np.testing.assert_allclose(hits.normals, outward / radius[:, None], atol=1e-6)
+    np.testing.assert_allclose(
+        hits.distance, np.linalg.norm(hits.points - origin, axis=1), rtol=1e-12
+    )
+
+
+def test_rays_that_miss_are_left_out():
+    caster = RayCaster(trimesh.creation.icosphere(subdivisions=2))
+    directions = np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 0, 1.0], [-1.0, 0, 0]])
+    hits = shoot(caster, np.array([3.0, 0.0, 0.0]), directions)
+    np.testing.assert_array_equal(hits.ray, [1, 3])
+    assert len(shoot(caster, np.array([3.0, 0, 0]), directions[:1]).ray) == 0
+
+
+def test_no_ray_leaks_out_through_edges_and_vertices():
+    mesh = trimesh.creation.icosphere(subdivisions=4)
+    caster = RayCaster(mesh)
+    aimed = np.concatenate([mesh.vertices, mesh.vertices[mesh.edges_unique].mean(axis=1)])
+    aimed /= np.linalg.norm(aimed, axis=1, keepdims=True)
+    assert len(shoot(caster, np.zeros(3), aimed).ray) == len(aimed)
+
+
+@pytest.mark.parametrize("shift", [0.0, 20.0])  # far off, single precision is a micrometre
+def test_a_surface_does_not_hide_itself(shift):
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=0.015)
+    place = np.array([shift, 0.0, 0.0])
+    mesh.apply_translation(place)
+    caster = RayCaster(mesh)
+    directions = fibonacci_sphere(20_000)
+    hits = shoot(caster, place, directions)  # from inside, so that all of it is met
+    flat = caster.face_normals[hits.triangle]
+    seen = caster.visible(hits.points, hits.points + 0.5 * flat, normals=flat)
+    assert seen.all()
+    towards = place + np.array([0.4, 0.0, 0.0])
+    rise = np.einsum("nd,nd->n", towards - hits.points, flat)
+    seen = caster.visible(hits.points, towards, normals=flat)
+    # A convex body is seen where it faces; facets that graze the line may go either way.
+    assert seen[rise > 1e-4].all()
+    assert seen[rise < -1e-4].mean() < 1e-3  # a few rays slip through vertices
+
+
+def test_occlusion_ends_at_the_target():
+    plate = trimesh.creation.box((0.01, 2.0, 2.0))
+    plate.apply_translation([1.0, 0.0, 0.0])
+    points = np.zeros((3, 3))
+    targets = np.array([[0.9, 0, 0], [1.1, 0, 0], [3.0, 3.5, 0]])
+    np.testing.assert_array_equal(RayCaster(plate).visible(points, targets), [True, False, True])
+
+
+def test_a_triangle_without_area_spoils_nothing():
+    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0, 0]]
+    caster = RayCaster(trimesh.Trimesh(vertices, [[0, 1, 2], [0, 3, 1]], process=False))
+    hits = shoot(caster, np.array([0.2, 0.2, 1.0]), np.array([[0.0, 0.0, -1.0]]))
+    np.testing.assert_allclose(hits.points, [[0.2, 0.2, 0.0]], atol=1e-12)
+
+
+def test_without_embree_the_answers_are_the_same(monkeypatch):
+    mesh = trimesh.creation.icosphere(subdivisions=2)
+    other = mesh.copy()
+    other.apply_translation([0.0, 1.5, 0.0])
+    mesh = trimesh.util.concatenate([mesh, other])
+    directions = fibonacci_cap(300, axis=(-1, 0, 0), half_angle=0.6, offset=(0.5, 0.0))
+    origin = np.array([3.0, 0.1, 0.2])
+    fast = RayCaster(mesh)
+    monkeypatch.setattr(raycast, "EmbreeScene", None)
+    slow = RayCaster(mesh)
+    assert type(slow._engine) is not type(fast._engine)
+    a, b = shoot(fast, origin, directions), shoot(slow, origin, directions)
+    np.testing.assert_array_equal(a.triangle, b.triangle)
+    np.testing.assert_allclose(a.points, b.points, atol=1e-12)
+    target = np.array([2.0, 1.5, 0.0])
+    flat = fast.face_normals[a.triangle]
+    seen = slow.visible(a.points, target, normals=flat)
+    np.testing.assert_array_equal(seen, fast.visible(a.points, target, normals=flat))
+    assert 0 < seen.sum() < len(seen)

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: MIT
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sononerf.errors import NumericalError
+from sononerf.render.spectrogram import sounding_slice, spectrogram_image, spectrogram_png
+
+RANGE = np.linspace(0.15, 0.75, 121)
+FREQUENCY = np.linspace(10e3, 100e3, 47)
+
+
+def echo(ears=2):
+    profile = 40 * np.exp(-(((RANGE - 0.4) / 0.01) ** 2))
+    return np.broadcast_to(profile[:, None], (ears, 121, 47))
+
+
+def test_a_picture_is_a_png_and_always_the_same():
+    first = spectrogram_png(echo(), 0.9 * echo(), RANGE, FREQUENCY, "pose 3")
+    assert first == spectrogram_png(echo(), 0.9 * echo(), RANGE, FREQUENCY, "pose 3")
+    assert Image.open(io.BytesIO(first)).size == (1365, 715)
+
+
+def test_only_what_sounds_is_shown():
+    shown = RANGE[sounding_slice(echo(), RANGE)]
+    # 40 dB falls to 3 dB within 0.01 sqrt(ln(40 / 3)) = 16 mm, and 20 mm are added.
+    assert shown[0] == pytest.approx(0.364, abs=0.005)
+    assert shown[-1] == pytest.approx(0.436, abs=0.005)
+    assert sounding_slice(0 * echo(), RANGE) == slice(0, 121)
+    one = np.zeros((2, 121, 47))
+    one[1, 0, 0] = 50
+    assert sounding_slice(one, RANGE).start == 0
+
+
+@pytest.mark.parametrize("ears", [1, 2, 3])
+def test_any_number_of_ears_and_silence(ears):
+    pixels = spectrogram_image(0 * echo(ears), 0 * echo(ears), RANGE, FREQUENCY)
+    assert pixels.dtype == np.uint8
+    assert pixels.shape[2] == 3
+    assert pixels.std() > 1
+
+
+def test_one_range_and_one_frequency():
+    spectrogram_png([[[5.0]]], [[[0.0]]], [0.4], [40e3])
+
+
+def test_a_difference_shows():
+    same = spectrogram_image(echo(), echo(), RANGE, FREQUENCY)
+    other = spectrogram_image(echo(), 0.5 * echo(), RANGE, FREQUENCY)
+    width = same.shape[1]
+    assert not np.array_equal(same[:, 2 * width // 3 :], other[:, 2 * width // 3 :])
+
+
+def test_wrong_input_is_refused():
+    with pytest.raises(ValueError, match=r"R = 121 and F = 47"):
+        spectrogram_png(echo()[:, :-1], echo()[:, :-1], RANGE, FREQUENCY)
+    with pytest.raises(NumericalError, match="predicted"):
+        spectrogram_png(echo(), echo() * np.nan, RANGE, FREQUENCY)

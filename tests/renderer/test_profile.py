@@ -1,0 +1,436 @@
+# SPDX-License-Identifier: MIT
+import math
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from sononerf.config import validate_settings
+from sononerf.experiment.build import acquisition as acquisition_of
+from sononerf.field.fourier import FourierField
+from sononerf.field.grid import GridField
+from sononerf.geometry.poses import look_at, rotation_from_euler
+from sononerf.renderer.profile import ProfileRenderer, lattice_over
+from sononerf.scene import Scene
+from sononerf.simulation.simulator import Simulator
+
+REGION = torch.tensor([[-0.02, -0.03, -0.01], [0.02, 0.01, 0.03]], dtype=torch.float64)
+POSITION = np.array([[0.29, 0.02, 0.01], [0.0, -0.28, 0.05]])
+ROTATION = np.stack(
+    [rotation_from_euler(np.pi + 0.1, 0.1, 0.05), rotation_from_euler(np.pi / 2, 0.2, -0.1)]
+)
+LEVEL_BACK = np.diag([-1.0, -1.0, 1.0])  # looks along -x, upright
+SILENCE = 1e-9  # what a spectrum of log_noise below -20 comes to
+
+
+def rows(count=120, poses=1):
+    return torch.arange(count).expand(poses, -1)
+
+
+def tensors(position, rotation):
+    return torch.as_tensor(np.atleast_2d(position)), torch.as_tensor(np.atleast_3d(rotation)).view(
+        -1, 3, 3
+    )
+
+
+def quiet(renderer):
+    with torch.no_grad():
+        renderer.log_noise.fill_(-25.0)
+    return renderer.double()
+
+
+@pytest.fixture
+def one_place(acquisition, formula):
+    """Make field and renderer of a single place that answers alike in all directions."""
+
+    def make(place, strength=1.0, **options):
+        corner = torch.as_tensor(place, dtype=torch.float64)
+        region = torch.stack((corner, corner + 0.001))
+        field = formula(
+            region,
+            acquisition.frequency,
+            lambda x, u: torch.full((*u.shape[:-1], 3), strength, dtype=u.dtype),
+            spacing=0.01,
+        )
+        renderer = quiet(ProfileRenderer(region, acquisition, **options))
+        assert renderer.prepare(field, None, 0)
+        assert len(renderer.lattice) == 1
+        return field, renderer
+
+    return make
+
+
+def smooth(places, directions):
+    """Real reflectivity that tells places, directions and frequencies apart."""
+    tilt = 1 + directions @ directions.new_tensor([0.3, -0.5, 0.2])
+    shape = 1 + places @ places.new_tensor([9.0, -7.0, 5.0])
+    return (tilt * shape)[..., None] * places.new_tensor([1.0, 0.7, 0.4])
+
+
+@pytest.fixture
+def cloud(acquisition, formula):
+    """A smooth field on a lattice of 10 mm, 125 places, and its renderer."""
+    field = formula(REGION, acquisition.frequency, smooth, spacing=0.01)
+    renderer = quiet(ProfileRenderer(REGION, acquisition))
+    renderer.prepare(field, None, 0)
+    assert len(renderer.lattice) == 125
+    return field, renderer
+
+
+@pytest.mark.parametrize("oversampling", [1, 2, 4])
+def test_one_place_sounds_as_the_window(head, one_place, oversampling):
+    """At (d + d') / 2, spread by 1 / (d d'), damped by the air, times the gains of its paths."""
+    place = np.array([0.004, 0.013, -0.006])
+    field, renderer = one_place(place, strength=3.0, oversampling=oversampling)
+    with torch.no_grad():
+        renderer.log_gain.fill_(math.log(2.0))
+        renderer.log_spectrum.copy_(torch.tensor([0.0, 0.1, -0.3]))
+    position, rotation = POSITION[0], ROTATION[0]
+    heard = renderer(field, *tensors(position, rotation), rows()).detach().numpy()[0]
+    out = place - position - rotation @ head.emitter
+    beam, _ = head.towards(rotation.T @ out)
+    peaks = []
+    for ear in (0, 1):
+        back = place - position - rotation @ head.ears[ear]
+        d1, d2 = np.linalg.norm(out), np.linalg.norm(back)
+        gain = beam * head.towards(rotation.T @ back)[1][ear]
+        level = 3.0 * 2.0 * np.exp([0.0, 0.1, -0.3] - head.alpha * (d1 + d2)) * gain / (d1 * d2)
+        offset = (head.range - (d1 + d2) / 2) / head.per_sample
+        window = np.interp(offset + 31.5, np.arange(64), head.window, left=0, right=0)
+        expected = window[:, None] * level
+        # The window ends with a step, which is smeared over a bin.
+        sure = np.abs(np.abs(offset) - 31.5) > 4 / oversampling
+        # Laying an echo between two bins of 2 or 1 samples costs h² / 8 of the curvature, at the
+        # peak 0.92 (2 π / 63)² of power; for 4 samples that is 2 % of power. 0.2 % come from the
+        # absorption, which is that of the mean path to both ears.
+        tolerance = {1: 0.012, 2: 0.005, 4: 0.0035}[oversampling] * expected.max()
+        np.testing.assert_allclose(heard[ear][sure], expected[sure], rtol=0, atol=tolerance)
+        assert expected.max() > 5 * tolerance
+        peaks.append((d1 + d2) / 2)
+    # 10 mm off the axis, the ears hear it 0.9 mm of range apart, more than a slice.
+    assert abs(peaks[0] - peaks[1]) > head.step
+    found = [(head.range[:, None] * e**2).sum(0) / (e**2).sum(0) for e in heard]
+    np.testing.assert_allclose(found, np.array(peaks)[:, None].repeat(3, 1), atol=2e-5)
+
+
+def slow(head, renderer, reflectivity, places, position, rotation):
+    """Sum of powers, place by place, each laid between two bins; the window squared over bins."""
+    size = head.step / renderer.oversampling
+    reach = int(31.5 * head.per_sample / size)
+    kernel = np.interp(
+        np.arange(-reach, reach + 1) * size / head.per_sample + 31.5, np.arange(64), head.window
+    )
+    bins = np.zeros((2, 4000, 3))  # from range 0
+    first = head.range[0] % size  # where the bins lie
+    for place in places:
+        paths = place - position - (rotation @ np.vstack((head.emitter, head.ears)).T).T
+        d = np.linalg.norm(paths, axis=1)
+        value = reflectivity(torch.from_numpy(place), torch.from_numpy(-paths[0] / d[0]))
+        beam, _ = head.towards(rotation.T @ paths[0])
+        # The air is taken over the mean path to both ears.
+        air = np.exp(-head.alpha * (d[0] + (d[1] + d[2]) / 2))
+        for ear in (0, 1):
+            gain = head.towards(rotation.T @ paths[1 + ear])[1][ear]
+            power = (np.abs(value.numpy()) * beam * gain * air / (d[0] * d[1 + ear])) ** 2
+            index, part = divmod(((d[0] + d[1 + ear]) / 2 - first) / size, 1)
+            bins[ear, int(index)] += (1 - part) * power
+            bins[ear, int(index) + 1] += part * power
+    start = round((head.range[0] - first) / size)
+    heard = np.zeros((2, len(head.range), 3))
+    for row in range(len(head.range)):
+        middle = start + row * renderer.oversampling
+        part = bins[:, middle - reach : middle + reach + 1]
+        heard[:, row] = (part * kernel[:, None] ** 2).sum(axis=1)
+    return heard
+
+
+@pytest.mark.parametrize("kind", ["real", "complex"])
+def test_many_places_against_a_slow_loop(head, acquisition, formula, kind):
+    def turning(places, directions):
+        return smooth(places, directions) * torch.exp(1j * 50 * places[..., :1])
+
+    function = smooth if kind == "real" else turning
+    field = formula(REGION, acquisition.frequency, function, spacing=0.01)
+    renderer = quiet(ProfileRenderer(REGION, acquisition))
+    renderer.prepare(field, None, 0)
+    with torch.no_grad():
+        renderer.log_noise.copy_(torch.tensor([-1.0, 0.0, 0.5]))
+    found = renderer(field, *tensors(POSITION, ROTATION), rows(poses=2)).detach().numpy()
+    assert not np.iscomplexobj(found)
+    for pose in (0, 1):
+        power = slow(
+            head, renderer, function, renderer.lattice.numpy(), POSITION[pose], ROTATION[pose]
+        )
+        expected = np.sqrt(power + np.exp([-2.0, 0.0, 1.0]))
+        np.testing.assert_allclose(found[pose], expected, rtol=1e-6)
+        assert expected.max() > 5 * expected.min()
+
+
+def test_doubling_the_range_divides_by_four(acquisition, one_place):
+    """Pressure falls with the product of both ways, here d²; the air's part is taken out."""
+    levels = []
+    for distance in (0.145, 0.29):
+        field, renderer = one_place(np.zeros(3))
+        renderer.first -= 0.25 - 0.13  # ranges from 0.13 m
+        renderer.emitter.zero_()
+        renderer.ear_positions.zero_()
+        renderer.absorption.zero_()
+        renderer.first += distance - 0.145  # both echoes at one place of the axis
+        heard = renderer(field, *tensors([distance, 0, 0], LEVEL_BACK), rows())
+        levels.append(heard.amax(dim=2))
+    torch.testing.assert_close(levels[0], 4 * levels[1], rtol=1e-6, atol=0)
+
+
+def test_emitter_and_ear_may_be_exchanged(one_place):
+    """Reciprocity: with gains that are alike, the way there is the way back."""
+    field, renderer = one_place([0.0, 0.015, 0.01])
+    ones = torch.ones_like(renderer.ears)
+    renderer.ears, renderer.beam = ones, ones[0]
+    there = renderer(field, *tensors(POSITION[0], ROTATION[0]), rows())[:, 0]
+    emitter = renderer.emitter.clone()
+    renderer.emitter = renderer.ear_positions[0].clone()
+    renderer.ear_positions[0] = emitter
+    back = renderer(field, *tensors(POSITION[0], ROTATION[0]), rows())[:, 0]
+    # The other ear's path, part of the mean for absorption, changed by millimetres.
+    torch.testing.assert_close(there, back, rtol=5e-3, atol=1e-6)
+
+
+def test_the_mirrored_scene_exchanges_the_ears(acquisition, formula):
+    mirror = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
+    region = torch.tensor([[-0.02] * 3, [0.02] * 3], dtype=torch.float64)
+    heard = []
+    for function in (smooth, lambda x, u: smooth(x * mirror, u * mirror)):
+        field = formula(region, acquisition.frequency, function, spacing=0.01)
+        renderer = quiet(ProfileRenderer(region, acquisition))
+        renderer.prepare(field, None, 0)
+        heard.append(renderer(field, *tensors([0.28, 0, 0.01], LEVEL_BACK), rows()))
+    torch.testing.assert_close(heard[0], heard[1].flip(1), rtol=1e-9, atol=1e-9)
+    assert (heard[0] - heard[1]).abs().max() > 0.1 * heard[0].max()
+
+
+def test_turning_scene_and_head_together_changes_nothing(acquisition, formula):
+    turn, shift = rotation_from_euler(np.pi / 2, 0.0, 0.0), np.array([1.0, -2.0, 0.5])
+    turned = torch.from_numpy(turn)
+    region = torch.tensor([[-0.02] * 3, [0.02] * 3], dtype=torch.float64)
+    moved = region + torch.from_numpy(shift)
+
+    def elsewhere(places, directions):
+        return smooth((places - torch.from_numpy(shift)) @ turned, directions @ turned)
+
+    heard = []
+    for box, function, where, rotation in (
+        (region, smooth, POSITION[0], ROTATION[0]),
+        (moved, elsewhere, turn @ POSITION[0] + shift, turn @ ROTATION[0]),
+    ):
+        field = formula(box, acquisition.frequency, function, spacing=0.01)
+        renderer = quiet(ProfileRenderer(box, acquisition))
+        renderer.prepare(field, None, 0)
+        heard.append(renderer(field, *tensors(where, rotation), rows()))
+    torch.testing.assert_close(*heard, rtol=1e-9, atol=1e-9)
+
+
+def test_the_order_of_the_places_changes_nothing(cloud):
+    field, renderer = cloud
+    one = renderer(field, *tensors(POSITION, ROTATION), rows(poses=2))
+    order = torch.randperm(125, generator=torch.Generator().manual_seed(0))
+    renderer.lattice = renderer.lattice[order]
+    two = renderer(field, *tensors(POSITION, ROTATION), rows(poses=2))
+    torch.testing.assert_close(one, two, rtol=1e-12, atol=1e-12)
+
+
+def test_silence_in_only_noise_out(acquisition, formula):
+    field = formula(REGION, acquisition.frequency, lambda x, u: 0 * smooth(x, u), spacing=0.01)
+    renderer = ProfileRenderer(REGION, acquisition).double()
+    renderer.prepare(field, None, 0)
+    heard = renderer(field, *tensors(POSITION, ROTATION), rows(poses=2))
+    # The noise starts at exp(-16), and the power's floor of 1e-24 lies below it.
+    torch.testing.assert_close(heard, torch.full_like(heard, math.exp(-16)), rtol=1e-6, atol=0)
+
+
+def test_what_is_out_of_range_is_not_heard(one_place):
+    field, renderer = one_place(np.zeros(3))
+    for far in (0.1, 0.24, 0.34, 2.0):
+        heard = renderer(field, *tensors([far, 0, 0], LEVEL_BACK), rows())
+        assert heard.max() < 1e-8
+
+
+def test_slices_and_frequencies_are_those_asked_for(cloud):
+    field, renderer = cloud
+    poses = tensors(POSITION, ROTATION)
+    whole = renderer(field, *poses, rows(poses=2))
+    wanted, bins = torch.tensor([[0, 40, 80], [119, 60, 30]]), torch.tensor([2, 0])
+    some = renderer(field, *poses, wanted, bins)
+    assert some.shape == (2, 2, 3, 2)
+    for pose in (0, 1):
+        torch.testing.assert_close(some[pose], whole[pose][:, wanted[pose]][..., bins])
+    # All of them in another order, too.
+    backwards = renderer(field, *poses, rows(poses=2).flip(1))
+    torch.testing.assert_close(backwards, whole.flip(2))
+
+
+def test_a_sample_of_the_places_is_right_on_average(cloud):
+    field, renderer = cloud
+    # What was loud once weighs more, whether or not it still is.
+    renderer.energy = 10 ** (4 * torch.rand(125, dtype=torch.float64, generator=_generator(0)) - 2)
+    poses = tensors(POSITION[0], ROTATION[0])
+    renderer.points = 30
+    whole = renderer.eval()(field, *poses, rows()).square()
+    renderer.train()
+    torch.manual_seed(0)
+    with torch.no_grad():
+        draws = torch.stack([renderer(field, *poses, rows()).square() for _ in range(600)])
+    error = (draws.mean(0) - whole).abs()
+    deviation = draws.std(0) / math.sqrt(len(draws))
+    loud = whole > 0.05 * whole.max()
+    assert (error <= 5 * deviation)[loud].all()
+    assert deviation[loud].div(whole[loud]).median() < 0.05  # so that the test can tell
+    assert not torch.equal(draws[0], draws[1])
+    assert int(renderer.points_evaluated) == 125 + 600 * 30
+
+
+def _generator(seed):
+    return torch.Generator().manual_seed(seed)
+
+
+def test_the_first_lattice_is_as_fine_as_its_bound_allows(acquisition, formula):
+    field = formula(REGION, acquisition.frequency, smooth, spacing=0.005)
+    # 9 x 9 x 9 = 729 vertices at 5 mm, 125 at 10 mm, 27 at 20 mm.
+    for start, count, spacing in ((729, 729, 0.005), (728, 125, 0.01), (124, 27, 0.02)):
+        renderer = ProfileRenderer(REGION, acquisition, start=start).double()
+        assert renderer.prepare(field, None, 0)
+        assert (len(renderer.lattice), float(renderer.spacing)) == (count, pytest.approx(spacing))
+        assert not renderer.prepare(field, None, 1)
+
+
+def test_only_possible_places_are_laid(acquisition, formula):
+    field = formula(REGION, acquisition.frequency, smooth, spacing=0.01)
+    asked = []
+
+    def right(places, tolerance):
+        asked.append(tolerance)
+        return places[:, 1] > -0.011
+
+    renderer = ProfileRenderer(REGION, acquisition).double()
+    renderer.prepare(field, right, 0)
+    assert len(renderer.lattice) == 75
+    assert asked == [pytest.approx(0.01 * math.sqrt(3) / 2)]  # half of a cell's diagonal
+    assert not field.inside(torch.tensor([[0.0, -0.02, 0.0]], dtype=torch.float64)).any()
+
+
+def ball(places, directions):
+    """Loud within 6 mm of the origin, hardly anything elsewhere."""
+    inside = places.norm(dim=-1) < 0.006
+    return torch.where(inside, 1.0, 1e-6)[..., None].expand(*directions.shape[:-1], 3) + 0 * (
+        directions[..., :1]
+    )
+
+
+def test_the_lattice_is_refined_where_there_is_energy(acquisition, formula):
+    region = torch.tensor([[-0.024] * 3, [0.024] * 3], dtype=torch.float64)
+    field = formula(region, acquisition.frequency, ball, spacing=0.002)
+    renderer = quiet(ProfileRenderer(region, acquisition, start=400, prune_every=10))
+    assert renderer.prepare(field, None, 0)
+    assert float(renderer.spacing) == pytest.approx(0.008)  # 343 vertices
+    assert [renderer.prepare(field, None, step) for step in (1, 9)] == [False, False]
+    assert len(renderer.lattice) == 343
+    spacings = []
+    for step in (10, 20, 30):
+        changed = renderer.prepare(field, None, step)
+        spacings.append((changed, round(float(renderer.spacing), 4)))
+    assert spacings == [(True, 0.004), (True, 0.002), (False, 0.002)]
+    # Every vertex of the fine lattice that is loud is there and alive, and no other.
+    found = renderer.lattice[renderer.alive]
+    fine = lattice_over(region, 0.002)
+    expected = fine[fine.norm(dim=1) < 0.006]
+    assert len(found) == len(expected)
+    assert torch.cdist(found, expected).amin(1).max() < 1e-6
+    # The field is silent from now on where nothing is left.
+    assert field.inside(expected).all()
+    assert not field.inside(expected + 0.013).any()
+    heard = renderer(field, *tensors(POSITION[0], ROTATION[0]), rows())
+    assert heard.max() > 1
+
+
+def test_what_is_weak_but_alone_is_kept(acquisition, formula):
+    """Judged by its surroundings of 30 mm: a faint place far from a loud one stays."""
+    region = torch.tensor([[-0.1, 0.0, 0.0], [0.1, 0.01, 0.01]], dtype=torch.float64)
+
+    def two(places, directions):
+        value = torch.full_like(places[..., 0], 1e-6)
+        value = torch.where(places[..., 0] < -0.095, 1.0, value)
+        value = torch.where(places[..., 0] > 0.095, 1e-3, value)
+        return value[..., None].expand(*directions.shape[:-1], 3)
+
+    field = formula(region, acquisition.frequency, two, spacing=0.01)
+    renderer = ProfileRenderer(region, acquisition, prune_every=1, prune_below=1e-4).double()
+    renderer.prepare(field, None, 0)
+    renderer.prepare(field, None, 1)
+    x = renderer.lattice[renderer.alive][:, 0]
+    assert (x < -0.095).sum() == 4
+    assert (x > 0.095).sum() == 4
+    near_loud = (x > -0.095) & (x < -0.045)
+    assert not near_loud.any()
+
+
+def test_never_pruned_where_the_settings_say_so(acquisition, formula):
+    field = formula(REGION, acquisition.frequency, ball, spacing=0.005)
+    renderer = ProfileRenderer(REGION, acquisition, start=200, prune_every=0).double()
+    renderer.prepare(field, None, 0)
+    assert not any(renderer.prepare(field, None, step) for step in range(1, 300))
+    assert len(renderer.lattice) == 125
+
+
+def test_the_lattice_goes_with_the_weights(acquisition, formula, cloud):
+    field, renderer = cloud
+    renderer.alive[5:50] = False
+    other = ProfileRenderer(REGION, acquisition).double()
+    other.load_state_dict(renderer.state_dict())
+    assert not other.prepare(field, None, 7)
+    poses = tensors(POSITION[0], ROTATION[0])
+    assert torch.equal(other(field, *poses, rows()), renderer(field, *poses, rows()))
+    assert int(other.points_evaluated) == 2 * 80 - 80 + 80 - 80 or other.points_evaluated > 0
+
+
+@pytest.mark.parametrize("kind", ["grid", "fourier"])
+def test_gradients(acquisition, gradients_are_right, kind):
+    torch.manual_seed(0)
+    if kind == "grid":
+        field = GridField(REGION, acquisition.frequency, spacing=0.02, levels=1)
+        with torch.no_grad():
+            field.grids[0].normal_()
+    else:
+        field = FourierField(REGION, acquisition.frequency, octaves=2, width=8)
+        # It knows no spacing; every place of a coarse lattice will do.
+    renderer = ProfileRenderer(REGION, acquisition, start=30).double()
+    renderer.prepare(field.double(), None, 0)
+    with torch.no_grad():
+        renderer.log_noise.fill_(-3.0)
+    poses = tensors(POSITION, ROTATION)
+    wanted = torch.tensor([[30, 45], [20, 60]])
+    assert gradients_are_right(field, renderer, *poses, wanted, torch.tensor([0, 2]))
+
+
+def test_the_peak_of_a_tiny_sphere_lies_where_the_simulator_hears_it():
+    settings = validate_settings(
+        {"scene": {"name": "test"}, "simulation": {"rays": 20_000}}, "test"
+    )
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.003)
+    simulator = Simulator.from_settings(Scene(ball), settings)
+    known = acquisition_of(settings)
+    position = np.array([0.4, 0.0, 0.0])
+    measured = simulator.spectrogram(position, look_at(position, np.zeros(3)), seed=0)
+    region = torch.tensor([[0.0029, -1e-4, -1e-4], [0.003, 0.0, 0.0]])  # the sphere's front
+    field = GridField(region, known.frequency, spacing=0.001, levels=1)
+    renderer = ProfileRenderer(region, known)
+    renderer.prepare(field, None, 0)
+    poses = tensors(position, look_at(position, np.zeros(3)))
+    predicted = renderer(
+        field, poses[0].float(), poses[1].float(), torch.arange(len(known.range))[None]
+    )
+    axis = known.range.numpy()
+    for ear in (0, 1):
+        one, two = measured[ear] ** 2, predicted[0, ear].detach().numpy() ** 2
+        middles = [(axis[:, None] * power).sum() / power.sum() for power in (one, two)]
+        # Half a hop, in range.
+        assert middles[0] == pytest.approx(middles[1], abs=0.00035)

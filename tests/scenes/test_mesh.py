@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: MIT
+import os
+
+import numpy as np
+import pytest
+import trimesh
+
+from sononerf.errors import InputError, SettingsError
+from sononerf.scene import load_scene
+
+BOX = trimesh.creation.box((30.0, 20.0, 10.0))
+
+
+def load(path, **options):
+    return load_scene("mesh", {"path": str(path), **options}).mesh
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.ply", "a.obj", "a.glb", "UPPER.STL", "text.stl"])
+def test_formats_and_units(tmp_path, name):
+    path = tmp_path / name
+    kind = "stl_ascii" if name == "text.stl" else path.suffix[1:].lower()
+    moved = BOX.copy()
+    moved.apply_translation([5.0, 6.0, 7.0])
+    moved.export(path, file_type=kind)
+    mesh = load(path, unit="mm")
+    np.testing.assert_allclose(
+        mesh.bounds, [[-0.015, -0.01, -0.005], [0.015, 0.01, 0.005]], atol=1e-8
+    )
+    assert mesh.is_watertight
+    np.testing.assert_allclose(
+        load(path, unit="cm", centre=False).bounds.mean(axis=0), [0.05, 0.06, 0.07], atol=1e-7
+    )
+
+
+def test_glb_is_in_metres(tmp_path):
+    BOX.export(tmp_path / "a.glb")
+    np.testing.assert_allclose(load(tmp_path / "a.glb").extents, [30, 20, 10])
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.ply", "a.obj"])
+def test_other_formats_must_be_told_the_unit(tmp_path, name):
+    BOX.export(tmp_path / name)
+    with pytest.raises(InputError, match=r"set scene\.options\.unit to m, cm or mm"):
+        load(tmp_path / name)
+    with pytest.raises(SettingsError, match="unit"):
+        load(tmp_path / name, unit="inch")
+
+
+def test_relative_paths_start_at_the_working_directory(tmp_path, monkeypatch):
+    BOX.export(tmp_path / "a.stl")
+    monkeypatch.chdir(tmp_path)
+    assert len(load("a.stl", unit="mm").faces) == 12
+
+
+STL = BOX.export(file_type="stl")
+TEXT = BOX.export(file_type="stl_ascii")
+NAN = STL[:96] + np.float32(np.nan).tobytes() + STL[100:]
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "match"),
+    [
+        ("empty.stl", b"", "empty"),
+        ("cut.stl", STL[:-30], "promises 12 triangles"),
+        ("long.stl", STL + b"\0", "promises 12 triangles"),
+        ("count.stl", STL[:80] + b"\xff\xff\xff\xff" + STL[84:], "promises 4294967295"),
+        ("none.stl", bytes(84), "without triangles"),
+        ("short.stl", b"<html>", "only 6 bytes"),
+        ("nan.stl", NAN, "vertex 0 of the mesh"),
+        ("cut_text.stl", TEXT[: len(TEXT) // 2].encode(), "breaks off"),
+        ("holed_text.stl", TEXT.replace("vertex", "", 1).encode(), "breaks off"),
+        ("nan_text.stl", TEXT.replace("vertex 1", "vertex nan1", 1).encode(), "nan_text"),
+        ("cut.ply", BOX.export(file_type="ply")[:-20], "cannot be read as PLY"),
+        ("cut.glb", BOX.export(file_type="glb")[:-100], "cannot be read as GLB"),
+        ("random.glb", np.random.default_rng(0).bytes(500), "cannot be read as GLB"),
+        ("random.obj", np.random.default_rng(0).bytes(500), "random.obj"),
+        ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "vertex 0"),
+        ("index.obj", b"v 0 0 1\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "index.obj"),
+        ("points.obj", b"v 0 0 1\nv 1 0 0\nv 0 1 0\n", "points.obj"),
+        ("bomb.3mf", b"PK", "not a file that ends in"),
+        ("a.zip", b"PK", "not a file that ends in"),
+    ],
+)
+def test_damaged_files_are_refused_by_name(tmp_path, name, data, match):
+    path = tmp_path / name
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=match) as caught:
+        load(path, unit="mm")
+    assert name in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_no_regular_file_is_refused(tmp_path):
+    with pytest.raises(InputError, match="No such file"):
+        load(tmp_path / "none.stl", unit="m")
+    (tmp_path / "folder.stl").mkdir()
+    with pytest.raises(InputError, match="not a regular file"):
+        load(tmp_path / "folder.stl", unit="m")
+    if not hasattr(os, "mkfifo"):  # Windows
+        return
+    os.mkfifo(tmp_path / "pipe.stl")
+    with pytest.raises(InputError, match="not a regular file"):
+        load(tmp_path / "pipe.stl", unit="m")
+    with pytest.raises(InputError, match="not a file that ends"):
+        load("https://example.org/a.stl", unit="m")
+
+
+def test_a_sphere_in_millimetres_taken_for_metres_is_refused(tmp_path):
+    trimesh.creation.icosphere(radius=120.0).export(tmp_path / "a.stl")
+    with pytest.raises(InputError, match=r"a\.stl: the mesh is 240 m large.*set the unit to mm"):
+        load(tmp_path / "a.stl", unit="m")

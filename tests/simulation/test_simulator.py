@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: MIT
+import math
+import pickle
+
+import numpy as np
+import pytest
+import trimesh
+
+from sononerf.acoustics.air import air_absorption
+from sononerf.acoustics.spectrogram import compress
+from sononerf.config import validate_settings
+from sononerf.geometry.poses import look_at, rotation_from_euler
+from sononerf.scene import Material, Scene, load_scene
+from sononerf.simulation.simulator import Simulator
+
+POINT_HEAD = {
+    "emitter": [0, 0, 0], "left": [0, 0, 0], "beam_radius": 0, "azimuth_deg": 0,
+    "elevation_deg": 0, "width_deg": 180, "notch_depth": 0,
+}  # fmt: skip
+WIDE = Material((1e5,), (math.radians(30),), (1.0,), (1.0,))
+NARROW = Material((1e5,), (math.radians(1),), (1.0,), (1.0,))
+
+
+def simulator(scene, rays=40_000, **sections):
+    sections = {"simulation": {"rays": rays}, **sections}
+    settings = validate_settings({"scene": {"name": "test"}, **sections}, "test")
+    return Simulator.from_settings(scene, settings)
+
+
+def plate(lower, upper):
+    lower, upper = np.array(lower, float), np.array(upper, float)
+    box = trimesh.creation.box(upper - lower)
+    box.apply_translation((lower + upper) / 2)
+    return box
+
+
+def spectrum(echo, frequency):
+    samples = np.arange(echo.shape[-1]) * 1e-6
+    return echo @ np.exp(-2j * np.pi * samples[:, None] * frequency)
+
+
+def active_error(a, b):
+    reference = 1e-3 * max(a.max(), b.max())
+    a, b = compress(a, reference), compress(b, reference)
+    return np.abs(a - b)[(a >= 3) | (b >= 3)].mean()
+
+
+def test_first_echo_of_a_sphere_comes_from_its_front():
+    scene = Scene(load_scene("sphere").mesh, NARROW)
+    found = simulator(scene, ears=POINT_HEAD)
+    position = np.array([0.4, 0.0, 0.0])
+    (echo, _) = found.echo(position, look_at(position, np.zeros(3)), seed=0)
+    middle = (np.arange(len(echo)) * echo**2).sum() / (echo**2).sum()
+    # 2 (0.4 - 0.015) m; the mesh lies up to 3 um inside the sphere, a sample is 171 um.
+    assert middle * 1e-6 * 343.0 / 2 == pytest.approx(0.385, abs=5e-6)
+    magnitude = found.spectrogram(position, look_at(position, np.zeros(3)), seed=0)
+    peak = found.range[magnitude[0, :, 30].argmax()]
+    assert abs(peak - 0.385) <= np.diff(found.range)[0] / 2 + 5e-6
+
+
+def test_a_wide_plate_is_a_mirror():
+    """Image source: pressure 1 / (2 h), air taken off, at any frequency and number of rays."""
+    height, frequency = 0.3, np.array([40e3, 60e3, 90e3])
+    scene = Scene(plate([height, -0.4, -0.4], [height + 0.01, 0.4, 0.4]), WIDE)
+    air = 10 ** (-air_absorption(frequency, relative_humidity=0.5) * 2 * height / 20)
+    levels = []
+    for rays in (100_000, 200_000):
+        found = simulator(scene, rays, ears=POINT_HEAD, simulation={"rays": rays, "bounces": 1})
+        echo = found.echo(np.zeros(3), np.eye(3), seed=1)
+        levels.append(np.abs(spectrum(echo[0], frequency)))
+    # The plate's rim and the lobe's width leave ripples of about one per cent.
+    np.testing.assert_allclose(levels[1], air / (2 * height), rtol=0.015)
+    np.testing.assert_allclose(levels[0], levels[1], rtol=0.005)
+
+
+def test_a_corner_answers_like_the_image_behind_its_edge():
+    """Two bounces between plates at right angles: pressure k / (2 d) at twice the distance d."""
+    material = Material((1e5,), (math.radians(30),), (1.0,), (0.5,))
+    one = plate([0.2, -0.5, -0.4], [0.21, 0.25, 0.4])
+    two = plate([-0.5, 0.25, -0.4], [0.21, 0.26, 0.4])
+    scene = Scene(trimesh.util.concatenate([one, two]), material)
+    distance = math.hypot(0.2, 0.25)
+    turned = rotation_from_euler(math.atan2(0.25, 0.2), 0.0, 0.0)
+    echoes = [
+        simulator(scene, ears=POINT_HEAD, simulation={"rays": 200_000, "bounces": bounces}).echo(
+            np.zeros(3), turned, seed=1
+        )[0]
+        for bounces in (1, 2)
+    ]
+    frequency = np.array([40e3, 60e3])
+    difference = echoes[1] - echoes[0]
+    # The single bounces, at 0.2 and 0.25 m, came from patterns of different density.
+    difference[: round(2 * 0.29 / 343e-6)] = 0.0
+    double = np.abs(spectrum(difference, frequency))
+    # Both orders of bounces meet at the edge, each lit from one side of it: the lobes leave 3 %.
+    air = 10 ** (-air_absorption(frequency, relative_humidity=0.5) * 2 * distance / 20)
+    np.testing.assert_allclose(double, 0.5 * air / (2 * distance), rtol=0.04)
+    loudest = np.abs(difference).argmax()  # a pulse is some six samples, 1 mm, long
+    assert loudest * 343e-6 / 2 == pytest.approx(distance, abs=1e-3)
+
+
+def test_level_does_not_depend_on_the_number_of_rays():
+    position = np.array([0.3, 0.2, 0.1])
+    rotation = look_at(position, np.zeros(3))
+    scene = load_scene("three_spheres")
+    few, many = (
+        simulator(scene, rays).spectrogram(position, rotation, seed=3) for rays in (30_000, 90_000)
+    )
+    assert few.max() == pytest.approx(many.max(), rel=1e-3)
+    assert active_error(few, many) < 0.3  # what 30,000 rays scatter by, not 20 log10(3) = 9.5
+
+
+def test_turning_scene_and_head_together_changes_nothing():
+    mesh = load_scene("three_spheres").mesh
+    position = np.array([0.3, 0.2, 0.1])
+    rotation = look_at(position, np.array([0.02, 0.01, 0.0]))
+    turn, shift = rotation_from_euler(1.0, 0.5, -0.3), np.array([1.0, -2.0, 0.5])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = turn, shift
+    moved = mesh.copy()
+    moved.apply_transform(matrix)
+    one = simulator(Scene(mesh)).spectrogram(position, rotation, seed=4)
+    two = simulator(Scene(moved)).spectrogram(turn @ position + shift, turn @ rotation, seed=4)
+    # The ball around the bounding box turns into a slightly different one.
+    assert active_error(one, two) < 0.3
+    quarter = rotation_from_euler(np.pi / 2, 0.0, 0.0)
+    matrix[:3, :3] = quarter
+    moved = mesh.copy()
+    moved.apply_transform(matrix)
+    two = simulator(Scene(moved)).spectrogram(
+        quarter @ position + shift, quarter @ rotation, seed=4
+    )
+    # By a quarter turn the ball stays, and with it every ray.
+    assert active_error(one, two) < 0.01
+
+
+def test_the_mirrored_scene_exchanges_the_ears():
+    mesh = load_scene("three_spheres").mesh
+    mirrored = trimesh.Trimesh(mesh.vertices * [1, -1, 1], mesh.faces[:, ::-1])
+    position = np.array([0.4, 0.0, 0.02])
+    rotation = look_at(position, np.array([0.0, 0.0, 0.02]))
+    one = simulator(Scene(mesh)).spectrogram(position, rotation, seed=5)
+    two = simulator(Scene(mirrored)).spectrogram(position, rotation, seed=6)
+    assert active_error(one, two[::-1]) < 0.2
+    assert active_error(one, two) > 1.0
+
+
+def test_what_a_plate_hides_is_not_heard():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.03)
+    ball.apply_translation([0.5, 0.0, 0.0])
+    hidden = trimesh.util.concatenate([ball, plate([0.3, -0.3, -0.3], [0.31, 0.3, 0.3])])
+    open_, shut = (
+        simulator(Scene(mesh), simulation={"rays": 40_000, "bounces": 1}) for mesh in (ball, hidden)
+    )
+    beyond = open_.range > 0.42
+    assert open_.spectrogram(np.zeros(3), np.eye(3), seed=0)[:, beyond].max() > 0
+    loud = shut.spectrogram(np.zeros(3), np.eye(3), seed=0)
+    assert loud[:, beyond].max() < 3e-4 * loud.max()  # the plate's own decay
+
+
+def test_an_ear_behind_a_plate_hears_nothing_though_the_other_does():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.03)
+    ball.apply_translation([0.5, 0.0, 0.0])
+    before_left_ear = plate([0.2, 0.06, -0.1], [0.21, 0.3, 0.1])
+    scene = Scene(trimesh.util.concatenate([ball, before_left_ear]), WIDE)
+    apart = {**POINT_HEAD, "left": [0.0, 0.2, 0.0]}
+    found = simulator(scene, ears=apart, simulation={"rays": 40_000, "bounces": 1})
+    left, right = found.spectrogram(np.zeros(3), np.eye(3), seed=0)
+    beyond = found.range > 0.45  # the ball's echo comes from (0.47 + 0.51) / 2
+    assert left[beyond].max() < 0.02 * right[beyond].max()
+
+
+def test_the_left_ear_hears_the_left_first():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.01)
+    ball.apply_translation([0.3, 0.3, 0.0])
+    found = simulator(Scene(ball))
+    left, right = found.echo(np.zeros(3), np.eye(3), seed=0)
+    late = [(np.arange(len(e)) * e**2).sum() / (e**2).sum() for e in (left, right)]
+    # Ears 20 mm apart across, sound from 45 degrees: 14 mm of path, 41 samples.
+    assert late[1] - late[0] == pytest.approx(0.02 * math.sin(math.pi / 4) / 343e-6, rel=0.1)
+    assert (left**2).sum() > 2 * (right**2).sum()
+
+
+def test_out_of_range_is_silence():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
+    found = simulator(Scene(ball))
+    assert found.spectrogram(np.array([2.0, 0, 0]), np.eye(3), seed=0).max() == 0.0
+
+
+def test_seed_turns_the_pattern_and_nothing_else():
+    found = simulator(load_scene("three_spheres"))
+    position = np.array([0.0, 0.4, 0.0])
+    pose = position, look_at(position, np.zeros(3))
+    one, same, other = (found.spectrogram(*pose, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(one, other)
+    assert active_error(one, other) < 0.3
+
+
+def test_a_pickled_simulator_says_the_same():
+    found = simulator(load_scene("sphere"), 5000)
+    pose = np.array([0.0, 0.0, 0.4]), look_at([0.0, 0.0, 0.4], np.zeros(3))
+    expected = found.spectrogram(*pose, seed=1)
+    again = pickle.loads(pickle.dumps(found))
+    np.testing.assert_array_equal(again.spectrogram(*pose, seed=1), expected)
+
+
+def test_axes_ears_and_speed_are_those_of_the_settings():
+    found = simulator(load_scene("sphere"))
+    assert found.speed_of_sound == 343.0
+    assert (len(found.range), len(found.frequency)) == (875, 47)
+    np.testing.assert_array_equal(found.ears.frequency, found.frequency)
+    pose = np.array([0.4, 0, 0]), look_at([0.4, 0, 0], np.zeros(3))
+    magnitude = found.spectrogram(*pose, seed=0)
+    assert magnitude.shape == (2, 875, 47)
+    assert magnitude.dtype == np.float32
+    warm = simulator(load_scene("sphere"), air={"temperature_c": 40.0})
+    assert warm.speed_of_sound == pytest.approx(354.7, abs=0.1)

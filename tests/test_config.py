@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: MIT
+"""Settings: every fault in one line that says where, what was found, and a way out."""
+
+from __future__ import annotations
+
+import pytest
+
+from sononerf import config
+from sononerf.config import Settings, apply_override, load_settings, read_yaml, validate_settings
+from sononerf.errors import SettingsError
+
+SCENE = "scene: {name: sphere}\n"
+
+
+@pytest.fixture
+def write(tmp_path):
+    def writer(text, name="a.yaml"):
+        path = tmp_path / name
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return path
+
+    return writer
+
+
+def faults(path, *overrides):
+    with pytest.raises(SettingsError) as caught:
+        load_settings(path, overrides)
+    return str(caught.value).splitlines()
+
+
+def test_defaults_of_the_design(write):
+    settings = load_settings(write(SCENE))
+    assert (settings.poses.count, settings.poses.validation, settings.poses.heldout) == (
+        400,
+        10,
+        20,
+    )
+    assert (settings.poses.radius, settings.poses.aim_jitter_deg) == (0.4, 15.0)
+    assert (settings.field.kind, settings.renderer.kind) == ("grid", "profile")
+    assert settings.fit.steps_per_epoch == "auto"
+
+
+def test_precedence(write):
+    path = write(SCENE + "fit: {epochs: 3, seed: 1}\n")
+    settings = load_settings(path, ["fit.seed=2", "fit.seed=4"])
+    assert (settings.fit.epochs, settings.fit.seed) == (3, 4)
+
+
+def test_what_is_dumped_reads_back(write):
+    settings = load_settings(
+        write(SCENE), ["fit.learning_rate=3e-3", "region.lower=[0,0,0]", "region.upper=[1,1,1]"]
+    )
+    assert load_settings(write(config.dump_yaml(settings), "b.yaml")) == settings
+    assert Settings.model_validate(settings.plain()) == settings
+
+
+def test_settings_do_not_change(write):
+    with pytest.raises(ValueError, match="frozen"):
+        load_settings(write(SCENE)).fit.epochs = 2
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("fit.epoch=3", ["fit.epoch: unknown key", "did you mean epochs?"]),
+        ("fits.epochs=3", ["fits: unknown key", "did you mean fit?"]),
+        ("fit.zzz=3", ["fit.zzz: unknown key", "known here: epochs"]),
+        ("fit.epochs=0", ["fit.epochs: found 0", "greater than or equal to 1"]),
+        ("fit.epochs=many", ["fit.epochs: found 'many'"]),
+        ("fit.loss=l3", ["fit.loss: found 'l3'", "'l1', 'l2' or 'l1_4l2'"]),
+        ("poses.radius=.inf", ["poses.radius: found"]),
+        ("poses.radius=-1", ["poses.radius: found -1"]),
+        ("scene.name=", ["scene.name: found None"]),
+        ("reconstruction.level=high", ["reconstruction.level: found 'high'"]),
+        ("fit.batch_frequencies=some", ["fit.batch_frequencies: found 'some'"]),
+        ("spectrogram.range_min=2", ["spectrogram: range_min must lie below range_max"]),
+        ("spectrogram.fft=32", ["spectrogram: fft must be at least window"]),
+        ("region.lower=[0,0,0]", ["region: lower and upper are set together"]),
+        ("ears.left=[1,2]", ["ears.left"]),
+    ],
+)
+def test_a_wrong_value_is_told_with_file_key_and_way_out(write, key, words):
+    path = write(SCENE)
+    lines = faults(path, key)
+    for word in words:
+        assert any(word in line for line in lines), lines
+    assert all(line.startswith(f"{path}: ") for line in lines)
+
+
+@pytest.mark.parametrize("key", ["fit.batch_frequencies", "reconstruction.level", "fit.max_steps"])
+def test_a_choice_of_types_is_told_under_its_own_key(write, key):
+    path = write(SCENE)
+    for line in faults(path, f"{key}=high"):
+        assert line.startswith(f"{path}: {key}: found 'high'")
+
+
+def test_one_line_per_fault(write):
+    lines = faults(write("fit: {epochs: 0, epoch: 1}\npose: 3\n"))
+    assert len(lines) == 4  # epochs, epoch, pose, and the scene that is missing
+    assert any("scene: missing" in line for line in lines)
+
+
+@pytest.mark.parametrize("key", ["fit", "=3", "fit..epochs=3", "fit.=1"])
+def test_what_is_no_assignment(key):
+    with pytest.raises(SettingsError, match="expected KEY=VALUE"):
+        apply_override({}, key)
+
+
+def test_an_assignment_through_a_value():
+    with pytest.raises(SettingsError, match="epochs is a value, not a section"):
+        apply_override({"fit": {"epochs": 3}}, "fit.epochs.x=1")
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("3e-3", 0.003),
+        ("010", 10.0),
+        ("12:30", "12:30"),
+        ("on", "on"),
+        ("1_000", "1_000"),
+        ("true", True),
+        ("~", None),
+        ("-.5", -0.5),
+        ("2026-01-01", "2026-01-01"),
+    ],
+)
+def test_yaml_reads_numbers_as_people_write_them(text, value):
+    data = {}
+    apply_override(data, f"a={text}")
+    assert data == {"a": value}
+    assert type(data["a"]) is type(value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: 1\na: 2\n", "the key 'a' stands twice"),
+        ("1: 2\n", "is no text"),
+        ("a: [\n", r"a\.yaml:2:1"),
+        ("a: &x [1]\nb: *x\n", "aliases are not accepted"),
+        ("[" * 60 + "]" * 60, "deeper than 50"),
+        ("- 1\n", "holds list"),
+        (b"\xff\xfe\x00", "UTF-8"),
+        ("a: " + "x" * 1_000_001, "larger than"),
+        ("a: !!python/object/apply:os.system [ls]\n", "could not determine a constructor"),
+        ("a: b: c\n", "not allowed here"),
+    ],
+)
+def test_what_is_no_settings_file(write, text, message):
+    with pytest.raises(SettingsError, match=message):
+        read_yaml(write(text))
+
+
+def test_an_empty_file_is_empty_settings(write):
+    assert read_yaml(write("")) == {}
+    assert read_yaml(write(b"\xef\xbb\xbfa: 1\n")) == {"a": 1}
+
+
+def test_a_missing_file_suggests_its_neighbour(write, tmp_path):
+    write(SCENE, "three_spheres.yaml")
+    with pytest.raises(SettingsError, match=r"did you mean .*three_spheres\.yaml"):
+        read_yaml(tmp_path / "three_sphere.yaml")
+    with pytest.raises(SettingsError, match=r"no such settings file$"):
+        read_yaml(tmp_path / "none" / "a.yaml")
+    with pytest.raises(SettingsError, match="cannot be read"):
+        read_yaml(tmp_path)
+
+
+def test_a_source_is_named_for_plain_data_too():
+    with pytest.raises(SettingsError, match=r"^RUN/config\.yaml: scene: missing"):
+        validate_settings({}, "RUN/config.yaml")

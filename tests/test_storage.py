@@ -1,0 +1,331 @@
+# SPDX-License-Identifier: MIT
+"""The one write path: old or new, never neither, never silent."""
+
+from __future__ import annotations
+
+import builtins
+import errno
+import json
+import os
+import resource
+import signal
+import stat
+import subprocess
+import sys
+import threading
+import time
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+
+from sononerf import storage
+from sononerf.errors import InputError, LockedError, NumericalError, StorageError
+
+
+@contextmanager
+def failing(monkeypatch, number, code, *, lasting):
+    """Let the `number`-th operating system call of a commit fail, and all later ones if lasting."""
+    count = 0
+
+    def counted(real):
+        def call(*args, **kwargs):
+            nonlocal count
+            count += 1
+            if count == number or (lasting and count > number):
+                raise OSError(code, os.strerror(code))
+            return real(*args, **kwargs)
+
+        return call
+
+    with monkeypatch.context() as patch:
+        patch.setattr(builtins, "open", counted(open))
+        for name in ("fsync", "replace", "link", "mkdir"):
+            patch.setattr(os, name, counted(getattr(os, name)))
+        # A file's own methods cannot be replaced: the writers of these tests call this one.
+        yield counted(lambda file, data: file.write(data))
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_commit_writes_and_replaces_and_leaves_nothing_else(tmp_path):
+    path = tmp_path / "a" / "b" / "file"
+    storage.commit_bytes(path, b"old")
+    storage.commit_bytes(path, b"new")
+    assert path.read_bytes() == b"new"
+    assert names(path.parent) == ["file"]
+
+
+def test_commit_keeps_the_replaced_content_where_asked(tmp_path):
+    path, previous = tmp_path / "file", tmp_path / "file.previous"
+    for content in (b"1", b"2", b"3"):
+        storage.commit(path, lambda file, data=content: file.write(data), previous=previous)
+    assert (path.read_bytes(), previous.read_bytes()) == (b"3", b"2")
+    assert names(tmp_path) == ["file", "file.previous"]
+
+
+def test_commit_is_durable_before_it_is_visible(tmp_path, monkeypatch):
+    order = []
+    real_fsync, real_replace = os.fsync, os.replace
+
+    def fsync(descriptor):
+        kind = "folder" if stat.S_ISDIR(os.fstat(descriptor).st_mode) else "file"
+        order.append(f"fsync {kind}")
+        real_fsync(descriptor)
+
+    def replace(source, target):
+        order.append("replace")
+        real_replace(source, target)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", replace)
+    storage.commit_bytes(tmp_path / "file", b"x")
+    assert order == ["fsync file", "replace", "fsync folder"]
+
+
+def test_new_folders_are_durable_too(tmp_path, monkeypatch):
+    synced = []
+    real = storage.sync_folder
+    monkeypatch.setattr(
+        storage, "sync_folder", lambda folder: (synced.append(folder), real(folder))
+    )
+    storage.commit_bytes(tmp_path / "a" / "b" / "file", b"x")
+    assert synced == [tmp_path, tmp_path / "a", tmp_path / "a" / "b"]
+
+
+@pytest.mark.parametrize("lasting", [False, True])
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EACCES, errno.EROFS])
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_fault_at_any_call_leaves_old_or_new_and_is_told(
+    tmp_path, monkeypatch, code, lasting, kept
+):
+    path = tmp_path / "file"
+    previous = tmp_path / "file.previous" if kept else None
+    for number in range(1, 20):
+        storage.commit_bytes(path, b"old")
+        with failing(monkeypatch, number, code, lasting=lasting) as write:
+            message = None
+            try:
+                storage.commit(path, lambda file, w=write: w(file, b"new"), previous=previous)
+            except StorageError as error:
+                message = str(error)
+        assert path.read_bytes() in (b"old", b"new")
+        assert set(names(tmp_path)) <= {"file", "file.previous"}
+        if message is None:
+            break
+        assert str(path) in message
+        assert "\n" not in message
+    assert path.read_bytes() == b"new"
+    # open, write, fsync, [link, replace,] replace, fsync; then nothing is left to fail
+    assert number == (8 if kept else 6)
+
+
+def test_a_file_size_limit_is_a_storage_error_and_keeps_the_old_file(tmp_path):
+    path = tmp_path / "file"
+    storage.commit_bytes(path, b"old")
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
+    try:
+        with pytest.raises(StorageError, match="size limit"):
+            storage.commit_bytes(path, bytes(100_000))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert path.read_bytes() == b"old"
+    assert names(tmp_path) == ["file"]
+
+
+def test_an_interrupt_in_the_writer_leaves_no_temporary_file(tmp_path):
+    def writer(file):
+        file.write(b"half")
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        storage.commit(tmp_path / "file", writer)
+    assert names(tmp_path) == []
+
+
+def test_threads_that_commit_one_name_do_not_mix_their_bytes(tmp_path):
+    path = tmp_path / "file"
+
+    def work(letter):
+        for _ in range(20):
+            storage.commit(path, lambda file: [file.write(letter) for _ in range(100)])
+
+    threads = [threading.Thread(target=work, args=(letter,)) for letter in (b"a", b"b")]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert path.read_bytes() in (b"a" * 100, b"b" * 100)
+
+
+def test_json_converts_numpy_and_refuses_nan(tmp_path):
+    path = tmp_path / "data.json"
+    data = {"f": np.float32(0.5), "i": np.int64(3), "b": np.bool_(True), "a": np.arange(2)}
+    storage.commit_json(path, data)
+    assert storage.read_json(path) == {"f": 0.5, "i": 3, "b": True, "a": [0, 1]}
+    assert path.read_text().startswith('{\n  "f"')
+    for bad in (float("nan"), np.float32("inf"), np.array([np.nan])):
+        with pytest.raises(NumericalError, match="NaN or infinite"):
+            storage.commit_json(path, {"x": bad})
+    assert storage.read_json(path)["i"] == 3
+
+
+@pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000])
+def test_read_json_tells_damage_in_one_line(tmp_path, content):
+    path = tmp_path / "data.json"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"data\.json: damaged") as caught:
+        storage.read_json(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_read_json_of_nothing_and_of_a_folder(tmp_path):
+    with pytest.raises(InputError, match="no such file"):
+        storage.read_json(tmp_path / "none.json")
+    with pytest.raises(InputError, match="cannot be read"):
+        storage.read_json(tmp_path)
+
+
+def test_append_line_closes_a_torn_line_first(tmp_path):
+    path = tmp_path / "journal"
+    storage.append_line(path, "one")
+    with path.open("ab") as file:
+        file.write(b"tor")
+    storage.append_line(path, "two")
+    assert path.read_bytes() == b"one\ntor\ntwo\n"
+
+
+def test_append_line_tells_a_full_disk():
+    with pytest.raises(StorageError, match="cannot be appended to"):
+        storage.append_line(storage.Path("/dev/full"), "one")
+
+
+def test_clean_leftovers_removes_those_of_the_dead_only(tmp_path):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    (tmp_path / f".file.{dead.pid}.tmp").write_bytes(b"")
+    (tmp_path / f".file.{dead.pid}-77.tmp").write_bytes(b"")
+    (tmp_path / f".folder.{dead.pid}.tmp").mkdir()
+    (tmp_path / f".folder.{dead.pid}.tmp" / "content").write_bytes(b"")
+    alive = tmp_path / f".file.{os.getpid()}.tmp"
+    alive.write_bytes(b"")
+    (tmp_path / "file.tmp").write_bytes(b"")
+    storage.clean_leftovers(tmp_path)
+    assert names(tmp_path) == sorted([alive.name, "file.tmp"])
+    storage.clean_leftovers(tmp_path / "none")
+
+
+def test_remove_file_twice(tmp_path):
+    storage.commit_bytes(tmp_path / "file", b"")
+    storage.remove_file(tmp_path / "file")
+    storage.remove_file(tmp_path / "file")
+    assert names(tmp_path) == []
+
+
+def test_probe_creates_the_folder_and_leaves_it_empty(tmp_path):
+    storage.probe_writable(tmp_path / "a" / "b")
+    assert names(tmp_path / "a" / "b") == []
+
+
+@pytest.mark.parametrize("number", range(1, 8))
+def test_probe_that_fails_leaves_nothing_behind(tmp_path, monkeypatch, number):
+    with failing(monkeypatch, number, errno.EROFS, lasting=True):
+        with pytest.raises(StorageError, match="read-only"):
+            storage.probe_writable(tmp_path / "a" / "b")
+    assert names(tmp_path) == []
+
+
+def test_probe_below_a_file_is_a_storage_error(tmp_path):
+    (tmp_path / "file").write_bytes(b"")
+    with pytest.raises(StorageError, match="part of the path is a file"):
+        storage.probe_writable(tmp_path / "file" / "folder")
+    assert names(tmp_path) == ["file"]
+
+
+def fork(work):
+    """Run `work` in a forked child; return its pid."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            work()
+        except BaseException:
+            os._exit(1)
+        os._exit(0)
+    return pid
+
+
+def test_lock_refuses_the_second_and_names_the_first(tmp_path):
+    with storage.lock(tmp_path):
+        with pytest.raises(LockedError, match=rf"process {os.getpid()} on .* since \d{{4}}-"):
+            with storage.lock(tmp_path):
+                pass
+    with storage.lock(tmp_path):
+        pass
+    assert names(tmp_path) == []
+
+
+def test_lock_is_not_taken_on_a_name_that_its_last_owner_removed(tmp_path, monkeypatch):
+    real, names_removed = storage.fcntl.flock, []
+
+    def flock(descriptor, operation):
+        if not names_removed:
+            names_removed.append((tmp_path / ".lock").unlink())
+        real(descriptor, operation)
+
+    monkeypatch.setattr(storage.fcntl, "flock", flock)
+    with storage.lock(tmp_path):
+        assert names(tmp_path) == [".lock"]
+        with pytest.raises(LockedError), storage.lock(tmp_path):
+            pass
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")  # only locks
+def test_lock_dies_with_its_process(tmp_path):
+    ready = tmp_path / "ready"
+
+    def hold():
+        with storage.lock(tmp_path):
+            storage.commit_bytes(ready, b"")
+            time.sleep(60)
+
+    pid = fork(hold)
+    while not ready.exists():
+        time.sleep(0.005)
+    with pytest.raises(LockedError, match=f"process {pid} "):
+        with storage.lock(tmp_path):
+            pass
+    os.kill(pid, signal.SIGKILL)
+    os.waitpid(pid, 0)
+    with storage.lock(tmp_path):
+        pass
+
+
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")  # only locks
+def test_of_many_at_once_one_holds_the_lock_at_a_time(tmp_path):
+    def work():
+        deadline = time.monotonic() + 20
+        for _ in range(10):
+            while True:
+                try:
+                    with storage.lock(tmp_path):
+                        descriptor = os.open(tmp_path / "inside", os.O_CREAT | os.O_EXCL)
+                        os.close(descriptor)
+                        os.unlink(tmp_path / "inside")  # noqa: PTH108
+                    break
+                except LockedError:
+                    if time.monotonic() > deadline:
+                        raise
+                    time.sleep(0.0005)
+
+    pids = [fork(work) for _ in range(4)]
+    assert [os.waitpid(pid, 0)[1] for pid in pids] == [0] * 4
+
+
+def test_messages_say_what_to_do(tmp_path):
+    for code, hint in [(errno.ENOSPC, "free space"), (errno.EACCES, "permission"), (9999, "check")]:
+        error = storage.storage_error("cannot be written", tmp_path, OSError(code, "reason"))
+        assert hint in str(error)
+    assert json.loads(storage.to_json({"b": 1, "a": 2}, sort_keys=True)) == {"a": 2, "b": 1}
