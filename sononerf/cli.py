@@ -8,21 +8,25 @@ from __future__ import annotations
 
 import json
 import logging
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
+from types import FrameType
 from typing import Annotated, Any
 
 import typer
 
 from sononerf import __version__
-from sononerf.errors import InputError, SettingsError, SonoNerfError
+from sononerf.errors import SettingsError, SonoNerfError, StoppedError
 
 app = typer.Typer(
     name="sononerf",
     help="Three-dimensional hearing: simulate echoes, fit a reflectivity field, predict, "
     "reconstruct.",
-    no_args_is_help=True,
+    invoke_without_command=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
@@ -70,11 +74,15 @@ def _version(wanted: bool) -> None:
 
 @app.callback()
 def _root(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
 ) -> None:
     del version
+    if context.invoked_subcommand is None:
+        _print(context.get_help())
+        raise typer.Exit(SettingsError.exit_code)
     logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
 
 
@@ -276,8 +284,6 @@ def reconstruct(
 @app.command()
 def evaluate(run: Run, as_json: Json = False) -> None:
     """Compare a run's mesh with the true scene, and show all its numbers."""
-    if not run.is_dir():
-        raise InputError(f"{run}: no run; make one with `sononerf fit`")
     from sononerf.experiment.reconstruct import evaluate as evaluate_run
     from sononerf.progress import Progress
 
@@ -288,17 +294,54 @@ def evaluate(run: Run, as_json: Json = False) -> None:
         _summary(run, metrics)
 
 
+class _SignalledError(BaseException):
+    """A signal came; nothing on the way may take it for a fault and go on."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+
+
+@contextmanager
+def _signals_unwind() -> Iterator[None]:
+    """Let signals close files and end child processes on the way out."""
+
+    def unwind(number: int, frame: FrameType | None) -> None:
+        del frame
+        raise _SignalledError(number)
+
+    before = {}
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        # What was ignored when we were started (nohup, a shell's &) stays ignored.
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            before[number] = signal.signal(number, unwind)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _run() -> int:
+    try:
+        with _signals_unwind():
+            return app(standalone_mode=False) or 0
+    except SonoNerfError as error:
+        fault = error
+    except typer.TyperException as error:
+        where = getattr(getattr(error, "ctx", None), "command_path", "sononerf")
+        text = error.format_message().rstrip(".")
+        fault = SettingsError(f"{text[:1].lower()}{text[1:]}; see `{where} --help`")
+    except _SignalledError as error:
+        fault = StoppedError(error.number)
+    for line in str(fault).splitlines():
+        typer.echo(f"error: {line}", err=True)
+    return fault.exit_code
+
+
 def main() -> None:
     """Run the command line and end with the exit code of what went wrong."""
     try:
-        app()
-    except SonoNerfError as error:
-        for line in str(error).splitlines():
-            typer.echo(f"error: {line}", err=True)
-        sys.exit(error.exit_code)
-    except KeyboardInterrupt:
-        typer.echo("stopped", err=True)
-        sys.exit(130)
+        sys.exit(_run())
     except BrokenPipeError:
         # The reader of our output went away, as `head` does.
         sys.stderr.close()

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import signal
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -13,7 +14,8 @@ from typing import Any
 
 import lightning
 
-from sononerf.callbacks.epoch import EpochCallback
+from sononerf.callbacks.epoch import EpochCallback, echo_module
+from sononerf.errors import StoppedError
 from sononerf.module import EchoModule
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -35,36 +37,68 @@ class CheckpointCallback(EpochCallback):
         self.seconds = seconds
         self.stopped_by: int | None = None
         self._saved = time.monotonic()
+        self._before: dict[signal.Signals, Callable[..., Any] | int] = {}
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Turn signals into an orderly stop; a second one stops at once."""
-
-        def note(number: int, frame: FrameType | None) -> None:
-            del frame
-            if self.stopped_by is not None:
-                raise KeyboardInterrupt
-            self.stopped_by = number
-
-        # What was ignored when we were started (nohup, a shell's &) stays ignored.
-        before = {s: signal.getsignal(s) for s in SIGNALS}
-        for number, handler in before.items():
-            if handler is not signal.SIG_IGN:
-                signal.signal(number, note)
+        """Turn signals into an orderly stop; a second one does what it did without us."""
+        if threading.current_thread() is threading.main_thread():
+            for number in SIGNALS:
+                handler = signal.getsignal(number)
+                # What was ignored when we were started (nohup, a shell's &) stays ignored.
+                if handler is not None and handler is not signal.SIG_IGN:
+                    self._before[number] = handler
+        self._watch()
         try:
             yield
         finally:
-            for number, handler in before.items():
-                signal.signal(number, handler)
+            self._let_go()
+
+    def _watch(self) -> None:
+        for number in self._before:
+            signal.signal(number, self._note)
+
+    def _let_go(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        del frame
+        if self.stopped_by is not None:
+            self._let_go()
+            signal.raise_signal(number)
+        self.stopped_by = number
 
     def _save(self, trainer: lightning.Trainer) -> None:
         trainer.save_checkpoint(self.path)
         self._saved = time.monotonic()
 
+    def _stop(self, module: EchoModule) -> None:
+        # Lightning's own way of stopping validates once more first.
+        raise StoppedError(
+            self.stopped_by or signal.SIGTERM,
+            f"stopped at step {module.global_step} of {module.total_steps}; "
+            "the same command goes on",
+        )
+
+    def _is_asked_to_stop(self, trainer: lightning.Trainer, module: EchoModule) -> bool:
+        # All devices stop together; a fit that is over has nothing to stop.
+        asked = trainer.strategy.reduce_boolean_decision(self.stopped_by is not None, all=False)
+        return asked and module.global_step < module.total_steps
+
+    def on_train_start(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Take SIGTERM back from Lightning, which would end with exit code 0."""
+        del trainer, pl_module
+        self._watch()
+
     def on_epoch(self, trainer: lightning.Trainer, module: EchoModule, epoch: int) -> None:
         """Save what the epoch reached."""
-        del module, epoch
+        del epoch
         self._save(trainer)
+        if self._is_asked_to_stop(trainer, module):
+            self._stop(module)
 
     def on_train_batch_end(
         self,
@@ -76,8 +110,12 @@ class CheckpointCallback(EpochCallback):
     ) -> None:
         """Save when it is time, or when asked to stop."""
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
-        if self.stopped_by is not None:
+        module = echo_module(pl_module)
+        if self._boundary(module):
+            return  # saved after its validation, so that none is left out by who goes on from it
+        asked = self._is_asked_to_stop(trainer, module)
+        late = time.monotonic() - self._saved >= self.seconds
+        if asked or trainer.strategy.reduce_boolean_decision(late, all=False):
             self._save(trainer)
-            trainer.should_stop = True
-        elif time.monotonic() - self._saved >= self.seconds:
-            self._save(trainer)
+        if asked:
+            self._stop(module)

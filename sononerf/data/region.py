@@ -20,17 +20,18 @@ HEARD_DB = 6.0
 """A range is heard where any cell of it reaches this, 60 dB below the loudest being zero."""
 WITNESS_GAIN = 0.1
 """A pose is a witness of the places towards which its gain is at least this part of the best."""
-SILENT_SHARE = 0.25
+SILENT_SHARES = (0.02, 0.25)
 """A place is empty where more than this share of its witnesses heard their first echo behind it.
 
-Not zero: a flat face answers only from straight ahead, and some pose hears what stands behind."""
+The strict share comes first. A flat face answers only from straight ahead, and poses that it does
+not answer hear what stands behind: the lax share serves the sound that is still unexplained."""
 HEARD_SHARE = 0.005
 """A place is empty where fewer than this share of its witnesses heard anything at its range."""
 AGREEMENT = 0.6
 """A place is taken where the sound from its range is this part of the best place's, or more."""
 UNEXPLAINED_SHARE = 0.02
 """The search for more places ends when only this share of the sound is not explained."""
-ROUNDS = 6
+ROUNDS = 4
 WINDOW_REACH = 0.006
 """One echo sounds this far in range, in metres: half of the analysis window."""
 LOOKS = 4
@@ -92,7 +93,13 @@ class EchoEvidence:
         gain = (ears.beam[None] * ears.ears).max(axis=(0, 1))  # (L, A)
         self.gain = gain / gain.max()
 
-    def about(self, points: Array, tolerance: float, sound: Array | None = None) -> Evidence:
+    def about(
+        self,
+        points: Array,
+        tolerance: float,
+        sound: Array | None = None,
+        silent_share: float = SILENT_SHARES[-1],
+    ) -> Evidence:
         """Return which places may hold something, and how much sound comes from their range.
 
         Parameters
@@ -103,6 +110,8 @@ class EchoEvidence:
             How far a place speaks for its surroundings.
         sound : (P, R) float or None
             The sound that is looked at; all of it where None.
+        silent_share : float
+            What share of a place's witnesses may have heard their first echo behind it.
         """
         reach = int(np.ceil(tolerance / self.step))
         heard = ndimage.maximum_filter1d(self.heard, 2 * reach + 1, axis=1, mode="constant")
@@ -110,7 +119,7 @@ class EchoEvidence:
             self.power if sound is None else sound, 2 * reach + 1, axis=1, mode="constant"
         )
         parts = [
-            self._about(points[start : start + CHUNK], tolerance, heard, power)
+            self._about(points[start : start + CHUNK], tolerance, heard, power, silent_share)
             for start in range(0, len(points), CHUNK)
         ]
         return Evidence(
@@ -118,7 +127,9 @@ class EchoEvidence:
             np.concatenate([part.energy for part in parts]),
         )
 
-    def _about(self, points: Array, tolerance: float, heard: Mask, power: Array) -> Evidence:
+    def _about(
+        self, points: Array, tolerance: float, heard: Mask, power: Array, silent_share: float
+    ) -> Evidence:
         distance, row, within = self._rows(points)
         witness = self._witnesses(points, distance)
         pose = np.arange(len(self.sources))[:, None]
@@ -129,7 +140,7 @@ class EchoEvidence:
         energy = (meets * power[pose, row]).sum(axis=0) / np.maximum(count, 1)
         possible = (
             (count > 0)
-            & (silent <= SILENT_SHARE * count)
+            & (silent <= silent_share * count)
             & (sounding >= np.maximum(2.0, HEARD_SHARE * count))
         )
         return Evidence(possible, energy)
@@ -195,15 +206,18 @@ class EchoEvidence:
         """
         unexplained = self.power.copy()
         keep = np.zeros(len(points), dtype=bool)
-        for _ in range(ROUNDS):
-            evidence = self.about(points, tolerance, unexplained)
-            energy = np.where(evidence.possible, evidence.energy, 0.0)
-            if energy.max() <= 0:
-                break
-            keep |= energy >= AGREEMENT * energy.max()
-            unexplained = np.where(self._covered(points[keep], tolerance), 0.0, self.power)
-            if unexplained.sum() <= UNEXPLAINED_SHARE * self.power.sum():
-                break
+        for silent_share in SILENT_SHARES:
+            for _ in range(ROUNDS):
+                evidence = self.about(points, tolerance, unexplained, silent_share)
+                energy = np.where(evidence.possible, evidence.energy, 0.0)
+                before = int(keep.sum())
+                if energy.max() > 0:
+                    keep |= energy >= AGREEMENT * energy.max()
+                if int(keep.sum()) == before:
+                    break
+                unexplained = np.where(self._covered(points[keep], tolerance), 0.0, self.power)
+                if unexplained.sum() <= UNEXPLAINED_SHARE * self.power.sum():
+                    return keep
         return keep
 
     def _covered(self, points: Array, tolerance: float) -> Mask:

@@ -8,6 +8,7 @@ import resource
 import sys
 import time
 import warnings
+from contextlib import suppress
 from pathlib import Path
 
 import lightning
@@ -44,6 +45,7 @@ def quiet_lightning() -> None:
         r".*resumed from a checkpoint that ended before the epoch.*",  # ours go by the step
         r".*\.*Checkpoint directory .* exists and is not empty.*",
         r".*`max_epochs` was not set.*",
+        r".*treespec, LeafSpec.* is deprecated.*",  # Lightning's own call of torch
     ):
         warnings.filterwarnings("ignore", message=pattern)
 
@@ -114,19 +116,27 @@ def fit(
         aside = run.move_aside()
         if aside:
             progress.say(f"moved the old run to {aside}")
+    was_there = path.exists()
     storage.probe_writable(path)
-    with storage.lock(path):
-        run.begin(settings)
-        if run.is_fitted:
-            return run
-        started = time.monotonic()
-        store = simulate(settings, workers=workers, progress=progress)
-        simulated = time.monotonic() - started
-        run.write_provenance(
-            echo_hash=store.attributes["echo_hash"], threads=torch.get_num_threads()
-        )
-        run.write_metrics("cost", {"simulate_s": simulated}, merge=True)
-        _fit(settings, run, store, accelerator, devices, num_nodes, progress)
+    try:
+        with storage.lock(path):
+            run.check(settings)
+            if run.is_fitted:
+                return run
+            started = time.monotonic()
+            store = simulate(settings, workers=workers, progress=progress)
+            simulated = time.monotonic() - started
+            run.begin(settings)
+            run.write_provenance(
+                echo_hash=store.attributes["echo_hash"], threads=torch.get_num_threads()
+            )
+            if "simulate_s" not in run.read_metrics().get("cost", {}):
+                run.write_metrics("cost", {"simulate_s": simulated}, merge=True)
+            _fit(settings, run, store, accelerator, devices, num_nodes, progress)
+    finally:
+        if not was_there:
+            with suppress(OSError):
+                path.rmdir()  # goes only if nothing came of the run
     return run
 
 
@@ -213,13 +223,19 @@ def _fit(
             log_every_n_steps=10,
             default_root_dir=run.path,
         )
-        trainer.fit(module, data, ckpt_path=run.checkpoint if resumed else None, weights_only=True)
-    if keeper.stopped_by is not None and trainer.global_step < total:
+        before = run.read_metrics().get("cost", {}).get("fit_s", 0.0) if resumed else 0.0
+        try:
+            trainer.fit(
+                module, data, ckpt_path=run.checkpoint if resumed else None, weights_only=True
+            )
+        finally:
+            seconds = before + time.monotonic() - started
+            run.write_metrics("cost", {"fit_s": seconds}, merge=True)
+        _finish(settings, run, store, module, trainer)
+    if keeper.stopped_by is not None:
         raise StoppedError(
-            keeper.stopped_by,
-            f"stopped at step {trainer.global_step} of {total}; the same command goes on",
+            keeper.stopped_by, "stopped after the last step; the same command goes on"
         )
-    _finish(settings, run, store, module, time.monotonic() - started, trainer)
 
 
 def _resume(run: RunFolder, data: EchoDataModule) -> bool:
@@ -236,7 +252,6 @@ def _finish(
     run: RunFolder,
     store: EnsembleStore,
     module: EchoModule,
-    seconds: float,
     trainer: lightning.Trainer,
 ) -> None:
     bad = [n for n, p in module.named_parameters() if not bool(p.isfinite().all())]
@@ -249,7 +264,6 @@ def _finish(
     run.write_metrics(
         "cost",
         {
-            "fit_s": run.read_metrics().get("cost", {}).get("fit_s_before", 0.0) + seconds,
             "steps": trainer.global_step,
             "points_evaluated": int(module.renderer.points_evaluated),
             "parameters": sum(p.numel() for p in module.parameters()),

@@ -30,7 +30,7 @@ from sononerf.progress import Progress
 from sononerf.reconstruction.prediction import prediction_metrics
 from sononerf.render.spectrogram import spectrogram_png
 from sononerf.scene import load_scene
-from sononerf.weights import load_weights
+from sononerf.weights import DESCRIPTION_NAME, load_weights
 
 Split = Literal["train", "val", "test"]
 
@@ -54,6 +54,11 @@ def load_fitted(path: Path) -> Fitted:
     IncompatibleError
         If they do not fit together or need a newer version.
     """
+    if not (path / DESCRIPTION_NAME).is_file():
+        raise InputError(
+            f"{path}: no fitted run (no {DESCRIPTION_NAME}); make or finish one with "
+            "`sononerf fit`"
+        )
     state, description = load_weights(path)
     try:
         settings = validate_settings(description["settings"], str(path / "model.json"))
@@ -180,9 +185,9 @@ def predict(
         if own is None and split == "test"
         else f"prediction-{'poses' if own is not None else split}"
     )
-    storage.probe_writable(folder)
     store = None if own is not None else store_of(fitted)
     poses = _poses_to_render(store, own, split, renderer.range, renderer.frequency)
+    storage.probe_writable(folder)
     magnitude = render_poses(fitted, poses, accelerator=accelerator, progress=progress)
     reference = fitted.module.reference
     predicted = compress(magnitude, reference)

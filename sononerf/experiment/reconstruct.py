@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from sononerf import storage
-from sononerf.errors import NumericalError, SonoNerfError
+from sononerf.errors import InputError, NumericalError, SonoNerfError
 from sononerf.experiment.predict import Fitted, load_fitted, store_of
 from sononerf.experiment.run_folder import RunFolder
 from sononerf.progress import Progress
@@ -124,15 +124,25 @@ def evaluate(path: Path, *, progress: Progress | None = None) -> dict[str, Any]:
     baseline: dict[str, Any] = {"backprojection": None, "voxels": None}
     if truth is not None:
         with progress.task("evaluating", 2) as task:
-            mesh = trimesh.load_mesh(folder / "mesh.ply", file_type="ply")
+            mesh = _read_mesh(folder / "mesh.ply")
             level = storage.read_json(folder / "read_out.json")["level"]
             geometry = {**geometry_metrics(mesh, truth), "level": level}
             task.advance()
             baseline["backprojection"] = _backprojection(fitted, truth)
             task.advance()
-    run.write_metrics("geometry", geometry or {})
+    run.write_metrics("geometry", geometry)
     run.write_metrics("baseline", baseline)
     return run.read_metrics()
+
+
+def _read_mesh(path: Path) -> trimesh.Trimesh:
+    try:
+        mesh = trimesh.load_mesh(path, file_type="ply")
+    except Exception as error:  # trimesh's readers raise whatever they met first
+        raise InputError(f"{path}: damaged ({error}); reconstruct again") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{path}: holds no surface; reconstruct again")
+    return mesh
 
 
 def _backprojection(fitted: Fitted, truth: trimesh.Trimesh) -> dict[str, Any] | None:

@@ -69,8 +69,8 @@ class RunFolder:
             raise InputError(f"{self.path}: no run (no config.yaml); make one with `sononerf fit`")
         return validate_settings(read_yaml(self.config), str(self.config))
 
-    def begin(self, settings: Settings) -> None:
-        """Write the settings of a new run, or make sure that an old one has the same.
+    def check(self, settings: Settings) -> None:
+        """Make sure that the folder is free, or holds a run of the same settings.
 
         Raises
         ------
@@ -88,21 +88,54 @@ class RunFolder:
                     "--overwrite to move it aside"
                 )
             return
+        self._refuse_foreign()
+
+    def _refuse_foreign(self) -> None:
         foreign = [p.name for p in self.path.iterdir() if not p.name.startswith(".")]
         if foreign:
             raise InputError(
                 f"{self.path}: holds {sorted(foreign)[0]!r} and is no run; choose another --output"
             )
-        storage.commit_text(self.config, dump_yaml(settings))
+
+    def begin(self, settings: Settings) -> None:
+        """Write the settings of a new run, or make sure that an old one has the same.
+
+        Raises
+        ------
+        IncompatibleError
+            If the folder holds a run of other settings.
+        InputError
+            If the folder holds something else.
+        """
+        self.check(settings)
+        if not self.config.is_file():
+            storage.commit_text(self.config, dump_yaml(settings))
 
     def move_aside(self) -> Path | None:
-        """Rename the folder so that a new run can take its place; nothing is deleted."""
+        """Rename the folder so that a new run can take its place; nothing is deleted.
+
+        Raises
+        ------
+        InputError
+            If the folder holds something that is no run.
+        LockedError
+            If another process works in it.
+        StorageError
+            If it cannot be renamed.
+        """
         if not self.path.exists():
             return None
+        path = self.path.resolve()
         number = 1
-        while (aside := self.path.with_name(f"{self.path.name}.old-{number}")).exists():
+        while (aside := path.with_name(f"{path.name}.old-{number}")).exists():
             number += 1
-        self.path.rename(aside)
+        with storage.lock(path):
+            if not self.config.is_file():
+                self._refuse_foreign()
+            try:
+                path.rename(aside)
+            except OSError as error:
+                raise storage.storage_error("cannot be moved aside", path, error) from error
         return aside
 
     @property
@@ -119,11 +152,13 @@ class RunFolder:
             raise InputError(f"{self.metrics}: holds no metrics; remove it and evaluate again")
         return metrics
 
-    def write_metrics(self, section: str, values: dict[str, Any], *, merge: bool = False) -> None:
+    def write_metrics(
+        self, section: str, values: dict[str, Any] | None, *, merge: bool = False
+    ) -> None:
         """Replace one section of ``metrics.json``; the others are left as they are."""
         metrics = self.read_metrics()
         if merge:
-            values = {**metrics.get(section, {}), **values}
+            values = {**(metrics.get(section) or {}), **(values or {})}
         storage.commit_json(self.metrics, {**metrics, "schema": METRICS_SCHEMA, section: values})
 
     def write_provenance(self, **facts: Any) -> None:

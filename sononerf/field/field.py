@@ -50,7 +50,7 @@ class Field(nn.Module):
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         # The fit finds out what is occupied, and how finely; a loaded map replaces ours whole.
         if prefix + "occupancy" in state_dict:
-            self.occupancy = torch.zeros_like(state_dict[prefix + "occupancy"])
+            self.occupancy = self.occupancy.new_zeros(state_dict[prefix + "occupancy"].shape)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @torch.no_grad()
@@ -71,8 +71,10 @@ class Field(nn.Module):
         index = index.clamp_min(0).minimum(size - 1)
         near[index[:, 0], index[:, 1], index[:, 2]] = 1.0
         reach = math.ceil(spacing / cell / 2 - 1e-6) if spacing > 1.001 * cell else 0
-        if reach:
-            near = max_pool3d(near[None, None], 2 * reach + 1, 1, reach)[0, 0]
+        for axis in range(3) if reach else ():  # one after the other: a cube would take reach² longer
+            size_of = [2 * reach + 1 if axis == a else 1 for a in range(3)]
+            edge = [reach if axis == a else 0 for a in range(3)]
+            near = max_pool3d(near[None, None], size_of, 1, edge)[0, 0]
         self.occupancy = near > 0
         self.cell = torch.full_like(self.cell, cell)
 
@@ -120,8 +122,11 @@ class Field(nn.Module):
         return response if bins is None else response[..., bins]
 
     def inside(self, positions: Tensor) -> Tensor:
-        """Return which places lie in the region, (...,) bool."""
-        within = ((positions >= self.region[0]) & (positions <= self.region[1])).all(dim=-1)
+        """Return which places lie in the region, its faces included, (...,) bool."""
+        # Places that were computed to lie on a face may miss it by a rounding.
+        slack = 4 * torch.finfo(positions.dtype).eps * self.region.abs().max()
+        above, below = positions >= self.region[0] - slack, positions <= self.region[1] + slack
+        within = (above & below).all(dim=-1)
         size = torch.tensor(self.occupancy.shape, device=positions.device)
         index = ((positions - self.region[0]) / self.cell).round().long()
         index = index.clamp_min(0).minimum(size - 1)

@@ -83,7 +83,7 @@ def automatic_level(volume: Volume) -> float:
 
     Otsu's threshold on the values: the level that parts them into two heaps, air and surface, each
     as even in itself as can be. The choice scales with the values. On blurred, uneven shells it
-    comes within 3 % of the best F-score at 5 mm that any level reaches; thresholds on decibels or
+    comes within 0.04 of the F-score at 5 mm of the best of twelve levels; thresholds on decibels or
     at the steepest gradient, tried in its place, swell or shatter the body.
 
     Parameters

@@ -10,6 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sononerf.reconstruction.occupancy import volumes
 from sononerf.reconstruction.prediction import mae_db, prediction_metrics
 from sononerf.reconstruction.solid import (
     Solid,
@@ -21,7 +22,6 @@ from sononerf.reconstruction.solid import (
     sample_surface,
     signed_distance,
     solid_from_mesh,
-    volumes,
 )
 
 __all__ = [

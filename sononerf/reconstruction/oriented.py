@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from sononerf.errors import NumericalError
 from sononerf.reconstruction.isosurface import isosurface
-from sononerf.reconstruction.parts import part_labels, submesh
+from sononerf.reconstruction.parts import supported_parts
 from sononerf.reconstruction.volume import Volume, check_memory, grid_over
 
 # Of the grid without air around it: 80 to 90 measured on a cube, twice that on a flat grid.
@@ -48,10 +48,6 @@ LEVEL_FLOOR = 0.05
 # Least standard deviation of the smoothing, in distances between neighbouring points: with less
 # the surface wraps single points.
 MIN_SMOOTHING = 0.45
-# Parts below a ball of this many voxels across are finer than the grid resolves.
-MIN_PART_VOXELS = 3.0
-# Parts with less than this share of the energy that a typical part has are noise.
-MIN_PART_ENERGY = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,34 +193,6 @@ def _levelled(
     return np.divide(chi, height, dtype=np.float32)
 
 
-def _without_crumbs(
-    mesh: trimesh.Trimesh,
-    points: NDArray[np.float64],
-    energies: NDArray[np.float64],
-    reach: float,
-    spacing: float,
-) -> trimesh.Trimesh:
-    """Leave out hollows, parts that the grid does not resolve, and parts that hardly echo."""
-    labels = part_labels(mesh)
-    parts = [submesh(mesh, labels == label) for label in range(labels.max() + 1)]
-    volumes = np.array([part.volume for part in parts])
-    areas = np.array([part.area for part in parts])
-    distance, vertex = cKDTree(mesh.vertices).query(points)
-    owner = np.zeros(len(mesh.vertices), np.intp)
-    owner[mesh.faces] = labels[:, None]
-    close = distance < reach
-    support = np.bincount(owner[vertex[close]], weights=energies[close], minlength=len(parts))
-    # No sound comes out of a hollow; its wall has a negative volume.
-    keep = volumes >= np.pi / 6 * (MIN_PART_VOXELS * spacing) ** 3
-    if not keep.any():
-        keep = volumes == volumes.max()
-    order = np.flatnonzero(keep)[np.argsort(support[keep], kind="stable")]
-    share = np.cumsum(areas[order]) / areas[order].sum()
-    typical = support[order[int(np.searchsorted(share, 0.5))]]
-    keep &= support >= MIN_PART_ENERGY * typical
-    return submesh(mesh, keep[labels])
-
-
 def oriented_surface(
     points: ArrayLike,
     energies: ArrayLike,
@@ -287,7 +255,7 @@ def oriented_surface(
     indicator = Volume(chi[1:-1, 1:-1, 1:-1].astype(np.float64), grid.origin, spacing)
     mesh = isosurface(indicator, used)
     reach = SUPPORT_RADIUS * cloud.pitch * spacing
-    mesh = _without_crumbs(mesh, place, energy, reach, spacing)
+    mesh = supported_parts(mesh, place, energy, reach=reach, spacing=spacing)
     return mesh, indicator, used
 
 

@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import NumericalError, ResourceError
+from sononerf.reconstruction.memory import available_memory
 
 # The value itself and the copies that an iso-surface takes, measured.
 BYTES_PER_VOXEL = 80
@@ -120,28 +119,6 @@ def estimated_bytes(
     """Return the memory that a grid over a box takes, in bytes."""
     x, y, z = grid_shape(lower, upper, spacing)
     return x * y * z * bytes_per_voxel
-
-
-def available_memory() -> int | None:
-    """Return the memory that can still be taken, in bytes; None where the system does not say."""
-    free: list[int] = []
-    meminfo = Path("/proc/meminfo")
-    if meminfo.is_file():
-        for line in meminfo.read_text(encoding="ascii").splitlines():
-            if line.startswith("MemAvailable:"):
-                free.append(int(line.split()[1]) * 1024)
-    else:
-        try:
-            free.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
-        except (AttributeError, ValueError, OSError):
-            return None
-    # A container may be held to less than the machine has.
-    limit, used = Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory.current")
-    if limit.is_file() and used.is_file():
-        bound = limit.read_text(encoding="ascii").strip()
-        if bound != "max":
-            free.append(int(bound) - int(used.read_text(encoding="ascii")))
-    return max(0, min(free)) if free else None
 
 
 def check_memory(

@@ -78,7 +78,7 @@ class ProfileRenderer(Renderer):
         acquisition: Acquisition,
         *,
         oversampling: Annotated[int, Option(ge=1, le=16)] = 2,
-        points: Annotated[int, Option(ge=1)] = 100_000,
+        points: Annotated[int, Option(ge=1)] = 25_000,
         uniform: Annotated[float, Option(gt=0, le=1)] = 0.4,
         start: Annotated[int, Option(ge=1)] = 12_000,
         prune_every: Annotated[int, Option(ge=0)] = 100,
@@ -115,7 +115,8 @@ class ProfileRenderer(Renderer):
         # The lattice's size is found by the fit, so a loaded one replaces ours whole.
         for name in ("lattice", "alive", "energy"):
             if prefix + name in state_dict:
-                setattr(self, name, torch.zeros_like(state_dict[prefix + name]))
+                found = getattr(self, name).new_zeros(state_dict[prefix + name].shape)
+                setattr(self, name, found)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @torch.no_grad()
@@ -135,14 +136,17 @@ class ProfileRenderer(Renderer):
         return False
 
     def _lay(self, field: Field, possible: Possible | None) -> None:
+        """Begin as finely as ``start`` allows; to ask about every fine place would take long."""
         spacing = field.resolution
+        while len(lattice_over(self.region, spacing)) > (4 if possible else 1) * self.start:
+            spacing *= 2
         while True:
             places = lattice_over(self.region, spacing)
             if possible is not None:
                 places = places[possible(places, spacing * math.sqrt(3) / 2)]
-            if len(places) <= self.start:
+            if spacing <= field.resolution or 8 * len(places) > self.start:
                 break
-            spacing *= 2
+            spacing /= 2
         self._replace(places, spacing)
         field.keep(self.lattice, spacing)
 
@@ -206,7 +210,8 @@ class ProfileRenderer(Renderer):
         noise = (2 * self.log_noise[bins]).exp()
         heard = heard * gain[:, None] + noise[:, None]
         heard = heard.transpose(-1, -2)  # (P, E, R, B)
-        if rows.shape[1] != len(self.range):
+        whole = torch.arange(len(self.range), device=rows.device).expand(len(rows), -1)
+        if not torch.equal(rows, whole):
             heard = heard.gather(
                 2, rows[:, None, :, None].expand(-1, heard.shape[1], -1, heard.shape[3])
             )

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
 import numpy as np
 import pytest
-import trimesh
 
 from sononerf.errors import NumericalError, ResourceError
 from sononerf.reconstruction import volume as volume_module
-from sononerf.reconstruction.oriented import _without_crumbs, oriented_surface
+from sononerf.reconstruction.oriented import oriented_surface
 from sononerf.reconstruction.parts import split_parts
 
 RADIUS, LATTICE, SPACING = 0.015, 0.004, 0.0025
@@ -106,22 +105,6 @@ def test_ghosts_are_no_parts():
         points, np.where(ghost, 0.002, 1.0) * energies, normals, lower, upper, SPACING
     )
     assert len(split_parts(mesh)) == 2
-
-
-@pytest.mark.parametrize(
-    ("radius", "energy", "kept"), [(0.01, 0.02, True), (0.01, 0.005, False), (0.003, 1.0, False)]
-)
-def test_crumbs_and_hollows_go(radius, energy, kept):
-    large = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
-    hollow = trimesh.creation.icosphere(subdivisions=2, radius=0.015)
-    hollow.invert()
-    other = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-    other.apply_translation([0.1, 0, 0])
-    points = np.vstack([large.vertices, other.vertices])
-    energies = np.repeat([1.0, energy], [len(large.vertices), len(other.vertices)])
-    mesh = trimesh.util.concatenate([large, hollow, other])
-    left = _without_crumbs(mesh, points, energies, 0.004, 0.0025)
-    assert left.area == pytest.approx(large.area + kept * other.area)
 
 
 def test_half_a_sphere_is_closed():

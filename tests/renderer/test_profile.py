@@ -21,7 +21,6 @@ ROTATION = np.stack(
     [rotation_from_euler(np.pi + 0.1, 0.1, 0.05), rotation_from_euler(np.pi / 2, 0.2, -0.1)]
 )
 LEVEL_BACK = np.diag([-1.0, -1.0, 1.0])  # looks along -x, upright
-SILENCE = 1e-9  # what a spectrum of log_noise below -20 comes to
 
 
 def rows(count=120, poses=1):
@@ -63,7 +62,7 @@ def one_place(acquisition, formula):
 
 def smooth(places, directions):
     """Real reflectivity that tells places, directions and frequencies apart."""
-    tilt = 1 + directions @ directions.new_tensor([0.3, -0.5, 0.2])
+    tilt = 1 + directions @ directions.new_tensor([0.2, 0.6, 0.1])
     shape = 1 + places @ places.new_tensor([9.0, -7.0, 5.0])
     return (tilt * shape)[..., None] * places.new_tensor([1.0, 0.7, 0.4])
 
@@ -206,7 +205,7 @@ def test_the_mirrored_scene_exchanges_the_ears(acquisition, formula):
         renderer.prepare(field, None, 0)
         heard.append(renderer(field, *tensors([0.28, 0, 0.01], LEVEL_BACK), rows()))
     torch.testing.assert_close(heard[0], heard[1].flip(1), rtol=1e-9, atol=1e-9)
-    assert (heard[0] - heard[1]).abs().max() > 0.1 * heard[0].max()
+    assert (heard[0] - heard[1]).abs().max() > 0.05 * heard[0].max()
 
 
 def test_turning_scene_and_head_together_changes_nothing(acquisition, formula):
@@ -272,7 +271,8 @@ def test_slices_and_frequencies_are_those_asked_for(cloud):
 def test_a_sample_of_the_places_is_right_on_average(cloud):
     field, renderer = cloud
     # What was loud once weighs more, whether or not it still is.
-    renderer.energy = 10 ** (4 * torch.rand(125, dtype=torch.float64, generator=_generator(0)) - 2)
+    generator = torch.Generator().manual_seed(0)
+    renderer.energy = 10 ** (4 * torch.rand(125, dtype=torch.float64, generator=generator) - 2)
     poses = tensors(POSITION[0], ROTATION[0])
     renderer.points = 30
     whole = renderer.eval()(field, *poses, rows()).square()
@@ -287,10 +287,6 @@ def test_a_sample_of_the_places_is_right_on_average(cloud):
     assert deviation[loud].div(whole[loud]).median() < 0.05  # so that the test can tell
     assert not torch.equal(draws[0], draws[1])
     assert int(renderer.points_evaluated) == 125 + 600 * 30
-
-
-def _generator(seed):
-    return torch.Generator().manual_seed(seed)
 
 
 def test_the_first_lattice_is_as_fine_as_its_bound_allows(acquisition, formula):
@@ -319,11 +315,9 @@ def test_only_possible_places_are_laid(acquisition, formula):
 
 
 def ball(places, directions):
-    """Loud within 6 mm of the origin, hardly anything elsewhere."""
-    inside = places.norm(dim=-1) < 0.006
-    return torch.where(inside, 1.0, 1e-6)[..., None].expand(*directions.shape[:-1], 3) + 0 * (
-        directions[..., :1]
-    )
+    """Loud within 6.2 mm of the origin, hardly anything elsewhere."""
+    inside = places.norm(dim=-1) < 0.0062
+    return torch.where(inside, 1.0, 1e-6)[..., None].expand(*directions.shape[:-1], 3)
 
 
 def test_the_lattice_is_refined_where_there_is_energy(acquisition, formula):
@@ -342,7 +336,7 @@ def test_the_lattice_is_refined_where_there_is_energy(acquisition, formula):
     # Every vertex of the fine lattice that is loud is there and alive, and no other.
     found = renderer.lattice[renderer.alive]
     fine = lattice_over(region, 0.002)
-    expected = fine[fine.norm(dim=1) < 0.006]
+    expected = fine[fine.norm(dim=1) < 0.0062]
     assert len(found) == len(expected)
     assert torch.cdist(found, expected).amin(1).max() < 1e-6
     # The field is silent from now on where nothing is left.
@@ -389,7 +383,7 @@ def test_the_lattice_goes_with_the_weights(acquisition, formula, cloud):
     assert not other.prepare(field, None, 7)
     poses = tensors(POSITION[0], ROTATION[0])
     assert torch.equal(other(field, *poses, rows()), renderer(field, *poses, rows()))
-    assert int(other.points_evaluated) == 2 * 80 - 80 + 80 - 80 or other.points_evaluated > 0
+    assert int(other.points_evaluated) == 80
 
 
 @pytest.mark.parametrize("kind", ["grid", "fourier"])
@@ -401,7 +395,6 @@ def test_gradients(acquisition, gradients_are_right, kind):
             field.grids[0].normal_()
     else:
         field = FourierField(REGION, acquisition.frequency, octaves=2, width=8)
-        # It knows no spacing; every place of a coarse lattice will do.
     renderer = ProfileRenderer(REGION, acquisition, start=30).double()
     renderer.prepare(field.double(), None, 0)
     with torch.no_grad():
