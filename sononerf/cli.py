@@ -324,7 +324,7 @@ def _signals_unwind() -> Iterator[None]:
 def _run() -> int:
     try:
         with _signals_unwind():
-            return app(standalone_mode=False) or 0
+            return app(prog_name="sononerf", standalone_mode=False) or 0
     except SonoNerfError as error:
         fault = error
     except typer.TyperException as error:

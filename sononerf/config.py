@@ -155,7 +155,7 @@ class RendererSettings(_Section):
 class FitSettings(_Section):
     """The fit: how long, on what, how fast."""
 
-    epochs: Count = 10
+    epochs: Count = 20
     steps_per_epoch: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
     max_steps: Count | None = None
     batch_poses: Count = 6
@@ -165,7 +165,7 @@ class FitSettings(_Section):
     schedule: Literal["cool", "staircase"] = "cool"
     final_rate_factor: Annotated[float, Field(gt=0, le=1)] = 0.1
     staircase_factor: Annotated[float, Field(gt=0, le=1)] = 0.97
-    staircase_epochs: Count = 10
+    staircase_epochs: Count = 20
     loss: Literal["l1", "l2", "l1_4l2"] = "l1"
     silent_weight: Annotated[float, Field(ge=0)] = 1.0
     gradient_clip: Positive | None = None

@@ -115,9 +115,16 @@ class EchoModule(lightning.LightningModule):
         if self.renderer.prepare(self.field, self.possible, step):
             with torch.no_grad():
                 self.renderer.calibrate(self(batch), batch.spectrum)
+                self._agree()
         loss = self._loss(self(batch), batch.spectrum)
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch.pose))
         return loss
+
+    def _agree(self) -> None:
+        """Give all devices one gain: each was calibrated on its own share of the batch."""
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            for parameter in self.renderer.parameters():
+                parameter.copy_(self.trainer.strategy.reduce(parameter.clone(), reduce_op="mean"))
 
     def _loss(self, predicted: Tensor, measured: Tensor) -> Tensor:
         target = decibels(measured, self.fit_reference)

@@ -7,6 +7,8 @@ elevation is positive up. Ear 0 is the left one.
 
 from __future__ import annotations
 
+import dataclasses
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,7 +16,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import j1
 
-from sononerf.config import EarSettings
+from sononerf.acoustics.spectrogram import frequency_axis
+from sononerf.config import EarSettings, SpectrogramSettings
 
 SPEED = 343.0  # m/s; the beam's width follows it so weakly that temperature is left out
 GRID_DEG = 2.0
@@ -121,6 +124,50 @@ def synthetic_ears(settings: EarSettings, frequency: ArrayLike) -> Ears:
         np.stack(ears).astype(np.float32),
         np.asarray(settings.emitter, dtype=np.float64),
         np.stack([left * (1.0, side, 1.0) for side in sides]),
+    )
+
+
+def analysed_ears(settings: EarSettings, analysis: SpectrogramSettings) -> Ears:
+    """Tables of the same head as an analysis hears it: smeared over frequency by its window.
+
+    A window of 64 µs cannot tell frequencies apart that lie closer than about 28 kHz. It fills a
+    narrow notch, and the spectrum of an echo in its middle is that of beam and ear convolved with
+    the window's transform. Beam and ear are smeared one by one: the beam varies slowly.
+
+    Parameters
+    ----------
+    settings : EarSettings
+        Places, axes, widths.
+    analysis : SpectrogramSettings
+        Window, transform and frequencies.
+
+    Returns
+    -------
+    ears : Ears
+        At the analysis' frequencies.
+    """
+    wanted = frequency_axis(analysis)
+    step = analysis.sampling_rate / analysis.fft
+    window = np.hamming(analysis.window)
+    # The transform about the window's own middle is real; two main lobes on each side suffice.
+    reach = math.ceil(4.0 * analysis.fft / analysis.window)
+    time = np.arange(analysis.window) - (analysis.window - 1) / 2.0
+    offsets = np.arange(-reach, reach + 1)
+    smear = np.cos(2.0 * np.pi / analysis.fft * np.outer(offsets, time)) @ window
+    first = round(float(wanted[0]) / step) - reach
+    count = len(wanted) + 2 * reach
+    # Below the first bin and above half the sampling rate there is nothing to hear.
+    bins = np.clip(np.arange(first, first + count), 1, analysis.fft // 2)
+    fine = synthetic_ears(settings, bins.clip(1) * step + np.arange(count) * 1e-9)
+    weight = smear / smear.sum()
+
+    def smeared(table: NDArray[np.float32]) -> NDArray[np.float32]:
+        padded = np.moveaxis(table, -3, 0).astype(np.float64)
+        total = sum(weight[k] * padded[k : k + len(wanted)] for k in range(2 * reach + 1))
+        return np.abs(np.moveaxis(np.asarray(total), 0, -3)).astype(np.float32)
+
+    return dataclasses.replace(
+        fine, frequency=wanted, beam=smeared(fine.beam), ears=smeared(fine.ears)
     )
 
 

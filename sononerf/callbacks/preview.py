@@ -16,7 +16,8 @@ from sononerf.module import EchoModule
 from sononerf.reconstruction.mesh import mesh_bytes
 from sononerf.reconstruction.projection import maximum_intensity_projections
 from sononerf.reconstruction.read_out import reconstruct
-from sononerf.render.projection import mip_image, mip_pngs
+from sononerf.render.figure import png_from_pixels
+from sononerf.render.projection import mip_image
 
 
 class PreviewCallback(EpochCallback):
@@ -64,11 +65,16 @@ class PreviewCallback(EpochCallback):
         finally:
             module.train(was_training)
         storage.commit_bytes(target / "mesh.ply", mesh_bytes(seen.mesh, "ply"))
-        for axis, picture in mip_pngs(seen.volume).items():
-            storage.commit_bytes(target / f"mip_{axis}.png", picture)
+        # Bare pixels: axes and labels would cost more than the rest of the epoch's look.
+        pictures = {
+            axis: mip_image(projection)
+            for axis, projection in maximum_intensity_projections(seen.volume).items()
+        }
+        for axis, pixels in pictures.items():
+            storage.commit_bytes(target / f"mip_{axis}.png", png_from_pixels(pixels))
         storage.commit_json(target / "metrics.json", numbers)
         if isinstance(trainer.logger, TensorBoardLogger):
-            for axis, projection in maximum_intensity_projections(seen.volume).items():
+            for axis, pixels in pictures.items():
                 trainer.logger.experiment.add_image(
-                    f"mip/{axis}", mip_image(projection), module.global_step, dataformats="HWC"
+                    f"mip/{axis}", pixels, module.global_step, dataformats="HWC"
                 )

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from sononerf.data.store import EnsembleStore
+from sononerf.errors import SettingsError
 
 
 class RangeSlice(NamedTuple):
@@ -88,6 +89,11 @@ class SliceStream(Dataset[RangeSlices]):
         How much of the ensemble may be kept in memory.
     share : (int, int)
         Which part of each batch this device gets, and of how many parts.
+
+    Raises
+    ------
+    SettingsError
+        If a batch is smaller than the number of devices.
     """
 
     def __init__(
@@ -112,6 +118,11 @@ class SliceStream(Dataset[RangeSlices]):
         self.whole_poses = whole_poses
         self.items = len(self.poses) if whole_poses else len(self.poses) * self.ranges
         self.batch = min(batch, self.items)
+        if self.batch < share[1]:
+            raise SettingsError(
+                f"a batch of {self.batch} cannot be shared by {share[1]} devices; raise "
+                "fit.batch_poses or fit.batch_slices, or use fewer devices"
+            )
         self.batch_frequencies = min(batch_frequencies or self.frequencies, self.frequencies)
         self.seed = seed
         self.share = share

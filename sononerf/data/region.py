@@ -176,9 +176,11 @@ class EchoEvidence:
         NumericalError
             If the poses leave no place possible.
         """
-        # A flight along a line or on one side still looks as far ahead as it hears.
-        ahead = self.sources + self.rotations[:, :, 0] * self.last[:, None]
-        ends = np.concatenate((self.sources, ahead))
+        # A flight along a line or on one side still hears so far ahead, and to the sides.
+        looks = np.array([[3, 0, 0], [3, 2, 0], [3, -2, 0], [3, 0, 2], [3, 0, -2]])  # 34 degrees
+        looks = looks / np.linalg.norm(looks, axis=1, keepdims=True)
+        ahead = [self.sources + self.rotations @ look * self.last[:, None] for look in looks]
+        ends = np.concatenate((self.sources, *ahead))
         lower, upper = ends.min(axis=0), ends.max(axis=0)
         for _ in range(LOOKS):  # coarse to fine
             spacing = float((upper - lower).max()) / COARSE

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sononerf import plugins
 from sononerf.acoustics.air import air_absorption, speed_of_sound
-from sononerf.acoustics.ears import synthetic_ears
+from sononerf.acoustics.ears import analysed_ears, synthetic_ears
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import Settings
 from sononerf.data.region import EchoEvidence
@@ -34,7 +34,7 @@ def acquisition(settings: Settings) -> Acquisition:
     temperature = air.temperature_c
     speed = DEFAULT_SPEED if temperature is None else speed_of_sound(temperature)
     frequency = frequency_axis(analysis)
-    ears = synthetic_ears(settings.ears, frequency)
+    ears = analysed_ears(settings.ears, analysis)
     absorption = air_absorption(
         frequency,
         temperature_c=DEFAULT_TEMPERATURE if temperature is None else temperature,

@@ -160,7 +160,7 @@ def _fit(
     progress: Progress,
 ) -> None:
     quiet_lightning()
-    started = time.monotonic()
+    keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
     region, possible = echo_region(settings, store)
     corners = (1000 * region).round().int().tolist()
     progress.say(f"region {corners[0]} to {corners[1]} mm")
@@ -187,7 +187,6 @@ def _fit(
         total_steps=total,
         steps_per_epoch=per_epoch,
     )
-    keeper = CheckpointCallback(run.path, options.checkpoint_seconds)
     resumed = _resume(run, data)
     if not resumed:
         run.clear_previews()

@@ -56,8 +56,7 @@ def load_fitted(path: Path) -> Fitted:
     """
     if not (path / DESCRIPTION_NAME).is_file():
         raise InputError(
-            f"{path}: no fitted run (no {DESCRIPTION_NAME}); make or finish one with "
-            "`sononerf fit`"
+            f"{path}: no fitted run (no {DESCRIPTION_NAME}); make or finish one with `sononerf fit`"
         )
     state, description = load_weights(path)
     try:

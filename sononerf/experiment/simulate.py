@@ -103,6 +103,7 @@ def simulate(
     simulator = Simulator.from_settings(scene, settings)
     head = np.concatenate((simulator.ears.emitter[None], simulator.ears.positions))
     check_poses(scene, poses, offsets=head)
+    _refuse_deaf(settings, scene, poses)
     storage.probe_writable(path)
     with storage.lock(path):
         store = EnsembleStore.create(
@@ -135,6 +136,26 @@ def _attributes(settings: Settings, wanted: str, simulator: Simulator) -> dict[s
         },
         "sononerf": __version__,
     }
+
+
+def _deaf(settings: Settings) -> NumericalError:
+    limits = settings.spectrogram
+    return NumericalError(
+        f"no pose received an echo between {limits.range_min} and {limits.range_max} m; check "
+        "poses.radius, the scene's size and the range limits"
+    )
+
+
+def _refuse_deaf(settings: Settings, scene: Scene, poses: Poses) -> None:
+    """Refuse range limits that no echo can reach; the tails of its filter would pass for one."""
+    lower, upper = scene.mesh.bounds
+    radius = float(np.linalg.norm(upper - lower)) / 2
+    distance = np.linalg.norm(poses.positions - (lower + upper) / 2, axis=1)
+    nearest = distance - radius
+    farthest = distance + settings.simulation.bounces * radius
+    limits = settings.spectrogram
+    if not ((nearest <= limits.range_max) & (farthest >= limits.range_min)).any():
+        raise _deaf(settings)
 
 
 def _fill(
@@ -179,11 +200,7 @@ def _fill(
         )
     loudest = max(float(store.read_pose(int(i)).max()) for i in store.indices("train"))
     if loudest <= 0.0:
-        raise NumericalError(
-            f"no pose received an echo between {settings.spectrogram.range_min} and "
-            f"{settings.spectrogram.range_max} m; check poses.radius, the scene's size and the "
-            "range limits"
-        )
+        raise _deaf(settings)
     reference = loudest * REFERENCE_RATIO
     noise: dict[str, float | None] = {"noise_floor_mae_db": None, "noise_floor_mae_db_active": None}
     if len(test):

@@ -71,7 +71,8 @@ class Field(nn.Module):
         index = index.clamp_min(0).minimum(size - 1)
         near[index[:, 0], index[:, 1], index[:, 2]] = 1.0
         reach = math.ceil(spacing / cell / 2 - 1e-6) if spacing > 1.001 * cell else 0
-        for axis in range(3) if reach else ():  # one after the other: a cube would take reach² longer
+        # One axis after the other: a cube at once would take reach² times as long.
+        for axis in range(3):
             size_of = [2 * reach + 1 if axis == a else 1 for a in range(3)]
             edge = [reach if axis == a else 0 for a in range(3)]
             near = max_pool3d(near[None, None], size_of, 1, edge)[0, 0]

@@ -161,4 +161,6 @@ def _row(
     level = axes[0].imshow(measured, cmap=LEVEL_MAP, vmin=0, vmax=top, **options)
     axes[1].imshow(predicted, cmap=LEVEL_MAP, vmin=0, vmax=top, **options)
     deviation = axes[2].imshow(difference, cmap=DIFFERENCE_MAP, vmin=-worst, vmax=worst, **options)
+    for panel in axes:
+        panel.locator_params(axis="x", nbins=5)  # more labels would touch one another
     return level, deviation

@@ -14,6 +14,11 @@ from torch import Tensor, nn
 from sononerf.field.field import Field
 from sononerf.renderer.renderer import Acquisition, Possible, Renderer, look_up
 
+KERNEL_WINDOWS = 2.0
+"""The kernel reaches this many half windows: beam, ears and call lengthen an echo."""
+KERNEL_FLOOR = -9.0
+"""What the squared kernel starts with beyond the window, as a natural logarithm."""
+
 
 class _Deposit(torch.autograd.Function):
     """Add values to bins; the gradient is a plain gather."""
@@ -68,7 +73,6 @@ class ProfileRenderer(Renderer):
     lattice: Tensor
     alive: Tensor
     energy: Tensor
-    kernel: Tensor
     spacing: Tensor
     absorption: Tensor
 
@@ -80,9 +84,9 @@ class ProfileRenderer(Renderer):
         oversampling: Annotated[int, Option(ge=1, le=16)] = 2,
         points: Annotated[int, Option(ge=1)] = 25_000,
         uniform: Annotated[float, Option(gt=0, le=1)] = 0.4,
-        start: Annotated[int, Option(ge=1)] = 12_000,
+        start: Annotated[int, Option(ge=1)] = 40_000,
         prune_every: Annotated[int, Option(ge=0)] = 100,
-        prune_below: Annotated[float, Option(ge=0, lt=1)] = 1e-5,
+        prune_below: Annotated[float, Option(ge=0, lt=1)] = 3e-5,
         surroundings: Annotated[float, Option(gt=0)] = 0.03,
     ) -> None:
         super().__init__(region, acquisition)
@@ -94,13 +98,15 @@ class ProfileRenderer(Renderer):
         self.bin = step / oversampling
         per_sample = acquisition.speed_of_sound / acquisition.sampling_rate / 2
         half = (len(acquisition.window) - 1) / 2
-        reach = math.floor(half * per_sample / self.bin)
-        offsets = torch.arange(-reach, reach + 1) * self.bin / per_sample + half
+        reach = math.ceil(KERNEL_WINDOWS * half * per_sample / self.bin)
+        offsets = half - torch.arange(reach + 1) * self.bin / per_sample  # from the middle down
         left = offsets.floor().long().clamp(0, len(acquisition.window) - 2)
         part = offsets - left
         window = acquisition.window
         window = window[left] * (1 - part) + window[left + 1] * part
-        self.register_buffer("kernel", window.square().float()[None, None])
+        skirt = (2 * window.log()).clamp_min(KERNEL_FLOOR)
+        skirt = torch.where(offsets >= 0, skirt, KERNEL_FLOOR).float()
+        self.log_kernel = nn.Parameter(skirt[1:].expand(len(acquisition.frequency), -1).clone())
         self.first = float(acquisition.range[0]) - reach * self.bin
         self.bins = (len(acquisition.range) - 1) * oversampling + 2 * reach + 1
         self.register_buffer("absorption", acquisition.absorption.clone())
@@ -203,8 +209,10 @@ class ProfileRenderer(Renderer):
         if bins is None:
             bins = torch.arange(len(self.frequency), device=self.frequency.device)
         power = self._profile(field, self.lattice[index], weight, position, rotation, bins)
+        half = self.log_kernel[bins].exp()
+        kernel = torch.cat((half.flip(1), torch.ones_like(half[:, :1]), half), dim=1)
         heard = F.conv1d(
-            power.reshape(-1, 1, self.bins), self.kernel, stride=self.oversampling
+            power.flatten(0, 1), kernel[:, None], stride=self.oversampling, groups=len(bins)
         ).reshape(*power.shape[:-1], -1)  # (P, E, B, R)
         gain = (2 * (self.log_gain + self.log_spectrum[bins])).exp()
         noise = (2 * self.log_noise[bins]).exp()

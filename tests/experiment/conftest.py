@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import pytest
 
-from sononerf.callbacks import preview, spectrogram_images
+from sononerf.callbacks import spectrogram_images
 from sononerf.config import validate_settings
 from sononerf.experiment.simulate import simulate
 
@@ -22,31 +22,37 @@ TINY = {
 }
 
 
-def tiny_settings(store=None, **sections):
+def _settings(store=None, **sections):
     data = {name: {**TINY.get(name, {}), **values} for name, values in sections.items()}
     where = {} if store is None else {"data": {"store": str(store)}}
-    return validate_settings({**TINY, **where, **data}, "tiny")
+    for name, values in where.items():
+        data[name] = {**values, **data.get(name, {})}
+    return validate_settings({**TINY, **data}, "tiny")
 
 
 @pytest.fixture(scope="session")
 def echoes(tmp_path_factory):
     """The store of the tiny experiment."""
     path = tmp_path_factory.mktemp("echoes") / "store"
-    simulate(tiny_settings(), output=path, workers=1)
+    simulate(_settings(), output=path, workers=1)
     return path
 
 
-@pytest.fixture
-def tiny(echoes):
+@pytest.fixture(scope="session")
+def tiny_settings(echoes):
     """Settings of the tiny experiment, section by section with changes."""
-    return lambda **sections: tiny_settings(echoes, **sections)
+    return lambda **sections: _settings(echoes, **sections)
 
 
 @pytest.fixture
-def without_pictures(monkeypatch):
-    """Pictures take nine tenths of a tiny fit and have tests of their own."""
-    monkeypatch.setattr(preview, "mip_pngs", lambda volume: {})
-    monkeypatch.setattr(preview, "maximum_intensity_projections", lambda volume: {})
-    monkeypatch.setattr(
-        spectrogram_images.SpectrogramImages, "on_epoch", lambda self, trainer, module, epoch: None
-    )
+def tiny(tiny_settings):
+    """The same under a short name."""
+    return tiny_settings
+
+
+@pytest.fixture(scope="module")
+def without_pictures():
+    """Spectrograms take most of a tiny fit and have tests of their own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(spectrogram_images.SpectrogramImages, "on_epoch", lambda *given: None)
+        yield

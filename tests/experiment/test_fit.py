@@ -3,69 +3,390 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import signal
+import time
+from pathlib import Path
 
 import pytest
 import safetensors.torch
 import torch
 
+from sononerf import storage
 from sononerf.callbacks.checkpoint import SIGNALS, CheckpointCallback
-from sononerf.errors import StoppedError
-from sononerf.experiment.fit import fit
+from sononerf.callbacks.preview import PreviewCallback
+from sononerf.callbacks.progress import ProgressCallback
+from sononerf.checkpoint_io import DurableCheckpointIO
+from sononerf.errors import (
+    IncompatibleError,
+    InputError,
+    LockedError,
+    NumericalError,
+    ResourceError,
+    StoppedError,
+)
+from sononerf.experiment import fit as fit_module
+from sononerf.experiment.fit import fit, peak_memory_bytes, require_accelerator
+from sononerf.module import EchoModule
 
-STEPS = 12  # of three epochs
+STEPS, PER_EPOCH = 12, 4
+
+pytestmark = pytest.mark.usefixtures("without_pictures")
 
 
 @pytest.fixture
 def interrupt(monkeypatch):
     """Send a signal to ourselves at the end of a step."""
-    real = CheckpointCallback.on_train_batch_end
+    real = ProgressCallback.on_train_batch_end
     wanted = {}
 
     def on_train_batch_end(self, trainer, pl_module, *rest):
-        number = wanted.pop(pl_module.global_step, None)
-        if number is not None:
-            os.kill(os.getpid(), number)
         real(self, trainer, pl_module, *rest)
+        if (number := wanted.pop(pl_module.global_step, None)) is not None:
+            os.kill(os.getpid(), number)
 
-    monkeypatch.setattr(CheckpointCallback, "on_train_batch_end", on_train_batch_end)
+    monkeypatch.setattr(ProgressCallback, "on_train_batch_end", on_train_batch_end)
+    return wanted.__setitem__
 
-    def at(step, number=signal.SIGTERM):
-        wanted.clear()
-        wanted[step] = number
 
-    return at
+def run(settings, path, **options):
+    return fit(settings, path, accelerator="cpu", workers=1, **options)
 
 
 def what_a_run_holds(path):
-    """Weights as bits, steps, and what each epoch measured."""
-    epochs = sorted((path / "epochs").iterdir())
+    """Weights as bits, steps, and what each epoch left."""
+    weights = safetensors.torch.load_file(path / "model.safetensors")
+    epochs = sorted((path / "epochs").iterdir())  # coarse meshes, metrics
     return {
-        "weights": {
-            name: (str(tensor.dtype), tuple(tensor.shape), tensor.numpy().tobytes())
-            for name, tensor in safetensors.torch.load_file(path / "model.safetensors").items()
-        },
-        "epochs": {p.name: json.loads((p / "metrics.json").read_text()) for p in epochs},
-        "meshes": {p.name: (p / "mesh.ply").is_file() for p in epochs},
+        **{name: (tensor.dtype, tensor.numpy().tobytes()) for name, tensor in weights.items()},
+        "previews": [sorted((f.name, f.read_bytes()) for f in p.iterdir()) for p in epochs],
+        "epochs": [p.name for p in epochs],
         "steps": json.loads((path / "metrics.json").read_text())["cost"]["steps"],
     }
 
 
-def fit_with_stops(settings, path, interrupt, stops, number=signal.SIGTERM):
-    for step in stops:
-        interrupt(step, number)
-        with pytest.raises(StoppedError, match=f"stopped at step {step} of {STEPS}") as caught:
-            fit(settings, path, accelerator="cpu")
-        assert caught.value.exit_code == 128 + number
-        assert not (path / "model.json").exists()
-    interrupt(0)
-    fit(settings, path, accelerator="cpu")
-    return what_a_run_holds(path)
+def differences(found, wanted):
+    assert found.keys() == wanted.keys()
+    return [name for name in wanted if found[name] != wanted[name]]
 
 
 @pytest.fixture(scope="module")
-def through(echoes, tmp_path_factory):
-    """The uninterrupted fit."""
-    from tests_experiment_conftest import tiny_settings  # placeholder
+def uninterrupted(tiny_settings, without_pictures, tmp_path_factory):
+    """What the fit leaves where nothing happens to it."""
+    path = tmp_path_factory.mktemp("uninterrupted") / "run"
+    run(tiny_settings(), path)
+    held = what_a_run_holds(path)
+    assert held["steps"] == STEPS
+    assert held["epochs"] == ["0001", "0002", "0003"]
+    return held
+
+
+def run_with_stops(settings, path, interrupt, stops, number=signal.SIGTERM):
+    for step in stops:
+        interrupt(step, number)
+        with pytest.raises(StoppedError, match=f"stopped at step {step} of {STEPS}") as caught:
+            run(settings, path)
+        assert caught.value.exit_code == 128 + number
+        assert not (path / "model.json").exists()
+    run(settings, path)
+    return what_a_run_holds(path)
+
+
+@pytest.mark.parametrize(
+    "stops",
+    [
+        [1],
+        [PER_EPOCH - 1],
+        [PER_EPOCH],
+        [PER_EPOCH + 1],
+        [STEPS - 1],
+        [PER_EPOCH, 2 * PER_EPOCH],  # through one boundary into another
+        [3, PER_EPOCH],
+        [PER_EPOCH, PER_EPOCH + 1],
+        [1, STEPS - 1],
+        list(range(1, 11)),
+    ],
+    ids=str,
+)
+def test_interrupted_fits_end_bit_for_bit_alike(tiny, tmp_path, interrupt, uninterrupted, stops):
+    held = run_with_stops(tiny(), tmp_path / "run", interrupt, stops)
+    assert differences(held, uninterrupted) == []
+
+
+@pytest.mark.parametrize("number", SIGNALS)
+def test_every_signal_stops_in_order_and_gives_back_its_handler(
+    tiny, tmp_path, interrupt, uninterrupted, number
+):
+    before = [signal.getsignal(each) for each in SIGNALS]
+    held = run_with_stops(tiny(), tmp_path / "run", interrupt, [5], number)
+    assert differences(held, uninterrupted) == []
+    assert [signal.getsignal(each) for each in SIGNALS] == before
+
+
+def test_a_signal_at_the_last_step_stops_what_would_follow_the_fit(
+    tiny, tmp_path, interrupt, uninterrupted
+):
+    interrupt(STEPS, signal.SIGTERM)
+    with pytest.raises(StoppedError, match="after the last step"):
+        run(tiny(), tmp_path / "run")
+    assert differences(what_a_run_holds(tmp_path / "run"), uninterrupted) == []
+
+
+class PowerCutError(BaseException):
+    """The process is gone."""
+
+
+@pytest.mark.parametrize(
+    ("owner", "hook", "step"),
+    [
+        (PreviewCallback, "on_validation_end", PER_EPOCH),  # validated, not yet saved
+        (CheckpointCallback, "on_epoch", PER_EPOCH),  # previewed, not yet saved
+        (CheckpointCallback, "on_epoch", 2 * PER_EPOCH),
+        (CheckpointCallback, "on_train_batch_end", PER_EPOCH),  # not yet validated
+        (CheckpointCallback, "on_train_batch_end", 6),
+        (ProgressCallback, "on_train_batch_end", 1),
+        (CheckpointCallback, "on_epoch", STEPS),
+    ],
+)
+def test_a_fit_that_was_cut_off_ends_bit_for_bit_alike(
+    tiny, tmp_path, monkeypatch, uninterrupted, owner, hook, step
+):
+    real = getattr(owner, hook)
+
+    def cut(self, trainer, pl_module, *rest):
+        if pl_module.global_step == step:
+            raise PowerCutError
+        return real(self, trainer, pl_module, *rest)
+
+    settings = tiny(fit={"checkpoint_seconds": 1e-9})  # a checkpoint at every step
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, hook, cut)
+        with pytest.raises(PowerCutError):
+            run(settings, tmp_path / "run")
+    run(settings, tmp_path / "run")
+    assert differences(what_a_run_holds(tmp_path / "run"), uninterrupted) == []
+
+
+def test_a_torn_checkpoint_costs_steps_and_no_bits(tiny, tmp_path, interrupt, uninterrupted):
+    interrupt(6, signal.SIGTERM)
+    with pytest.raises(StoppedError):
+        run(tiny(), tmp_path / "run")
+    (tmp_path / "run" / "checkpoints" / "last.ckpt").write_bytes(b"PK")
+    run(tiny(), tmp_path / "run")
+    assert differences(what_a_run_holds(tmp_path / "run"), uninterrupted) == []
+
+
+# Canaries: where something that resuming rests on is taken away, the tests above must see it.
+
+
+def forget_the_seed_of_a_step(monkeypatch):
+    real = EchoModule.training_step
+
+    def training_step(self, batch, batch_index):
+        with monkeypatch.context() as patch:
+            patch.setattr(torch, "manual_seed", lambda seed: None)
+            return real(self, batch, batch_index)
+
+    monkeypatch.setattr(EchoModule, "training_step", training_step)
+
+
+def lose(key):
+    def change(monkeypatch):
+        real = DurableCheckpointIO.load_checkpoint
+
+        def load_checkpoint(self, *arguments, **options):
+            content = real(self, *arguments, **options)
+            if key == "moments":
+                content["optimizer_states"][0]["state"] = {}
+            elif key == "schedule":
+                content["lr_schedulers"][0]["last_epoch"] = 0
+                content["lr_schedulers"][0]["_step_count"] = 1
+            return content
+
+        monkeypatch.setattr(DurableCheckpointIO, "load_checkpoint", load_checkpoint)
+
+    return change
+
+
+def begin_the_data_anew(monkeypatch):
+    real = fit_module._resume
+
+    def resume(folder, data):
+        found = real(folder, data)
+        data.sampler.start = 0
+        return found
+
+    monkeypatch.setattr(fit_module, "_resume", resume)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [forget_the_seed_of_a_step, lose("moments"), lose("schedule"), begin_the_data_anew],
+    ids=["seeds", "moments", "schedule", "data"],
+)
+def test_canary_what_resuming_rests_on_is_missed(tiny, tmp_path, interrupt, monkeypatch, change):
+    change(monkeypatch)
+    run(tiny(), tmp_path / "through")
+    held = run_with_stops(tiny(), tmp_path / "stopped", interrupt, [6])
+    changed = differences(held, what_a_run_holds(tmp_path / "through"))
+    assert any(name.startswith("field.") for name in changed)
+
+
+def test_without_validation_poses_epochs_are_still_ours(tiny, tmp_path, interrupt):
+    settings = tiny(poses={"validation": 0, "heldout": 0}, data={"store": str(tmp_path / "store")})
+    run(settings, tmp_path / "through")
+    held = run_with_stops(settings, tmp_path / "stopped", interrupt, [PER_EPOCH, 6])
+    assert differences(held, what_a_run_holds(tmp_path / "through")) == []
+    assert held["epochs"] == ["0001", "0002", "0003"]
+
+
+@pytest.mark.slow  # processes that import torch
+def test_the_number_of_loading_processes_moves_no_bit(
+    tiny, tmp_path, interrupt, uninterrupted, echoes
+):
+    settings = tiny(data={"store": str(echoes), "workers": 2})
+    held = run_with_stops(settings, tmp_path / "run", interrupt, [6])
+    assert differences(held, uninterrupted) == []
+
+
+def files(folder):
+    return {
+        str(p.relative_to(folder)): (p.read_bytes(), p.stat().st_mtime_ns)
+        for p in folder.rglob("*")
+        if p.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_settings, without_pictures, tmp_path_factory):
+    path = tmp_path_factory.mktemp("finished") / "run"
+    run(tiny_settings(), path)
+    return path
+
+
+def test_a_finished_run_is_left_as_it_is(tiny, finished):
+    before = files(finished)
+    found = run(tiny(data={"memory_bytes": 10**9}, fit={"checkpoint_seconds": 5}), finished)
+    assert found.is_fitted
+    assert files(finished) == before
+
+
+def test_other_settings_are_refused_by_name(tiny, finished):
+    before = files(finished)
+    with pytest.raises(IncompatibleError, match=r"other settings \(fit\.epochs, poses\.radius\)"):
+        run(tiny(fit={"epochs": 4}, poses={"radius": 0.5}), finished)
+    assert files(finished) == before
+
+
+def test_overwrite_moves_aside_and_loses_nothing(tiny, tmp_path):
+    path = tmp_path / "run"
+    run(tiny(), path)
+    first = files(path)
+    for number, seed in ((1, 1), (2, 2)):
+        run(tiny(fit={"seed": seed, "max_steps": 2}), path, overwrite=True)
+        assert (tmp_path / f"run.old-{number}" / "model.json").is_file()
+    moved = files(tmp_path / "run.old-1")
+    assert {name: moved[name] for name in first} == first
+
+
+def test_overwrite_leaves_a_run_at_work_and_other_peoples_folders_alone(tiny, tmp_path):
+    path = tmp_path / "run"
+    run(tiny(fit={"max_steps": 1}), path)
+    with storage.lock(path), pytest.raises(LockedError, match="in use"):
+        run(tiny(fit={"max_steps": 2}), path, overwrite=True)
+    assert (path / "model.json").is_file()
+    thesis = tmp_path / "thesis"
+    thesis.mkdir()
+    (thesis / "chapter.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"holds 'chapter\.txt' and is no run"):
+        run(tiny(), thesis, overwrite=True)
+    assert files(thesis).keys() == {"chapter.txt"}
+
+
+def test_what_fails_before_the_fit_leaves_no_run(tiny, tmp_path):
+    deaf = tiny(
+        spectrogram={"range_min": 1.0, "range_max": 1.1}, data={"store": str(tmp_path / "store")}
+    )
+    with pytest.raises(NumericalError, match="no pose received an echo"):
+        run(deaf, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_gradient_that_is_no_number_leaves_a_sound_checkpoint(tiny, tmp_path, monkeypatch):
+    real = EchoModule._loss
+
+    def loss(self, predicted, measured):
+        found = real(self, predicted, measured)
+        return found * float("nan") if self.global_step == 6 else found
+
+    monkeypatch.setattr(EchoModule, "_loss", loss)
+    with pytest.raises(NumericalError, match="is not finite at step 6"):
+        run(tiny(fit={"checkpoint_seconds": 1e-9}), tmp_path / "run")
+    content = DurableCheckpointIO().load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    assert content["global_step"] == 6
+    assert all(bool(value.isfinite().all()) for value in content["state_dict"].values())
+    assert not (tmp_path / "run" / "model.json").exists()
+
+
+def test_what_a_fit_cost_is_counted_over_its_parts(tiny, tmp_path, interrupt, monkeypatch):
+    path = tmp_path / "run"
+
+    def cost():
+        return json.loads((path / "metrics.json").read_text())["cost"]
+
+    interrupt(5, signal.SIGTERM)
+    with pytest.raises(StoppedError):
+        run(tiny(), path)
+    first = cost()
+    real = fit_module.simulate
+
+    def slow(*arguments, **options):
+        time.sleep(0.3)
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(fit_module, "simulate", slow)
+    run(tiny(), path)
+    assert cost()["fit_s"] > first["fit_s"] > 0
+    assert cost()["simulate_s"] == first["simulate_s"] < 0.3
+    assert cost()["steps"] == STEPS
+    assert cost()["points_evaluated"] > 0
+    assert cost()["device"] == "cpu"
+    assert cost()["peak_memory_bytes"] > 50_000_000
+
+
+@pytest.mark.parametrize(
+    ("changes", "steps", "epochs"),
+    [
+        ({"steps_per_epoch": "auto"}, 12, 3),  # 8 poses, 2 at a time
+        ({"steps_per_epoch": "auto", "batch_poses": 3}, 9, 3),
+        ({"max_steps": 6}, 6, 1),
+        ({"max_steps": 2}, 2, 1),  # shorter than an epoch: it is the epoch then
+    ],
+)
+def test_the_smaller_bound_ends_the_fit(tiny, tmp_path, changes, steps, epochs):
+    run(tiny(fit=changes), tmp_path / "run")
+    held = what_a_run_holds(tmp_path / "run")
+    assert (held["steps"], len(held["epochs"])) == (steps, epochs)
+
+
+def test_provenance_names_no_people_machines_or_folders(finished):
+    text = (finished / "provenance.json").read_text()
+    assert json.loads(text)["packages"]["torch"] == importlib.metadata.version("torch")
+    assert json.loads(text)["echo_hash"]
+    for secret in (os.uname().nodename, str(finished.parent), f"{Path.home()}/"):
+        assert secret not in text
+
+
+def test_a_gpu_that_is_not_there(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    with pytest.raises(ResourceError, match="--accelerator cpu"):
+        fit(tiny(), tmp_path / "run", accelerator="gpu")
+    assert not (tmp_path / "run").exists()
+    require_accelerator("auto")
+
+
+def test_memory_is_counted_in_bytes():
+    assert 50_000_000 < peak_memory_bytes() < 1_000_000_000_000

@@ -74,7 +74,9 @@ def test_linear_functions_are_read_exactly():
     with torch.no_grad():
         for level, values in enumerate(field.grids):
             step = 0.01 * 2**level
-            axes = [REGION[0, a] + step * torch.arange(values.shape[4 - a]).double() for a in range(3)]
+            axes = [
+                REGION[0, a] + step * torch.arange(values.shape[4 - a]).double() for a in range(3)
+            ]
             vertices = torch.stack(torch.meshgrid(*axes, indexing="ij"), dim=-1)  # (X, Y, Z, 3)
             linear = vertices @ slopes[level].T + offsets[level]
             values.copy_(linear.permute(3, 2, 1, 0)[None])

@@ -63,7 +63,7 @@ def one_place(acquisition, formula):
 def smooth(places, directions):
     """Real reflectivity that tells places, directions and frequencies apart."""
     tilt = 1 + directions @ directions.new_tensor([0.2, 0.6, 0.1])
-    shape = 1 + places @ places.new_tensor([9.0, -7.0, 5.0])
+    shape = 1 + places @ places.new_tensor([9.0, -25.0, 5.0])
     return (tilt * shape)[..., None] * places.new_tensor([1.0, 0.7, 0.4])
 
 
@@ -104,7 +104,12 @@ def test_one_place_sounds_as_the_window(head, one_place, oversampling):
         # peak 0.92 (2 π / 63)² of power; for 4 samples that is 2 % of power. 0.2 % come from the
         # absorption, which is that of the mean path to both ears.
         tolerance = {1: 0.012, 2: 0.005, 4: 0.0035}[oversampling] * expected.max()
-        np.testing.assert_allclose(heard[ear][sure], expected[sure], rtol=0, atol=tolerance)
+        inside = sure & (np.abs(offset) < 31.5)
+        np.testing.assert_allclose(heard[ear][inside], expected[inside], rtol=0, atol=tolerance)
+        # Beyond the window a skirt 39 dB down may be learned on.
+        beyond = heard[ear][sure & ~inside]
+        assert (beyond < 0.012 * expected.max(axis=0)).all()
+        assert (heard[ear][np.abs(offset) > 70] < 1e-9).all()
         assert expected.max() > 5 * tolerance
         peaks.append((d1 + d2) / 2)
     # 10 mm off the axis, the ears hear it 0.9 mm of range apart, more than a slice.
@@ -113,39 +118,37 @@ def test_one_place_sounds_as_the_window(head, one_place, oversampling):
     np.testing.assert_allclose(found, np.array(peaks)[:, None].repeat(3, 1), atol=2e-5)
 
 
-def slow(head, renderer, reflectivity, places, position, rotation):
-    """Sum of powers, place by place, each laid between two bins; the window squared over bins."""
-    size = head.step / renderer.oversampling
-    reach = int(31.5 * head.per_sample / size)
-    kernel = np.interp(
-        np.arange(-reach, reach + 1) * size / head.per_sample + 31.5, np.arange(64), head.window
-    )
-    bins = np.zeros((2, 4000, 3))  # from range 0
-    first = head.range[0] % size  # where the bins lie
-    for place in places:
+def heard_from_bins(renderer, monkeypatch):
+    """Power in each slice from one unit of power in each fine bin, (K, R, F)."""
+    unit = torch.eye(renderer.bins, dtype=torch.float64)[:, None, None]
+    with monkeypatch.context() as patch:
+        patch.setattr(renderer, "_profile", lambda *_: unit.expand(-1, 1, 3, -1))
+        some = torch.zeros(renderer.bins, 3, dtype=torch.float64)
+        heard = renderer(None, some, some, rows(poses=renderer.bins))
+    return (heard[:, 0].square()).detach().numpy()
+
+
+def slow(head, renderer, reflectivity, position, rotation):
+    """Power laid into fine bins, place by place, (E, K, F)."""
+    laid = np.zeros((2, renderer.bins, 3))
+    for place in renderer.lattice.numpy():
         paths = place - position - (rotation @ np.vstack((head.emitter, head.ears)).T).T
         d = np.linalg.norm(paths, axis=1)
-        value = reflectivity(torch.from_numpy(place), torch.from_numpy(-paths[0] / d[0]))
+        value = reflectivity(torch.from_numpy(place), torch.from_numpy(-paths[0] / d[0])).numpy()
         beam, _ = head.towards(rotation.T @ paths[0])
         # The air is taken over the mean path to both ears.
         air = np.exp(-head.alpha * (d[0] + (d[1] + d[2]) / 2))
         for ear in (0, 1):
             gain = head.towards(rotation.T @ paths[1 + ear])[1][ear]
-            power = (np.abs(value.numpy()) * beam * gain * air / (d[0] * d[1 + ear])) ** 2
-            index, part = divmod(((d[0] + d[1 + ear]) / 2 - first) / size, 1)
-            bins[ear, int(index)] += (1 - part) * power
-            bins[ear, int(index) + 1] += part * power
-    start = round((head.range[0] - first) / size)
-    heard = np.zeros((2, len(head.range), 3))
-    for row in range(len(head.range)):
-        middle = start + row * renderer.oversampling
-        part = bins[:, middle - reach : middle + reach + 1]
-        heard[:, row] = (part * kernel[:, None] ** 2).sum(axis=1)
-    return heard
+            power = (np.abs(value) * beam * gain * air / (d[0] * d[1 + ear])) ** 2
+            index, part = divmod(((d[0] + d[1 + ear]) / 2 - renderer.first) / renderer.bin, 1)
+            laid[ear, int(index)] += (1 - part) * power
+            laid[ear, int(index) + 1] += part * power
+    return laid
 
 
 @pytest.mark.parametrize("kind", ["real", "complex"])
-def test_many_places_against_a_slow_loop(head, acquisition, formula, kind):
+def test_many_places_against_a_slow_loop(head, acquisition, formula, kind, monkeypatch):
     def turning(places, directions):
         return smooth(places, directions) * torch.exp(1j * 50 * places[..., :1])
 
@@ -153,14 +156,14 @@ def test_many_places_against_a_slow_loop(head, acquisition, formula, kind):
     field = formula(REGION, acquisition.frequency, function, spacing=0.01)
     renderer = quiet(ProfileRenderer(REGION, acquisition))
     renderer.prepare(field, None, 0)
+    window = heard_from_bins(renderer, monkeypatch)
     with torch.no_grad():
         renderer.log_noise.copy_(torch.tensor([-1.0, 0.0, 0.5]))
     found = renderer(field, *tensors(POSITION, ROTATION), rows(poses=2)).detach().numpy()
     assert not np.iscomplexobj(found)
     for pose in (0, 1):
-        power = slow(
-            head, renderer, function, renderer.lattice.numpy(), POSITION[pose], ROTATION[pose]
-        )
+        laid = slow(head, renderer, function, POSITION[pose], ROTATION[pose])
+        power = np.einsum("ekf,krf->erf", laid, window)
         expected = np.sqrt(power + np.exp([-2.0, 0.0, 1.0]))
         np.testing.assert_allclose(found[pose], expected, rtol=1e-6)
         assert expected.max() > 5 * expected.min()
@@ -249,7 +252,7 @@ def test_silence_in_only_noise_out(acquisition, formula):
 
 def test_what_is_out_of_range_is_not_heard(one_place):
     field, renderer = one_place(np.zeros(3))
-    for far in (0.1, 0.24, 0.34, 2.0):
+    for far in (0.1, 0.22, 0.36, 2.0):
         heard = renderer(field, *tensors([far, 0, 0], LEVEL_BACK), rows())
         assert heard.max() < 1e-8
 
@@ -332,6 +335,9 @@ def test_the_lattice_is_refined_where_there_is_energy(acquisition, formula):
     for step in (10, 20, 30):
         changed = renderer.prepare(field, None, step)
         spacings.append((changed, round(float(renderer.spacing), 4)))
+        # The field sounds as far as the new lattice speaks for, half a spacing around it.
+        edge = renderer.lattice[renderer.alive][:, 0].max() + 0.45 * float(renderer.spacing)
+        assert field.inside(torch.stack((edge, 0 * edge, 0 * edge)))
     assert spacings == [(True, 0.004), (True, 0.002), (False, 0.002)]
     # Every vertex of the fine lattice that is loud is there and alive, and no other.
     found = renderer.lattice[renderer.alive]

@@ -86,7 +86,8 @@ def test_any_field_works_with_any_renderer(acquisition, kind, heard_by, device):
     assert heard.shape == (3, 2, 120, 3)
     assert heard.dtype == torch.float32
     assert heard.device == rotation.device
-    assert bool(heard.max() > 1e3 * heard.min()) and bool(heard.min() >= 0)
+    assert bool(heard.max() > 50 * heard.min())
+    assert bool(heard.min() >= 0)
     heard.log1p().sum().backward()
     for module in (field, renderer):
         for name, parameter in module.named_parameters():

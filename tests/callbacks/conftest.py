@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: MIT
+"""A training of eight steps in two epochs, for callbacks to hang on."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import lightning
+import pytest
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from sononerf.checkpoint_io import DurableCheckpointIO
+from sononerf.config import validate_settings
+from sononerf.data.datamodule import EchoDataModule
+from sononerf.data.store import EnsembleStore
+from sononerf.experiment.build import echo_region, field_and_renderer, module_for
+from sononerf.experiment.fit import quiet_lightning
+from sononerf.experiment.simulate import simulate
+
+SETTINGS = {
+    "scene": {"name": "sphere", "options": {"radius": 0.02}},
+    "poses": {"count": 8, "validation": 2, "heldout": 0},
+    "simulation": {"rays": 500},
+    "spectrogram": {"range_min": 0.34, "range_max": 0.45},
+    "field": {"options": {"finest": 0.01, "levels": 2}},
+    "renderer": {"options": {"start": 2000}},
+    "fit": {"batch_poses": 2, "batch_frequencies": 2},
+}
+PER_EPOCH, STEPS = 4, 8
+
+
+@pytest.fixture(scope="session")
+def ensemble(tmp_path_factory):
+    settings = validate_settings(SETTINGS, "callbacks")
+    path = tmp_path_factory.mktemp("callbacks") / "store"
+    return settings, simulate(settings, output=path, workers=1).path
+
+
+@pytest.fixture
+def training(ensemble, tmp_path):
+    """Make module, data and a trainer with callbacks; ``train`` runs them."""
+    settings, path = ensemble
+
+    def make(*callbacks, validation=True, sanity=0, logger=False, start=0):
+        quiet_lightning()
+        store = EnsembleStore.open(path)
+        region, possible = echo_region(settings, store)
+        module = module_for(
+            settings,
+            *field_and_renderer(settings, region),
+            reference=store.attributes["reference"],
+            possible=possible,
+            total_steps=STEPS,
+            steps_per_epoch=PER_EPOCH,
+        )
+        data = EchoDataModule(store, whole_poses=True, batch=2, batch_frequencies=2, seed=0)
+        data.sampler.start = start
+        trainer = lightning.Trainer(
+            accelerator="cpu",
+            max_epochs=-1,
+            max_steps=STEPS,
+            val_check_interval=PER_EPOCH,
+            check_val_every_n_epoch=None,
+            limit_val_batches=1.0 if validation else 0,
+            num_sanity_val_steps=sanity,
+            logger=TensorBoardLogger(tmp_path, name="tensorboard", version="") if logger else False,
+            callbacks=list(callbacks),
+            plugins=[DurableCheckpointIO()],
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            log_every_n_steps=1,
+            default_root_dir=tmp_path,
+        )
+
+        def train(checkpoint=None):
+            trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
+
+        return SimpleNamespace(module=module, data=data, trainer=trainer, train=train)
+
+    return make

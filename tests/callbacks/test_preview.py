@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: MIT
+"""What each epoch leaves to look at, and how little it disturbs the fit."""
+
+from __future__ import annotations
+
+import io
+import json
+
+import lightning
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sononerf.callbacks import preview as preview_module
+from sononerf.callbacks.preview import PreviewCallback
+from sononerf.errors import NumericalError
+
+
+def previews(folder, **changes):
+    return PreviewCallback(folder, **{"every_epochs": 1, "voxels": 12, "directions": 20, **changes})
+
+
+class Modes(lightning.Callback):
+    """Notes whether each step is taken in training mode."""
+
+    def __init__(self):
+        self.seen = []
+
+    def on_train_batch_start(self, trainer, pl_module, *rest):
+        self.seen.append(
+            pl_module.training and pl_module.field.training and pl_module.renderer.training
+        )
+
+
+def loud(module):
+    """Put a surface into the field from the first step on."""
+    with torch.no_grad():
+        grid = module.field.grids[0]
+        middle = [size // 2 for size in grid.shape[2:]]
+        grid[0, 0] = -12.0
+        z, y, x = (slice(m - 1, m + 2) for m in middle)
+        grid[0, 0, z, y, x] = 0.0
+    return module
+
+
+def test_mesh_projections_and_numbers(training, tmp_path):
+    modes = Modes()
+    made = training(previews(tmp_path / "run"), modes, logger=True)
+    loud(made.module)
+    made.train()
+    folders = sorted((tmp_path / "run" / "epochs").iterdir())
+    assert [p.name for p in folders] == ["0001", "0002"]
+    for number, folder in enumerate(folders, start=1):
+        assert {p.name for p in folder.iterdir()} == {
+            "mesh.ply",
+            "mip_x.png",
+            "mip_y.png",
+            "mip_z.png",
+            "metrics.json",
+        }
+        assert len(trimesh.load_mesh(folder / "mesh.ply").faces) > 3
+        for axis in "xyz":
+            with Image.open(io.BytesIO((folder / f"mip_{axis}.png").read_bytes())) as image:
+                assert min(image.size) >= 8
+        numbers = json.loads((folder / "metrics.json").read_text())
+        assert (numbers["epoch"], numbers["step"]) == (number, 4 * number)
+        assert {"train/loss", "val/mae_db"} <= numbers.keys()
+    assert modes.seen == [True] * 8
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    for axis in "xyz":
+        assert [image.step for image in events.Images(f"mip/{axis}")] == [4, 8]
+    assert [scalar.step for scalar in events.Scalars("val/mae_db")] == [3, 7]
+    assert len(events.Scalars("train/loss")) == 8
+
+
+def test_every_so_many_epochs(training, tmp_path):
+    training(previews(tmp_path, every_epochs=2)).train()
+    assert [p.name for p in (tmp_path / "epochs").iterdir()] == ["0002"]
+
+
+def test_a_field_without_a_surface_is_news_and_no_fault(training, tmp_path, monkeypatch):
+    def none(*given, **options):
+        raise NumericalError("no surface: the field is silent")
+
+    monkeypatch.setattr(preview_module, "reconstruct", none)
+    modes = Modes()
+    made = training(previews(tmp_path), modes)
+    made.train()
+    assert made.trainer.global_step == 8
+    assert modes.seen == [True] * 8
+    for number in ("0001", "0002"):
+        folder = tmp_path / "epochs" / number
+        assert [p.name for p in folder.iterdir()] == ["metrics.json"]
+        assert json.loads((folder / "metrics.json").read_text())["no_surface"] == (
+            "no surface: the field is silent"
+        )
+
+
+def test_other_faults_are_not_hidden(training, tmp_path, monkeypatch):
+    def broken(*given, **options):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(preview_module, "reconstruct", broken)
+    made = training(previews(tmp_path))
+    with pytest.raises(ZeroDivisionError):
+        made.train()
+
+
+def test_only_one_of_many_devices_writes(training, tmp_path):
+    class Second:
+        is_global_zero = False
+
+    previews(tmp_path).on_epoch(Second(), training().module, 1)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_fit_does_not_feel_it(training, tmp_path):
+    with_them, without = training(previews(tmp_path)), training()
+    with_them.train()
+    without.train()
+    for (name, first), second in zip(
+        with_them.module.named_parameters(), without.module.parameters(), strict=True
+    ):
+        assert torch.equal(first, second), name

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: MIT
+"""Measured, predicted and difference, once in every epoch, in TensorBoard alone."""
+
+from __future__ import annotations
+
+import io
+
+import lightning
+import torch
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sononerf.callbacks import spectrogram_images as images_module
+from sononerf.callbacks.spectrogram_images import SpectrogramImages
+
+
+def callback(made, poses=None):
+    renderer = made.module.renderer
+    poses = made.data.whole("val") if poses is None else poses
+    return SpectrogramImages(poses, renderer.range, renderer.frequency)
+
+
+class Modes(lightning.Callback):
+    """Notes whether each step is taken in training mode."""
+
+    def __init__(self):
+        self.seen = []
+
+    def on_train_batch_start(self, trainer, pl_module, *rest):
+        self.seen.append(pl_module.training and pl_module.renderer.training)
+
+
+def test_one_picture_per_epoch(training, tmp_path):
+    modes = Modes()
+    made = training(modes, logger=True)
+    made.trainer.callbacks.append(callback(made))
+    made.train()
+    assert modes.seen == [True] * 8
+    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events.Reload()
+    pictures = events.Images("spectrogram")
+    assert [picture.step for picture in pictures] == [4, 8]
+    with Image.open(io.BytesIO(pictures[0].encoded_image_string)) as image:
+        assert min(image.size) > 100
+
+
+def test_what_is_shown_is_the_first_validation_pose(training, monkeypatch):
+    shown = []
+
+    def draw(measured, predicted, range_m, frequency_hz):
+        shown.append((measured, predicted, range_m, frequency_hz))
+        return torch.zeros(2, 2, 3, dtype=torch.uint8).numpy()
+
+    monkeypatch.setattr(images_module, "spectrogram_image", draw)
+    made = training(logger=True)
+    made.trainer.callbacks.append(callback(made))
+    made.train()
+    store = made.data.store
+    first = torch.from_numpy(store.read_pose(int(store.indices("val")[0])))
+    expected = 20 * torch.log10(1 + first / store.attributes["reference"])
+    assert len(shown) == 2
+    for measured, predicted, range_m, frequency_hz in shown:
+        torch.testing.assert_close(torch.from_numpy(measured), expected)
+        assert predicted.shape == measured.shape == (2, len(range_m), len(frequency_hz))
+
+
+def test_nothing_without_poses_or_without_tensorboard(training, monkeypatch):
+    monkeypatch.setattr(images_module, "spectrogram_image", None)
+    made = training(logger=True)
+    made.trainer.callbacks.append(callback(made, poses=[]))
+    made.train()
+    made = training()
+    made.trainer.callbacks.append(callback(made))
+    made.train()

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: MIT
+import numpy as np
+import pytest
+
+from sononerf.acoustics.ears import synthetic_ears
+from sononerf.config import EarSettings
+from sononerf.data.region import EchoEvidence
+from sononerf.data.store import EnsembleStore
+from sononerf.errors import NumericalError
+from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.geometry.poses import look_at
+
+STEP = 0.001
+RANGE = 0.15 + STEP * np.arange(601)
+FREQUENCY = np.array([40e3, 70e3])
+EARS = synthetic_ears(EarSettings(), FREQUENCY)
+HALF_WINDOW = 0.0054
+
+
+def echoes(position, rotation, places):
+    """Each place heard by each ear at half of its path, as long as the analysis window."""
+    emitter = position + rotation @ EARS.emitter
+    heard = np.zeros((2, len(RANGE), 2))
+    for ear, offset in enumerate(EARS.positions):
+        for place in places:
+            there = np.linalg.norm(place - emitter)
+            back = np.linalg.norm(place - position - rotation @ offset)
+            middle = (there + back) / 2
+            inside = np.abs(RANGE - middle) < HALF_WINDOW
+            window = 0.54 + 0.46 * np.cos(np.pi * (RANGE - middle) / HALF_WINDOW)
+            heard[ear, inside] += window[inside, None] / (there * back)
+    return heard
+
+
+def evidence(path, positions, rotations, places, **options):
+    """Simulate the echoes of places that reflect alike in all directions."""
+    store = EnsembleStore.create(
+        path,
+        poses_positions=positions,
+        poses_rotations=rotations,
+        split=np.zeros(len(positions), int),
+        range=RANGE,
+        frequency=FREQUENCY,
+        attributes={"echo_hash": "a", "reference": 6.25 / 1000, "speed_of_sound": 343.0},
+    )
+    heard = places if callable(places) else lambda p, r: echoes(p, r, places)
+    for index, (position, rotation) in enumerate(zip(positions, rotations, strict=True)):
+        store.write_pose(index, heard(position, rotation))
+    store.seal()
+    return EchoEvidence(store, EARS, **options)
+
+
+def around(count=60, radius=0.4):
+    positions = radius * fibonacci_sphere(count)
+    return positions, look_at(positions, np.zeros(3))
+
+
+PLACES = np.array([[0.03, -0.02, 0.01], [-0.02, 0.03, -0.02], [0.0, -0.03, 0.03]])
+
+
+def test_the_box_holds_the_places_and_hardly_more(tmp_path):
+    found = evidence(tmp_path / "s", *around(), PLACES)
+    box = found.box(margin=0.0)
+    assert (box[0] <= PLACES.min(axis=0)).all()
+    assert (box[1] >= PLACES.max(axis=0)).all()
+    # An echo is as long as the window, and its threshold is met half a window off the middle.
+    spare = np.concatenate((PLACES.min(axis=0) - box[0], box[1] - PLACES.max(axis=0)))
+    assert spare.max() < 0.025
+    wider = found.box(margin=0.01)
+    np.testing.assert_allclose(wider - box, [[-0.01] * 3, [0.01] * 3], atol=1e-12)
+
+
+def test_the_box_goes_where_the_places_go(tmp_path):
+    shift = np.array([1.0, -2.0, 0.5])
+    positions, rotations = around()
+    one = evidence(tmp_path / "1", positions, rotations, PLACES).box()
+    two = evidence(tmp_path / "2", positions + shift, rotations, PLACES + shift).box()
+    np.testing.assert_allclose(two, one + shift, atol=2e-3)
+
+
+def test_places_are_needed_and_the_air_between_is_not(tmp_path):
+    far = np.array([[0.06, 0.0, 0.0], [-0.06, 0.0, 0.0]])
+    found = evidence(tmp_path / "s", *around(100), far)
+    probes = np.concatenate((far, [[0.0, 0.0, 0.0], [0.03, 0.0, 0.0], [0.0, 0.06, 0.0]]))
+    grid = np.concatenate((probes, np.random.default_rng(0).uniform(-0.1, 0.1, (400, 3))))
+    needed = found.needed(grid, 0.002)
+    assert needed[:5].tolist() == [True, True, False, False, False]
+
+
+def test_silence_carves(tmp_path):
+    """What lies before the first echo of many poses is empty, whatever the other echoes say."""
+    found = evidence(tmp_path / "s", *around(), PLACES[:1])
+    towards = PLACES[0] + 0.05 * fibonacci_sphere(50)
+    about = found.about(np.concatenate((PLACES[:1], towards)), 0.002)
+    assert about.possible.tolist() == [True] + [False] * 50
+    # There the poses agree; 50 mm off, each place is at the range of a few poses' echo by chance.
+    assert about.energy[0] > 4 * about.energy[1:].max()
+
+
+def test_a_face_that_answers_few_poses_is_kept(tmp_path):
+    """A mirror answers only from straight ahead; who sees it aslant hears what stands behind."""
+    # How tightly the box fits is not asked: few poses say where such a face ends.
+    face, ball = np.array([0.05, 0.0, 0.0]), np.array([-0.03, 0.0, 0.0])
+
+    def heard(position, rotation):
+        ahead = position[0] / np.linalg.norm(position) > np.cos(np.radians(35))
+        return echoes(position, rotation, [ball, face] if ahead else [ball])
+
+    box = evidence(tmp_path / "s", *around(100), heard).box(margin=0.0)
+    for place in (face, ball):
+        assert (box[0] <= place).all()
+        assert (box[1] >= place).all()
+
+
+def test_poses_that_hear_nothing_carve_nothing(tmp_path):
+    positions, rotations = around()
+    deaf = np.arange(len(positions)) % 2 == 0
+
+    def heard(position, rotation):
+        index = int(np.linalg.norm(positions - position, axis=1).argmin())
+        return echoes(position, rotation, [] if deaf[index] else PLACES)
+
+    box = evidence(tmp_path / "s", positions, rotations, heard).box()
+    assert (box[0] <= PLACES.min(axis=0)).all()
+    assert (box[1] >= PLACES.max(axis=0)).all()
+
+
+def test_no_echo_is_an_error(tmp_path):
+    with pytest.raises(NumericalError, match="no pose received an echo"):
+        evidence(tmp_path / "s", *around(6), [])
+
+
+def test_echoes_that_do_not_meet_are_an_error(tmp_path):
+    """One pose alone hears something: no second one confirms it."""
+    positions, rotations = around(20)
+
+    def heard(position, rotation):
+        alone = np.allclose(position, positions[0])
+        return echoes(position, rotation, PLACES if alone else [])
+
+    with pytest.raises(NumericalError, match=r"set region\.lower"):
+        evidence(tmp_path / "s", positions, rotations, heard).box()
+
+
+def test_validation_and_test_poses_are_not_asked(tmp_path):
+    positions, rotations = around(40)
+    store = EnsembleStore.create(
+        tmp_path / "s",
+        poses_positions=positions,
+        poses_rotations=rotations,
+        split=np.arange(40) % 2,
+        range=RANGE,
+        frequency=FREQUENCY,
+        attributes={"echo_hash": "a", "reference": 6.25 / 1000},
+    )
+    for index in range(0, 40, 2):  # the others are not even there
+        store.write_pose(index, echoes(positions[index], rotations[index], PLACES))
+    assert len(EchoEvidence(store, EARS).sources) == 20
+    few = EchoEvidence(store, EARS, most=5)
+    assert len(few.sources) == 5
+    head = (EARS.emitter + EARS.positions.mean(axis=0)) / 2
+    expected = positions[[0, 8, 18, 28, 38]] + rotations[[0, 8, 18, 28, 38]] @ head
+    np.testing.assert_allclose(few.sources, expected)
+
+
+@pytest.mark.parametrize("looks", ["at", "along"])
+def test_a_flight_in_a_line(tmp_path, looks):
+    """All poses in one plane, or on one side: the box has room off the plane as well."""
+    place = np.array([[0.3, 0.1, 0.02]])
+    positions = np.linspace([0.0, -0.2, 0.0], [0.0, 0.4, 0.0], 40)
+    towards = place[0] if looks == "at" else positions + np.eye(3)[0]
+    rotations = look_at(positions, towards * [1, 1, 0])
+    box = evidence(tmp_path / "s", positions, rotations, place).box()
+    assert (box[0] <= place[0]).all()
+    assert (box[1] >= place[0]).all()

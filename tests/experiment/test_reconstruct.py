@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: MIT
+"""A fitted field becomes files, and numbers where the truth is known."""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from sononerf.errors import InputError, NumericalError
+from sononerf.experiment import reconstruct as reconstruct_module
+from sononerf.experiment.fit import fit
+from sononerf.experiment.reconstruct import evaluate, reconstruct
+from sononerf.scene import Scene
+
+GEOMETRY = {
+    "chamfer_m",
+    "fscore",
+    "thickness_bias_m",
+    "volume_ratio",
+    "iou",
+    "normal_consistency",
+    "components",
+    "components_true",
+    "level",
+}
+
+
+@pytest.fixture(scope="module")
+def fitted(tiny_settings, without_pictures, tmp_path_factory):
+    path = tmp_path_factory.mktemp("fitted") / "run"
+    fit(tiny_settings(fit={"epochs": 10}), path, accelerator="cpu", workers=1)
+    return path
+
+
+@pytest.fixture
+def run(fitted, tmp_path):
+    path = tmp_path / "elsewhere"
+    path.mkdir()
+    for name in ("model.safetensors", "model.json"):
+        shutil.copy(fitted / name, path)
+    return path
+
+
+@pytest.fixture
+def few_samples(monkeypatch):
+    """A hundred thousand samples of each surface are for the reports."""
+    metrics = functools.partial(reconstruct_module.geometry_metrics, samples=2000)
+    monkeypatch.setattr(reconstruct_module, "geometry_metrics", metrics)
+    monkeypatch.setattr(reconstruct_module, "BASELINE_VOXELS", 24)
+
+
+def read_out(folder):
+    return json.loads((folder / "read_out.json").read_text())
+
+
+def test_every_file_is_there_and_readable(run):
+    import pyvista
+
+    folder = reconstruct(run)
+    assert folder == run / "reconstruction"
+    assert sorted(p.name for p in folder.iterdir()) == sorted(
+        ["mesh.ply", "mesh.stl", "mesh.glb", "volume.vti", "view.png", "read_out.json"]
+        + [f"mip_{axis}.png" for axis in "xyz"]
+    )
+    meshes = {kind: trimesh.load_mesh(folder / f"mesh.{kind}") for kind in ("ply", "stl", "glb")}
+    faces = {len(mesh.faces) for mesh in meshes.values()}
+    assert len(faces) == 1
+    assert faces.pop() > 20
+    for mesh in meshes.values():
+        np.testing.assert_allclose(mesh.bounds, meshes["ply"].bounds, atol=1e-6)
+    volume = pyvista.read(folder / "volume.vti")
+    assert np.isfinite(volume.point_data.active_scalars).all()
+    assert volume.spacing[0] == pytest.approx(read_out(folder)["spacing_m"])
+    for picture in folder.glob("*.png"):
+        with Image.open(io.BytesIO(picture.read_bytes())) as image:
+            assert min(image.size) > 50
+    assert json.loads((run / "metrics.json").read_text())["cost"]["reconstruct_s"] > 0
+
+
+def test_spacing_and_level_are_obeyed(run, tmp_path):
+    coarse = reconstruct(run, spacing=0.02, output=tmp_path / "coarse")
+    fine = reconstruct(run, spacing=0.007, output=tmp_path / "fine")
+    assert read_out(coarse)["spacing_m"] == pytest.approx(0.02)
+    assert read_out(fine)["spacing_m"] == pytest.approx(0.007)
+    level = read_out(fine)["level"]
+    other = reconstruct(run, spacing=0.007, level=level / 2, output=tmp_path / "low")
+    assert read_out(other)["level"] == pytest.approx(level / 2)
+    assert (fine / "mesh.ply").read_bytes() != (other / "mesh.ply").read_bytes()
+    same = reconstruct(run, spacing=0.007, level=level, output=tmp_path / "same")
+    assert (fine / "mesh.ply").read_bytes() == (same / "mesh.ply").read_bytes()
+    assert not (run / "metrics.json").exists()
+
+
+def test_a_level_above_everything_has_no_surface(run):
+    with pytest.raises(NumericalError):
+        reconstruct(run, level=1e9)
+
+
+def test_what_is_evaluated(run, few_samples):
+    metrics = evaluate(run)  # reconstructs where that was not done
+    assert (run / "reconstruction" / "mesh.ply").is_file()
+    assert metrics == json.loads((run / "metrics.json").read_text())
+    assert metrics["geometry"].keys() == GEOMETRY
+    assert metrics["geometry"]["fscore"].keys() == {"0.001", "0.002", "0.005"}
+    assert metrics["geometry"]["components_true"] == 1
+    assert metrics["baseline"].keys() == {"backprojection", "voxels"}
+    assert metrics["baseline"]["backprojection"].keys() == GEOMETRY
+
+
+def test_a_scene_that_is_not_installed_has_no_truth(run, few_samples):
+    description = json.loads((run / "model.json").read_text())
+    description["settings"]["scene"] = {"name": "theirs", "options": {}}
+    (run / "model.json").write_text(json.dumps(description))
+    metrics = evaluate(run)
+    assert metrics["geometry"] is None
+    assert metrics["baseline"] == {"backprojection": None, "voxels": None}
+    with Image.open(run / "reconstruction" / "view.png") as image:
+        assert min(image.size) > 50
+
+
+def test_what_needs_a_closed_surface_is_null_for_an_open_one(run, few_samples, monkeypatch):
+    open_mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
+    open_mesh.update_faces(np.arange(len(open_mesh.faces)) > 40)
+    open_scene = Scene(open_mesh)
+    monkeypatch.setattr(reconstruct_module, "load_scene", lambda *given: open_scene)
+    geometry = evaluate(run)["geometry"]
+    for key in ("volume_ratio", "iou", "thickness_bias_m"):
+        assert geometry[key] is None, key
+    assert geometry["chamfer_m"] > 0
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\nnonsense", b"\x00" * 100])
+def test_a_damaged_mesh_is_told(run, content, few_samples):
+    reconstruct(run, spacing=0.02)
+    (run / "reconstruction" / "mesh.ply").write_bytes(content)
+    with pytest.raises(InputError, match=r"mesh\.ply: .*reconstruct again"):
+        evaluate(run)

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: MIT
+import numpy as np
+import pytest
+import torch
+
+from sononerf.errors import NumericalError
+from sononerf.field.field import Field
+from sononerf.field.grid import GridField
+from sononerf.reconstruction import read_out
+from sononerf.reconstruction.read_out import reconstruct
+
+FREQUENCY = torch.tensor([30e3, 50e3, 70e3])
+RADIUS, SPACING = 0.015, 0.003
+MIDDLE = torch.tensor([0.1, -0.05, 0.02])
+REGION = torch.stack((MIDDLE - 0.0303, MIDDLE + 0.0303))
+
+
+def lobes_on_a_sphere(radius=RADIUS, region=REGION):
+    """A grid whose lobes stand on a sphere, blurred by 2 mm as a fit blurs them."""
+    field = GridField(region, FREQUENCY, spacing=SPACING, levels=1)
+    values = field.grids[0]
+    axes = [region[0, a] + SPACING * torch.arange(values.shape[4 - a]) for a in range(3)]
+    offset = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1) - MIDDLE
+    distance = offset.norm(dim=-1)
+    with torch.no_grad():
+        # Half of the logarithm of the energy: values are log pressure.
+        values[0, 0] = (-0.25 * ((distance - radius) / 0.002) ** 2).permute(2, 1, 0)
+        values[0, 1:] = (10 * offset / distance.clamp_min(1e-9)[..., None]).permute(3, 2, 1, 0)
+    return field
+
+
+class Blob(Field):
+    """No lobes: 1 / (1 + exp((d - radius) / width)) around a place, alike in all directions."""
+
+    def __init__(self, region=REGION, level=1.0):
+        super().__init__(region, FREQUENCY)
+        self.level = level
+
+    @property
+    def resolution(self):
+        return 0.004
+
+    def forward(self, positions, directions):
+        distance = (positions - MIDDLE).norm(dim=-1)
+        value = self.level * torch.sigmoid((RADIUS - distance) / 0.001) * self.inside(positions)
+        return value[..., None].expand(*positions.shape[:-1], 3)
+
+
+def radii(mesh):
+    return np.linalg.norm(mesh.triangles_center - MIDDLE.numpy(), axis=1)
+
+
+@pytest.mark.parametrize("spacing", [None, 0.0025])
+def test_lobes_on_a_sphere_give_the_sphere(spacing):
+    found = reconstruct(lobes_on_a_sphere(), spacing=spacing)
+    assert found.method == "oriented"
+    assert found.volume.spacing == pytest.approx(spacing or SPACING / 2)
+    assert found.mesh.is_watertight
+    mean = np.average(radii(found.mesh), weights=found.mesh.area_faces)
+    # A shell of Gaussian blur σ = 2 mm holds more volume outside: 2 σ² / r = 0.5 mm.
+    assert mean == pytest.approx(RADIUS + 0.0003, abs=0.0006)
+    assert radii(found.mesh).std() < 0.0004
+    assert found.mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.15)
+
+
+def test_the_volume_holds_the_energy_where_it_is():
+    field = lobes_on_a_sphere()
+    volume = reconstruct(field).volume
+    for spare in (REGION[0].numpy() - volume.origin, volume.upper - REGION[1].numpy()):
+        assert (spare > -1e-6).all()
+        assert (spare < SPACING / 2).all()
+    points = volume.points()
+    loud = points[np.argsort(volume.values.ravel())[-500:]]
+    distance = np.linalg.norm(loud - MIDDLE.numpy(), axis=1)
+    np.testing.assert_allclose(distance, RADIUS, atol=0.0015)
+    places = torch.as_tensor(points[::997], dtype=torch.float32)
+    expected = field.oriented(places, 100)[0]
+    np.testing.assert_allclose(volume.values.ravel()[::997], expected, rtol=1e-4)
+
+
+def test_the_surface_moves_with_the_field():
+    shift = torch.tensor([0.003, -0.006, 0.009])  # whole steps of the grid
+    one = reconstruct(lobes_on_a_sphere()).mesh
+    two = reconstruct(lobes_on_a_sphere(region=REGION + shift)).mesh
+    # The same sphere in another region.
+    assert two.volume == pytest.approx(one.volume, rel=0.01)
+    np.testing.assert_allclose(two.centroid, one.centroid, atol=1e-4)
+    np.testing.assert_allclose(one.centroid, MIDDLE, atol=2e-4)
+
+
+def test_a_field_without_lobes_is_read_at_a_level():
+    found = reconstruct(Blob(), spacing=0.0025, directions=8)
+    assert found.method == "isosurface"
+    # Magnitudes of 8 directions and 3 frequencies, summed.
+    assert found.volume.values.max() == pytest.approx(24, rel=1e-3)
+    # The automatic level lies somewhere on the slope, which is 1 mm wide.
+    assert np.average(radii(found.mesh)) == pytest.approx(RADIUS, abs=0.001)
+    half = reconstruct(Blob(), spacing=0.0025, directions=8, level=12.0)
+    assert half.level == 12.0
+    # Linear interpolation between voxels across a steep slope.
+    np.testing.assert_allclose(radii(half.mesh), RADIUS, atol=0.0003)
+    assert half.mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)
+    low = reconstruct(Blob(), spacing=0.0025, directions=8, level=1.0)
+    assert low.mesh.volume > half.mesh.volume
+
+
+def test_finer_voxels_come_nearer():
+    errors = []
+    for spacing in (0.006, 0.003, 0.0015):
+        mesh = reconstruct(Blob(), spacing=spacing, directions=2, level=3.0).mesh
+        errors.append(np.abs(radii(mesh) - RADIUS).mean())
+    assert errors[0] > errors[1] > errors[2]
+
+
+def test_the_method_may_be_chosen():
+    found = reconstruct(lobes_on_a_sphere(), method="isosurface", directions=30)
+    assert found.method == "isosurface"
+    # A shell: its outer side lies outside of the sphere, its inner side is a cavity.
+    assert radii(found.mesh).min() < RADIUS - 0.0005 < RADIUS + 0.0005 < radii(found.mesh).max()
+
+
+def test_chunks_have_no_seams(monkeypatch):
+    whole = reconstruct(lobes_on_a_sphere())
+    done = []
+    monkeypatch.setattr(read_out, "CHUNK", 777)
+    pieces = reconstruct(lobes_on_a_sphere(), progress=lambda *counts: done.append(counts))
+    np.testing.assert_allclose(pieces.volume.values, whole.volume.values, rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(pieces.mesh.vertices, whole.mesh.vertices, atol=1e-5)
+    total = whole.volume.values.size
+    assert done[-1] == (total, total)
+    assert len(done) >= total // 777
+
+
+def test_what_is_not_kept_has_no_surface():
+    field = lobes_on_a_sphere()
+    vertices = field.region[0] + SPACING * torch.cartesian_prod(*[torch.arange(21)] * 3)
+    distance = (vertices - MIDDLE).norm(dim=1)
+    field.keep(vertices[(distance - RADIUS).abs() < 0.004], SPACING)
+    volume = reconstruct(field).volume
+    outside = np.linalg.norm(volume.points() - MIDDLE.numpy(), axis=1) > RADIUS + 0.008
+    assert volume.values.ravel()[outside].max() == 0
+
+
+def test_a_silent_field_is_an_error():
+    for field in (Blob(level=0.0), lobes_on_a_sphere()):
+        if field.knows_directions:
+            field.occupancy.zero_()
+        with pytest.raises(NumericalError, match="silent everywhere"):
+            reconstruct(field, directions=4)

@@ -1,0 +1,676 @@
+# SPDX-License-Identifier: MIT
+"""The command line as people use it: the whole way, and every way in which it refuses."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import io
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+import typer
+import yaml
+from PIL import Image
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from sononerf import cli, storage
+from sononerf.callbacks import preview, spectrogram_images
+from sononerf.experiment import predict as predict_module
+from sononerf.experiment import reconstruct as reconstruct_module
+from sononerf.reconstruction import baseline
+
+CONFIGS = Path(__file__).resolve().parent.parent / "configs"
+SMOKE = str(CONFIGS / "smoke.yaml")
+COMMANDS = ["scenes", "simulate", "fit", "predict", "reconstruct", "evaluate"]
+SHORT = [  # of the smoke settings, so that a fit takes a second
+    "poses.count=6",
+    "poses.validation=1",
+    "poses.heldout=1",
+    "simulation.rays=500",
+    "simulation.noise_floor_poses=1",
+    "field.options.finest=0.02",
+    "fit.epochs=2",
+    "fit.steps_per_epoch=3",
+    "preview.voxels=8",
+]
+
+
+def run(*arguments):
+    """Give a command in this process; return its exit code, output and messages."""
+    out, err = io.StringIO(), io.StringIO()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["sononerf", *map(str, arguments)])
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            with pytest.raises(SystemExit) as caught:
+                cli.main()
+    return SimpleNamespace(code=caught.value.code or 0, out=out.getvalue(), err=err.getvalue())
+
+
+def done(*arguments):
+    result = run(*arguments)
+    assert result.code == 0, result.err
+    assert "Traceback" not in result.err
+    return result
+
+
+def refused(code, *arguments):
+    """Give a command that must fail cleanly; return its message."""
+    result = run(*arguments)
+    assert result.code == code, result.err
+    assert result.out == ""
+    assert "Traceback" not in result.err
+    lines = [line for line in result.err.splitlines() if not line.startswith("warning: ")]
+    assert 1 <= len(lines) <= 10
+    assert all(line.startswith("error: ") for line in lines), result.err
+    return "\n".join(lines)
+
+
+def tree(folder):
+    return {
+        str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+    }
+
+
+@pytest.fixture(scope="module")
+def quick():
+    """Fewer samples of surfaces, and no previews: both have tests of their own."""
+    with pytest.MonkeyPatch.context() as patch:
+        metrics = functools.partial(reconstruct_module.geometry_metrics, samples=3000)
+        patch.setattr(reconstruct_module, "geometry_metrics", metrics)
+        patch.setattr(reconstruct_module, "BASELINE_VOXELS", 24)
+        patch.setattr(baseline, "LEVEL_SAMPLES", 500)
+        yield
+
+
+@pytest.fixture(scope="module")
+def smoke(tmp_path_factory, quick):
+    """The smoke settings, simulated and fitted by the commands of the README."""
+    home = tmp_path_factory.mktemp("smoke")
+    with contextlib.chdir(home):
+        simulated = done("simulate", SMOKE, "--preview", "pictures")
+        fitted = done("fit", SMOKE, "--accelerator", "cpu")
+    return SimpleNamespace(home=home, run=home / "runs" / "smoke", simulated=simulated, fit=fitted)
+
+
+@pytest.fixture
+def at_home(smoke, monkeypatch):
+    monkeypatch.chdir(smoke.home)
+    return smoke
+
+
+def test_every_promised_file_is_there(smoke):
+    found = {str(path.relative_to(smoke.run)) for path in smoke.run.rglob("*") if path.is_file()}
+    promised = {
+        "config.yaml",
+        "provenance.json",
+        "metrics.json",
+        "model.safetensors",
+        "model.json",
+        "checkpoints/last.ckpt",
+        "prediction/spectrograms.npz",
+        *(f"prediction/pose_{number:04d}.png" for number in (42, 43, 44)),
+        *(f"reconstruction/mesh.{kind}" for kind in ("ply", "stl", "glb")),
+        "reconstruction/volume.vti",
+        "reconstruction/view.png",
+        *(f"reconstruction/mip_{axis}.png" for axis in "xyz"),
+        *(f"epochs/{epoch:04d}/metrics.json" for epoch in (1, 2, 3)),
+        *(f"epochs/0003/mip_{axis}.png" for axis in "xyz"),
+        "epochs/0003/mesh.ply",
+    }
+    assert promised <= found
+    assert any(name.startswith("tensorboard/events") for name in found)
+    hidden = [name for name in found if Path(name).name.startswith(".")]
+    assert hidden == []  # no lock, nothing half-written
+    assert (smoke.home / "pictures" / "scene.png").is_file()
+
+
+def test_every_file_can_be_read(smoke):
+    import pyvista
+    import safetensors.torch
+
+    for picture in smoke.home.rglob("*.png"):
+        with Image.open(picture) as image:
+            image.load()
+            assert min(image.size) > (8 if "epochs" in picture.parts else 50), picture
+    for path in smoke.run.rglob("mesh.*"):
+        mesh = trimesh.load_mesh(path)
+        assert len(mesh.faces) > 100, path
+        assert np.abs(mesh.bounds).max() < 0.2, path  # metres
+    assert pyvista.read(smoke.run / "reconstruction" / "volume.vti").n_points > 1000
+    with np.load(smoke.run / "prediction" / "spectrograms.npz", allow_pickle=False) as arrays:
+        assert arrays["predicted"].shape == arrays["measured"].shape
+        assert len(arrays["predicted"]) == 3
+    assert safetensors.torch.load_file(smoke.run / "model.safetensors")
+    settings = yaml.safe_load((smoke.run / "config.yaml").read_text())
+    assert settings["fit"]["steps_per_epoch"] == 40
+    assert settings["fit"]["seed"] == 0  # the defaults are there too
+
+
+def finite_or_null(values):
+    for value in values.values():
+        if isinstance(value, dict):
+            finite_or_null(value)
+        elif isinstance(value, float):
+            assert np.isfinite(value)
+
+
+def test_the_numbers_are_those_of_schema_one(smoke):
+    metrics = json.loads((smoke.run / "metrics.json").read_text())
+    assert metrics["schema"] == 1
+    assert metrics.keys() == {"schema", "prediction", "geometry", "baseline", "cost"}
+    both = ("mae_db", "mean_predictor_mae_db", "noise_floor_mae_db")
+    assert metrics["prediction"].keys() == {
+        *("split", "poses", "log_spectral_distance_db", "psnr_db", "ssim", "pearson"),
+        *both,
+        *(f"{name}_active" for name in both),
+    }
+    geometry = {
+        *("chamfer_m", "fscore", "thickness_bias_m", "volume_ratio", "iou"),
+        *("normal_consistency", "components", "components_true", "level"),
+    }
+    assert metrics["geometry"].keys() == geometry
+    assert metrics["geometry"]["fscore"].keys() == {"0.001", "0.002", "0.005"}
+    assert metrics["baseline"]["backprojection"].keys() == geometry
+    assert metrics["baseline"]["voxels"] is None
+    assert metrics["cost"].keys() == {
+        *("simulate_s", "fit_s", "reconstruct_s", "steps", "points_evaluated"),
+        *("peak_memory_bytes", "device", "parameters"),
+    }
+    assert metrics["cost"]["steps"] == 120
+    finite_or_null(metrics)
+
+
+def test_it_learns(smoke):
+    events = EventAccumulator(str(smoke.run / "tensorboard"))
+    events.Reload()
+    losses = [scalar.value for scalar in events.Scalars("train/loss")]
+    assert np.mean(losses[-3:]) < 0.6 * np.mean(losses[:3])
+    errors = [scalar.value for scalar in events.Scalars("val/mae_db")]
+    assert errors == sorted(errors, reverse=True)
+    assert {"spectrogram", "mip/x"} <= set(events.Tags()["images"])
+    metrics = json.loads((smoke.run / "metrics.json").read_text())
+    prediction = metrics["prediction"]
+    assert prediction["mae_db"] < 0.75 * prediction["mean_predictor_mae_db"]
+    assert prediction["mae_db_active"] < 0.75 * prediction["mean_predictor_mae_db_active"]
+    assert metrics["geometry"]["components"] == metrics["geometry"]["components_true"] == 3
+    assert metrics["geometry"]["fscore"]["0.005"] > 0.9
+    baseline_metrics = metrics["baseline"]["backprojection"]
+    assert metrics["geometry"]["chamfer_m"] < 0.5 * baseline_metrics["chamfer_m"]
+
+
+def test_what_is_printed(smoke):
+    assert smoke.simulated.out == smoke.fit.out == ""
+    assert "wrote data/three_spheres-" in smoke.simulated.err
+    text = smoke.fit.err
+    for words in (
+        "region ",
+        "prediction of 3 held-out poses: ",
+        "geometry: Chamfer ",
+        "3 parts (true: 3)",
+        "backprojection instead: ",
+        "mesh:        runs/smoke/reconstruction/mesh.ply",
+        "numbers:     runs/smoke/metrics.json",
+        "tensorboard --logdir runs/smoke",
+    ):
+        assert words in text
+    # Plain lines where there is no terminal; nothing of the libraries' own talk.
+    for noise in ("\x1b", "\r", "LeafSpec", "GPU available", "lightning.pytorch", "Tip:"):
+        assert noise not in text
+    assert len(list((smoke.home / "data").iterdir())) == 1  # the fit took what was simulated
+
+
+def test_a_finished_run_is_left_as_it_is_and_says_so(at_home):
+    before = tree(at_home.run)
+    result = done("fit", SMOKE, "--accelerator", "cpu")
+    assert "runs/smoke: is finished; --overwrite fits it anew" in result.err
+    assert "geometry: Chamfer" in result.err
+    assert tree(at_home.run) == before
+
+
+def test_other_settings_in_the_same_folder_are_refused(at_home):
+    before = tree(at_home.home)
+    message = refused(8, "fit", SMOKE, "fit.learning_rate=0.1", "--seed", 3)
+    assert "(fit.learning_rate, fit.seed)" in message
+    assert "--overwrite" in message
+    assert tree(at_home.home) == before
+
+
+def test_evaluate_prints_one_json_object(at_home):
+    result = done("evaluate", "runs/smoke", "--json")
+    assert json.loads(result.out) == json.loads((at_home.run / "metrics.json").read_text())
+    assert result.err == ""
+
+
+def test_predict_poses_of_ones_own(at_home, tmp_path):
+    csv = tmp_path / "mine.csv"
+    csv.write_text("x,y,z,yaw,pitch,roll\n-0.4,0,0,0,0,0\n")
+    elsewhere = tmp_path / "only"
+    elsewhere.mkdir()
+    for name in ("model.safetensors", "model.json"):
+        shutil.copy(at_home.run / name, elsewhere)
+    with contextlib.chdir(tmp_path):  # no ensemble here
+        done("predict", "only", "--poses", csv, "--output", "there", "--accelerator", "cpu")
+        assert "sononerf simulate" in refused(3, "predict", "only")
+    with np.load(tmp_path / "there" / "spectrograms.npz", allow_pickle=False) as arrays:
+        assert len(arrays["predicted"]) == 1
+    assert sorted(p.name for p in elsewhere.iterdir()) == ["model.json", "model.safetensors"]
+
+
+def test_reconstruct_with_spacing_and_level(at_home, tmp_path):
+    before = tree(at_home.run)
+    options = ("--spacing", "0.012", "--level", "0.4", "--output", tmp_path / "coarse")
+    assert f"wrote {tmp_path / 'coarse'}" in done("reconstruct", "runs/smoke", *options).err
+    said = json.loads((tmp_path / "coarse" / "read_out.json").read_text())
+    assert (said["spacing_m"], said["level"]) == (pytest.approx(0.012), pytest.approx(0.4))
+    assert tree(at_home.run) == before
+
+
+@pytest.fixture
+def fit_alone(monkeypatch):
+    """Let `fit` leave out what follows the fit; return what it would have called."""
+    called = []
+    monkeypatch.setattr(predict_module, "predict", lambda *run, **options: called.append("predict"))
+    for name in ("reconstruct", "evaluate"):
+        monkeypatch.setattr(
+            reconstruct_module,
+            name,
+            lambda run, *, progress, name=name: called.append(name) or {},
+        )
+    monkeypatch.setattr(spectrogram_images.SpectrogramImages, "on_epoch", lambda *given: None)
+    return called
+
+
+def test_overwrite_moves_the_old_run_aside(fit_alone, clean):
+    command = ("fit", SMOKE, *SHORT, "--accelerator", "cpu", "--output", "run")
+    done(*command)
+    first = (clean / "run" / "model.safetensors").read_bytes()
+    result = done(*command, "--overwrite", "--seed", "7")
+    assert "moved the old run to" in result.err
+    assert (clean / "run.old-1" / "model.safetensors").read_bytes() == first
+    assert (clean / "run" / "model.safetensors").read_bytes() != first
+
+
+def test_what_follows_the_fit_is_made_up_for(fit_alone, clean):
+    command = ("fit", SMOKE, *SHORT, "--accelerator", "cpu", "--output", "run")
+    done(*command)
+    model = (clean / "run" / "model.json").stat()
+    done(*command)  # as after a stop between the fit and its end
+    assert fit_alone == ["predict", "reconstruct", "evaluate"] * 2
+    assert (clean / "run" / "model.json").stat() == model
+
+
+def test_a_plugins_scene_goes_the_whole_way(plugin, quick, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    listed = {row["name"]: row for row in json.loads(done("scenes", "--json").out)["scenes"]}
+    assert listed["fixture_bar"]["distribution"] == "sononerf-fixture"
+    overrides = ["scene.name=fixture_bar", "scene.options={length: 0.05}", "preview.every_epochs=9"]
+    done("fit", SMOKE, *overrides, "--accelerator", "cpu", "--output", "bar")
+    metrics = json.loads((tmp_path / "bar" / "metrics.json").read_text())
+    assert metrics["geometry"]["chamfer_m"] < 0.01
+    mesh = trimesh.load_mesh(tmp_path / "bar" / "reconstruction" / "mesh.ply")
+    assert mesh.extents[2] == max(mesh.extents)  # it stands
+    assert (tmp_path / "bar" / "reconstruction" / "view.png").is_file()
+
+
+def test_scenes_are_listed_for_people_and_for_programs():
+    text = done("scenes")
+    assert text.err == ""
+    assert any(line.startswith("three_spheres ") for line in text.out.splitlines())
+    rows = json.loads(done("scenes", "--json").out)["scenes"]
+    assert {"name", "distribution", "version", "broken", "options", "summary"} == rows[0].keys()
+
+
+# How it refuses.
+
+
+@pytest.fixture
+def clean(tmp_path, monkeypatch):
+    """An empty working directory, in which a refused command must leave nothing."""
+    home = tmp_path / "home"
+    home.mkdir()
+    monkeypatch.chdir(home)
+    return home
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["poses.cuont=3"], ["poses.cuont", "unknown key", "did you mean count?"]),
+        (["fitt.epochs=3"], ["fitt", "unknown key", "did you mean fit?"]),
+        (["fit.epochs=many"], ["fit.epochs", "'many'"]),
+        (["poses.radius=-0.4"], ["poses.radius", "-0.4", "greater than 0"]),
+        (["poses.count=0"], ["poses.count", "greater than or equal to 1"]),
+        (["spectrogram.range_min=0.6"], ["range_min must lie below range_max"]),
+        (["poses.radius=.nan"], ["poses.radius"]),
+        (["fit.epochs=3", "fit.epochs"], ["'fit.epochs'", "expected KEY=VALUE"]),
+        (["scene.name.x=1"], ["scene.name.x", "is a value, not a section"]),
+        (["scene.name=sphree", "scene.options={}"], ["unknown scene 'sphree'", "sphere"]),
+        (["field.kind=gird"], ["unknown field 'gird'", "did you mean grid"]),
+        (["renderer.kind=x"], ["unknown renderer 'x'", "profile, shell"]),
+        (["scene.options.radius=-1"], ["scene.options", "radius", "greater than 0"]),
+        (["field.options.fines=1"], ["field.options", "fines", "did you mean finest?"]),
+        (["renderer.options.points=0"], ["renderer.options", "points"]),
+        (["--seed", "4294967296"], ["fit.seed", "less than 4294967296"]),
+        (["--frobnicate"], ["no such option", "--frobnicate", "sononerf fit --help"]),
+        (["--devices", "0"], ["--devices", "greater than or equal to 1"]),
+        (["--accelerator", "abacus"], ["--accelerator", "abacus"]),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_wrong_settings_and_options(clean, arguments, words):
+    message = refused(2, "fit", SMOKE, *arguments, "--output", "run")
+    for word in words:
+        assert word in message
+    assert tree(clean) == {}
+
+
+@pytest.mark.parametrize("command", ["fit", "simulate"])
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, ["mine.yaml", "no such settings file"]),
+        ("scene: [", ["mine.yaml:1"]),
+        ("scene:\n  name: sphere\nscene:\n  name: ua\n", ["mine.yaml:3", "stands twice"]),
+        ("- a\n", ["mine.yaml", "holds list"]),
+        ("", ["mine.yaml", "scene: missing"]),
+        ("scene: {name: sphere}\nfit: {epochs: !!python/name:os.system x}\n", ["mine.yaml:2"]),
+        ("scene: {name: sphere}\nposes: {cuont: 1, radius: far}\n", ["count?", "poses.radius"]),
+        ("\x00", ["mine.yaml"]),
+    ],
+)
+def test_settings_files_that_are_none(clean, command, content, words):
+    if content is not None:
+        Path("mine.yaml").write_text(content)
+    before = tree(clean)
+    message = refused(2, command, "mine.yaml", "--output", "out")
+    for word in words:
+        assert word in message
+    assert tree(clean) == before
+
+
+def test_several_faults_are_told_at_once(clean):
+    message = refused(2, "fit", SMOKE, "poses.count=0", "fit.epochs=0")
+    assert len(message.splitlines()) == 2
+
+
+STL = trimesh.creation.box((0.05, 0.05, 0.05)).export(file_type="stl")
+BROKEN_MESHES = {
+    "missing": None,
+    "empty": b"",
+    "truncated": STL[:-7],
+    "NaN": STL[:96] + np.float32(np.nan).tobytes() + STL[100:],
+    "no mesh": b"<html>not found</html>",
+}
+
+
+@pytest.mark.parametrize("name", BROKEN_MESHES)
+@pytest.mark.parametrize("command", ["fit", "simulate"])
+def test_mesh_files_that_are_none(clean, command, name):
+    if BROKEN_MESHES[name] is not None:
+        Path("mine.stl").write_bytes(BROKEN_MESHES[name])
+    before = tree(clean)
+    scene = ["scene.name=mesh", "scene.options={path: mine.stl, unit: m}"]
+    assert "mine.stl" in refused(3, command, SMOKE, *scene, "--output", "out")
+    assert tree(clean) == before
+
+
+def test_a_mesh_needs_its_unit(clean):
+    Path("mine.stl").write_bytes(STL)
+    scene = ["scene.name=mesh", "scene.options={path: mine.stl}"]
+    assert "scene.options.unit" in refused(3, "fit", SMOKE, *scene, "--output", "out")
+    scene = ["scene.name=mesh", "scene.options={path: mine.stl, unit: inch}"]
+    assert "unit" in refused(2, "fit", SMOKE, *scene, "--output", "out")
+
+
+def test_poses_inside_the_scene(clean):
+    message = refused(3, "fit", SMOKE, "poses.radius=0.03", "--output", "out")
+    assert "pose" in message
+    assert tree(clean) == {}
+
+
+def test_a_broken_plugin_hurts_only_who_asks_for_it(clean, tmp_path, monkeypatch):
+    folder = tmp_path / "plugins"
+    info = folder / "broken-2.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 2.0\n")
+    (info / "entry_points.txt").write_text("[sononerf.scenes]\nbroken = no_such_module:make\n")
+    monkeypatch.syspath_prepend(folder)
+    wanted = ["scene.name=broken", "scene.options={}"]
+    assert "broken 2.0 cannot be loaded" in refused(3, "fit", SMOKE, *wanted, "--output", "out")
+    assert tree(clean) == {}
+    assert "broken: " in done("scenes").out
+
+
+@pytest.mark.parametrize("command", ["fit", "simulate"])
+def test_a_scene_that_no_pose_hears(clean, command):
+    limits = ["spectrogram.range_min=1.0", "spectrogram.range_max=1.1"]
+    message = refused(5, command, SMOKE, *limits, "--output", "out")
+    assert "no pose received an echo between 1.0 and 1.1 m" in message
+    assert {path for path in tree(clean) if path.startswith("out")} == set()
+
+
+@pytest.mark.parametrize("output", ["file", "file/run", "/dev/null/x", "/proc/nowhere/x"])
+@pytest.mark.parametrize("command", ["fit", "simulate"])
+def test_folders_that_cannot_be_written(clean, command, output):
+    Path("file").write_text("mine")
+    before = tree(clean)
+    message = refused(4, command, SMOKE, *SHORT, "--output", output)
+    assert output.split("/x")[0] in message
+    assert tree(clean) == before
+
+
+def test_a_folder_that_is_no_run(clean):
+    Path("thesis").mkdir()
+    Path("thesis/chapter.tex").write_text("mine")
+    before = tree(clean)
+    assert "is no run" in refused(3, "fit", SMOKE, "--output", "thesis")
+    assert "is no run" in refused(3, "fit", SMOKE, "--output", "thesis", "--overwrite")
+    assert tree(clean) == before
+
+
+def test_a_folder_in_use(clean):
+    with storage.lock(Path("run")):
+        message = refused(7, "fit", SMOKE, "--output", "run")
+        assert f"in use by process {os.getpid()}" in message
+        assert "in use" in refused(7, "fit", SMOKE, "--output", "run", "--overwrite")
+    assert [path for path in tree(clean) if path != "run"] == []
+
+
+@pytest.mark.parametrize("command", ["predict", "reconstruct", "evaluate"])
+def test_runs_that_are_not_there_or_not_finished(clean, command):
+    assert "nowhere: no fitted run" in refused(3, command, "nowhere")
+    Path("empty").mkdir()
+    assert "sononerf fit" in refused(3, command, "empty")
+    assert tree(clean) == {"empty": None}
+
+
+@pytest.mark.parametrize("command", ["predict", "reconstruct", "evaluate"])
+@pytest.mark.parametrize("name", ["model.safetensors", "model.json"])
+def test_runs_that_are_damaged(smoke, clean, command, name):
+    Path("run").mkdir()
+    for file in ("model.safetensors", "model.json"):
+        shutil.copy(smoke.run / file, "run")
+    data = bytearray((clean / "run" / name).read_bytes())
+    del data[len(data) // 2 :]
+    (clean / "run" / name).write_bytes(data)
+    before = tree(clean)
+    assert name in refused(3, command, "run")
+    assert tree(clean) == before
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (None, ["mine.csv", "cannot be read"]),
+        ("", ["mine.csv", "header"]),
+        ("x,y,z\n0,0,0\n", ["x,y,z,yaw,pitch,roll"]),
+        ("x,y,z,yaw,pitch,roll\n", ["no poses"]),
+        ("x,y,z,yaw,pitch,roll\n0,0,far,0,0,0\n", ["mine.csv:2", "z"]),
+        ("x,y,z,yaw,pitch,roll\n0,0,nan,0,0,0\n", ["mine.csv:2", "z"]),
+        ("x,y,z,yaw,pitch,roll\n0,0,0\n", ["mine.csv:2"]),
+    ],
+)
+def test_tables_of_poses_that_are_none(smoke, clean, content, words):
+    if content is not None:
+        Path("mine.csv").write_text(content)
+    before = tree(clean)
+    message = refused(3, "predict", smoke.run, "--poses", "mine.csv", "--output", "out")
+    for word in words:
+        assert word in message
+    assert tree(clean) == before
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--level", "high"),
+        ("--level", "nan"),
+        ("--spacing", "0"),
+        ("--spacing", "nan"),
+        ("--spacing", "wide"),
+    ],
+)
+def test_wrong_numbers_for_the_read_out(smoke, clean, options):
+    assert options[0] in refused(2, "reconstruct", smoke.run, *options, "--output", "out")
+    assert tree(clean) == {}
+
+
+def test_a_surface_that_is_not_there(smoke, clean):
+    refused(5, "reconstruct", smoke.run, "--level", "1e9", "--output", "out")
+    assert [name for name in tree(clean) if name != "out"] == []
+
+
+def test_workers_and_scheduler_exclude_each_other(clean):
+    message = refused(2, "simulate", SMOKE, "--workers", "1", "--scheduler", "tcp://x:1")
+    assert "exclude each other" in message
+    assert tree(clean) == {}
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.parametrize("command", ["fit", "predict"])
+def test_a_gpu_that_is_not_there(smoke, clean, command, monkeypatch):
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    if command == "fit":
+        arguments = [SMOKE, "--output", "out"]
+    else:
+        Path("mine.csv").write_text("x,y,z,yaw,pitch,roll\n-0.4,0,0,0,0,0\n")
+        arguments = [smoke.run, "--poses", "mine.csv", "--output", "out"]
+    assert "--accelerator cpu" in refused(6, command, *arguments, "--accelerator", "gpu")
+    assert not Path("out/spectrograms.npz").exists()
+
+
+def test_a_fault_of_ours_is_not_dressed_up(monkeypatch):
+    def broken():
+        raise ZeroDivisionError("ours")
+
+    from sononerf.experiment import scenes
+
+    monkeypatch.setattr(scenes, "describe_scenes", broken)
+    monkeypatch.setattr(sys, "argv", ["sononerf", "scenes"])
+    with pytest.raises(ZeroDivisionError):
+        cli.main()
+
+
+# Help.
+
+
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)], ids=" ".join)
+def test_help(command):
+    result = done(*command, "--help")
+    assert result.out.startswith("Usage: ")
+    assert result.err == ""
+
+
+def test_all_commands_are_here():
+    assert sorted(typer.main.get_command(cli.app).commands) == sorted(COMMANDS)
+
+
+def test_nothing_and_nonsense_are_wrong_usage():
+    result = run()
+    assert result.code == 2
+    assert "Commands:" in result.err
+    assert "no such command 'frobnicate'" in refused(2, "frobnicate")
+    assert "missing argument" in refused(2, "fit")
+    assert done("--version").out.startswith("sononerf ")
+
+
+# Signals.
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signals_outside_the_fit_unwind_and_say_so(monkeypatch, number):
+    from sononerf.experiment import scenes
+
+    closed = []
+
+    def work():
+        try:
+            os.kill(os.getpid(), number)
+            time.sleep(5)
+        finally:
+            closed.append(True)
+
+    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    monkeypatch.setattr(scenes, "describe_scenes", work)
+    assert "the same command goes on" in refused(128 + number, "scenes")
+    assert closed == [True]
+    after = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
+    assert after == before
+
+
+def test_sigterm_stops_a_fit_in_time_and_the_same_command_goes_on(clean, fit_alone, monkeypatch):
+    arguments = [
+        *("fit", SMOKE, *SHORT, "fit.epochs=40", "fit.steps_per_epoch=10"),
+        *("preview.every_epochs=100", "--accelerator", "cpu", "--output", "run"),
+    ]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sononerf.cli", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+    )
+    checkpoint = clean / "run" / "checkpoints" / "last.ckpt"
+    deadline = time.monotonic() + 90
+    while not checkpoint.exists():
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+    asked = time.monotonic()
+    process.send_signal(signal.SIGTERM)
+    out, err = process.communicate(timeout=60)
+    assert time.monotonic() - asked < 5
+    assert (process.returncode, out) == (143, "")
+    last = err.strip().splitlines()[-1]
+    assert last.startswith("error: stopped at step ")
+    assert last.endswith(" of 400; the same command goes on")
+    stopped = int(last.split()[4])
+    assert 10 <= stopped < 400
+    for noise in ("Traceback", "LeafSpec", "\x1b"):
+        assert noise not in err
+    assert not (clean / "run" / ".lock").exists()
+
+    steps = []
+    real = preview.EpochCallback.on_train_batch_end
+
+    def count(self, trainer, pl_module, *rest):
+        steps.append(pl_module.global_step)
+        real(self, trainer, pl_module, *rest)
+
+    monkeypatch.setattr(preview.PreviewCallback, "on_train_batch_end", count)
+    done(*arguments)
+    assert steps == list(range(stopped + 1, 401))
+    assert json.loads((clean / "run" / "metrics.json").read_text())["cost"]["steps"] == 400

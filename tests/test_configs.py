@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: MIT
+"""Every settings file that we ship loads, round-trips and builds."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+import torch
+
+from sononerf.config import dump_yaml, load_settings, read_yaml, validate_settings
+from sononerf.experiment.build import field_and_renderer
+from sononerf.experiment.fit import fit
+from sononerf.module import EchoModule
+from sononerf.scene import load_scene
+
+CONFIGS = Path(__file__).resolve().parent.parent / "configs"
+FILES = sorted(CONFIGS.rglob("*.yaml"))
+BOX = torch.tensor([[-0.05] * 3, [0.05] * 3])
+
+
+def named(path):
+    return str(path.relative_to(CONFIGS))
+
+
+def leaves(data):
+    for key, value in data.items():
+        if isinstance(value, dict) and value:
+            yield from ((f"{key}.{name}", leaf) for name, leaf in leaves(value))
+        else:
+            yield key, value
+
+
+def test_there_are_some():
+    assert {"smoke.yaml", "three_spheres.yaml", "paper/three_spheres.yaml"} <= {
+        named(path) for path in FILES
+    }
+    assert [path.name for path in CONFIGS.rglob("*.yml")] == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=named)
+def test_it_loads_and_round_trips(path, tmp_path):
+    settings = load_settings(path)
+    (tmp_path / "whole.yaml").write_text(dump_yaml(settings))
+    assert load_settings(tmp_path / "whole.yaml") == settings
+    assert dump_yaml(load_settings(tmp_path / "whole.yaml")) == dump_yaml(settings)
+
+
+@pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=named)  # not the paper's
+def test_it_says_only_what_differs_from_the_defaults(path):
+    settings = read_yaml(path)
+    defaults = validate_settings({"scene": {"name": settings["scene"]["name"]}}, "defaults")
+    same = dict(leaves(defaults.plain()))
+    same.pop("scene.name")
+    assert [key for key, value in leaves(settings) if key in same and same[key] == value] == []
+
+
+@pytest.mark.parametrize("path", FILES, ids=named)
+def test_its_scene_field_and_renderer_build(path):
+    settings = load_settings(path)
+    assert len(load_scene(settings.scene.name, settings.scene.options).mesh.faces) > 0
+    field, renderer = field_and_renderer(settings, BOX)
+    assert sum(parameter.numel() for parameter in field.parameters()) > 0
+    assert renderer.whole_poses == (settings.renderer.kind != "shell")
+
+
+PAPER = CONFIGS / "paper" / "three_spheres.yaml"
+
+
+def test_the_papers_training_is_the_papers():
+    settings = load_settings(PAPER)
+    fit_settings = settings.fit
+    assert (settings.field.kind, settings.renderer.kind) == ("fourier", "shell")
+    assert settings.renderer.options["directions"] == 600
+    assert (fit_settings.epochs, fit_settings.batch_slices) == (100, 512)
+    assert (fit_settings.learning_rate, fit_settings.loss) == (0.01, "l2")
+    assert (fit_settings.schedule, fit_settings.staircase_factor) == ("staircase", 0.97)
+    assert fit_settings.staircase_epochs == 10
+
+
+@pytest.mark.parametrize(
+    "slices",
+    [64, pytest.param(512, marks=pytest.mark.slow)],  # its full batch: half a minute
+)
+def test_the_papers_training_takes_steps(tmp_path, monkeypatch, slices):
+    settings = load_settings(
+        PAPER,
+        [
+            "poses.count=4",
+            "poses.validation=0",
+            "poses.heldout=0",
+            "simulation.rays=1000",
+            "fit.max_steps=3",
+            f"fit.batch_slices={slices}",
+            f"data.store={tmp_path / 'store'}",
+        ],
+    )
+    losses = []
+    real = EchoModule._loss
+
+    def loss(self, predicted, measured):
+        found = real(self, predicted, measured)
+        losses.append(float(found.detach()))
+        return found
+
+    monkeypatch.setattr(EchoModule, "_loss", loss)
+    fit(settings, tmp_path / "run", accelerator="cpu", workers=1)
+    assert len(losses) == 3
+    assert all(math.isfinite(loss) for loss in losses)
+    # The second step overshoots, as Adam does at this rate; the third has made up for it.
+    assert slices < 512 or losses[-1] <= losses[0]
+    assert (tmp_path / "run" / "model.safetensors").is_file()

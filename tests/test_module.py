@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: MIT
+import math
+from types import SimpleNamespace
+
+import lightning
+import numpy as np
+import pytest
+import torch
+
+from sononerf.data.datamodule import EchoDataModule
+from sononerf.data.range_slices import RangeSlices
+from sononerf.data.store import EnsembleStore
+from sononerf.errors import NumericalError
+from sononerf.field.grid import GridField
+from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.geometry.poses import look_at
+from sononerf.module import EchoModule, decibels
+from sononerf.renderer.profile import ProfileRenderer
+from sononerf.renderer.renderer import Acquisition, Renderer
+from sononerf.renderer.shell import ShellRenderer
+
+REGION = torch.tensor([[-0.02] * 3, [0.02] * 3])
+FREQUENCY = torch.tensor([40e3, 60e3, 80e3])
+STEP = 4 * 343 / 1e6 / 2
+ACQUISITION = Acquisition(
+    frequency=FREQUENCY,
+    range=0.2 + torch.arange(150) * STEP,
+    window=torch.hamming_window(64, periodic=False),
+    sampling_rate=1e6,
+    speed_of_sound=343.0,
+    absorption=torch.tensor([0.1, 0.2, 0.3]),
+    beam=torch.ones(3, 5, 9),
+    ears=torch.ones(2, 3, 5, 9),
+    emitter=torch.zeros(3),
+    ear_positions=torch.tensor([[-0.01, 0.01, 0.0], [-0.01, -0.01, 0.0]]),
+)
+
+
+class Given(Renderer):
+    """Renders a parameter, whatever the field and the pose."""
+
+    def __init__(self, values):
+        super().__init__(REGION, ACQUISITION)
+        self.values = torch.nn.Parameter(values.clone())
+
+    def forward(self, field, position, rotation, rows, bins=None):
+        return self.values
+
+
+def module(renderer, field=None, **options):
+    field = field or GridField(REGION, FREQUENCY, spacing=0.01, levels=1)
+    given = {
+        "reference": 0.001, "dynamic_range_db": 60.0, "possible": None, "learning_rate": 0.1,
+        "total_steps": 100, "steps_per_epoch": 10, **options,
+    }  # fmt: skip
+    return EchoModule(field, renderer, **given)
+
+
+def batch(spectrum):
+    count = len(spectrum)
+    rows = torch.arange(spectrum.shape[2]).expand(count, -1)
+    bins = torch.arange(spectrum.shape[3])
+    pose = torch.arange(count)
+    return RangeSlices(
+        pose, torch.zeros(count, 3), torch.eye(3).expand(count, 3, 3), rows, bins, spectrum
+    )
+
+
+def logged(found, monkeypatch):
+    values = {}
+    monkeypatch.setattr(
+        found, "log", lambda name, value, **_: values.update({name: float(value.detach())})
+    )
+    return values
+
+
+def test_decibels_have_a_soft_floor():
+    found = decibels(torch.tensor([0.0, 0.001, 0.999]), 0.001)
+    np.testing.assert_allclose(found, [0.0, 20 * math.log10(2), 60.0], atol=1e-4)
+
+
+# Measured 0 dB and 60 dB, predicted 6 dB and 48 dB: errors of 0.1 and -0.2 of the full 60 dB.
+MEASURED = torch.tensor([0.0, 10**3 - 1]).mul(0.001).reshape(1, 1, 1, 2)
+PREDICTED = torch.tensor([10**0.3 - 1, 10**2.4 - 1]).mul(0.001).reshape(1, 1, 1, 2)
+LOSSES = {
+    "l1": (0.1 + 0.2) / 2,
+    "l2": 0.5 * (0.01 + 0.04) / 2,
+    "l1_4l2": (0.1 + 0.2 + 4 * (0.01 + 0.04)) / 2,
+}
+
+
+@pytest.mark.parametrize("loss", LOSSES)
+def test_losses_by_hand(loss, monkeypatch):
+    found = module(Given(PREDICTED), loss=loss)
+    values = logged(found, monkeypatch)
+    monkeypatch.setattr(found.renderer, "prepare", lambda *_: False)
+    assert float(found.training_step(batch(MEASURED), 0).detach()) == pytest.approx(
+        LOSSES[loss], rel=1e-4
+    )
+    assert values["train/loss"] == pytest.approx(LOSSES[loss], rel=1e-4)
+
+
+def test_the_fit_may_compress_otherwise():
+    """40 dB instead of 60: the floor is ten times as high, and the error a part of 40."""
+    found = module(Given(PREDICTED), dynamic_range_db=40.0)
+    assert found.fit_reference == pytest.approx(0.01)
+
+    def level(x):
+        return 20 * math.log10(1 + x / 0.01)
+
+    pairs = zip(PREDICTED.flatten().tolist(), MEASURED.flatten().tolist(), strict=True)
+    expected = np.mean([abs(level(p) - level(m)) / 40 for p, m in pairs])
+    assert float(found._loss(PREDICTED, MEASURED).detach()) == pytest.approx(expected, rel=1e-4)
+
+
+def test_silent_cells_may_weigh_less():
+    """A cell is silent where both stay below 3 dB; the weights are a mean's."""
+    level = 0.001 * (10 ** (torch.tensor([[0.0, 0.0, 6.0, 60.0], [2.0, 6.0, 0.0, 48.0]]) / 20) - 1)
+    measured, predicted = level.reshape(2, 1, 1, 1, 4)
+    found = module(Given(predicted), silent_weight=0.5)
+    expected = (0.5 * 2 + 6 + 6 + 12) / 60 / 3.5
+    assert float(found._loss(predicted, measured).detach()) == pytest.approx(expected, rel=1e-4)
+    plain = module(Given(predicted))
+    assert float(plain._loss(predicted, measured).detach()) == pytest.approx(26 / 60 / 4, rel=1e-4)
+
+
+def test_the_rate_cools_in_the_second_half():
+    found = module(Given(PREDICTED), total_steps=100, final_rate_factor=0.01)
+    rates = [found._rate(step) for step in (0, 30, 50, 75, 100)]
+    assert rates == pytest.approx([1, 1, 1, 0.1, 0.01])
+
+
+def test_the_rate_falls_in_stairs_of_epochs():
+    found = module(Given(PREDICTED), schedule="staircase", staircase_factor=0.5, staircase_epochs=2)
+    # Ten steps an epoch, two epochs a stair.
+    assert [found._rate(step) for step in (0, 19, 20, 39, 40)] == [1, 1, 0.5, 0.5, 0.25]
+
+
+def test_the_schedule_reaches_the_optimizer():
+    found = module(Given(PREDICTED), total_steps=4, final_rate_factor=0.01)
+    configured = found.configure_optimizers()
+    optimizer, scheduler = configured["optimizer"], configured["lr_scheduler"]["scheduler"]
+    assert configured["lr_scheduler"]["interval"] == "step"
+    rates = []
+    for _ in range(5):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        scheduler.step()
+    assert rates == pytest.approx([0.1, 0.1, 0.1, 0.01, 0.001])
+    assert sum(len(g["params"]) for g in optimizer.param_groups) == len(list(found.parameters()))
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf])
+def test_a_gradient_that_is_no_number_stops_the_fit_by_name(value):
+    found = module(Given(PREDICTED))
+    found.renderer.values.grad = torch.ones_like(PREDICTED)
+    found.field.spectrum.grad = torch.zeros(3)
+    found.on_before_optimizer_step(None)
+    found.field.spectrum.grad[1] = value
+    with pytest.raises(
+        NumericalError, match=r"gradient of field\.spectrum is not finite at step 0"
+    ):
+        found.on_before_optimizer_step(None)
+    found.field.spectrum.grad[1] = 0.0
+    found.renderer.values.grad[0, 0, 0, 1] = value
+    with pytest.raises(NumericalError, match=r"gradient of renderer\.values"):
+        found.on_before_optimizer_step(None)
+
+
+def test_validation_is_in_the_decibels_of_every_report(monkeypatch):
+    """Errors 6 and -12 dB, both active; then 2 dB in silence and 3 dB, all over two batches."""
+    found = module(Given(PREDICTED), dynamic_range_db=30.0)
+    values = logged(found, monkeypatch)
+    found.validation_step(batch(MEASURED), 0)
+    levels = 0.001 * (10 ** (torch.tensor([[0.0, 0.0], [2.0, 3.01]]) / 20) - 1)
+    found.renderer.values.data = levels[1].reshape(1, 1, 1, 2)
+    found.validation_step(batch(levels[0].reshape(1, 1, 1, 2)), 1)
+    found.on_validation_epoch_end()
+    assert values["val/mae_db"] == pytest.approx((6 + 12 + 2 + 3.01) / 4, rel=1e-4)
+    assert values["val/mae_db_active"] == pytest.approx((6 + 12 + 3.01) / 3, rel=1e-4)
+    # The next epoch starts anew, and where nothing is active there is no such figure.
+    values.clear()
+    found.renderer.values.data = levels[1, :1].reshape(1, 1, 1, 1)
+    found.validation_step(batch(levels[0, :1].reshape(1, 1, 1, 1)), 0)
+    found.on_validation_epoch_end()
+    assert values == {"val/mae_db": pytest.approx(2, rel=1e-4)}
+
+
+def test_the_first_step_sets_the_gain(monkeypatch):
+    asked = []
+
+    class Gained(Given):
+        def forward(self, *given):
+            return self.values * self.log_gain.exp()
+
+        def prepare(self, field, possible, step):
+            asked.append((possible, step))
+            return True
+
+    possible = object()
+    found = module(Gained(torch.full((1, 2, 3, 2), 0.02)), possible=possible)
+    logged(found, monkeypatch)
+    loss = found.training_step(batch(torch.full((1, 2, 3, 2), 0.5)), 0)
+    assert asked == [(possible, 0)]
+    assert float(loss.detach()) == pytest.approx(0, abs=1e-6)
+    assert float(found.renderer.log_gain.detach().exp()) == pytest.approx(25)
+    torch.testing.assert_close(
+        found.predict_step(batch(torch.zeros(1, 2, 3, 2)), 0), found(batch(torch.zeros(1, 2, 3, 2)))
+    )
+
+
+def test_all_devices_begin_with_one_gain(monkeypatch):
+    """Each is calibrated on its own share of the batch; nothing later would bring them together."""
+    found = module(Given(PREDICTED))
+    logged(found, monkeypatch)
+    other = 3.0  # the other device's gain and values
+    strategy = SimpleNamespace(reduce=lambda mine, reduce_op: (mine + other) / 2)
+    monkeypatch.setattr(type(found), "trainer", SimpleNamespace(strategy=strategy))
+    monkeypatch.setattr(type(found), "global_step", 0)
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    found.training_step(batch(MEASURED), 0)
+    ratio = MEASURED.square().sum() / PREDICTED.square().sum()
+    expected = (0.5 * float(ratio.log()) + other) / 2
+    assert float(found.renderer.log_gain.detach()) == pytest.approx(expected, rel=1e-5)
+    torch.testing.assert_close(found.renderer.values.detach(), (PREDICTED + other) / 2)
+    # Between two calibrations, and with one device, everyone keeps what it has.
+    monkeypatch.setattr(found.renderer, "prepare", lambda *_: False)
+    found.training_step(batch(MEASURED), 0)
+    torch.testing.assert_close(found.renderer.values.detach(), (PREDICTED + other) / 2)
+
+
+def test_epochs_are_counted_from_the_step(monkeypatch):
+    found = module(Given(PREDICTED))
+    for step, epoch in ((0, 0), (9, 0), (10, 1), (25, 2)):
+        monkeypatch.setattr(type(found), "global_step", step)
+        assert found.epoch_done == epoch
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """Echoes of a known field: three places of a grid, heard from 12 poses."""
+    field = GridField(REGION, FREQUENCY, spacing=0.01, levels=1)
+    with torch.no_grad():
+        field.grids[0][:, 0] = -10.0
+        for x, y, z in ((1, 1, 1), (3, 2, 1), (2, 3, 4)):
+            field.grids[0][0, 0, z, y, x] = 0.0
+    renderer = ProfileRenderer(REGION, ACQUISITION)
+    renderer.prepare(field, None, 0)
+    positions = 0.24 * fibonacci_sphere(12)
+    rotations = look_at(positions, np.zeros(3))
+    rows = torch.arange(150).expand(12, -1)
+    with torch.no_grad():
+        heard = renderer(
+            field, torch.tensor(positions).float(), torch.tensor(rotations).float(), rows
+        )
+    store = EnsembleStore.create(
+        tmp_path_factory.mktemp("data") / "store",
+        poses_positions=positions,
+        poses_rotations=rotations,
+        split=np.arange(12) % 6 == 5,
+        range=ACQUISITION.range.numpy(),
+        frequency=FREQUENCY.numpy(),
+        attributes={"echo_hash": "a", "reference": float(heard.max()) / 1000},
+    )
+    for index, values in enumerate(heard.numpy()):
+        store.write_pose(index, values)
+    store.seal()
+    return store
+
+
+def fit(store, renderer, path, steps):
+    torch.manual_seed(0)
+    field = GridField(REGION, FREQUENCY, spacing=0.01, levels=1)
+    found = module(
+        renderer,
+        field,
+        reference=store.attributes["reference"],
+        total_steps=steps,
+        steps_per_epoch=steps,
+        learning_rate=0.3,
+    )
+    data = EchoDataModule(
+        store,
+        whole_poses=renderer.whole_poses,
+        batch=4 if renderer.whole_poses else 200,
+        batch_frequencies=None,
+        seed=0,
+    )
+    losses = []
+
+    class Losses(lightning.Callback):
+        def on_train_batch_end(self, trainer, pl_module, outputs, *_):
+            losses.append(float(outputs["loss"]))
+
+    trainer = lightning.Trainer(
+        accelerator="cpu", max_epochs=-1, max_steps=steps, logger=False,
+        val_check_interval=steps, check_val_every_n_epoch=None, num_sanity_val_steps=0,
+        enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
+        use_distributed_sampler=False, default_root_dir=path, callbacks=[Losses()],
+    )  # fmt: skip
+    trainer.fit(found, data)
+    return losses, {k: float(v) for k, v in trainer.callback_metrics.items()}, found
+
+
+def test_training_lowers_the_loss_and_repeats(store, tmp_path):
+    losses, metrics, _ = fit(store, ProfileRenderer(REGION, ACQUISITION), tmp_path, 40)
+    assert len(losses) == 40
+    assert np.mean(losses[-3:]) < 0.3 * losses[0]
+    assert metrics["val/mae_db"] < 0.3 * 60 * losses[0]
+    again, _, _ = fit(store, ProfileRenderer(REGION, ACQUISITION), tmp_path, 40)
+    assert again == losses
+
+
+def test_training_on_single_slices_lowers_the_loss(store, tmp_path):
+    losses, _, found = fit(store, ShellRenderer(REGION, ACQUISITION, directions=200), tmp_path, 30)
+    assert np.mean(losses[-3:]) < 0.8 * losses[0]
+    assert all(p.isfinite().all() for p in found.parameters())

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""The commands that the README shows are ones that there are."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer
+
+from sononerf.cli import app
+from sononerf.config import load_settings
+from sononerf.plugins import SCENES, registered
+
+ROOT = Path(__file__).resolve().parent.parent
+TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
+OTHERS = {".", "tensorboard", "pip", "git", "cd"}  # not ours to test
+
+
+def blocks(kind):
+    return re.findall(rf"^```{kind}\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+
+
+def commands():
+    lines = "\n".join(blocks("sh")).replace("\\\n", " ").splitlines()
+    found = [shlex.split(line, comments=True) for line in lines]
+    return [words for words in found if words]
+
+
+def targets():
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    lines = re.findall(r"^([\w -]+):", makefile, re.MULTILINE)
+    return {name for line in lines for name in line.split()}
+
+
+def parse(words):
+    """Let the command line read a command without running it; return its parameters."""
+    group = typer.main.get_command(app)
+    name, *arguments = words
+    assert name in group.commands, f"no command {name}"
+    return group.commands[name].make_context(name, arguments).params
+
+
+def test_two_commands_come_first():
+    assert [words[:2] for words in commands()[:2]] == [["make", "demo"], ["make", "test"]]
+
+
+@pytest.mark.parametrize("words", commands(), ids=" ".join)
+def test_a_command_exists(words):
+    program, *arguments = words
+    if program == "make":
+        assert set(arguments) <= targets()
+    elif program == "sononerf":
+        parameters = parse(arguments)
+        config = parameters.get("config")
+        if config is not None:
+            load_settings(ROOT / config, parameters["overrides"] or ())
+    else:
+        assert program in OTHERS
+
+
+def test_a_command_that_there_is_not_is_seen():
+    for words in (["fiddle", "x"], ["fit", "configs/ua.yaml", "--resume"], ["predict"]):
+        with pytest.raises((AssertionError, typer.TyperException)):
+            parse(words)
+
+
+def test_the_files_and_scenes_it_names_are_there():
+    for path in set(re.findall(r"configs/[\w/]+\.yaml", TEXT)):
+        assert (ROOT / path).is_file(), path
+    assert {"mesh"} <= {plugin.name for plugin in registered(SCENES)}
+
+
+def test_it_stays_short():
+    assert len(TEXT.splitlines()) <= 150
