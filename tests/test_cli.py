@@ -633,7 +633,7 @@ def test_signals_outside_the_fit_unwind_and_say_so(monkeypatch, number):
 
 def test_sigterm_stops_a_fit_in_time_and_the_same_command_goes_on(clean, fit_alone, monkeypatch):
     arguments = [
-        *("fit", SMOKE, *SHORT, "fit.epochs=40", "fit.steps_per_epoch=10"),
+        *("fit", SMOKE, *SHORT, "fit.epochs=20", "fit.steps_per_epoch=10"),
         *("preview.every_epochs=100", "--accelerator", "cpu", "--output", "run"),
     ]
     process = subprocess.Popen(
@@ -656,9 +656,9 @@ def test_sigterm_stops_a_fit_in_time_and_the_same_command_goes_on(clean, fit_alo
     assert (process.returncode, out) == (143, "")
     last = err.strip().splitlines()[-1]
     assert last.startswith("error: stopped at step ")
-    assert last.endswith(" of 400; the same command goes on")
+    assert last.endswith(" of 200; the same command goes on")
     stopped = int(last.split()[4])
-    assert 10 <= stopped < 400
+    assert 10 <= stopped < 200
     for noise in ("Traceback", "LeafSpec", "\x1b"):
         assert noise not in err
     assert not (clean / "run" / ".lock").exists()
@@ -672,5 +672,5 @@ def test_sigterm_stops_a_fit_in_time_and_the_same_command_goes_on(clean, fit_alo
 
     monkeypatch.setattr(preview.PreviewCallback, "on_train_batch_end", count)
     done(*arguments)
-    assert steps == list(range(stopped + 1, 401))
-    assert json.loads((clean / "run" / "metrics.json").read_text())["cost"]["steps"] == 400
+    assert steps == list(range(stopped + 1, 201))
+    assert json.loads((clean / "run" / "metrics.json").read_text())["cost"]["steps"] == 200

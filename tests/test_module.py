@@ -214,7 +214,12 @@ def test_all_devices_begin_with_one_gain(monkeypatch):
     found = module(Given(PREDICTED))
     logged(found, monkeypatch)
     other = 3.0  # the other device's gain and values
-    strategy = SimpleNamespace(reduce=lambda mine, reduce_op: (mine + other) / 2)
+
+    def reduce(mine, reduce_op):
+        assert reduce_op == "mean"
+        return (mine + other) / 2
+
+    strategy = SimpleNamespace(reduce=reduce)
     monkeypatch.setattr(type(found), "trainer", SimpleNamespace(strategy=strategy))
     monkeypatch.setattr(type(found), "global_step", 0)
     monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)

@@ -36,8 +36,23 @@ class CheckpointCallback(EpochCallback):
         self.path = folder / "checkpoints" / "last.ckpt"
         self.seconds = seconds
         self.stopped_by: int | None = None
-        self._saved = time.monotonic()
+        self._saved = self._began = time.monotonic()
+        self._earlier = 0.0
         self._before: dict[signal.Signals, Callable[..., Any] | int] = {}
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of fitting so far, those before an interruption included."""
+        return self._earlier + time.monotonic() - self._began
+
+    def state_dict(self) -> dict[str, float]:
+        """Return what a checkpoint keeps of this callback."""
+        return {"elapsed": self.elapsed}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Go on counting where the interrupted fit stopped."""
+        self._earlier = float(state_dict["elapsed"])
+        self._began = time.monotonic()
 
     @contextmanager
     def watching(self) -> Iterator[None]:

@@ -222,15 +222,8 @@ def _fit(
             log_every_n_steps=10,
             default_root_dir=run.path,
         )
-        before = run.read_metrics().get("cost", {}).get("fit_s", 0.0) if resumed else 0.0
-        try:
-            trainer.fit(
-                module, data, ckpt_path=run.checkpoint if resumed else None, weights_only=True
-            )
-        finally:
-            seconds = before + time.monotonic() - started
-            run.write_metrics("cost", {"fit_s": seconds}, merge=True)
-        _finish(settings, run, store, module, trainer)
+        trainer.fit(module, data, ckpt_path=run.checkpoint if resumed else None, weights_only=True)
+        _finish(settings, run, store, module, keeper.elapsed, trainer)
     if keeper.stopped_by is not None:
         raise StoppedError(
             keeper.stopped_by, "stopped after the last step; the same command goes on"
@@ -251,6 +244,7 @@ def _finish(
     run: RunFolder,
     store: EnsembleStore,
     module: EchoModule,
+    seconds: float,
     trainer: lightning.Trainer,
 ) -> None:
     bad = [n for n, p in module.named_parameters() if not bool(p.isfinite().all())]
@@ -263,6 +257,7 @@ def _finish(
     run.write_metrics(
         "cost",
         {
+            "fit_s": seconds,
             "steps": trainer.global_step,
             "points_evaluated": int(module.renderer.points_evaluated),
             "parameters": sum(p.numel() for p in module.parameters()),

@@ -3,10 +3,13 @@
 
 from __future__ import annotations
 
+import functools
+
 import pytest
 
 from sononerf.callbacks import spectrogram_images
 from sononerf.config import validate_settings
+from sononerf.experiment import build
 from sononerf.experiment.simulate import simulate
 
 TINY = {
@@ -52,7 +55,8 @@ def tiny(tiny_settings):
 
 @pytest.fixture(scope="module")
 def without_pictures():
-    """Spectrograms take most of a tiny fit and have tests of their own."""
+    """Spectrograms and ears take most of a tiny fit and have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(build, "analysed_ears", functools.cache(build.analysed_ears))
         patch.setattr(spectrogram_images.SpectrogramImages, "on_epoch", lambda *given: None)
         yield

@@ -103,9 +103,7 @@ def run_with_stops(settings, path, interrupt, stops, number=signal.SIGTERM):
         [PER_EPOCH + 1],
         [STEPS - 1],
         [PER_EPOCH, 2 * PER_EPOCH],  # through one boundary into another
-        [3, PER_EPOCH],
-        [PER_EPOCH, PER_EPOCH + 1],
-        [1, STEPS - 1],
+        [3, PER_EPOCH, PER_EPOCH + 1],
         list(range(1, 11)),
     ],
     ids=str,
@@ -115,7 +113,7 @@ def test_interrupted_fits_end_bit_for_bit_alike(tiny, tmp_path, interrupt, unint
     assert differences(held, uninterrupted) == []
 
 
-@pytest.mark.parametrize("number", SIGNALS)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])  # SIGTERM is above
 def test_every_signal_stops_in_order_and_gives_back_its_handler(
     tiny, tmp_path, interrupt, uninterrupted, number
 ):
@@ -339,17 +337,23 @@ def test_what_a_fit_cost_is_counted_over_its_parts(tiny, tmp_path, interrupt, mo
     interrupt(5, signal.SIGTERM)
     with pytest.raises(StoppedError):
         run(tiny(), path)
-    first = cost()
-    real = fit_module.simulate
+    first = cost()["simulate_s"]
+    simulate, load = fit_module.simulate, DurableCheckpointIO.load_checkpoint
 
     def slow(*arguments, **options):
-        time.sleep(0.3)
-        return real(*arguments, **options)
+        time.sleep(first + 0.1)
+        return simulate(*arguments, **options)
+
+    def long_ago(self, *arguments, **options):
+        content = load(self, *arguments, **options)
+        content["callbacks"]["CheckpointCallback"]["elapsed"] += 1000.0
+        return content
 
     monkeypatch.setattr(fit_module, "simulate", slow)
+    monkeypatch.setattr(DurableCheckpointIO, "load_checkpoint", long_ago)
     run(tiny(), path)
-    assert cost()["fit_s"] > first["fit_s"] > 0
-    assert cost()["simulate_s"] == first["simulate_s"] < 0.3
+    assert 1000.0 < cost()["fit_s"] < 1100.0
+    assert cost()["simulate_s"] == first
     assert cost()["steps"] == STEPS
     assert cost()["points_evaluated"] > 0
     assert cost()["device"] == "cpu"

@@ -38,6 +38,11 @@ def run(fitted, tmp_path):
     return path
 
 
+@pytest.fixture
+def no_pictures(monkeypatch):
+    monkeypatch.setattr(predict_module, "spectrogram_png", lambda *given: b"")
+
+
 def arrays_of(folder):
     with np.load(folder / "spectrograms.npz", allow_pickle=False) as file:
         return dict(file)
@@ -66,7 +71,7 @@ def test_measured_predicted_and_numbered_as_in_the_store(run, echoes):
         assert min(image.size) > 100
 
 
-def test_the_numbers_are_those_of_the_arrays(run, echoes):
+def test_the_numbers_are_those_of_the_arrays(run, echoes, no_pictures):
     arrays = arrays_of(predict(run, accelerator="cpu"))
     numbers = json.loads((run / "metrics.json").read_text())["prediction"]
     store = EnsembleStore.open(echoes)
@@ -89,7 +94,7 @@ def test_the_numbers_are_those_of_the_arrays(run, echoes):
 
 
 @pytest.mark.parametrize(("split", "count"), [("train", 8), ("val", 2)])
-def test_other_splits_have_their_own_folder_and_no_numbers(run, split, count):
+def test_other_splits_have_their_own_folder_and_no_numbers(run, split, count, no_pictures):
     folder = predict(run, split=split, accelerator="cpu")
     assert folder == run / f"prediction-{split}"
     assert len(arrays_of(folder)["pose"]) == count
@@ -114,7 +119,7 @@ def test_poses_of_ones_own_need_neither_store_nor_scene(run, tmp_path, monkeypat
     assert not (run / "metrics.json").exists()
 
 
-def test_the_same_field_predicts_the_same_bits_wherever_it_lies(run, fitted, tmp_path):
+def test_the_same_field_predicts_the_same_bits_wherever_it_lies(run, fitted, tmp_path, no_pictures):
     (tmp_path / "poses.csv").write_text(CSV)
     first, second = (
         arrays_of(

@@ -17,6 +17,7 @@ from sononerf.errors import InputError, NumericalError
 from sononerf.experiment import reconstruct as reconstruct_module
 from sononerf.experiment.fit import fit
 from sononerf.experiment.reconstruct import evaluate, reconstruct
+from sononerf.reconstruction import baseline
 from sononerf.scene import Scene
 
 GEOMETRY = {
@@ -50,10 +51,16 @@ def run(fitted, tmp_path):
 
 @pytest.fixture
 def few_samples(monkeypatch):
-    """A hundred thousand samples of each surface are for the reports."""
+    """A hundred thousand samples of each surface are for the reports, and so are pictures."""
     metrics = functools.partial(reconstruct_module.geometry_metrics, samples=2000)
     monkeypatch.setattr(reconstruct_module, "geometry_metrics", metrics)
     monkeypatch.setattr(reconstruct_module, "BASELINE_VOXELS", 24)
+    monkeypatch.setattr(baseline, "LEVEL_SAMPLES", 300)
+
+
+@pytest.fixture
+def no_projections(monkeypatch):
+    monkeypatch.setattr(reconstruct_module, "mip_pngs", lambda volume: {})
 
 
 def read_out(folder):
@@ -84,7 +91,7 @@ def test_every_file_is_there_and_readable(run):
     assert json.loads((run / "metrics.json").read_text())["cost"]["reconstruct_s"] > 0
 
 
-def test_spacing_and_level_are_obeyed(run, tmp_path):
+def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
     coarse = reconstruct(run, spacing=0.02, output=tmp_path / "coarse")
     fine = reconstruct(run, spacing=0.007, output=tmp_path / "fine")
     assert read_out(coarse)["spacing_m"] == pytest.approx(0.02)
@@ -125,7 +132,9 @@ def test_a_scene_that_is_not_installed_has_no_truth(run, few_samples):
         assert min(image.size) > 50
 
 
-def test_what_needs_a_closed_surface_is_null_for_an_open_one(run, few_samples, monkeypatch):
+def test_what_needs_a_closed_surface_is_null_for_an_open_one(
+    run, few_samples, no_projections, monkeypatch
+):
     open_mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
     open_mesh.update_faces(np.arange(len(open_mesh.faces)) > 40)
     open_scene = Scene(open_mesh)
@@ -137,7 +146,7 @@ def test_what_needs_a_closed_surface_is_null_for_an_open_one(run, few_samples, m
 
 
 @pytest.mark.parametrize("content", [b"", b"ply\nnonsense", b"\x00" * 100])
-def test_a_damaged_mesh_is_told(run, content, few_samples):
+def test_a_damaged_mesh_is_told(run, content, no_projections):
     reconstruct(run, spacing=0.02)
     (run / "reconstruction" / "mesh.ply").write_bytes(content)
     with pytest.raises(InputError, match=r"mesh\.ply: .*reconstruct again"):
