@@ -227,7 +227,7 @@ def test_what_is_printed(smoke):
     ):
         assert words in text
     # Plain lines where there is no terminal; nothing of the libraries' own talk.
-    for noise in ("\x1b", "\r", "LeafSpec", "GPU available", "lightning.pytorch", "Tip:"):
+    for noise in ("\x1b", "\r", "━", "LeafSpec", "GPU available", "lightning.pytorch", "Tip:"):
         assert noise not in text
     assert len(list((smoke.home / "data").iterdir())) == 1  # the fit took what was simulated
 

@@ -35,8 +35,12 @@ def test_once_after_each_epoch_without_validation(training):
 
 def test_not_while_sanity_checking(training):
     record = Record()
-    training(record, sanity=1).train()
+    made = training(record, sanity=1)
+    made.train()
     assert record.seen == [(1, 4, True), (2, 8, True)]
+    made.trainer.sanity_checking = True  # at a boundary
+    record.on_validation_end(made.trainer, made.module)
+    assert len(record.seen) == 2
 
 
 @pytest.mark.parametrize("validation", [True, False])

@@ -76,6 +76,12 @@ def test_mesh_projections_and_numbers(training, tmp_path):
     assert len(events.Scalars("train/loss")) == 8
 
 
+def test_training_mode_is_put_back(training, tmp_path):
+    modes = Modes()
+    training(previews(tmp_path), modes, validation=False).train()  # Lightning would put it back
+    assert modes.seen == [True] * 8
+
+
 def test_every_so_many_epochs(training, tmp_path):
     training(previews(tmp_path, every_epochs=2)).train()
     assert [p.name for p in (tmp_path / "epochs").iterdir()] == ["0002"]

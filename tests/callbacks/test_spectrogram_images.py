@@ -32,7 +32,7 @@ class Modes(lightning.Callback):
 
 def test_one_picture_per_epoch(training, tmp_path):
     modes = Modes()
-    made = training(modes, logger=True)
+    made = training(modes, logger=True, validation=False)  # it would put training mode back
     made.trainer.callbacks.append(callback(made))
     made.train()
     assert modes.seen == [True] * 8
