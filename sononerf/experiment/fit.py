@@ -20,6 +20,7 @@ from sononerf.callbacks.checkpoint import CheckpointCallback
 from sononerf.callbacks.preview import PreviewCallback
 from sononerf.callbacks.progress import ProgressCallback
 from sononerf.callbacks.spectrogram_images import SpectrogramImages
+from sononerf.callbacks.threads import ThreadsCallback
 from sononerf.checkpoint_io import DurableCheckpointIO
 from sononerf.config import Settings
 from sononerf.data.datamodule import EchoDataModule
@@ -205,6 +206,7 @@ def _fit(
             logger=TensorBoardLogger(run.path, name="tensorboard", version=""),
             callbacks=[
                 ProgressCallback(task),
+                ThreadsCallback(),
                 PreviewCallback(
                     run.path,
                     every_epochs=settings.preview.every_epochs,

@@ -125,6 +125,11 @@ class ProfileRenderer(Renderer):
                 setattr(self, name, found)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
+    @property
+    def places_per_pose(self) -> int | None:
+        """How many places a step evaluates per pose."""
+        return min(int(self.alive.sum()), self.points) if len(self.alive) else None
+
     @torch.no_grad()
     def prepare(self, field: Field, possible: Possible | None, step: int) -> bool:
         """Lay the lattice at the first step; drop what has no energy and refine every so often."""

@@ -132,6 +132,11 @@ class Renderer(nn.Module):
         del field, possible
         return step == 0
 
+    @property
+    def places_per_pose(self) -> int | None:
+        """How many places a step evaluates per pose; None where that is not known beforehand."""
+        return None
+
     @torch.no_grad()
     def calibrate(self, predicted: Tensor, measured: Tensor) -> None:
         """Set the gain so that prediction and measurement have the same energy."""

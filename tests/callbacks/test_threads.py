@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: MIT
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from sononerf.callbacks import threads
+from sononerf.callbacks.threads import WORTH_THREADS, ThreadsCallback
+
+
+@pytest.fixture
+def two_threads(monkeypatch):
+    monkeypatch.setattr(threads, "echo_module", lambda module: module)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("places", "poses", "expected"),
+    [
+        (WORTH_THREADS // 4 - 1, 4, 1),
+        (WORTH_THREADS // 4, 4, 2),
+        (None, 4, 2),  # not known: as torch would
+    ],
+)
+def test_small_steps_take_one_thread(two_threads, places, poses, expected):
+    callback = ThreadsCallback()
+    module = SimpleNamespace(renderer=SimpleNamespace(places_per_pose=places))
+    callback.on_train_batch_start(None, module, SimpleNamespace(pose=range(poses)), 0)
+    assert torch.get_num_threads() == expected
+    callback.teardown(None, module, "fit")
+    assert torch.get_num_threads() == 2
