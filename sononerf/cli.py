@@ -165,6 +165,7 @@ def fit(
     extra = [] if seed is None else [f"fit.seed={seed}"]
     settings = load_settings(config, [*(overrides or ()), *extra])
     from sononerf.experiment.fit import fit as run
+    from sononerf.experiment.fit import follows
     from sononerf.experiment.predict import predict as predict_run
     from sononerf.experiment.reconstruct import evaluate as evaluate_run
     from sononerf.experiment.reconstruct import reconstruct as reconstruct_run
@@ -182,6 +183,8 @@ def fit(
         workers=workers,
         progress=progress,
     )
+    if follows():
+        return  # the first process does the rest
     metrics = done.read_metrics()
     if "baseline" in metrics:  # what is written last
         _print(f"{folder}: is finished; --overwrite fits it anew")
@@ -333,6 +336,9 @@ def _run() -> int:
         fault = SettingsError(f"{text[:1].lower()}{text[1:]}; see `{where} --help`")
     except _SignalledError as error:
         fault = StoppedError(error.number)
+    if isinstance(fault, StoppedError):
+        _print(str(fault))  # the user's wish, not a fault
+        return fault.exit_code
     for line in str(fault).splitlines():
         typer.echo(f"error: {line}", err=True)
     return fault.exit_code

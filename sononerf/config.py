@@ -20,6 +20,8 @@ from sononerf.errors import SettingsError
 
 MAX_SETTINGS_BYTES = 1_000_000
 MAX_SETTINGS_DEPTH = 50
+PLUGIN_NAMES = (("scene", "name"), ("field", "kind"), ("renderer", "kind"))
+"""Keys whose value decides what the options beside it mean."""
 
 Vector = tuple[float, float, float]
 Name = Annotated[str, Field(min_length=1)]
@@ -171,7 +173,6 @@ class FitSettings(_Section):
     gradient_clip: Positive | None = None
     seed: Seed = 0
     checkpoint_seconds: Positive = 60.0
-    patience_epochs: Count | None = None
 
 
 class PreviewSettings(_Section):
@@ -321,6 +322,16 @@ def apply_override(data: dict[str, Any], assignment: str) -> None:
     node[parts[-1]] = _parse_yaml(value, key)
 
 
+def _drop_options_of_another(data: dict[str, Any], assignment: str) -> None:
+    """Leave out the file's options where the command line names another scene than the file."""
+    key, _, value = assignment.partition("=")
+    section, _, name = key.strip().partition(".")
+    if (section, name) not in PLUGIN_NAMES or not isinstance(data.get(section), dict):
+        return
+    if data[section].get(name) != value.strip():
+        data[section].pop("options", None)
+
+
 def _model_at(model: type[BaseModel], path: Iterable[str | int]) -> type[BaseModel] | None:
     for part in path:
         info = model.model_fields.get(str(part))
@@ -383,12 +394,18 @@ def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
 def load_settings(path: Path, overrides: Iterable[str] = ()) -> Settings:
     """Read a settings file and lay ``KEY=VALUE`` assignments over it.
 
+    An assignment that names another scene, field or renderer than the file does takes the file's
+    options for the old one away.
+
     Raises
     ------
     SettingsError
         If the file cannot be read or any key or value is not allowed.
     """
     data = read_yaml(path)
+    overrides = list(overrides)
+    for assignment in overrides:
+        _drop_options_of_another(data, assignment)
     for assignment in overrides:
         apply_override(data, assignment)
     return validate_settings(data, str(path))

@@ -117,6 +117,9 @@ class EchoModule(lightning.LightningModule):
                 self.renderer.calibrate(self(batch), batch.spectrum)
                 self._agree()
         loss = self._loss(self(batch), batch.spectrum)
+        # Under Lightning's own name, which would otherwise stay at 0: its one epoch has no end.
+        epoch = float(step // self.steps_per_epoch + 1)
+        self.log("epoch", epoch, batch_size=len(batch.pose))
         self.log("train/loss", loss, prog_bar=True, batch_size=len(batch.pose))
         return loss
 
@@ -168,9 +171,10 @@ class EchoModule(lightning.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         """Log the error over the validation poses."""
-        self.log("val/mae_db", self.mae.compute(), prog_bar=True)
+        self.log("epoch", float(self.epoch_done), sync_dist=True)
+        self.log("val/mae_db", self.mae.compute(), prog_bar=True, sync_dist=True)
         if self.mae_active.update_count:
-            self.log("val/mae_db_active", self.mae_active.compute(), prog_bar=True)
+            self.log("val/mae_db_active", self.mae_active.compute(), prog_bar=True, sync_dist=True)
         self.mae.reset()
         self.mae_active.reset()
 

@@ -170,3 +170,12 @@ def test_a_missing_file_suggests_its_neighbour(write, tmp_path):
 def test_a_source_is_named_for_plain_data_too():
     with pytest.raises(SettingsError, match=r"^RUN/config\.yaml: scene: missing"):
         validate_settings({}, "RUN/config.yaml")
+
+
+def test_another_scene_does_not_inherit_the_options_of_the_files_scene(tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("scene:\n  name: sphere\n  options:\n    radius: 0.02\n", encoding="utf-8")
+    other = load_settings(path, ["scene.options.path=b.stl", "scene.name=mesh"])
+    assert other.scene.options == {"path": "b.stl"}
+    same = load_settings(path, ["scene.name=sphere"])
+    assert same.scene.options == {"radius": 0.02}

@@ -69,7 +69,9 @@ def batch(spectrum):
 def logged(found, monkeypatch):
     values = {}
     monkeypatch.setattr(
-        found, "log", lambda name, value, **_: values.update({name: float(value.detach())})
+        found,
+        "log",
+        lambda name, value, **_: values.update({name: float(torch.as_tensor(value).detach())}),
     )
     return values
 
@@ -183,7 +185,7 @@ def test_validation_is_in_the_decibels_of_every_report(monkeypatch):
     found.renderer.values.data = levels[1, :1].reshape(1, 1, 1, 1)
     found.validation_step(batch(levels[0, :1].reshape(1, 1, 1, 1)), 0)
     found.on_validation_epoch_end()
-    assert values == {"val/mae_db": pytest.approx(2, rel=1e-4)}
+    assert values == {"val/mae_db": pytest.approx(2, rel=1e-4), "epoch": 0.0}
 
 
 def test_the_first_step_sets_the_gain(monkeypatch):
@@ -320,3 +322,12 @@ def test_training_on_single_slices_lowers_the_loss(store, tmp_path):
     losses, _, found = fit(store, ShellRenderer(REGION, ACQUISITION, directions=200), tmp_path, 30)
     assert np.mean(losses[-3:]) < 0.8 * losses[0]
     assert all(p.isfinite().all() for p in found.parameters())
+
+
+@pytest.mark.parametrize(("step", "epoch"), [(0, 1.0), (9, 1.0), (10, 2.0)])
+def test_tensorboard_counts_our_epochs(monkeypatch, step, epoch):
+    found = module(Given(MEASURED))
+    values = logged(found, monkeypatch)
+    monkeypatch.setattr(type(found), "global_step", step)
+    found.training_step(batch(MEASURED), 0)
+    assert values["epoch"] == epoch  # ten steps each

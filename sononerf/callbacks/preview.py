@@ -47,7 +47,7 @@ class PreviewCallback(EpochCallback):
             return
         target = self.folder / "epochs" / f"{epoch:04d}"
         shown = {k: float(v) for k, v in trainer.callback_metrics.items()}
-        numbers = {"epoch": epoch, "step": module.global_step, **shown}
+        numbers = {**shown, "epoch": epoch, "step": module.global_step}
         extent = float((module.field.region[1] - module.field.region[0]).max())
         was_training = module.training
         module.eval()

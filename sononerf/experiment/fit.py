@@ -13,6 +13,7 @@ from pathlib import Path
 
 import lightning
 import torch
+from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from sononerf import storage
@@ -28,10 +29,13 @@ from sononerf.data.store import EnsembleStore
 from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.experiment.build import check_plugins, echo_region, field_and_renderer, module_for
 from sononerf.experiment.run_folder import RunFolder
-from sononerf.experiment.simulate import simulate
+from sononerf.experiment.simulate import simulate, store_path
 from sononerf.module import EchoModule
 from sononerf.progress import Progress
+from sononerf.scene import load_scene
 from sononerf.weights import save_weights
+
+WAIT_SECONDS = 0.5
 
 
 def quiet_lightning() -> None:
@@ -63,6 +67,22 @@ def require_accelerator(accelerator: str) -> None:
         torch.cuda.is_available() or torch.backends.mps.is_available()
     ):
         raise ResourceError("no GPU that torch can use; take --accelerator cpu, or auto")
+
+
+def follows() -> bool:
+    """Return whether this process is one of several that fit together, and not the first."""
+    return int(getattr(rank_zero_only, "rank", 0)) > 0
+
+
+def _wait_for_store(settings: Settings) -> EnsembleStore:
+    """Open the ensemble once the first process has sealed it."""
+    path = store_path(settings, load_scene(settings.scene.name, settings.scene.options), None)
+    while True:
+        if (path / "zarr.json").is_file():
+            store = EnsembleStore.open(path)
+            if "reference" in store.attributes and not store.missing():
+                return store
+        time.sleep(WAIT_SECONDS)
 
 
 def fit(
@@ -113,6 +133,11 @@ def fit(
     run = RunFolder(path)
     require_accelerator(accelerator)
     check_plugins(settings)
+    if follows():
+        # The first process holds the lock, simulates and writes; the others only compute.
+        store = _wait_for_store(settings)
+        _fit(settings, run, store, accelerator, devices, num_nodes, Progress(quiet=True))
+        return run
     if overwrite:
         aside = run.move_aside()
         if aside:
@@ -189,7 +214,7 @@ def _fit(
         steps_per_epoch=per_epoch,
     )
     resumed = _resume(run, data)
-    if not resumed:
+    if not resumed and not follows():
         run.clear_previews()
     with progress.task("fitting", total) as task, keeper.watching():
         trainer = lightning.Trainer(
@@ -221,11 +246,14 @@ def _fit(
             enable_progress_bar=False,
             enable_model_summary=False,
             use_distributed_sampler=False,
-            log_every_n_steps=10,
+            log_every_n_steps=5,
             default_root_dir=run.path,
         )
         trainer.fit(module, data, ckpt_path=run.checkpoint if resumed else None, weights_only=True)
         _finish(settings, run, store, module, keeper.elapsed, trainer)
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        # What follows is for the first process alone; metrics would wait for the others.
+        torch.distributed.destroy_process_group()
     if keeper.stopped_by is not None:
         raise StoppedError(
             keeper.stopped_by, "stopped after the last step; the same command goes on"

@@ -12,7 +12,7 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
-from sononerf.errors import NumericalError
+from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
 from sononerf.reconstruction.isosurface import automatic_level, isosurface
 from sononerf.reconstruction.oriented import oriented_surface
@@ -66,6 +66,8 @@ def reconstruct(
 
     Raises
     ------
+    SettingsError
+        If the spacing is larger than the region.
     NumericalError
         If the field is silent everywhere, or there is no surface at the level.
     ResourceError
@@ -73,6 +75,11 @@ def reconstruct(
     """
     lower, upper = (corner.double().cpu().numpy() for corner in field.region)
     step = spacing or field.resolution / 2
+    if step > float((upper - lower).min()):
+        raise SettingsError(
+            f"a spacing of {step:g} m is larger than the region ({(upper - lower).min():.3g} m "
+            "at its narrowest); give metres"
+        )
     if method == "auto":
         method = "oriented" if field.knows_directions else "isosurface"
     volume = volume_from_function(

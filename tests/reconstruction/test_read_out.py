@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import torch
 
-from sononerf.errors import NumericalError
+from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
 from sononerf.field.grid import GridField
 from sononerf.reconstruction import read_out
@@ -147,3 +147,10 @@ def test_a_silent_field_is_an_error():
             field.occupancy.zero_()
         with pytest.raises(NumericalError, match="silent everywhere"):
             reconstruct(field, directions=4)
+
+
+def test_a_spacing_larger_than_the_region_is_said_to_be_so():
+    region = torch.tensor([[-0.02] * 3, [0.02] * 3])
+    field = GridField(region, torch.tensor([20e3, 40e3]), spacing=0.01, levels=1)
+    with pytest.raises(SettingsError, match="larger than the region"):
+        reconstruct(field, spacing=2.0)
