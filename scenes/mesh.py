@@ -12,7 +12,7 @@ import numpy as np
 import trimesh
 
 from sononerf.errors import InputError
-from sononerf.scene import Scene, check_surface
+from sononerf.scene import MATERIALS, MaterialName, Scene, check_surface
 
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 FORMATS = ("stl", "ply", "obj", "glb")
@@ -22,7 +22,12 @@ STL_HEADER = 84  # bytes, the last four of them the number of triangles
 STL_TRIANGLE = 50  # bytes
 
 
-def mesh(path: str, unit: Literal["m", "cm", "mm"] | None = None, centre: bool = True) -> Scene:
+def mesh(
+    path: str,
+    unit: Literal["m", "cm", "mm"] | None = None,
+    centre: bool = True,
+    material: MaterialName = "rigid",
+) -> Scene:
     """Load a surface from a file.
 
     Parameters
@@ -34,6 +39,8 @@ def mesh(path: str, unit: Literal["m", "cm", "mm"] | None = None, centre: bool =
         must be given.
     centre : bool
         Move the middle of the bounding box to the origin, at which poses look.
+    material : {"rigid", "sonotracelab", "leaf", "insect"}
+        Of all of it.
 
     Returns
     -------
@@ -74,7 +81,7 @@ def mesh(path: str, unit: Literal["m", "cm", "mm"] | None = None, centre: bool =
         raise InputError(f"{path}: {error}") from None
     if centre:
         vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
-    return Scene(trimesh.Trimesh(vertices, faces))
+    return Scene(trimesh.Trimesh(vertices, faces), MATERIALS[material])
 
 
 def _read(file: Path) -> bytes:

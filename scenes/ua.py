@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from sononerf.scene import Scene
+from sononerf.scene import MaterialName, Scene
 
 from .spheres import spheres
 
@@ -20,7 +20,9 @@ LETTER_A = (
 )
 
 
-def ua(radius: Annotated[float, Field(gt=0)] = 1.0 / 35.0) -> Scene:
+def ua(
+    radius: Annotated[float, Field(gt=0)] = 1.0 / 35.0, material: MaterialName = "rigid"
+) -> Scene:
     """Build "UA" from spheres of a radius (m), their mean at the origin."""
     centres = tuple((0.0, y, z) for y, z in (*LETTER_U, *LETTER_A))
-    return spheres(centres, radius, subdivisions=4)
+    return spheres(centres, radius, subdivisions=4, material=material)

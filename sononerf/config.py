@@ -26,6 +26,8 @@ PLUGIN_NAMES = (("scene", "name"), ("field", "kind"), ("renderer", "kind"))
 Vector = tuple[float, float, float]
 Name = Annotated[str, Field(min_length=1)]
 Positive = Annotated[float, Field(gt=0)]
+Level = Annotated[float, Field(ge=0)]
+Decibels = Annotated[float, Field(ge=-100, le=200)]
 Count = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 
@@ -44,22 +46,56 @@ class SceneSettings(_Section):
 
 
 class PoseSettings(_Section):
-    """Where the calls are made from; both test sets are drawn apart from the training spiral."""
+    """Where the calls are made from; both test sets are drawn apart from the training poses.
 
+    On a ``sphere`` about the origin, on a ``cap`` of it about an axis, in a ``volume`` between
+    two radii (within the cap, where an angle is set), or along a ``path``: the rows of a table
+    ``x,y,z,yaw,pitch,roll``. Of a path's rows those for validation and test are drawn at random
+    and all others train; number, radius, axis and jitter do not apply to it.
+    """
+
+    arrangement: Literal["sphere", "cap", "volume", "path"] = "sphere"
     count: Count = 400
     validation: Annotated[int, Field(ge=0)] = 10
     heldout: Annotated[int, Field(ge=0)] = 20
     radius: Positive = 0.4
+    radius_max: Positive | None = None
+    axis: Vector = (1.0, 0.0, 0.0)
+    half_angle_deg: Annotated[float, Field(gt=0, le=180)] | None = None
+    path: Path | None = None
     aim_jitter_deg: Annotated[float, Field(ge=0, le=90)] = 15.0
     seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _arranged(self) -> PoseSettings:
+        # What is set for another arrangement would be passed over without a word.
+        for name, needed, allowed in (
+            ("half_angle_deg", "cap", ("cap", "volume")),
+            ("radius_max", "volume", ("volume",)),
+            ("path", "path", ("path",)),
+        ):
+            there = getattr(self, name) is not None
+            if there and self.arrangement not in allowed:
+                raise ValueError(
+                    f"{name} is of the arrangement {' or '.join(allowed)}, "
+                    f"not of {self.arrangement}; set arrangement, or leave it out"
+                )
+            if not there and self.arrangement == needed:
+                raise ValueError(f"the arrangement {needed} needs {name}")
+        if not 1e-6 <= max(abs(part) for part in self.axis) <= 1e6:
+            raise ValueError("axis gives no direction; expected one such as [1, 0, 0]")
+        if self.radius_max is not None and self.radius >= self.radius_max:
+            raise ValueError("radius must lie below radius_max")
+        return self
 
 
 class SimulationSettings(_Section):
     """The echo simulator: rays per pose (after aiming), bounces, and the turn of the pattern."""
 
-    engine: Literal["rays"] = "rays"
-    rays: Annotated[int, Field(ge=100, le=100_000_000)] = 100_000
+    engine: Literal["rays", "kirchhoff"] = "rays"
+    rays: Annotated[int, Field(ge=100, le=100_000_000)] = 300_000
     bounces: Annotated[int, Field(ge=1, le=10)] = 3
+    diffraction_points: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
     seed: Seed = 0
     noise_floor_poses: Annotated[int, Field(ge=0)] = 20
 
@@ -85,9 +121,33 @@ class EarSettings(_Section):
 
 
 class CallSettings(_Section):
-    """What is emitted."""
+    """What is emitted: an impulse, or a sweep of frequency down or up, with its harmonics."""
 
-    kind: Literal["impulse"] = "impulse"
+    kind: Literal["impulse", "linear", "hyperbolic"] = "impulse"
+    duration: Annotated[float, Field(ge=1e-5, le=0.1)] = 0.4e-3
+    frequency_start: Positive = 150e3
+    frequency_end: Positive = 40e3
+    harmonics: Annotated[tuple[Level, ...], Field(min_length=1, max_length=10)] = (1.0,)
+    taper: Annotated[float, Field(ge=0, le=1)] = 0.1  # of the duration, half at either end
+
+    @model_validator(mode="after")
+    def _sweeps(self) -> CallSettings:
+        if self.frequency_start == self.frequency_end:
+            raise ValueError("frequency_start and frequency_end must differ")
+        if not any(self.harmonics):
+            raise ValueError("one of the harmonics at least must be above 0")
+        return self
+
+    @property
+    def bands(self) -> dict[int, tuple[float, float]]:
+        """Lowest and highest frequency (Hz) of each harmonic that is emitted; none of an impulse.
+
+        Harmonics count from 1, the fundamental.
+        """
+        if self.kind == "impulse":
+            return {}
+        low, high = sorted((self.frequency_start, self.frequency_end))
+        return {h: (h * low, h * high) for h, a in enumerate(self.harmonics, start=1) if a > 0.0}
 
 
 class SpectrogramSettings(_Section):
@@ -114,6 +174,15 @@ class SpectrogramSettings(_Section):
         if self.fft < self.window:
             raise ValueError("fft must be at least window")
         return self
+
+
+class NoiseSettings(_Section):
+    """White noise of the ears; what the ratio is measured by stands in ``acoustics.noise``."""
+
+    snr_db: Decibels | tuple[Decibels, Decibels] | None = None  # none, both ears, (left, right)
+    relative_to: Literal["target", "pose"] = "target"
+    target_strength_db: Decibels = -46.0  # of a rigid sphere 2 cm across
+    target_distance: Positive = 0.4
 
 
 class DataSettings(_Section):
@@ -201,6 +270,7 @@ class Settings(_Section):
     ears: EarSettings = EarSettings()
     call: CallSettings = CallSettings()
     spectrogram: SpectrogramSettings = SpectrogramSettings()
+    noise: NoiseSettings = NoiseSettings()
     data: DataSettings = DataSettings()
     region: RegionSettings = RegionSettings()
     field: FieldSettings = FieldSettings()
@@ -208,6 +278,26 @@ class Settings(_Section):
     fit: FitSettings = FitSettings()
     preview: PreviewSettings = PreviewSettings()
     reconstruction: ReconstructionSettings = ReconstructionSettings()
+
+    @model_validator(mode="after")
+    def _call_is_sampled_and_heard(self) -> Settings:
+        bands, analysis = self.call.bands, self.spectrogram
+        half = analysis.sampling_rate / 2
+        for number, (_, high) in bands.items():
+            if high > half:
+                raise ValueError(
+                    f"call: harmonic {number} reaches {high:g} Hz, above half of "
+                    f"spectrogram.sampling_rate ({half:g} Hz); lower the call's frequencies, leave "
+                    "the harmonic out (amplitude 0) or raise the rate"
+                )
+        low, high = analysis.frequency_min, analysis.frequency_max
+        if bands and not any(lo <= high and hi >= low for lo, hi in bands.values()):
+            swept = ", ".join(f"{lo:g} to {hi:g} Hz" for lo, hi in bands.values())
+            raise ValueError(
+                f"call: sweeps {swept}, all outside spectrogram.frequency_min to frequency_max "
+                f"({low:g} to {high:g} Hz); nothing would be heard"
+            )
+        return self
 
     def plain(self) -> dict[str, Any]:
         """Return the settings as plain data, ready for YAML, JSON and checkpoints."""

@@ -4,63 +4,34 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import NDArray
 
 from sononerf import plugins
 from sononerf.errors import InputError, SonoNerfError
+from sononerf.geometry.faults import surface_faults
+from sononerf.material import MATERIALS, RIGID, Material, MaterialName
+
+__all__ = [
+    "MATERIALS",
+    "Material",
+    "MaterialName",
+    "Scene",
+    "check_surface",
+    "list_scenes",
+    "load_scene",
+]
 
 logger = logging.getLogger("sononerf")
 
 LARGEST = 100.0  # m
 SMALLEST = 1e-3  # m
-
-
-@dataclass(frozen=True)
-class Material:
-    """How a surface reflects, at nodes over frequency.
-
-    Between the nodes values run straight over the logarithm of frequency; beyond them they stay.
-    The defaults are the specular ones of SonoTraceLab.
-
-    Attributes
-    ----------
-    frequency : (K,) float, Hz
-        Nodes, ascending.
-    lobe_width : (K,) float, rad
-        Standard deviation of the lobe about the mirror direction.
-    strength : (K,) float, 1
-        What is heard of a hit, relative to a mirror.
-    reflection : (K,) float, 1
-        What is kept of the pressure when the sound travels on after a bounce, 0 to 1.
-    """
-
-    frequency: tuple[float, ...] = (20e3, 150e3)
-    lobe_width: tuple[float, ...] = (math.radians(12.0), math.radians(4.0))
-    strength: tuple[float, ...] = (1.0, 0.7)
-    reflection: tuple[float, ...] = (1.0, 0.7)
-
-    def __post_init__(self) -> None:
-        nodes = np.asarray(self.frequency, dtype=np.float64)
-        if len(nodes) < 1 or not (nodes > 0.0).all() or not (np.diff(nodes) > 0.0).all():
-            raise ValueError(f"material frequency is {self.frequency}, expected ascending nodes")
-        for name, lowest, highest in (
-            ("lobe_width", 1e-4, math.pi),
-            ("strength", 0.0, math.inf),
-            ("reflection", 0.0, 1.0),
-        ):
-            values = np.asarray(getattr(self, name), dtype=np.float64)
-            if values.shape != nodes.shape:
-                raise ValueError(
-                    f"material {name} has {values.size} values, frequency {nodes.size}"
-                )
-            if not (np.isfinite(values) & (values >= lowest) & (values <= highest)).all():
-                raise ValueError(f"material {name} is {values}, expected {lowest} to {highest}")
+LARGE, SMALL = 5.0, 5e-3  # m, beyond which a mistaken unit is likelier than such a scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,22 +42,45 @@ class Scene:
     ----------
     mesh : trimesh.Trimesh
         Metres, world frame; bodies may overlap.
-    material : Material
-        One for all of it.
+    material : Material or tuple of Material
+        One for all of it, or one for each of its parts.
+    part : (T,) int, optional
+        Which of the materials each triangle is of, where there are several.
 
     Raises
     ------
+    ValueError
+        If materials and parts do not fit.
     InputError
         If the mesh has no triangles, a vertex that is no finite number, an index to no vertex,
         or a size that says its unit was mistaken.
     """
 
     mesh: trimesh.Trimesh
-    material: Material = Material()
+    material: Material | tuple[Material, ...] = RIGID
+    part: NDArray[np.int64] | None = None
 
     def __post_init__(self) -> None:
+        several = isinstance(self.material, tuple)
+        if several != (self.part is not None):
+            raise ValueError("several materials and the parts they are of are given together")
+        if self.part is not None:
+            part = np.asarray(self.part)
+            if part.shape != (len(self.mesh.faces),):
+                raise ValueError(
+                    f"part has shape {part.shape}, expected one number for each of the "
+                    f"{len(self.mesh.faces)} triangles"
+                )
+            if part.dtype.kind not in "iu" or part.min() < 0 or part.max() >= len(self.materials):
+                raise ValueError(f"part names no material, expected 0 to {len(self.materials) - 1}")
+            object.__setattr__(self, "part", part.astype(np.int64))
         check_surface(self.mesh)
         _warn_of_faults(self.mesh)
+
+    @property
+    def materials(self) -> tuple[Material, ...]:
+        """All of them; ``part`` counts through them."""
+        return self.material if isinstance(self.material, tuple) else (self.material,)
 
 
 def check_surface(mesh: trimesh.Trimesh) -> None:
@@ -105,8 +99,7 @@ def check_surface(mesh: trimesh.Trimesh) -> None:
     bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
     if len(bad):
         raise InputError(f"vertex {bad[0]} of the mesh is {vertices[bad[0]]}; mend the mesh")
-    used = vertices[np.unique(faces)]
-    size = float(np.ptp(used, axis=0).max())
+    size = _size(mesh)
     if not SMALLEST <= size <= LARGEST:
         hint = (
             "millimetres taken for metres? set the unit to mm"
@@ -118,16 +111,26 @@ def check_surface(mesh: trimesh.Trimesh) -> None:
         )
 
 
+def _size(mesh: trimesh.Trimesh) -> float:
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    used[np.asarray(mesh.faces)] = True
+    return float(np.ptp(np.asarray(mesh.vertices)[used], axis=0).max())
+
+
 def _warn_of_faults(mesh: trimesh.Trimesh) -> None:
-    if not mesh.is_watertight:
-        _, uses = np.unique(np.sort(mesh.edges, axis=1), axis=0, return_counts=True)
-        count = int((uses % 2).sum())
-        what = f"{count} edges belong to one triangle alone" if count else "edges are shared oddly"
-        logger.warning("the mesh is open (%s); volumes will not be measured", what)
-    elif not mesh.is_winding_consistent:
-        logger.warning("the mesh's triangles do not agree on which side is outside")
-    elif mesh.volume < 0.0:
-        logger.warning("the mesh is inside out; echoes do not mind, volumes do")
+    size = _size(mesh)
+    if size > LARGE:
+        logger.warning(
+            "the mesh is %.3g m large; were millimetres taken for metres? It would be %.3g mm",
+            *(size, size),
+        )
+    elif size < SMALL:
+        logger.warning(
+            "the mesh is %.3g mm large; were metres taken for millimetres? It would be %.3g m",
+            *(1e3 * size, 1e3 * size),
+        )
+    for line in surface_faults(mesh.vertices, mesh.faces):
+        logger.warning("%s", line)
 
 
 def list_scenes() -> list[plugins.Plugin]:

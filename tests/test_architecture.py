@@ -19,8 +19,8 @@ PACKAGE = ROOT / "sononerf"
 
 # In the order in which data flows: each may import what stands before it, and itself.
 LAYERS = (
-    "errors config plugins progress storage checkpoint_io weights geometry scene acoustics "
-    "simulation data field renderer module reconstruction render callbacks experiment cli"
+    "errors config plugins progress storage checkpoint_io weights geometry material scene "
+    "acoustics simulation data field renderer module reconstruction render callbacks experiment cli"
 ).split()
 # Below the place that turns settings into objects, nobody chooses a device.
 DEVICELESS = LAYERS[: LAYERS.index("experiment")]
@@ -30,6 +30,7 @@ PURE = {"field": {"errors", "field"}, "renderer": {"errors", "field", "renderer"
 
 WITHOUT_TEST_FILE = {
     "errors.py": "names and numbers only; each is met in the tests of who raises it",
+    "simulation/engine.py": "what the engines share, seen through rays and kirchhoff",
     "data/attributes.py": "seen through the store, tests/data/test_store.py",
     "data/layout.py": "seen through the store, tests/data/test_store.py",
 }

@@ -77,6 +77,14 @@ def test_settings_do_not_change(write):
         ("spectrogram.fft=32", ["spectrogram: fft must be at least window"]),
         ("region.lower=[0,0,0]", ["region: lower and upper are set together"]),
         ("ears.left=[1,2]", ["ears.left"]),
+        ("call.kind=chirp", ["call.kind: found 'chirp'", "'impulse', 'linear' or 'hyperbolic'"]),
+        ("call.duration=3", ["call.duration: found 3", "less than or equal to 0.1"]),
+        ("call.frequency_end=150000", ["call: frequency_start and frequency_end must differ"]),
+        ("call.harmonics=[0, 0]", ["call: one of the harmonics at least must be above 0"]),
+        ("call.harmonics=[1, -1]", ["call.harmonics.1: found -1"]),
+        ("noise.snr_db=loud", ["noise.snr_db: found 'loud'"]),
+        ("noise.snr_db=[1, 2, 3]", ["noise.snr_db"]),
+        ("noise.snr=3", ["noise.snr: unknown key", "did you mean snr_db?"]),
     ],
 )
 def test_a_wrong_value_is_told_with_file_key_and_way_out(write, key, words):
@@ -85,6 +93,42 @@ def test_a_wrong_value_is_told_with_file_key_and_way_out(write, key, words):
     for word in words:
         assert any(word in line for line in lines), lines
     assert all(line.startswith(f"{path}: ") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("assignments", "words"),
+    [
+        (
+            ["call.harmonics=[1, 0, 0, 0.1]"],
+            "call: harmonic 4 reaches 600000 Hz, above half of spectrogram.sampling_rate (500000",
+        ),
+        (["spectrogram.sampling_rate=250e3"], "call: harmonic 1 reaches 150000 Hz"),
+        (
+            ["call.frequency_start=200e3", "call.frequency_end=120e3"],
+            "call: sweeps 120000 to 200000 Hz, all outside spectrogram.frequency_min",
+        ),
+    ],
+)
+def test_a_call_that_cannot_be_sampled_or_heard_is_refused(write, assignments, words):
+    path = write(SCENE)
+    (line,) = faults(path, "call.kind=linear", *assignments)
+    assert line.startswith(f"{path}: {words}")
+    load_settings(path, assignments)  # an impulse has no frequencies
+
+
+def test_a_call_may_reach_half_the_sampling_rate_and_noise_be_set_per_ear(write):
+    settings = load_settings(
+        write(SCENE),
+        [
+            "call.kind=hyperbolic",
+            "call.frequency_start=250e3",
+            "call.harmonics=[0.5, 1]",
+            "noise.snr_db=[20, 3.5]",
+        ],
+    )
+    assert settings.call.bands == {1: (40e3, 250e3), 2: (80e3, 500e3)}
+    assert settings.noise.snr_db == (20.0, 3.5)
+    assert Settings.model_validate(settings.plain()) == settings
 
 
 @pytest.mark.parametrize("key", ["fit.batch_frequencies", "reconstruction.level", "fit.max_steps"])
@@ -179,3 +223,24 @@ def test_another_scene_does_not_inherit_the_options_of_the_files_scene(tmp_path)
     assert other.scene.options == {"path": "b.stl"}
     same = load_settings(path, ["scene.name=sphere"])
     assert same.scene.options == {"radius": 0.02}
+
+
+@pytest.mark.parametrize(
+    ("poses", "said"),
+    [
+        ("arrangement: cap", "the arrangement cap needs half_angle_deg"),
+        ("arrangement: volume", "the arrangement volume needs radius_max"),
+        ("arrangement: path", "the arrangement path needs path"),
+        ("path: a.csv", "path is of the arrangement path, not of sphere"),
+        ("half_angle_deg: 9", "half_angle_deg is of the arrangement cap or volume, not of sphere"),
+        (
+            "{arrangement: cap, half_angle_deg: 9, radius_max: 1}",
+            "radius_max is of the arrangement volume, not of cap",
+        ),
+        ("{arrangement: volume, radius_max: 0.4}", "radius must lie below radius_max"),
+        ("axis: [0, 0, 0]", "axis gives no direction"),
+    ],
+)
+def test_poses_of_an_arrangement_say_what_it_needs_and_nothing_else(write, poses, said):
+    (line,) = faults(write(SCENE + f"poses: {poses if poses[0] == '{' else '{' + poses + '}'}\n"))
+    assert f": poses: {said}" in line

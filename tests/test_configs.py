@@ -33,7 +33,7 @@ def leaves(data):
 
 
 def test_there_are_some():
-    assert {"smoke.yaml", "three_spheres.yaml", "paper/three_spheres.yaml"} <= {
+    assert {"smoke.yaml", "sweep.yaml", "three_spheres.yaml", "paper/three_spheres.yaml"} <= {
         named(path) for path in FILES
     }
     assert [path.name for path in CONFIGS.rglob("*.yml")] == []

@@ -25,7 +25,7 @@ STEP = 4 * 343 / 1e6 / 2
 ACQUISITION = Acquisition(
     frequency=FREQUENCY,
     range=0.2 + torch.arange(150) * STEP,
-    window=torch.hamming_window(64, periodic=False),
+    window=torch.hamming_window(64, periodic=False).expand(3, -1),
     sampling_rate=1e6,
     speed_of_sound=343.0,
     absorption=torch.tensor([0.1, 0.2, 0.3]),

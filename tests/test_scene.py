@@ -7,7 +7,8 @@ import trimesh
 
 from sononerf import plugins
 from sononerf.errors import InputError, SettingsError
-from sononerf.scene import Material, Scene, list_scenes, load_scene
+from sononerf.material import LEAF, MATERIALS, RIGID, Material
+from sononerf.scene import Scene, list_scenes, load_scene
 
 
 def box(size=0.1):
@@ -49,6 +50,21 @@ def test_sizes_within_the_bounds_pass(size):
     Scene(box(size))
 
 
+@pytest.mark.parametrize(
+    ("size", "said"),
+    [
+        (5.1, "5.1 m large; were millimetres taken for metres? It would be 5.1 mm"),
+        (4.9e-3, "4.9 mm large; were metres taken for millimetres? It would be 4.9 m"),
+    ],
+)
+def test_sizes_of_likely_another_unit_are_told_of(caplog, size, said):
+    Scene(box(size))
+    assert caplog.messages == [f"the mesh is {said}"]
+    caplog.clear()
+    Scene(box(min(max(size, 5.1e-3), 4.9)))
+    assert not caplog.records
+
+
 def test_open_and_inside_out_meshes_are_told_of(caplog):
     mesh = box()
     Scene(trimesh.Trimesh(mesh.vertices, mesh.faces[:-1]))
@@ -60,20 +76,29 @@ def test_open_and_inside_out_meshes_are_told_of(caplog):
 
 
 @pytest.mark.parametrize(
-    "arguments",
+    ("material", "part", "match"),
     [
-        {"frequency": (2.0, 1.0)},
-        {"frequency": (0.0, 1.0)},
-        {"strength": (1.0,)},
-        {"strength": (1.0, -0.1)},
-        {"reflection": (1.0, 1.1)},
-        {"lobe_width": (0.0, 0.1)},
-        {"lobe_width": (float("nan"), 0.1)},
+        ((RIGID, LEAF), None, "given together"),
+        (RIGID, np.zeros(12, int), "given together"),
+        ((RIGID, LEAF), np.zeros(11, int), r"part has shape \(11,\), .*each of the 12 triangles"),
+        ((RIGID, LEAF), np.zeros((12, 1), int), r"part has shape \(12, 1\)"),
+        ((RIGID, LEAF), np.full(12, 2), "expected 0 to 1"),
+        ((RIGID, LEAF), np.full(12, -1), "expected 0 to 1"),
+        ((RIGID, LEAF), np.full(12, 0.5), "expected 0 to 1"),
     ],
 )
-def test_materials_that_make_no_sense_are_refused(arguments):
-    with pytest.raises(ValueError, match="material"):
-        Material(**arguments)
+def test_parts_that_do_not_fit_the_mesh_or_the_materials_are_refused(material, part, match):
+    with pytest.raises(ValueError, match=match) as error:
+        Scene(box(), material, part)
+    assert "\n" not in str(error.value)
+
+
+def test_each_triangle_may_have_its_material():
+    assert Scene(box()).materials == (RIGID,)
+    scene = Scene(box(), (RIGID, LEAF), np.repeat([0, 1], 6).astype(np.uint8))
+    assert scene.materials == (RIGID, LEAF)
+    assert scene.part.dtype == np.int64
+    np.testing.assert_array_equal(scene.part, np.repeat([0, 1], 6))
 
 
 def test_built_in_scenes_are_listed():
@@ -83,6 +108,22 @@ def test_built_in_scenes_are_listed():
 
 def test_options_reach_the_factory():
     assert load_scene("sphere", {"radius": 0.05}).mesh.extents[0] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("name", ["sphere", "three_spheres", "ua"])
+@pytest.mark.parametrize("material", ["rigid", "sonotracelab", "leaf", "insect"])
+def test_the_material_of_a_built_in_scene_is_an_option(name, material):
+    assert load_scene(name, {"material": material}).material == MATERIALS[material]
+
+
+@pytest.mark.parametrize("name", ["sphere", "three_spheres", "ua", "mesh"])
+def test_an_unknown_material_is_refused_with_the_known_ones(name):
+    with pytest.raises(SettingsError, match=r"material.*rigid.*sonotracelab.*leaf.*insect"):
+        load_scene(name, {"material": "wood"} | ({"path": "a.stl"} if name == "mesh" else {}))
+
+
+def test_scenes_are_rigid_unless_told_otherwise():
+    assert load_scene("three_spheres").material == RIGID
 
 
 def test_wrong_options_and_names_are_refused():

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""From echo to spectrogram: short windows over range, magnitude without phase, compression."""
+"""From echo to spectrogram: short windows over range, dechirp, magnitude, compression."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+import scipy.fft
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
@@ -87,17 +88,49 @@ def _frames(settings: SpectrogramSettings, speed_of_sound: float) -> tuple[int, 
     return first, last
 
 
-def echo_samples(settings: SpectrogramSettings, speed_of_sound: float) -> int:
-    """How many samples from the emission on the last analysis frame needs."""
-    return _frames(settings, speed_of_sound)[1] * settings.hop + settings.window
+def echo_samples(
+    settings: SpectrogramSettings, speed_of_sound: float, longest_delay: float = 0.0
+) -> int:
+    """How many samples from the emission on the last analysis frame needs.
+
+    Parameters
+    ----------
+    settings : SpectrogramSettings
+        The analysis.
+    speed_of_sound : float, m/s
+        Of the medium.
+    longest_delay : float, s
+        The greatest by which a frequency's row is advanced; 0 for an impulse.
+
+    Returns
+    -------
+    samples : int
+        At the sampling rate of the settings.
+
+    Raises
+    ------
+    ValueError
+        If no frame lies between the settings' ranges.
+    """
+    last = _frames(settings, speed_of_sound)[1]
+    return last * settings.hop + settings.window + math.ceil(longest_delay * settings.sampling_rate)
 
 
 def spectrogram(
-    echo: ArrayLike, settings: SpectrogramSettings, speed_of_sound: float
+    echo: ArrayLike,
+    settings: SpectrogramSettings,
+    speed_of_sound: float,
+    delay: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
-    """Magnitude of the short-time Fourier transform on the range and frequency axes.
+    r"""Magnitude of the short-time Fourier transform on the range and frequency axes, dechirped.
 
-    A symmetric Hamming window, unnormalised.
+    A symmetric Hamming window, unnormalised. A sweep emits each frequency at a time
+    :math:`\tau(f)` of its own; its row is advanced by exactly that [1]_,
+
+    .. math:: S(r, f) = \left| X\left(\tfrac{2 r}{c} + \tau(f), f\right) \right|
+
+    with :math:`X(t, f)` the transform of the window that is centred at :math:`t`, between two
+    samples too.
 
     Parameters
     ----------
@@ -107,6 +140,8 @@ def spectrogram(
         The analysis.
     speed_of_sound : float, m/s
         Of the medium.
+    delay : (F,) float, s, optional
+        Emission time of each frequency, zero or more; all at once where it is left out.
 
     Returns
     -------
@@ -116,22 +151,51 @@ def spectrogram(
     Raises
     ------
     ValueError
-        If the echo ends before the last frame.
+        If the echo ends before the last frame, or a delay is negative.
+
+    References
+    ----------
+    .. [1] W. Jansen and J. Steckel, SonoNERFs, Biomimetics 9(6):321, 2024, equation (16).
     """
     signal = np.asarray(echo, dtype=np.float64)
-    first, last = _frames(settings, speed_of_sound)
-    needed = echo_samples(settings, speed_of_sound)
+    advance = np.zeros(1) if delay is None else np.asarray(delay, dtype=np.float64)
+    if not (advance >= 0.0).all():
+        raise ValueError("a delay is negative; a frequency is emitted at time 0 or later")
+    needed = echo_samples(settings, speed_of_sound, float(advance.max()))
     if signal.shape[-1] < needed:
         raise ValueError(
             f"the echo has {signal.shape[-1]} samples, the last frame needs {needed}; "
             "record longer or lower range_max"
         )
-    frames = sliding_window_view(signal, settings.window, axis=-1)
-    frames = frames[..., first * settings.hop : last * settings.hop + 1 : settings.hop, :]
+    first, last = _frames(settings, speed_of_sound)
+    starts = slice(first * settings.hop, last * settings.hop + 1, settings.hop)
+    if advance.any():
+        return _dechirped(signal, settings, starts, advance)
+    frames = sliding_window_view(signal, settings.window, axis=-1)[..., starts, :]
     low, high = _bins(settings)
     spectrum = np.fft.rfft(frames * np.hamming(settings.window), n=settings.fft, axis=-1)
     magnitude: NDArray[np.float64] = np.abs(spectrum[..., low : high + 1])
     return magnitude
+
+
+def _dechirped(
+    signal: NDArray[np.float64],
+    settings: SpectrogramSettings,
+    starts: slice,
+    delay: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Each frequency's row as a filter, the window on that frequency; a delay is then a phase."""
+    length = int(scipy.fft.next_fast_len(signal.shape[-1]))
+    spectrum = np.fft.fft(signal, length)
+    turn = 2j * np.pi * np.fft.fftfreq(length)
+    sample = np.arange(settings.window) / settings.sampling_rate
+    window = np.hamming(settings.window)
+    rows = []
+    for frequency, advance in zip(frequency_axis(settings), delay, strict=True):
+        kernel = np.fft.fft(window * np.exp(2j * np.pi * frequency * sample), length)
+        phase = np.exp(turn * (advance * settings.sampling_rate))
+        rows.append(np.abs(np.fft.ifft(spectrum * kernel.conj() * phase)[..., starts]))
+    return np.stack(rows, axis=-1)
 
 
 def compress(magnitude: ArrayLike, reference: float) -> NDArray[np.float64]:

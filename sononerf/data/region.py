@@ -9,7 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from sononerf.acoustics.call import covered
 from sononerf.acoustics.ears import Ears
+from sononerf.acoustics.reception import effective_window
+from sononerf.acoustics.spectrogram import frequency_axis
+from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import NumericalError
 
@@ -32,8 +36,8 @@ AGREEMENT = 0.6
 UNEXPLAINED_SHARE = 0.02
 """The search for more places ends when only this share of the sound is not explained."""
 ROUNDS = 4
-WINDOW_REACH = 0.006
-"""One echo sounds this far in range, in metres: half of the analysis window."""
+ECHO_END = 0.05
+"""An echo ends where its magnitude is this part of its middle's; a Hamming window ends earlier."""
 LOOKS = 4
 COARSE = 28
 """Cells along the longest side of each look."""
@@ -47,6 +51,30 @@ class Evidence(NamedTuple):
     energy: Array  # (N,) mean share of a pose's sound that comes from the place's range
 
 
+def echo_reach(call: CallSettings, analysis: SpectrogramSettings, speed_of_sound: float) -> float:
+    """How far in range one echo sounds to either side of its middle, over all frequencies, in m.
+
+    Parameters
+    ----------
+    call : CallSettings
+        What is emitted.
+    analysis : SpectrogramSettings
+        How echoes become spectrograms.
+    speed_of_sound : float, m/s
+        Of the medium.
+
+    Examples
+    --------
+    >>> round(echo_reach(CallSettings(), SpectrogramSettings(), 343.0), 4)
+    0.0054
+    """
+    window = effective_window(call, analysis)
+    swept = covered(call, frequency_axis(analysis))
+    power = (window[swept] if swept.any() else window[:1]) ** 2
+    sounding = np.flatnonzero(power.mean(axis=0) >= ECHO_END**2)
+    return float(sounding[-1] - sounding[0]) / 2.0 * speed_of_sound / 2.0 / analysis.sampling_rate
+
+
 class EchoEvidence:
     """What the training poses say about places.
 
@@ -56,6 +84,8 @@ class EchoEvidence:
         A sealed ensemble; only its training poses are looked at.
     ears : Ears
         Gains and places of emitter and ears.
+    reach : float, m
+        How far in range one echo sounds to either side of its middle.
     most : int
         How many poses are asked at most, evenly spread over the training poses.
 
@@ -65,7 +95,8 @@ class EchoEvidence:
         If no pose heard anything.
     """
 
-    def __init__(self, store: EnsembleStore, ears: Ears, *, most: int = 400) -> None:
+    def __init__(self, store: EnsembleStore, ears: Ears, *, reach: float, most: int = 400) -> None:
+        self.reach = reach
         indices = np.asarray(store.indices("train"))
         indices = indices[np.linspace(0, len(indices) - 1, min(most, len(indices))).astype(int)]
         self.range = np.asarray(store.range, dtype=np.float64)
@@ -229,6 +260,6 @@ class EchoEvidence:
             _, row, within = self._rows(points[start : start + CHUNK])
             pose = np.broadcast_to(np.arange(len(row))[:, None], row.shape)
             covered[pose[within], row[within]] = True
-        reach = int(np.ceil((tolerance + WINDOW_REACH) / self.step))
+        reach = int(np.ceil((tolerance + self.reach) / self.step))
         covered = ndimage.maximum_filter1d(covered, 2 * reach + 1, axis=1, mode="constant")
         return np.asarray(covered)

@@ -13,9 +13,10 @@ from torch import Tensor
 from sononerf import plugins
 from sononerf.acoustics.air import air_absorption, speed_of_sound
 from sononerf.acoustics.ears import analysed_ears, synthetic_ears
+from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import Settings
-from sononerf.data.region import EchoEvidence
+from sononerf.data.region import EchoEvidence, echo_reach
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError
 from sononerf.field.field import Field
@@ -28,13 +29,18 @@ def _tensor(values: NDArray[np.floating]) -> Tensor:
     return torch.as_tensor(np.asarray(values), dtype=torch.float32)
 
 
+def _speed(settings: Settings) -> float:
+    given = settings.air.temperature_c
+    return DEFAULT_SPEED if given is None else speed_of_sound(given)
+
+
 def acquisition(settings: Settings) -> Acquisition:
     """Return what a renderer has to know of how the spectra came to be."""
     air, analysis = settings.air, settings.spectrogram
     temperature = air.temperature_c
-    speed = DEFAULT_SPEED if temperature is None else speed_of_sound(temperature)
+    speed = _speed(settings)
     frequency = frequency_axis(analysis)
-    ears = analysed_ears(settings.ears, analysis)
+    ears, lag = analysed_ears(settings.ears, settings.call, analysis)
     absorption = air_absorption(
         frequency,
         temperature_c=DEFAULT_TEMPERATURE if temperature is None else temperature,
@@ -44,7 +50,7 @@ def acquisition(settings: Settings) -> Acquisition:
     return Acquisition(
         frequency=_tensor(frequency),
         range=_tensor(range_axis(analysis, speed)),
-        window=torch.hamming_window(analysis.window, periodic=False),
+        window=_tensor(effective_window(settings.call, analysis)),
         sampling_rate=analysis.sampling_rate,
         speed_of_sound=speed,
         absorption=_tensor(absorption) * (math.log(10.0) / 20.0),
@@ -52,6 +58,7 @@ def acquisition(settings: Settings) -> Acquisition:
         ears=_tensor(ears.ears),
         emitter=_tensor(ears.emitter),
         ear_positions=_tensor(ears.positions),
+        lag=None if lag is None else _tensor(lag) * (speed / 2.0),
     )
 
 
@@ -66,7 +73,8 @@ def echo_region(settings: Settings, store: EnsembleStore) -> tuple[Tensor, Possi
         Which places the echoes leave possible.
     """
     ears = synthetic_ears(settings.ears, frequency_axis(settings.spectrogram))
-    evidence = EchoEvidence(store, ears, most=200)
+    reach = echo_reach(settings.call, settings.spectrogram, _speed(settings))
+    evidence = EchoEvidence(store, ears, reach=reach, most=200)
     set_region = settings.region
     if set_region.lower is not None and set_region.upper is not None:
         box = np.asarray((set_region.lower, set_region.upper))

@@ -23,13 +23,12 @@ from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.experiment.build import field_and_renderer, module_for
 from sononerf.experiment.fit import quiet_lightning, require_accelerator
 from sononerf.experiment.run_folder import RunFolder
-from sononerf.experiment.simulate import store_path
+from sononerf.experiment.simulate import default_store
 from sononerf.geometry.poses import Poses, read_pose_csv
 from sononerf.module import EchoModule
 from sononerf.progress import Progress
 from sononerf.reconstruction.prediction import prediction_metrics
 from sononerf.render.spectrogram import spectrogram_png
-from sononerf.scene import load_scene
 from sononerf.weights import DESCRIPTION_NAME, load_weights
 
 Split = Literal["train", "val", "test"]
@@ -94,10 +93,7 @@ def store_of(fitted: Fitted) -> EnsembleStore:
         If another one lies there.
     """
     settings = fitted.settings
-    if settings.data.store is not None:
-        path = settings.data.store
-    else:
-        path = store_path(settings, load_scene(settings.scene.name, settings.scene.options), None)
+    path = settings.data.store or default_store(settings, fitted.echo_hash)
     if not path.exists():
         raise InputError(
             f"{path}: the ensemble of this run is not there; make it again with "

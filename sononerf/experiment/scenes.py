@@ -8,12 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from sononerf import plugins, storage
+from sononerf.acoustics.spectrogram import compress
 from sononerf.config import Settings
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import SonoNerfError
+from sononerf.render.echo import echo_png
 from sononerf.render.mesh import mesh_png
 from sononerf.render.scene import scene_png
 from sononerf.scene import list_scenes, load_scene
+from sononerf.simulation.ensemble import pose_seed
+from sononerf.simulation.simulator import Simulator
 
 
 def describe_scenes() -> list[dict[str, Any]]:
@@ -53,8 +57,53 @@ def draw_scenes(folder: Path) -> list[Path]:
 
 
 def draw_ensemble(settings: Settings, store: EnsembleStore, folder: Path) -> list[Path]:
-    """Draw a scene with the poses of its ensemble; return the files."""
+    """Draw a scene with the poses of its ensemble, and the echo of the first test pose.
+
+    The first pose of all where none is for the test.
+
+    Parameters
+    ----------
+    settings : Settings
+        Of the ensemble.
+    store : EnsembleStore
+        Complete.
+    folder : Path
+        Of the pictures.
+
+    Returns
+    -------
+    written : list of Path
+        ``scene.png`` and ``pose_0000.png``, numbered as in the store.
+
+    Raises
+    ------
+    StorageError
+        If a picture cannot be written.
+    """
     scene = load_scene(settings.scene.name, settings.scene.options)
-    path = folder / "scene.png"
-    storage.commit_bytes(path, scene_png(scene.mesh, store.positions, store.rotations[:, :, 0]))
-    return [path]
+    written = [folder / "scene.png"]
+    forward = store.rotations[:, :, 0]
+    storage.commit_bytes(
+        written[0], scene_png(scene.mesh, store.positions, forward, split=store.split)
+    )
+    index = int([*store.indices("test"), 0][0])
+    written.append(folder / f"pose_{index:04d}.png")
+    simulator = Simulator.from_settings(scene, settings)
+    pose = store.positions[index], store.rotations[index]
+    seed = pose_seed(settings.simulation.seed, index)
+    points, level_db = simulator.hits(*pose, seed=seed)
+    picture = echo_png(
+        scene.mesh,
+        points,
+        level_db,
+        *pose,
+        simulator.receive(*pose, seed=seed)[0],
+        settings.spectrogram.sampling_rate,
+        compress(store.read_pose(index), store.attributes["reference"]),
+        store.range,
+        store.frequency,
+        speed_of_sound=simulator.speed_of_sound,
+        title=f"{settings.scene.name}, pose {index}",
+    )
+    storage.commit_bytes(written[1], picture)
+    return written

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf import __version__, storage
+from sononerf.acoustics.reception import warn_of_call
 from sononerf.acoustics.spectrogram import compress
 from sononerf.config import Settings
 from sononerf.data.store import EnsembleStore
@@ -20,32 +21,54 @@ from sononerf.geometry.poses import Poses
 from sononerf.progress import Progress
 from sononerf.reconstruction.prediction import mae_db
 from sononerf.scene import Scene, load_scene
-from sononerf.simulation.ensemble import check_poses, ensemble_poses, simulate_ensemble
+from sononerf.simulation.ensemble import (
+    check_poses,
+    check_reach,
+    deaf,
+    ensemble_poses,
+    simulate_ensemble,
+)
 from sononerf.simulation.simulator import Simulator
 
 REFERENCE_RATIO = 1e-3
 """The reported decibels start 60 dB below the greatest magnitude of the training poses."""
-ECHO_SECTIONS = ("poses", "simulation", "air", "ears", "call", "spectrogram")
+HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")
 MOST_WORKERS = 8
 WORTH_WORKERS = 64
 """Fewer poses than this are simulated before other processes have even started."""
 
 
 def echo_hash(settings: Settings, scene: Scene) -> str:
-    """Return a hash of all that the echoes depend on."""
+    """Return a hash of all that the echoes depend on.
+
+    Poses count as what they are, not as how they were asked for: a changed table at the same
+    place is another ensemble, the same table at another place is not.
+    """
     plain = settings.plain()
     digest = hashlib.sha256()
-    digest.update(json.dumps([plain[name] for name in ECHO_SECTIONS], sort_keys=True).encode())
+    digest.update(json.dumps([plain[name] for name in HASHED_SECTIONS], sort_keys=True).encode())
+    poses, split = ensemble_poses(settings)
+    for values in (poses.positions, poses.rotations):
+        # The last bits of a sine are the processor's own; adding zero makes -0 the same as 0.
+        digest.update((np.round(values, 9) + 0.0).astype("<f8").tobytes())
+    digest.update(split.tobytes())
     digest.update(np.ascontiguousarray(scene.mesh.vertices, dtype="<f8").tobytes())
     digest.update(np.ascontiguousarray(scene.mesh.faces, dtype="<i8").tobytes())
     digest.update(repr(scene.material).encode())
+    if scene.part is not None:
+        digest.update(scene.part.astype("<i8").tobytes())
     return digest.hexdigest()
 
 
 def store_path(settings: Settings, scene: Scene, output: Path | None) -> Path:
     """Return where the ensemble lies: as asked for, as set, or by its hash under ``data/``."""
     chosen = output or settings.data.store
-    return chosen or Path("data") / f"{settings.scene.name}-{echo_hash(settings, scene)[:12]}"
+    return chosen or default_store(settings, echo_hash(settings, scene))
+
+
+def default_store(settings: Settings, echoes: str) -> Path:
+    """Return where the ensemble of a hash lies when nobody says where."""
+    return Path("data") / f"{settings.scene.name}-{echoes[:12]}"
 
 
 def simulate(
@@ -100,10 +123,17 @@ def simulate(
         if "reference" in store.attributes and not store.missing():
             return store
     poses, split = ensemble_poses(settings)
+    warn_of_call(settings.call, settings.spectrogram)
     simulator = Simulator.from_settings(scene, settings)
     head = np.concatenate((simulator.ears.emitter[None], simulator.ears.positions))
     check_poses(scene, poses, offsets=head)
-    _refuse_deaf(settings, scene, poses)
+    check_reach(
+        scene,
+        poses,
+        bounces=settings.simulation.bounces,
+        range_min=settings.spectrogram.range_min,
+        range_max=settings.spectrogram.range_max,
+    )
     storage.probe_writable(path)
     with storage.lock(path):
         store = EnsembleStore.create(
@@ -126,7 +156,7 @@ def _attributes(settings: Settings, wanted: str, simulator: Simulator) -> dict[s
         "echo_hash": wanted,
         "origin": "simulated",
         "scene": plain["scene"],
-        "settings": {name: plain[name] for name in ECHO_SECTIONS},
+        "settings": {name: plain[name] for name in ("poses", *HASHED_SECTIONS)},
         "speed_of_sound": simulator.speed_of_sound,
         "units": {
             "spectrogram": "linear magnitude, sound pressure over that of the call at 1 m",
@@ -136,26 +166,6 @@ def _attributes(settings: Settings, wanted: str, simulator: Simulator) -> dict[s
         },
         "sononerf": __version__,
     }
-
-
-def _deaf(settings: Settings) -> NumericalError:
-    limits = settings.spectrogram
-    return NumericalError(
-        f"no pose received an echo between {limits.range_min} and {limits.range_max} m; check "
-        "poses.radius, the scene's size and the range limits"
-    )
-
-
-def _refuse_deaf(settings: Settings, scene: Scene, poses: Poses) -> None:
-    """Refuse range limits that no echo can reach; the tails of its filter would pass for one."""
-    lower, upper = scene.mesh.bounds
-    radius = float(np.linalg.norm(upper - lower)) / 2
-    distance = np.linalg.norm(poses.positions - (lower + upper) / 2, axis=1)
-    nearest = distance - radius
-    farthest = distance + settings.simulation.bounces * radius
-    limits = settings.spectrogram
-    if not ((nearest <= limits.range_max) & (farthest >= limits.range_min)).any():
-        raise _deaf(settings)
 
 
 def _fill(
@@ -200,7 +210,7 @@ def _fill(
         )
     loudest = max(float(store.read_pose(int(i)).max()) for i in store.indices("train"))
     if loudest <= 0.0:
-        raise _deaf(settings)
+        raise NumericalError(deaf(settings.spectrogram.range_min, settings.spectrogram.range_max))
     reference = loudest * REFERENCE_RATIO
     noise: dict[str, float | None] = {"noise_floor_mae_db": None, "noise_floor_mae_db_active": None}
     if len(test):

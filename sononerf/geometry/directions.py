@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -70,6 +71,39 @@ def fibonacci_cap(
 
 
 @dataclass(frozen=True, eq=False)
+class Cells:
+    """Parallelograms on the plane of (share of a cap's area, turn about its axis).
+
+    Attributes
+    ----------
+    middles : (2, N) float64
+        Share and turn.
+    sides : (2, 2, N) float64
+        Two sides, each in share and turn.
+    parts : int
+        How many of them make up one cell of the spiral.
+    """
+
+    middles: NDArray[np.float64]
+    sides: NDArray[np.float64]
+    parts: int
+
+    def __getitem__(self, chosen: NDArray[Any]) -> Cells:
+        """Return the chosen cells."""
+        return Cells(self.middles[:, chosen], self.sides[:, :, chosen], self.parts)
+
+    def divided(self, split: int) -> Cells:
+        """Divide each cell into ``split**2`` of one size."""
+        steps = (np.arange(split) + 0.5) / split - 0.5
+        middles = self.middles[:, :, None]
+        for side in self.sides:
+            moved = middles[..., None] + side[:, :, None, None] * steps
+            middles = moved.reshape(*moved.shape[:2], -1)
+        sides = np.repeat(self.sides / split, split**2, axis=2)
+        return Cells(middles.reshape(2, -1), sides, self.parts * split**2)
+
+
+@dataclass(frozen=True, eq=False)
 class CapSpiral:
     """The pattern of :func:`fibonacci_cap`, which can be made denser where that is needed.
 
@@ -118,34 +152,27 @@ class CapSpiral:
 
     def neighbourhood(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return directions' indices together with those of their four neighbours, sorted."""
-        near, far = _cell_steps(self._ring(index), self._depth / self.count)
+        near, far = self.neighbour_steps(index)
         around = np.concatenate([index, index - near, index + near, index - far, index + far])
         return np.unique(around[(around >= 0) & (around < self.count)])
 
-    def divided(self, index: NDArray[np.int64], split: int) -> NDArray[np.float64]:
-        """Divide the cells of some directions into ``split**2`` cells each.
+    def neighbour_steps(
+        self, index: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the two steps in index (N,) that lead to the nearest neighbours, either way."""
+        return _cell_steps(self._ring(index), self._depth / self.count)
 
-        Parameters
-        ----------
-        index : (N,) int64
-            Of the directions.
-        split : int
-            Into how many parts along each side.
-
-        Returns
-        -------
-        directions : (N * split**2, 3) float64
-            Middles of the new cells; a new one stands for ``solid_angle / split**2``.
-        """
+    def cells(self, index: NDArray[np.int64]) -> Cells:
+        """Return the cells of directions by their index (N,)."""
         share, turn = self._lattice(index.astype(np.float64))
-        near, far = _cell_steps(self._ring(index), self._depth / self.count)
-        steps = (np.arange(split) + 0.5) / split - 0.5
-        for step in (near, far):
-            across = np.mod(step * GOLDEN_TURN + 0.5, 1.0) - 0.5
-            along = step / self.count
-            share = share.reshape(len(index), -1, 1) + along[:, None, None] * steps
-            turn = turn.reshape(len(index), -1, 1) + across[:, None, None] * steps
-        return self._at(share.ravel(), turn.ravel())
+        steps = np.stack(self.neighbour_steps(index))
+        across = np.mod(steps * GOLDEN_TURN + 0.5, 1.0) - 0.5
+        sides = np.stack([steps / self.count, across], axis=1)
+        return Cells(np.stack([share, turn]), sides, 1)
+
+    def towards(self, cells: Cells) -> NDArray[np.float64]:
+        """Return the unit vectors (N, 3) of the middles of cells."""
+        return self._at(*cells.middles)
 
     def _lattice(
         self, index: NDArray[np.float64]
@@ -165,12 +192,9 @@ class CapSpiral:
         turn = 2.0 * math.pi * np.mod(turn + 0.5 * over, 1.0)
         ring = np.sqrt(drop * (2.0 - drop))
         frame = _frame(self.axis)
-        middle, side, up = frame if self.rotation is None else frame @ self.rotation.T
-        return (
-            (1.0 - drop)[:, None] * middle
-            + (ring * np.cos(turn))[:, None] * side
-            + (ring * np.sin(turn))[:, None] * up
-        )
+        if self.rotation is not None:
+            frame = frame @ self.rotation.T
+        return np.stack([1.0 - drop, ring * np.cos(turn), ring * np.sin(turn)]).T @ frame
 
 
 def _cell_steps(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import InputError
-from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.geometry.directions import fibonacci_cap, fibonacci_sphere
 
 CSV_COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
 
@@ -207,6 +207,95 @@ def random_sphere_poses(
     places = generator.standard_normal((count, 3))
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     return _aimed(radius * places, aim_jitter, generator)
+
+
+def cap_poses(
+    count: int,
+    *,
+    radius: float,
+    axis: ArrayLike,
+    half_angle: float,
+    aim_jitter: float,
+    generator: np.random.Generator,
+) -> Poses:
+    """Poses on a spiral over a cap of a sphere that look at the origin, each a little off.
+
+    Parameters
+    ----------
+    count : int
+        How many.
+    radius : float, m
+        Distance from the origin.
+    axis : (3,) float
+        From the origin to the cap's middle; any length but zero.
+    half_angle : float, rad
+        From the axis to the cap's rim, 0 to pi.
+    aim_jitter : float, rad
+        Standard deviation of the two turns about the head's own y and z axes.
+    generator : numpy.random.Generator
+        Draws the turns.
+
+    Returns
+    -------
+    poses : Poses
+        Level (roll 0), ``count`` of them.
+
+    Raises
+    ------
+    ValueError
+        If ``count`` is below one, the axis has no length, or the angle is outside 0 to pi.
+    """
+    spiral = fibonacci_cap(count, axis=axis, half_angle=half_angle, offset=(0.5, 0.0))
+    return _aimed(radius * spiral, aim_jitter, generator)
+
+
+def random_poses(
+    count: int,
+    *,
+    radius: tuple[float, float],
+    axis: ArrayLike,
+    half_angle: float,
+    aim_jitter: float,
+    generator: np.random.Generator,
+) -> Poses:
+    """Poses at random places between two spheres and within a cone, uniform in volume.
+
+    Parameters
+    ----------
+    count : int
+        How many; none is allowed.
+    radius : (2,) float, m
+        Least and greatest distance from the origin; where they are the same, the places are
+        uniform over a cap of that sphere.
+    axis : (3,) float
+        From the origin along the cone's middle; any length but zero.
+    half_angle : float, rad
+        From the axis to the cone, 0 to pi.
+    aim_jitter : float, rad
+        Standard deviation of the two turns about the head's own y and z axes.
+    generator : numpy.random.Generator
+        Draws places and turns.
+
+    Returns
+    -------
+    poses : Poses
+        Level (roll 0), ``count`` of them; they look at the origin, each a little off.
+
+    Raises
+    ------
+    ValueError
+        If the axis has no length.
+    """
+    height, turn, depth = generator.random((3, count))
+    # Equal steps along the axis cut a sphere into equal areas; equal steps of r^3, equal volumes.
+    along = 1.0 - height * 2.0 * math.sin(half_angle / 2.0) ** 2
+    across = np.sqrt(1.0 - along**2)
+    turn = 2.0 * math.pi * turn
+    places = np.stack([along, across * np.cos(turn), across * np.sin(turn)], axis=1)
+    near, far = radius
+    distance = near if near == far else np.cbrt(near**3 + depth * (far**3 - near**3))[:, None]
+    places = distance * (places @ look_at(np.zeros(3), axis).T)
+    return _aimed(places, aim_jitter, generator)
 
 
 def read_pose_csv(path: Path) -> Poses:

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sononerf.geometry.surface import corner_normals
+from sononerf.geometry.surface import corner_normals, total_curvature, weight_gradients
 
 try:
     from embreex.mesh_construction import TriangleMesh
@@ -39,6 +39,11 @@ class Hits:
         Index of the triangle.
     distance : (H,) float64, m
         Along the ray.
+    flat : (H, 3) float64
+        Unit normals of the flat triangles.
+    gradients : (4, 3, H) float32
+        How the smooth normal changes along the triangle: gradients of the second and third
+        corner's weight (1/m), and by how much the normals there differ from that at the first.
     """
 
     ray: NDArray[np.int64]
@@ -46,6 +51,8 @@ class Hits:
     normals: NDArray[np.float64]
     triangle: NDArray[np.int64]
     distance: NDArray[np.float64]
+    flat: NDArray[np.float64]
+    gradients: NDArray[np.float32]
 
 
 class _Engine(Protocol):
@@ -146,6 +153,8 @@ class RayCaster:
     ----------
     face_normals : (T, 3) float64
         Unit normals of the flat triangles; of one without area, zero.
+    curvature : (T,) float64, 1/m
+        Total curvature of the smooth surface.
     lift : float, m
         How far above its triangle a ray starts from a hit.
     """
@@ -158,16 +167,21 @@ class RayCaster:
         faces = np.asarray(mesh.faces, dtype=np.int64)
         vertices = np.asarray(mesh.vertices, dtype=np.float64)
         self._corners = vertices[faces]  # (T, 3, 3)
-        self._normals = corner_normals(mesh)  # (T, 3, 3)
         ab = self._corners[:, 1] - self._corners[:, 0]
         ac = self._corners[:, 2] - self._corners[:, 0]
         sides = np.cross(ab, ac)
         area = np.linalg.norm(sides, axis=1, keepdims=True)
         solid = np.where(area > 0.0, area, np.inf)
         self.face_normals = sides / solid
-        # Products with these are the weights of the second and third corner.
-        self._second = np.cross(ac, self.face_normals) / solid
-        self._third = np.cross(self.face_normals, ab) / solid
+        smooth = corner_normals(mesh)  # (T, 3, 3)
+        self.curvature = total_curvature(mesh, smooth)
+        second, third = weight_gradients(self._corners)
+        # Side by side, so that a hit reads one stretch of memory.
+        self._planes = np.concatenate([self._corners[:, 0], self.face_normals], axis=1)
+        differs = smooth[:, 1:] - smooth[:, :1]
+        self._gradients = np.concatenate(
+            [second, third, differs[:, 0], differs[:, 1], smooth[:, 0]], axis=1
+        ).astype(np.float32)
         # Single precision counts from the origin: far from it, millimetres would be lost.
         scaled = (vertices - self._middle) / self._size
         self._engine: _Engine = (
@@ -189,29 +203,32 @@ class RayCaster:
         hits : Hits
             Points and distances in double precision, from the triangles' planes.
         """
-        found = self._engine.first((origins - self._middle) / self._size, directions)
+        found = self._engine.first(self._scaled(origins), directions)
         ray = np.flatnonzero(found >= 0)
-        triangle = found[ray]
-        start, along = origins[ray], directions[ray]
-        anchor, flat = self._corners[triangle, 0], self.face_normals[triangle]
+        triangle = found.take(ray)
+        start, along = origins.take(ray, axis=0), directions.take(ray, axis=0)
+        plane = self._planes.take(triangle, axis=0)
+        anchor, flat = plane[:, :3], np.ascontiguousarray(plane[:, 3:])
         slope = _dot(along, flat)
         # A ray along the plane meets it nowhere; it is then moved onto the triangle below.
         slope = np.where(np.abs(slope) > 1e-12, slope, np.inf)
         distance = _dot(anchor - start, flat) / slope
         points = start + distance[:, None] * along
         offset = points - anchor
-        second, third = _dot(offset, self._second[triangle]), _dot(offset, self._third[triangle])
-        weights = np.stack([1.0 - second - third, second, third], axis=1)
-        off = np.flatnonzero(weights.min(axis=1) < -1e-4)
+        smooth = np.ascontiguousarray(self._gradients.take(triangle, axis=0).T).reshape(5, 3, -1)
+        second, third = np.einsum("kdn,nd->kn", smooth[:2], offset.astype(np.float32))
+        off = np.flatnonzero(np.minimum(np.minimum(second, third), 1.0 - second - third) < -1e-4)
         if len(off):
-            inside = np.clip(weights[off], 0.0, None)
-            weights[off] = inside / inside.sum(axis=1, keepdims=True)
-            points[off] = np.einsum("nc,ncd->nd", weights[off], self._corners[triangle[off]])
+            weights = np.stack([1.0 - second[off] - third[off], second[off], third[off]], axis=1)
+            weights = np.clip(weights, 0.0, None)
+            weights /= weights.sum(axis=1, keepdims=True)
+            _, second[off], third[off] = weights.T
+            points[off] = np.einsum("nc,ncd->nd", weights, self._corners[triangle[off]])
             distance[off] = _dot(points[off] - start[off], along[off])
-        normals = np.einsum("nc,ncd->nd", weights, self._normals[triangle])
-        length = np.sqrt(_dot(normals, normals))
-        normals /= np.where(length > 0.0, length, 1.0)[:, None]
-        return Hits(ray, points, normals, triangle, distance)
+        normals = smooth[4] + second * smooth[2] + third * smooth[3]
+        length = np.sqrt(np.einsum("dn,dn->n", normals, normals))
+        normals /= np.where(length > 0.0, length, np.float32(1.0))
+        return Hits(ray, points, normals.T.astype(np.float64), triangle, distance, flat, smooth[:4])
 
     def visible(
         self,
@@ -243,4 +260,12 @@ class RayCaster:
             normals = spans / np.where(length > 0.0, length, 1.0)
         lifted = points + self.lift * normals
         spans = np.broadcast_to(targets, points.shape) - lifted
-        return ~self._engine.blocked((lifted - self._middle) / self._size, spans / self._size)
+        return ~self._engine.blocked(self._scaled(lifted), spans * (1.0 / self._size))
+
+    def _scaled(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return points in the engine's coordinates."""
+        if len(points) > 1 and points.strides[0] == 0:  # one point for all
+            return np.broadcast_to(self._scaled(points[:1]), points.shape)
+        scaled = points - self._middle
+        scaled *= 1.0 / self._size
+        return scaled

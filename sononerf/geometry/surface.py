@@ -51,6 +51,61 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease: float = CREASE) -> NDArray[
     return normals[group].reshape(-1, 3, 3)
 
 
+def total_curvature(mesh: trimesh.Trimesh, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Total curvature of the smooth surface over each triangle.
+
+    The square root of the sum of both principal curvatures' squares, which is the Frobenius norm
+    of the map from a step along the surface to the normal's change; the normals at the corners
+    give that map, as in Rusinkiewicz [1]_. Edges are no part of it.
+
+    Parameters
+    ----------
+    mesh : trimesh.Trimesh
+        With shared vertices.
+    normals : (T, 3, 3) float64
+        From :func:`corner_normals`.
+
+    Returns
+    -------
+    curvature : (T,) float64, 1/m
+        Of a sphere, the square root of 2 over its radius; of a triangle without area, 0.
+
+    References
+    ----------
+    .. [1] S. Rusinkiewicz, "Estimating curvatures and their derivatives on triangle meshes",
+       3DPVT 2004.
+    """
+    corners = mesh.vertices.view(np.ndarray)[np.asarray(mesh.faces)]
+    second, third = weight_gradients(corners)
+    to_second, to_third = normals[:, 1] - normals[:, 0], normals[:, 2] - normals[:, 0]
+    square = (to_second**2).sum(1) * (second**2).sum(1)
+    square += (to_third**2).sum(1) * (third**2).sum(1)
+    square += 2.0 * (to_second * to_third).sum(1) * (second * third).sum(1)
+    return np.sqrt(np.maximum(square, 0.0))
+
+
+def weight_gradients(
+    corners: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How the weights of a triangle's second and third corner grow along it.
+
+    Parameters
+    ----------
+    corners : (T, 3, 3) float64, m
+        Of the triangles.
+
+    Returns
+    -------
+    second, third : (T, 3) float64, 1/m
+        Gradients in the triangle's plane; of a triangle without area, zero.
+    """
+    ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    sides = np.cross(ab, ac)
+    square = (sides**2).sum(1, keepdims=True)
+    square = np.where(square > 0.0, square, np.inf)
+    return np.cross(ac, sides) / square, np.cross(sides, ab) / square
+
+
 def _smooth_corners(mesh: trimesh.Trimesh, crease: float) -> NDArray[np.int32]:
     """Return a number per corner (3 T), the same for those that share a normal."""
     faces = np.asarray(mesh.faces)

@@ -23,7 +23,10 @@ from sononerf.render.shading import (
     draw_mesh,
 )
 
-NEAR, FAR = np.array([190, 70, 40]), np.array([226, 196, 178])
+# Training, validation, test; paler the further away.
+NEAR = np.array([[190, 70, 40], [20, 140, 100], [50, 70, 200]])
+FAR = np.round(NEAR + 0.7 * (240 - NEAR))
+SPLITS = ("train", "validation", "test")
 BOX = (90, 110, 130)
 # Length of a look, as a share of the picture's height.
 LOOK = 0.045
@@ -35,6 +38,7 @@ def scene_png(
     poses_forward: ArrayLike,
     region_box: tuple[ArrayLike, ArrayLike] | None = None,
     *,
+    split: ArrayLike | None = None,
     size: tuple[int, int] = (960, 800),
     view: ArrayLike = DEFAULT_VIEW,
 ) -> bytes:
@@ -50,6 +54,8 @@ def scene_png(
         Directions of look, drawn as strokes.
     region_box : ((3,), (3,)) float, m, optional
         Opposite corners of the box that is fitted.
+    split : (P,) int, optional
+        What each pose is for: 0 train, 1 validation, 2 test; each has a colour of its own.
     size : (int, int)
         Width and height in pixels.
     view : (3,) float
@@ -71,6 +77,9 @@ def scene_png(
     looks = np.asarray(poses_forward, dtype=np.float64).reshape(-1, 3)
     if heads.shape != looks.shape:
         raise ValueError(f"positions {heads.shape} and forward {looks.shape} differ in shape")
+    kinds = np.zeros(len(heads), dtype=np.int64) if split is None else np.asarray(split)
+    if kinds.shape != (len(heads),) or not np.isin(kinds, range(len(SPLITS))).all():
+        raise ValueError(f"split of shape {kinds.shape}: expected 0, 1 or 2 for each pose")
     if not len(mesh.faces):
         raise NumericalError("there is nothing to draw: the scene is empty")
     if not np.isfinite(looks).all():
@@ -83,16 +92,16 @@ def scene_png(
     nearness = (heads - camera.centre) @ camera.axes[0]
     behind = nearness < middle
     picture = Image.fromarray(np.round(255 * background(fine.width, fine.height)).astype(np.uint8))
-    _draw_poses(picture, fine, heads, looks, nearness, behind)
+    _draw_poses(picture, fine, heads, looks, kinds, nearness, behind)
     _draw_box(picture, fine, corners)
     pixels = np.asarray(picture) / 255.0
     draw_mesh(pixels, mesh, fine, STEEL)
     picture = Image.fromarray(np.round(255 * pixels).astype(np.uint8))
-    _draw_poses(picture, fine, heads, looks, nearness, ~behind)
+    _draw_poses(picture, fine, heads, looks, kinds, nearness, ~behind)
     done = Image.fromarray(averaged(np.asarray(picture) / 255.0))
     draw_scale_bar(done, camera)
-    _draw_axes(done, camera)
-    _draw_caption(done, camera, len(heads))
+    draw_axes(done, camera)
+    _draw_caption(done, camera, len(heads), None if split is None else kinds)
     return png_from_pixels(np.asarray(done))
 
 
@@ -106,6 +115,7 @@ def _draw_poses(
     camera: Camera,
     heads: NDArray[np.float64],
     looks: NDArray[np.float64],
+    kinds: NDArray[np.int64],
     nearness: NDArray[np.float64],
     chosen: NDArray[np.bool_],
 ) -> None:
@@ -116,9 +126,10 @@ def _draw_poses(
     share = 1 - (nearness.max() - nearness) / spread
     starts, _ = camera.project(heads)
     ends, _ = camera.project(heads + looks * LOOK * camera.height / camera.scale)
-    radius = 2.6 * OVERSAMPLING
     for index in np.flatnonzero(chosen)[np.argsort(nearness[chosen], kind="stable")]:
-        colour = tuple(int(c) for c in np.round(FAR + share[index] * (NEAR - FAR)))
+        far, near = FAR[kinds[index]], NEAR[kinds[index]]
+        colour = tuple(int(c) for c in np.round(far + share[index] * (near - far)))
+        radius = (2.6 if kinds[index] == 0 else 4.2) * OVERSAMPLING
         (x, y), end = starts[index], ends[index]
         draw.line([(x, y), (end[0], end[1])], fill=colour, width=OVERSAMPLING)
         draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=colour)
@@ -135,7 +146,7 @@ def _draw_box(picture: Image.Image, camera: Camera, corners: NDArray[np.float64]
             draw.line([tuple(places[i]), tuple(places[j])], fill=BOX, width=OVERSAMPLING)
 
 
-def _draw_axes(picture: Image.Image, camera: Camera) -> None:
+def draw_axes(picture: Image.Image, camera: Camera) -> None:
     """Draw the world's axes in the lower left corner."""
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(max(11, camera.height // 44))
@@ -150,7 +161,22 @@ def _draw_axes(picture: Image.Image, camera: Camera) -> None:
         draw.text(tuple(label), "xyz"[axis], fill=colours[axis], font=font, anchor="mm")
 
 
-def _draw_caption(picture: Image.Image, camera: Camera, count: int) -> None:
-    font = ImageFont.load_default(max(12, camera.height // 36))
-    text = f"{count} pose" + ("" if count == 1 else "s")
-    ImageDraw.Draw(picture).text((camera.width / 2, 10), text, fill=INK, font=font, anchor="ma")
+def _draw_caption(
+    picture: Image.Image, camera: Camera, count: int, kinds: NDArray[np.int64] | None
+) -> None:
+    draw = ImageDraw.Draw(picture)
+    size = max(12, camera.height // 36)
+    font = ImageFont.load_default(size)
+    if kinds is None:
+        text = f"{count} pose" + ("" if count == 1 else "s")
+        draw.text((camera.width / 2, 10), text, fill=INK, font=font, anchor="ma")
+        return
+    numbers = np.bincount(kinds, minlength=len(SPLITS))
+    texts = [f"{number} {name}" for number, name in zip(numbers, SPLITS, strict=True)]
+    gap, dot = 1.6 * size, 0.35 * size
+    widths = [2 * gap + draw.textlength(text, font=font) for text in texts]
+    x, y = (camera.width - sum(widths)) / 2, 10 + size / 2
+    for text, width, colour in zip(texts, widths, NEAR.tolist(), strict=True):
+        draw.ellipse([x + gap - dot, y - dot, x + gap + dot, y + dot], fill=tuple(colour))
+        draw.text((x + gap + 2 * dot, y), text, fill=INK, font=font, anchor="lm")
+        x += width

@@ -97,8 +97,8 @@ def _checked(
     return measured, predicted, ranges, frequencies
 
 
-def _edges(axis: NDArray[np.float64]) -> tuple[float, float]:
-    """Outer edges of the first and last cell, so that ticks stand at the cells' centres."""
+def axis_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the outer edges of an axis' first and last cell, so that ticks stand at centres."""
     half = (axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5
     return float(axis[0] - half), float(axis[-1] + half)
 
@@ -126,7 +126,7 @@ def _pixels(
     worst = _round_up(float(np.quantile(np.abs(difference), 0.998)), 3)
     ears = len(measured)
     names = ["left ear", "right ear"] if ears == 2 else [f"ear {ear}" for ear in range(ears)]
-    extent = (*_edges(ranges), *_edges(frequencies / 1e3))
+    extent = (*axis_edges(ranges), *axis_edges(frequencies / 1e3))
     with figure(10.5, 0.9 + 2.3 * ears, dpi) as drawn:
         axes = drawn.subplots(ears, 3, sharex=True, sharey=True, squeeze=False)
         for ear in range(ears):

@@ -14,8 +14,8 @@ from torch import Tensor, nn
 from sononerf.field.field import Field
 from sononerf.renderer.renderer import Acquisition, Possible, Renderer, look_up
 
-KERNEL_WINDOWS = 2.0
-"""The kernel reaches this many half windows: beam, ears and call lengthen an echo."""
+KERNEL_SKIRT = 31e-6
+"""The kernel reaches so much further than the window, s: beam and ears lengthen an echo."""
 KERNEL_FLOOR = -9.0
 """What the squared kernel starts with beyond the window, as a natural logarithm."""
 
@@ -38,13 +38,16 @@ class ProfileRenderer(Renderer):
     r"""Power of a fine range profile, seen through the squared analysis window.
 
     .. math::
-        S_e(f, r)^2 = n_f^2 + g^2 \sum_i W(r - r_i)\, |\rho(x_i, u_i, f)|^2
+        S_e(f, r)^2 = n_f^2 + g^2 \sum_i W_f(r - r_i)\, |\rho(x_i, u_i, f)|^2
         \frac{B(f)^2 E_e(f)^2 e^{-2 \alpha_f (d_i + d_i^e)}}{(d_i\, d_i^e)^2}
 
     The sum runs over the vertices of a lattice that are still alive. Each is deposited, linearly
     between two bins, at :math:`r_i = (d_i + d_i^e) / 2`, emitter and ear at their true places,
-    so both ears hear it at their own time. Spreading and absorption are known physics and stay
-    out of the field. Summing power ignores interference between glints inside one window.
+    so both ears hear it at their own time; of a sweep each row hears it by the row's lag farther
+    off. Spreading and absorption are known physics and stay out of the field. The kernel
+    :math:`W_f` starts as the square of a point echo in its row, the analysis window or what that
+    makes of a sweep, and is learned on. Summing power ignores interference between glints inside
+    one window.
 
     Parameters
     ----------
@@ -75,6 +78,7 @@ class ProfileRenderer(Renderer):
     energy: Tensor
     spacing: Tensor
     absorption: Tensor
+    lag: Tensor | None
 
     def __init__(
         self,
@@ -97,19 +101,21 @@ class ProfileRenderer(Renderer):
         step = float(acquisition.range[1] - acquisition.range[0])
         self.bin = step / oversampling
         per_sample = acquisition.speed_of_sound / acquisition.sampling_rate / 2
-        half = (len(acquisition.window) - 1) / 2
-        reach = math.ceil(KERNEL_WINDOWS * half * per_sample / self.bin)
+        window = acquisition.window.clamp(1e-6, 1.0)  # a row that is not swept has no middle
+        last = window.shape[1] - 1
+        half = last / 2
+        reach = math.ceil((half + KERNEL_SKIRT * acquisition.sampling_rate) * per_sample / self.bin)
         offsets = half - torch.arange(reach + 1) * self.bin / per_sample  # from the middle down
-        left = offsets.floor().long().clamp(0, len(acquisition.window) - 2)
+        left = offsets.floor().long().clamp(0, last - 1)
         part = offsets - left
-        window = acquisition.window
-        window = window[left] * (1 - part) + window[left + 1] * part
+        window = window[:, left] * (1 - part) + window[:, left + 1] * part
         skirt = (2 * window.log()).clamp_min(KERNEL_FLOOR)
         skirt = torch.where(offsets >= 0, skirt, KERNEL_FLOOR).float()
-        self.log_kernel = nn.Parameter(skirt[1:].expand(len(acquisition.frequency), -1).clone())
+        self.log_kernel = nn.Parameter(skirt[:, 1:].clone())
         self.first = float(acquisition.range[0]) - reach * self.bin
         self.bins = (len(acquisition.range) - 1) * oversampling + 2 * reach + 1
         self.register_buffer("absorption", acquisition.absorption.clone())
+        self.register_buffer("lag", acquisition.lag)
         self.log_spectrum = nn.Parameter(torch.zeros(len(acquisition.frequency)))
         self.log_noise = nn.Parameter(torch.full((len(acquisition.frequency),), -16.0))
         self.register_buffer("lattice", torch.zeros(0, 3))
@@ -256,19 +262,20 @@ class ProfileRenderer(Renderer):
         spread = (length[:, :1] * length[:, 1:]).square().reciprocal()  # (P, E, N)
         if weight is not None:
             spread = spread * weight
-        place = ((length[:, :1] + length[:, 1:]) / 2 - self.first) / self.bin
-        left = place.floor()
-        part = place - left
-        audible = (left >= 0) & (left < self.bins - 1)
-        left = left.long().clamp(0, self.bins - 2)
+        middle = ((length[:, :1] + length[:, 1:]) / 2 - self.first) / self.bin
         count, ears, width = len(position), len(self.ears), len(bins)
-        rows = torch.arange(count * ears * width, device=left.device).reshape(count, ears, width)
+        rows = torch.arange(count * ears * width, device=places.device).reshape(count, ears, width)
         profiles = places.new_zeros(count * ears * width * self.bins)
         for ear in range(ears):
             gain = look_up(self.ears[ear, bins], head[:, 1 + ear]).square()
-            echo = common * gain * (spread * audible)[:, ear, :, None]  # (P, N, B)
-            index = rows[:, ear, None] * self.bins + left[:, ear, :, None]
-            near = echo * (1 - part[:, ear, :, None])
+            place = middle[:, ear, :, None]  # (P, N, 1) or (P, N, B)
+            if self.lag is not None:
+                place = place + look_up(self.lag[ear, bins], head[:, 1 + ear]) / self.bin
+            left = place.floor()
+            audible = (left >= 0) & (left < self.bins - 1)
+            echo = common * gain * (spread[:, ear, :, None] * audible)  # (P, N, B)
+            index = rows[:, ear, None] * self.bins + left.long().clamp(0, self.bins - 2)
+            near = echo * (1 - (place - left))
             profiles = profiles + _Deposit.apply(near, index, len(profiles))
             profiles = profiles + _Deposit.apply(echo - near, index + 1, len(profiles))
         return profiles.reshape(count, ears, width, self.bins)

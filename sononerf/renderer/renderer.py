@@ -27,8 +27,9 @@ class Acquisition:
         Frequencies.
     range : (R,) float, m
         Ranges of the slices, evenly spaced.
-    window : (W,) float
-        Analysis window, one value per sample.
+    window : (F, W) float
+        How a point echo swells and fades in each frequency's row, 1 in its middle, one value per
+        sample: the analysis window, or what it makes of a sweep.
     sampling_rate : float, Hz
         Of the window.
     speed_of_sound : float, m/s
@@ -43,6 +44,9 @@ class Acquisition:
         Place of the emitter in the head frame.
     ear_positions : (E, 3) float, m
         Places of the ears in the head frame.
+    lag : (E, F, L, A) float or None, m
+        How much too far off each ear hears an echo, over the directions of ``ears``; none for an
+        impulse.
     """
 
     frequency: Tensor
@@ -55,6 +59,7 @@ class Acquisition:
     ears: Tensor
     emitter: Tensor
     ear_positions: Tensor
+    lag: Tensor | None = None
 
 
 def look_up(table: Tensor, directions: Tensor) -> Tensor:

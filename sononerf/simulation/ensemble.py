@@ -6,22 +6,34 @@ from __future__ import annotations
 import logging
 import math
 import warnings
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.config import Settings
-from sononerf.errors import InputError, ResourceError, SonoNerfError
-from sononerf.geometry.poses import Poses, random_sphere_poses, sphere_poses
+from sononerf.config import PoseSettings, Settings
+from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
+from sononerf.geometry.inside import winding_numbers
+from sononerf.geometry.poses import (
+    Poses,
+    cap_poses,
+    random_poses,
+    random_sphere_poses,
+    read_pose_csv,
+    sphere_poses,
+)
 from sononerf.scene import Scene
 from sononerf.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     from distributed import Client
+
+logger = logging.getLogger("sononerf")
 
 Write = Callable[[int, NDArray[np.float32]], None]
 Progress = Callable[[int, int], None]
@@ -29,12 +41,15 @@ Progress = Callable[[int, int], None]
 TRAIN, VALIDATION, TEST = 0, 1, 2
 CONNECT_SECONDS = 30  # a scheduler across a network answers in one
 QUEUED_PER_WORKER = 4  # results wait in memory; more than this would only fill it
+PATIENCE_SECONDS = 10  # without a result, before workers are looked for
+SENT_AGAIN = 3  # times, and each time Dask itself tries four workers
 
 
 def ensemble_poses(settings: Settings) -> tuple[Poses, NDArray[np.int8]]:
-    """Poses of an experiment: the training spiral, then those for validation, then for the test.
+    """Poses of an experiment: those to train on, then those for validation, then for the test.
 
     Each set draws from a generator of its own, so that the number of one does not move another.
+    The poses of a path stay in the order of its table.
 
     Parameters
     ----------
@@ -47,22 +62,61 @@ def ensemble_poses(settings: Settings) -> tuple[Poses, NDArray[np.int8]]:
         All of them.
     split : (P,) int8
         0 train, 1 validation, 2 test.
+
+    Raises
+    ------
+    InputError
+        If the table of a path cannot be read, or has too few rows.
     """
     wanted = settings.poses
+    if wanted.path is not None:
+        return _path_poses(wanted, wanted.path)
+    train, test = _arrangement(wanted)
     sets = (
-        (TRAIN, wanted.count, sphere_poses),
-        (VALIDATION, wanted.validation, random_sphere_poses),
-        (TEST, wanted.heldout, random_sphere_poses),
+        (TRAIN, wanted.count, train),
+        (VALIDATION, wanted.validation, test),
+        (TEST, wanted.heldout, test),
     )
     made, split = [], []
     for member, count, draw in sets:
-        generator = np.random.default_rng(np.random.SeedSequence([wanted.seed, member]))
         jitter = math.radians(wanted.aim_jitter_deg)
-        made.append(draw(count, radius=wanted.radius, aim_jitter=jitter, generator=generator))
+        made.append(draw(count, aim_jitter=jitter, generator=_generator(wanted, member)))
         split.append(np.full(count, member, dtype=np.int8))
     positions = np.concatenate([poses.positions for poses in made])
     rotations = np.concatenate([poses.rotations for poses in made])
     return Poses(positions, rotations), np.concatenate(split)
+
+
+def _generator(wanted: PoseSettings, member: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence([wanted.seed, member]))
+
+
+def _arrangement(wanted: PoseSettings) -> tuple[Callable[..., Poses], Callable[..., Poses]]:
+    """Return what makes the training poses, and what draws those for validation and test."""
+    radius, axis = wanted.radius, wanted.axis
+    if wanted.arrangement == "sphere":
+        return partial(sphere_poses, radius=radius), partial(random_sphere_poses, radius=radius)
+    angle = math.pi if wanted.half_angle_deg is None else math.radians(wanted.half_angle_deg)
+    distances = radius, wanted.radius_max or radius
+    draw = partial(random_poses, radius=distances, axis=axis, half_angle=angle)
+    if wanted.arrangement == "volume":
+        return draw, draw
+    return partial(cap_poses, radius=radius, axis=axis, half_angle=angle), draw
+
+
+def _path_poses(wanted: PoseSettings, path: Path) -> tuple[Poses, NDArray[np.int8]]:
+    """Read a flight path; its rows for validation and test are drawn at random."""
+    poses = read_pose_csv(path)
+    if len(poses) <= wanted.validation + wanted.heldout:
+        raise InputError(
+            f"{path}: {len(poses)} poses, of which poses.validation takes {wanted.validation} and "
+            f"poses.heldout {wanted.heldout}; none is left to train on"
+        )
+    split = np.full(len(poses), TRAIN, dtype=np.int8)
+    for member, count in ((TEST, wanted.heldout), (VALIDATION, wanted.validation)):
+        order = _generator(wanted, member).permutation(len(poses))
+        split[order[split[order] == TRAIN][:count]] = member
+    return poses, split
 
 
 def pose_seed(seed: int, index: int) -> int:
@@ -92,34 +146,71 @@ def check_poses(scene: Scene, poses: Poses, *, offsets: NDArray[np.float64] | No
     _refuse(~finite, "no finite numbers")
     points = np.zeros((1, 3)) if offsets is None else np.vstack([np.zeros((1, 3)), offsets])
     places = poses.positions[:, None] + np.einsum("pij,kj->pki", poses.rotations, points)
-    lower, upper = np.asarray(scene.mesh.bounds)
-    inside = np.zeros(places.shape[:2], dtype=bool)
-    corners = np.asarray(scene.mesh.triangles, dtype=np.float64)
-    for pose, point in np.argwhere(((places >= lower) & (places <= upper)).all(axis=2)):
-        inside[pose, point] = abs(_winding(corners, places[pose, point])) > 0.5
+    winding = winding_numbers(scene.mesh.vertices, scene.mesh.faces, places.reshape(-1, 3))
+    inside = np.abs(winding.reshape(places.shape[:2])) > 0.5
     _refuse(inside.any(axis=1), "inside the scene's surface")
 
 
 def _refuse(bad: ArrayLike, what: str) -> None:
     bad = np.asarray(bad)
+    if bad.any():
+        raise InputError(f"{_named(bad)} {what}; move them, or raise poses.radius")
+
+
+def _named(bad: NDArray[np.bool_]) -> str:
+    """Say how many poses there are of a kind, and which are the first ten."""
     indices = np.flatnonzero(bad)
-    if len(indices):
-        more = ", ..." if len(indices) > 10 else ""
-        named = ", ".join(str(index) for index in indices[:10])
-        raise InputError(
-            f"{len(indices)} of {len(bad)} poses are {what}: {named}{more}; "
-            "move them, or raise poses.radius"
-        )
+    listed = ", ".join(str(index) for index in indices[:10])
+    return (
+        f"{len(indices)} of {len(bad)} poses ({listed}{', ...' if len(indices) > 10 else ''}) are"
+    )
 
 
-def _winding(corners: NDArray[np.float64], point: NDArray[np.float64]) -> float:
-    """How often the surface winds round a point; holds for overlapping bodies, unlike parity."""
-    a, b, c = np.moveaxis(corners - point, 1, 0)
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    volume = np.einsum("td,td->t", a, np.cross(b, c))
-    spread = la * lb * lc
-    spread += (a * b).sum(1) * lc + (b * c).sum(1) * la + (c * a).sum(1) * lb
-    return float(np.arctan2(volume, spread).sum() / (2.0 * math.pi))
+def check_reach(
+    scene: Scene, poses: Poses, *, bounces: int, range_min: float, range_max: float
+) -> None:
+    """Warn of poses that no echo can reach within the range limits.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is ensonified.
+    poses : Poses
+        To be checked.
+    bounces : int
+        How often sound may hit.
+    range_min, range_max : float, m
+        The limits of the spectrograms.
+
+    Raises
+    ------
+    NumericalError
+        If it is so for all poses; the tails of the analysis would pass for echoes.
+    """
+    lower, upper = np.asarray(scene.mesh.bounds)
+    radius = float(np.linalg.norm(upper - lower)) / 2.0
+    nearest = np.linalg.norm(poses.positions - np.clip(poses.positions, lower, upper), axis=1)
+    distance = np.linalg.norm(poses.positions - (lower + upper) / 2.0, axis=1)
+    far, near = nearest > range_max, distance + bounces * radius < range_min
+    if (far | near).all():
+        raise NumericalError(deaf(range_min, range_max))
+    for bad, what, limit in (
+        (far, "farther from the scene than range_max", range_max),
+        (near, "nearer to all of the scene than range_min", range_min),
+    ):
+        if bad.any():
+            logger.warning(
+                "%s %s (%g m) and will hear nothing; set spectrogram.range_%s, or move them",
+                *(_named(bad), what, limit, "max" if bad is far else "min"),
+            )
+
+
+def deaf(range_min: float, range_max: float) -> str:
+    """Say that no pose hears anything within the range limits."""
+    return (
+        f"no pose received an echo between {range_min} and {range_max} m; check poses.radius, "
+        "the scene's size and the range limits"
+    )
 
 
 def simulate_ensemble(
@@ -216,27 +307,66 @@ def _one(
 def _simulate_there(
     client: Client, simulator: Simulator, poses: Poses, indices: list[int], seed: int
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
-    from concurrent.futures import FIRST_COMPLETED, Future, wait
+    from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 
-    executor = client.get_executor(pure=False)
-    # Sent once, as a task: a worker that dies takes nothing with it that cannot be sent again.
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sending large graph", category=UserWarning)
-        sent = client.submit(_receive, simulator, pure=False)
-    left, running = deque(indices), dict[Future[Any], int]()
-    limit = QUEUED_PER_WORKER * max(1, len(client.ncores()))
+    from distributed import KilledWorker
+
+    executor, sent = client.get_executor(pure=False), _send(client, simulator)
+    left, running, lost = deque(indices), dict[Future[Any], int](), Counter[int]()
+    idle = False
     while left or running:
-        while left and len(running) < limit:
+        # Workers come and go.
+        threads = _threads(client)
+        while left and len(running) < QUEUED_PER_WORKER * max(1, threads):
             index = left.popleft()
             pose = poses.positions[index], poses.rotations[index]
             running[executor.submit(_one, sent, *pose, pose_seed(seed, index))] = index
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
+        done = wait(running, PATIENCE_SECONDS, return_when=FIRST_COMPLETED).done
+        if not done and not threads and not idle:
+            logger.warning("the Dask scheduler has no workers; waiting for some")
+        idle = not done and not threads
+        for future in done:
             index = running.pop(future)
             try:
                 spectrogram = future.result()
+            except KilledWorker as error:
+                # Whose workers died is not to blame, until it has happened again and again.
+                lost[index] += 1
+                if lost[index] > SENT_AGAIN:
+                    raise ResourceError(
+                        f"pose {index}: every worker that took it was killed; give workers more "
+                        "memory, or start fewer on a machine"
+                    ) from error
+                left.appendleft(index)
+                if sent.status == "error":
+                    sent = _send(client, simulator)
+                continue
+            except CancelledError as error:
+                raise _unreachable(error) from error
             except Exception as error:
                 raise _failed(index, error) from error
             yield index, spectrogram
+
+
+def _send(client: Client, simulator: Simulator) -> Any:
+    """Send the simulator once, as a task: what dies with a worker can be made again."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sending large graph", category=UserWarning)
+        return client.submit(_receive, simulator, pure=False)
+
+
+def _threads(client: Client) -> int:
+    try:
+        return sum(client.nthreads().values())
+    except OSError as error:
+        raise _unreachable(error) from error
+
+
+def _unreachable(error: BaseException) -> ResourceError:
+    return ResourceError(
+        f"the Dask scheduler is gone ({type(error).__name__}); the same command goes on with what "
+        "is missing"
+    )
 
 
 @contextmanager
@@ -255,7 +385,7 @@ def _workers(workers: int, scheduler: str | None) -> Iterator[Client]:
                     n_workers=workers,
                     threads_per_worker=1,
                     processes=True,
-                    dashboard_address=None,
+                    dashboard_address="127.0.0.1:0",  # none would still take port 8787
                     silence_logs=logging.CRITICAL,
                 )
                 scheduler = stack.enter_context(cluster)
@@ -268,10 +398,13 @@ def _workers(workers: int, scheduler: str | None) -> Iterator[Client]:
 
 @contextmanager
 def _quiet(name: str) -> Iterator[None]:
-    log = logging.getLogger(name)
-    level = log.level
-    log.setLevel(logging.CRITICAL)
+    """Silence a package's loggers; it has given some of them levels of their own."""
+    names = [known for known in logging.root.manager.loggerDict if known.split(".")[0] == name]
+    levels = {known: logging.getLogger(known).level for known in names}
+    for known in names:
+        logging.getLogger(known).setLevel(logging.CRITICAL)
     try:
         yield
     finally:
-        log.setLevel(level)
+        for known, level in levels.items():
+            logging.getLogger(known).setLevel(level)

@@ -1,27 +1,39 @@
 # SPDX-License-Identifier: MIT
 """From single echoes with a strength per frequency to the pressure at an ear.
 
-Each echo is laid into fine time bins, one row of bins per frequency node; a row is then filtered,
-once, with the part of the spectrum that its node stands for. Synthesis is linear in the
+Each echo is laid into fine time bins, one column of bins per frequency node; a column is then
+filtered, once, with the part of the spectrum that its node stands for. Synthesis is linear in the
 strengths, so this equals a filter per echo.
+
+An echo that stands for a patch of surface does not come all at once. It is laid into bins as wide
+as its arrival times are spread, as a texture seen from afar is read from a coarser image [1]_: so
+patches that are too large for the shortest wavelengths fall silent there instead of adding noise.
+
+References
+----------
+.. [1] L. Williams, "Pyramidal parametrics", SIGGRAPH 1983.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+from scipy.sparse import csc_array
 
-from sononerf.acoustics.spectrogram import echo_samples
 from sononerf.config import SpectrogramSettings
 
 LOWEST_NODE = 5e3  # Hz
 HIGHEST_NODE = 150e3  # Hz
 NODE_SPACING = 11.2e3  # Hz; 14 nodes over the band above
 OVERSAMPLING = 4
+LEVELS = 10  # of bins, each twice as wide as the one before; the last smooths away even 10 kHz
 GUARD = 512  # samples behind the last frame, for what filters put before and after an echo
+# Laying an echo between two bins of width 1 and reading them as triangles spreads it by 1/6 twice.
+LEVEL_VARIANCE = 1.0 / 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +44,10 @@ class Synthesis:
     ----------
     nodes : (F,) float64, Hz
         Where strengths are wanted.
-    basis : (F, K) complex128
-        Spectrum that each node stands for, times ``j f`` in Hz.
+    hats : (K, F) complex128
+        Spectrum that each node stands for.
+    basis : (K, F) complex128
+        The same times ``j f`` in Hz, for what surfaces send back.
     sampling_rate : float, Hz
         Of the echo.
     samples : int
@@ -43,13 +57,28 @@ class Synthesis:
     """
 
     nodes: NDArray[np.float64]
+    hats: NDArray[np.complex128]
     basis: NDArray[np.complex128]
     sampling_rate: float
     samples: int
     length: int
 
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of time bins of each level; together B."""
+        return tuple(OVERSAMPLING * self.length >> level for level in range(LEVELS))
 
-def plan_synthesis(settings: SpectrogramSettings, speed_of_sound: float) -> Synthesis:
+    @property
+    def frequency(self) -> NDArray[np.float64]:
+        """Of the filters (K,), Hz."""
+        return np.fft.rfftfreq(self.length, 1.0 / self.sampling_rate).astype(np.float64)
+
+    def silence(self) -> NDArray[np.float64]:
+        """Return empty bins (B, F)."""
+        return np.zeros((sum(self.sizes), len(self.nodes)))
+
+
+def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     """Lay out nodes and filters for an analysis.
 
     Between neighbouring nodes strengths run straight; below the lowest they stay, and above the
@@ -61,79 +90,141 @@ def plan_synthesis(settings: SpectrogramSettings, speed_of_sound: float) -> Synt
     ----------
     settings : SpectrogramSettings
         The analysis the echo is made for.
-    speed_of_sound : float, m/s
-        Of the medium.
+    samples : int
+        How long the echo is to be, S.
 
     Returns
     -------
     synthesis : Synthesis
-        For an echo that reaches to the end of the last frame.
+        Time bins, nodes and filters.
     """
     rate = settings.sampling_rate
     top = min(max(HIGHEST_NODE, 1.2 * settings.frequency_max), 0.45 * rate)
     bottom = min(LOWEST_NODE, top / 2.0)
     count = max(2, 1 + round((top - bottom) / NODE_SPACING))
     nodes = np.linspace(bottom, top, count)
-    samples = echo_samples(settings, speed_of_sound)
-    length = int(scipy.fft.next_fast_len(samples + GUARD, real=True))
-    length += length % 2
+    # The coarsest level must hold a whole number of bins.
+    unit = 2 ** (LEVELS - 1)
+    length = unit * int(scipy.fft.next_fast_len(math.ceil((samples + GUARD) / unit), real=True))
     frequency = np.fft.rfftfreq(length, 1.0 / rate)
-    hats = np.stack([np.interp(frequency, nodes, row) for row in np.eye(count)])
+    hats = np.stack([np.interp(frequency, nodes, row) for row in np.eye(count)], axis=1)
     end = min(top * 4.0 / 3.0, rate / 2.0)
     fall = np.clip((frequency - top) / (end - top), 0.0, 1.0)
-    # Laying an echo between two bins damps it by this much, on average over where it falls.
+    # Laying an echo between two of the finest bins damps it by this much, on average over where
+    # it falls.
     damping = np.sinc(frequency / (OVERSAMPLING * rate)) ** 2
-    shape = 1j * frequency * 0.5 * (1.0 + np.cos(np.pi * fall)) / damping
-    return Synthesis(nodes, hats * shape, rate, samples, length)
+    shape = 0.5 * (1.0 + np.cos(np.pi * fall)) / damping
+    hats = (hats * shape[:, None]).astype(np.complex128)
+    return Synthesis(nodes, hats, hats * (1j * frequency)[:, None], rate, samples, length)
 
 
 def deposit(
-    synthesis: Synthesis, delay: NDArray[np.float64], strength: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Lay echoes into fine time bins, each between the two nearest.
+    synthesis: Synthesis,
+    bins: NDArray[np.float64],
+    delay: NDArray[np.float64],
+    spread: NDArray[np.float64],
+    strength: NDArray[np.float64],
+) -> None:
+    """Lay echoes into time bins, each between the two nearest of the two levels it lies between.
 
     Parameters
     ----------
     synthesis : Synthesis
         The bins.
+    bins : (B, F) float64
+        To these the echoes are added, in place.
     delay : (N,) float64, s
         From the emission; echoes too late for the last frame are left out.
+    spread : (N,) float64, s
+        Standard deviation of the arrival times of what an echo stands for.
     strength : (N, F) float64
         Per node.
-
-    Returns
-    -------
-    bins : (F, OVERSAMPLING * length) float64
-        Sums of strengths.
     """
-    place = delay * (synthesis.sampling_rate * OVERSAMPLING)
-    heard = place < OVERSAMPLING * (synthesis.samples + GUARD // 2)
-    place, strength = place[heard], strength[heard]
-    index = place.astype(np.int64)
-    late = (place - index)[:, None] * strength
-    early = strength - late
-    size = OVERSAMPLING * synthesis.length
-    both = np.concatenate([index, index + 1])
-    weights = np.ascontiguousarray(np.concatenate([early, late]).T)
-    return np.stack([np.bincount(both, row, minlength=size) for row in weights])
+    rate = synthesis.sampling_rate * OVERSAMPLING
+    last = OVERSAMPLING * (synthesis.samples + GUARD // 2)
+    place = delay * rate
+    heard = place < last
+    if not heard.all():
+        place, spread, strength = place[heard], spread[heard], strength[heard]
+    # In units of the finest bin; level l spreads by LEVEL_VARIANCE * 4**l, level 0 not at all.
+    variance = np.square(spread * rate) / LEVEL_VARIANCE
+    level = np.clip((np.frexp(variance)[1] - 1) // 2, 0, LEVELS - 2)
+    floor = np.ldexp(1.0, 2 * level)
+    below = np.where(level > 0, floor, 0.0)
+    share = np.clip((variance - below) / (4.0 * floor - below), 0.0, 1.0)
+    start = np.concatenate([[0], np.cumsum(synthesis.sizes)])
+    rows = np.zeros((len(place), 4), dtype=np.int32)
+    weights = np.zeros((len(place), 4))
+    for step, part in ((0, 1.0 - share), (1, share)):
+        at = np.ldexp(place, -(level + step))
+        index = at.astype(np.int32)
+        rows[:, 2 * step] = start[level + step] + index
+        rows[:, 2 * step + 1] = rows[:, 2 * step] + 1
+        late = (at - index) * part
+        weights[:, 2 * step] = part - late
+        weights[:, 2 * step + 1] = late
+    ends = np.arange(0, 4 * len(place) + 1, 4, dtype=np.int32)
+    lay = csc_array((weights.ravel(), rows.ravel(), ends), shape=(len(bins), len(place)))
+    bins += lay @ strength
 
 
-def synthesise(synthesis: Synthesis, bins: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Filter each node's bins with its part of the spectrum, and add up.
+def air_loss(synthesis: Synthesis, decay: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return what the air leaves of an echo in each bin (B, F), by its decay (F,) in 1/s."""
+    rate = OVERSAMPLING * synthesis.sampling_rate
+    times = [np.arange(size) * (2.0**level / rate) for level, size in enumerate(synthesis.sizes)]
+    loss: NDArray[np.float64] = np.exp(-np.multiply.outer(np.concatenate(times), decay))
+    return loss
+
+
+def synthesise(
+    synthesis: Synthesis,
+    bins: NDArray[np.float64],
+    air: NDArray[np.float64],
+    basis: NDArray[np.complex128],
+) -> NDArray[np.float64]:
+    """Weaken each node's bins by the air, filter them with its part of the spectrum, add up.
 
     Parameters
     ----------
     synthesis : Synthesis
         The filters.
-    bins : (..., F, OVERSAMPLING * length) float64
+    bins : (B, F) float64
         From :func:`deposit`.
+    air : (B, F) float64
+        From :func:`air_loss`.
+    basis : (K, F) complex128
+        The synthesis' ``basis``, or its ``hats``.
 
     Returns
     -------
-    echo : (..., S) float64
+    echo : (S,) float64
         Pressure for a call that is one sample of height 1, at the sampling rate.
     """
     kept = synthesis.length // 2 + 1
-    spectrum = (scipy.fft.rfft(bins, axis=-1)[..., :kept] * synthesis.basis).sum(axis=-2)
-    echo: NDArray[np.float64] = scipy.fft.irfft(spectrum, n=synthesis.length, axis=-1)
-    return echo[..., : synthesis.samples]
+    spectrum = np.zeros((kept, len(synthesis.nodes)), dtype=np.complex128)
+    frequency = np.arange(kept) * (synthesis.sampling_rate / synthesis.length)
+    first = 0
+    for level, size in enumerate(synthesis.sizes):
+        part = bins[first : first + size]
+        weakened = part * air[first : first + size] if part.any() else None
+        first += size
+        if weakened is None:
+            continue
+        half = scipy.fft.rfft(weakened, axis=0)
+        if level == 0:
+            spectrum += half[:kept]
+            continue
+        # Beyond half their own rate the bins' spectrum repeats; the triangle fades that out.
+        index = np.arange(kept) % size
+        mirrored = index > size // 2
+        index[mirrored] = size - index[mirrored]
+        whole = half[index]
+        whole[mirrored] = whole[mirrored].conj()
+        width = 2.0**level / (OVERSAMPLING * synthesis.sampling_rate)
+        triangle = np.sinc(frequency * width) ** 2
+        # What the filters make up for happens in the finest bins alone.
+        triangle *= np.sinc(frequency / (OVERSAMPLING * synthesis.sampling_rate)) ** 2
+        spectrum += whole * triangle[:, None]
+    spectrum = (spectrum * basis).sum(axis=1)
+    echo: NDArray[np.float64] = scipy.fft.irfft(spectrum, n=synthesis.length)
+    return echo[: synthesis.samples]

@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: MIT
-"""Where the sound goes: rays from the emitter, bounce by bounce."""
+"""Where the sound goes: rays from the emitter, bounce by bounce, each with what it stands for."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.geometry.directions import CapSpiral
+from sononerf.geometry.directions import CapSpiral, Cells
 from sononerf.geometry.raycast import RayCaster
+from sononerf.simulation.footprint import Footprint, Real, across, dots, land
 from sononerf.simulation.reflection import keep_outside, mirror
+
+SPLIT = 2  # along each side of a divided cell
+CHUNK = 16_384  # rays; what is known of so many stays near the processor
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +34,8 @@ class Bounce:
         Which of the emitted rays.
     emitted : (H, 3) float64
         Their directions from the emitter.
+    incoming : (H, 3) float64
+        Their directions before the hit.
     points : (H, 3) float64, m
         Where they hit.
     flat : (H, 3) float64
@@ -37,16 +44,69 @@ class Bounce:
         Where a mirror would send them.
     length : (H,) float64, m
         From the emitter along the path.
+    footprint : Footprint
+        Of the bundles.
+    triangles : (H, n) int64
+        Which were hit, this one last.
     """
 
     number: int
     solid_angle: float
     ray: NDArray[np.int64]
     emitted: NDArray[np.float64]
+    incoming: NDArray[np.float64]
     points: NDArray[np.float64]
     flat: NDArray[np.float64]
     mirrored: NDArray[np.float64]
     length: NDArray[np.float64]
+    footprint: Footprint
+    triangles: NDArray[np.int64]
+
+    def detour(
+        self, towards: NDArray[np.float64], distance: NDArray[np.float64]
+    ) -> tuple[Real, Real, Real, Real]:
+        """Compare paths to a listener with those of a mirror.
+
+        Parameters
+        ----------
+        towards : (H, 3) float64
+            Unit vectors from the hits to the listener.
+        distance : (H,) float64, m
+            From the hits to the listener.
+
+        Returns
+        -------
+        rise : (H,) float32
+            Cosine between the way to the listener and the outward normal.
+        detour, spread, stiffness : (H,) float32
+            See :meth:`Footprint.detour`.
+        """
+        there = _single(towards)
+        rise = dots(there, _single(self.flat))
+        return rise, *self.footprint.detour(
+            there, rise, distance.astype(np.float32), self.solid_angle
+        )
+
+    def __getitem__(self, chosen: NDArray[np.int64]) -> Bounce:
+        """Return the chosen hits."""
+        return Bounce(
+            self.number,
+            self.solid_angle,
+            self.ray.take(chosen),
+            self.emitted.take(chosen, axis=0),
+            self.incoming.take(chosen, axis=0),
+            self.points.take(chosen, axis=0),
+            self.flat.take(chosen, axis=0),
+            self.mirrored.take(chosen, axis=0),
+            self.length.take(chosen),
+            self.footprint[chosen],
+            self.triangles.take(chosen, axis=0),
+        )
+
+
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    product: NDArray[np.float64] = np.einsum("nd,nd->n", a, b)
+    return product
 
 
 def aim(
@@ -105,22 +165,53 @@ def trace(
     bounce : Bounce
         One per bounce, as long as any ray hits.
     """
-    ray, emitted = np.arange(len(directions)), directions
     origins = np.broadcast_to(emitter, directions.shape)
-    length = np.zeros(len(directions))
+    hits = caster.first_hit(origins, directions)
+    ray, emitted = hits.ray, directions.take(hits.ray, axis=0)
+    incoming, length = emitted, hits.distance
+    # Turned at the emitter, not moved there.
+    turn = across(_single(incoming))
+    shift = hits.distance.astype(np.float32) * turn
+    triangles = hits.triangle[:, None]
     for number in range(1, bounces + 1):
-        hits = caster.first_hit(origins, directions)
-        if len(hits.ray) == 0:
+        if len(ray) == 0:
             return
-        ray, length = ray[hits.ray], length[hits.ray] + hits.distance
-        incoming = directions[hits.ray]
-        flat = caster.face_normals[hits.triangle]
-        behind = np.einsum("nd,nd->n", incoming, flat) > 0.0
-        flat = np.where(behind[:, None], -flat, flat)
+        flat = hits.flat.copy()
+        flat[_dot(incoming, flat) > 0.0] *= -1.0
         mirrored = mirror(incoming, hits.normals)
-        yield Bounce(number, solid_angle, ray, emitted[ray], hits.points, flat, mirrored, length)
-        directions = keep_outside(mirrored, flat)
-        origins = hits.points + caster.lift * flat
+        outward, normals, gradients = _single(flat), _single(hits.normals), hits.gradients
+        # The smooth normals may point either way.
+        side = np.where(dots(outward, normals) < 0.0, np.float32(-1.0), np.float32(1.0))
+        gradients[2:] *= side
+        footprint, turned = land(
+            shift,
+            turn,
+            incoming=_single(incoming),
+            flat=outward,
+            normals=side * normals,
+            gradients=gradients,
+        )
+        yield Bounce(
+            number, solid_angle, ray, emitted, incoming, hits.points, flat, mirrored, length,
+            footprint, triangles,
+        )  # fmt: skip
+        if number == bounces:
+            return
+        onward = keep_outside(mirrored, flat)
+        hits = caster.first_hit(hits.points + caster.lift * flat, onward)
+        further = hits.ray
+        incoming, turn = onward.take(further, axis=0), turned.take(further, axis=2)
+        ahead = _single(incoming)
+        shift = footprint.shift.take(further, axis=2) + hits.distance.astype(np.float32) * turn
+        shift -= dots(shift, ahead)[:, None] * ahead  # what goes along the ray is no move of it
+        ray, emitted = ray.take(further), emitted.take(further, axis=0)
+        length = length.take(further) + hits.distance
+        triangles = np.concatenate([triangles[further], hits.triangle[:, None]], axis=1)
+
+
+def _single(vectors: NDArray[np.float64]) -> Real:
+    """Return vectors (N, 3) as (3, N) in single precision."""
+    return vectors.astype(np.float32).T.copy()
 
 
 def echo_paths(
@@ -130,12 +221,14 @@ def echo_paths(
     *,
     bounces: int,
     extra: int,
+    judge: Callable[[Bounce], tuple[NDArray[np.bool_], NDArray[np.float64]]],
 ) -> Iterator[Bounce]:
-    """Follow the rays of a cap, with more of them where they hit more than once.
+    """Follow the rays of a cap, with more of them where a few would be noise.
 
-    A curved surface spreads neighbouring rays tenfold and more at each bounce, so that a pattern
-    that is dense at the first hit is sparse at the second: the echoes of two bounces would be
-    noise. The cells of rays that hit twice, and of their neighbours, are divided instead.
+    A curved surface spreads neighbouring rays tenfold and more at each bounce, so a pattern that
+    is dense at the first hit is sparse at the second. The cells of doubtful rays are divided, and
+    their parts again, until none is in doubt or the extra rays are used up: stratified sampling,
+    refined where the integrand is not resolved.
 
     Parameters
     ----------
@@ -149,20 +242,44 @@ def echo_paths(
         How often a ray may hit.
     extra : int
         At most so many rays come to the first ones.
+    judge : callable
+        Takes hits; returns which of them (H,) can be heard at all, and how much of each (H,) may
+        be wrong for the size of its cell, in any unit, zero where it is small enough.
 
     Yields
     ------
     bounce : Bounce
-        First hits of the first rays, then later hits of the divided ones.
+        Audible hits of cells that are left as they are.
     """
-    whole = cap.solid_angle
-    first = list(trace(caster, emitter, cap.directions(), min(bounces, 2), solid_angle=whole))
-    yield from first[:1]
-    if len(first) < 2:
-        return
-    index = cap.neighbourhood(first[1].ray)
-    split = max(1, math.isqrt(extra // len(index)))
-    fine = cap.divided(index, split)
-    for bounce in trace(caster, emitter, fine, bounces, solid_angle=whole / split**2):
-        if bounce.number > 1:
-            yield bounce
+    directions, parts = cap.directions(), 1
+    cells: Cells | None = None
+    while True:
+        weight = np.zeros(len(directions))
+        found: list[Bounce] = []
+        solid_angle = cap.solid_angle / parts
+        for start in range(0, len(directions), CHUNK):
+            chunk = directions[start : start + CHUNK]
+            for bounce in trace(caster, emitter, chunk, bounces, solid_angle=solid_angle):
+                bounce = replace(bounce, ray=bounce.ray + start)
+                audible, doubt = judge(bounce)
+                # A ray hits once a time, so none stands here twice.
+                weight[bounce.ray] = np.maximum(weight[bounce.ray], doubt)
+                if cells is None and bounce.number == 2:
+                    # Next to a ray that hits again is one that just missed.
+                    around = cap.neighbourhood(bounce.ray)
+                    least = max(float(doubt.mean()), sys.float_info.min)
+                    weight[around] = np.maximum(weight[around], least)
+                found.append(bounce[np.flatnonzero(audible)])
+        chosen = np.flatnonzero(weight)
+        most = extra // SPLIT**2
+        if len(chosen) > most:
+            chosen = np.sort(chosen[np.argsort(-weight[chosen], kind="stable")[:most]])
+        left = np.ones(len(weight), dtype=bool)
+        left[chosen] = False
+        for bounce in found:
+            yield bounce[np.flatnonzero(left[bounce.ray])] if len(chosen) else bounce
+        if len(chosen) == 0:
+            return
+        cells = (cap.cells(chosen) if cells is None else cells[chosen]).divided(SPLIT)
+        directions, parts = cap.towards(cells), cells.parts
+        extra -= len(directions)

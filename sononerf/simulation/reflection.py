@@ -3,15 +3,27 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.scene import Material
+from sononerf.material import Material
 
+COARSEST = 10.0  # rad
+LEAST_RISE = 1e-4  # sine of the angle at which what runs into a surface grazes it
 # Beyond this many standard deviations a lobe is 3e-4 of its middle (-70 dB) and left out.
 REACH = 4.0
+# A smooth surface sends sound where its shape does: Kirchhoff's integral over it, which lives from
+# the first Fresnel zones about the mirror point. What lies further is faded out by this much per
+# radian of phase; by itself it would cancel, up to false echoes from the border of light and
+# shadow and the noise of rays that are too few for it.
+FADE = 1.0
+# Well below this the fade is no slower, so that what is far from the mirror point need not be
+# followed.
+FADE_FREQUENCY = 25e3  # Hz
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,27 +32,163 @@ class Reflection:
 
     Attributes
     ----------
+    fade : (F,) float64, 1/m
+        Of a smooth surface, over the detour from the mirror's path.
     lobe_width : (F,) float64, rad
-        Standard deviation of the lobe.
+        Standard deviation of the lobe; of a smooth surface, not used.
     strength : (F,) float64, 1
         Of what is heard of a hit.
     kept : (F,) float64, 1
         Of the pressure after a bounce.
+    curved_lobe_width, curved_strength : (F,) float64
+        The same where the surface is strongly curved.
+    diffraction : (F,) float64, 1
+        Strength of edges and strongly curved places as sources of their own.
+    material : Material
+        What these are the values of.
     """
 
+    fade: NDArray[np.float64]
     lobe_width: NDArray[np.float64]
     strength: NDArray[np.float64]
     kept: NDArray[np.float64]
+    curved_lobe_width: NDArray[np.float64]
+    curved_strength: NDArray[np.float64]
+    diffraction: NDArray[np.float64]
+    material: Material
+
+    def curved_share(self, curvature: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return how curved places are, 0 to 1, by their total curvature (N,) in 1/m."""
+        steepness = 8.0 * self.material.transition_slope
+        away = steepness * (curvature - self.material.transition_curvature)
+        share: NDArray[np.float64] = 0.5 * (1.0 + np.tanh(0.5 * away))
+        return share
+
+    def heard(
+        self,
+        cosine: NDArray[np.float64],
+        detour: NDArray[np.floating[Any]],
+        curvature: NDArray[np.float64],
+    ) -> NDArray[np.floating[Any]]:
+        r"""Lobe times strength.
+
+        A smooth surface fades by :math:`e^{-\epsilon k \delta}` with the detour :math:`\delta`;
+        :func:`unfaded` makes good what that takes.
+
+        Parameters
+        ----------
+        cosine : (N,) float64
+            Of the angle between the mirror direction and that towards the listener.
+        detour : (N,) float, m
+            From :meth:`Bounce.detour`.
+        curvature : (N,) float64, 1/m
+            Total curvature at the hits.
+
+        Returns
+        -------
+        gain : (N, F) float
+            Linear.
+        """
+        strength = self.strength
+        share = None
+        if self.material.mixed:
+            share = self.curved_share(curvature)[:, None]
+            strength = strength + share * (self.curved_strength - strength)
+        gain: NDArray[np.floating[Any]]
+        if self.material.lobe_width is None:
+            gain = np.exp(np.multiply.outer(detour, -self.fade.astype(np.float32)))
+        else:
+            width = self.lobe_width
+            if share is not None:
+                width = width + share * (self.curved_lobe_width - width)
+            gain = np.exp(lobe_exponent(cosine, width))
+        gain *= strength
+        return gain
+
+    @property
+    def reach(self) -> float:
+        """Angle off the mirror direction beyond which nothing is heard, rad."""
+        if self.material.lobe_width is None:
+            return math.pi
+        widest = float(self.lobe_width.max())
+        if self.material.mixed:
+            widest = max(widest, float(self.curved_lobe_width.max()))
+        return min(REACH * widest, float(np.pi))
 
 
-def reflection(material: Material, frequency: ArrayLike) -> Reflection:
+def reflection(material: Material, frequency: ArrayLike, *, speed_of_sound: float) -> Reflection:
     """Return a material's values at frequencies (F,) in Hz, straight over their logarithm."""
     wanted, nodes = np.log(np.asarray(frequency)), np.log(material.frequency)
-    width, strength, kept = (
-        np.interp(wanted, nodes, values)
-        for values in (material.lobe_width, material.strength, material.reflection)
+
+    def at(*curves: tuple[float, ...] | None) -> NDArray[np.float64]:
+        given = next((curve for curve in curves if curve is not None), (0.0,) * len(nodes))
+        return np.interp(wanted, nodes, given)
+
+    fade, _ = unfaded(np.asarray(frequency, dtype=np.float64), speed_of_sound=speed_of_sound)
+    return Reflection(
+        fade,
+        at(material.lobe_width),
+        at(material.strength),
+        at(material.reflection),
+        at(material.curved_lobe_width, material.lobe_width),
+        at(material.curved_strength, material.strength),
+        at(material.diffraction),
+        material,
     )
-    return Reflection(width, strength, kept)
+
+
+def unfaded(
+    frequency: NDArray[np.float64], *, speed_of_sound: float
+) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+    r"""Return the fade of smooth surfaces, and what makes good for it.
+
+    Faded, Kirchhoff's integral over the Fresnel zones is
+    :math:`\int e^{-(\epsilon + j) k \delta} d\delta = 1 / (\epsilon + j) k` in place of
+    :math:`1 / j k`, at all curvatures; the factor :math:`1 - j \epsilon` is the same everywhere.
+
+    Parameters
+    ----------
+    frequency : (F,) float64, Hz
+        Zero or more.
+    speed_of_sound : float, m/s
+        Of the air.
+
+    Returns
+    -------
+    fade : (F,) float64, 1/m
+        :math:`\epsilon k`, over the detour.
+    gain : (F,) complex128, Hz
+        :math:`j f (1 - j \epsilon)`.
+    """
+    faded = FADE * np.hypot(frequency, FADE_FREQUENCY)
+    gain = (1j * frequency + faded).astype(np.complex128)
+    return 2.0 * math.pi / speed_of_sound * faded, gain
+
+
+def coarse_gain(bend: NDArray[np.float32]) -> NDArray[np.float32]:
+    r"""Make good what a smooth surface loses, on average, to cells that are too coarse.
+
+    A cell is laid into time bins as wide as its paths are spread, by the slope of the path over it
+    and by its bend :math:`b = k \lambda \Omega`, :math:`\lambda` the Hessian's eigenvalue. Over
+    all places of a mirror point among the cells the slope's spread acts as a further fade by
+    :math:`b / 12`, and the bend's as a loss of :math:`e^{-b^2 / 720}`: variances over a square.
+
+    Parameters
+    ----------
+    bend : (N, F) float32, rad
+        Of a cell.
+
+    Returns
+    -------
+    gain : (N, F) float32
+        One where cells are fine; no more than that of 10 rad, beyond which there is little left
+        to be made good.
+    """
+    b = np.minimum(bend, np.float32(COARSEST))
+    fade = np.square(np.float32(FADE) + b / np.float32(12.0)) + np.float32(1.0)
+    fade /= np.float32(FADE**2 + 1.0)
+    gain: NDArray[np.float32] = np.sqrt(fade) * np.exp(np.square(b) / np.float32(720.0))
+    return gain
 
 
 def mirror(directions: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -81,8 +229,10 @@ def keep_outside(directions: NDArray[np.float64], flat: NDArray[np.float64]) -> 
         Unit vectors.
     """
     rise = np.einsum("nd,nd->n", directions, flat)
-    lifted = directions + np.maximum(1e-4 - rise, 0.0)[:, None] * flat
-    turned: NDArray[np.float64] = lifted / np.linalg.norm(lifted, axis=1, keepdims=True)
+    low = np.flatnonzero(rise < LEAST_RISE)
+    turned = directions.copy()
+    lifted = directions[low] + (LEAST_RISE - rise[low])[:, None] * flat[low]
+    turned[low] = lifted / np.linalg.norm(lifted, axis=1, keepdims=True)
     return turned
 
 
@@ -95,7 +245,7 @@ def lobe_exponent(
     ----------
     cosine : (N,) float64
         Of the angle theta between the mirror direction and that towards the listener.
-    lobe_width : (F,) float64, rad
+    lobe_width : (F,) or (N, F) float64, rad
         Standard deviations.
 
     Returns

@@ -3,9 +3,15 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
+from sononerf.acoustics.call import call_waveform, sweep_delay
 from sononerf.acoustics.ears import Ears, analysed_ears, beam_gain, ear_gain, synthetic_ears
-from sononerf.acoustics.spectrogram import frequency_axis
-from sononerf.config import EarSettings, SpectrogramSettings
+from sononerf.acoustics.spectrogram import (
+    echo_samples,
+    frequency_axis,
+    range_axis,
+    spectrogram,
+)
+from sononerf.config import CallSettings, EarSettings, SpectrogramSettings
 from sononerf.geometry.directions import fibonacci_sphere
 
 FREQUENCY = np.array([10e3, 40e3, 60e3, 100e3])
@@ -111,7 +117,8 @@ def test_analysed_ears_are_what_the_window_makes_of_an_echo():
     analysis = SpectrogramSettings()
     head = EarSettings(beam_radius=0.0)
     wanted = frequency_axis(analysis)
-    heard = analysed_ears(head, analysis)
+    heard, lag = analysed_ears(head, CallSettings(), analysis)
+    assert lag is None
     step = analysis.sampling_rate / analysis.fft
     fine = synthetic_ears(head, np.arange(1, analysis.fft // 2 + 1) * step)
     row, column = 40, 95  # a little below and to the left of straight ahead
@@ -130,3 +137,32 @@ def test_analysed_ears_are_what_the_window_makes_of_an_echo():
     # Side lobes beyond two main lobes are left out.
     np.testing.assert_allclose(heard.ears[0, :, row, column], expected, atol=0.01)
     assert heard.beam.max() == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["linear", "hyperbolic"])
+def test_analysed_ears_are_what_a_sweeps_rows_hear(kind):
+    """A sweep, filtered by an ear, through the dechirped spectrogram: each row's power and time."""
+    analysis = SpectrogramSettings(window=150, hop=1, frequency_min=45e3, range_max=0.6)
+    call = CallSettings(kind=kind, duration=1e-3, frequency_end=20e3)
+    head = EarSettings(beam_radius=0.0)
+    heard, lag = analysed_ears(head, call, analysis)
+    delay = sweep_delay(call, heard.frequency)
+    echo = np.zeros(echo_samples(analysis, 343.0, float(delay.max())))
+    waveform = call_waveform(call, analysis.sampling_rate)
+    echo[2000 : 2000 + len(waveform)] = waveform
+    frequency = np.fft.rfftfreq(len(echo), 1 / analysis.sampling_rate)
+    fine = synthetic_ears(head, np.maximum(frequency, 1.0) + 1e-6 * np.arange(len(frequency)))
+    row, column = 40, 95
+    gain = fine.ears[0, :, row, column].astype(float)
+    # The beam of no radius fades towards the back and sounds alike at all frequencies.
+    both = np.stack((echo, np.fft.irfft(np.fft.rfft(echo) * gain, len(echo))))
+    power = spectrogram(both, analysis, 343.0, delay) ** 2  # (2, R, F)
+    expected = np.sqrt(power[1].sum(axis=0) / power[0].sum(axis=0))
+    found = heard.ears[0, :, row, column]
+    raw = np.interp(heard.frequency, frequency, gain)
+    time = 2.0 * range_axis(analysis, 343.0) / 343.0 - 2000.0 / analysis.sampling_rate
+    late = time @ power[1] / power[1].sum(axis=0)
+    np.testing.assert_allclose(found, expected, atol=0.0015)
+    assert np.abs(raw - expected).max() > 0.05
+    np.testing.assert_allclose(lag[0, :, row, column], late, atol=2e-6)
+    assert np.abs(late).max() > 20e-6

@@ -82,6 +82,41 @@ def test_no_frame_between_the_ranges_is_refused():
         range_axis(SpectrogramSettings(hop=1000, range_min=0.2, range_max=0.21), 343.0)
 
 
+def test_a_row_is_advanced_by_its_own_delay():
+    delay = np.arange(47) * 3e-6  # whole samples, not whole hops
+    needed = echo_samples(DEFAULT, 343.0, delay[-1])
+    assert needed == echo_samples(DEFAULT, 343.0) + 138
+    echo = np.random.default_rng(0).normal(size=(2, needed))
+    found = spectrogram(echo, DEFAULT, 343.0, delay)
+    for row, advance in enumerate(3 * np.arange(47)):
+        expected = spectrogram(echo[:, advance:], DEFAULT, 343.0)
+        np.testing.assert_allclose(found[..., row], expected[..., row], atol=1e-11)
+
+
+def test_a_row_is_advanced_between_two_samples():
+    half = np.full(47, 0.5e-6)
+    time = np.arange(2 * echo_samples(DEFAULT, 343.0, 0.5e-6) + 2) / 2e6
+    fine = np.exp(-0.5 * ((time - 2.1e-3) / 5e-6) ** 2) * np.cos(2 * np.pi * 60e3 * time)
+    between = spectrogram(fine[None, 1::2], DEFAULT, 343.0)
+    found = spectrogram(fine[None, ::2], DEFAULT, 343.0, half)
+    np.testing.assert_allclose(found, between, atol=1e-9 * between.max())
+    assert abs(spectrogram(fine[None, ::2], DEFAULT, 343.0) - between).max() > 0.01 * between.max()
+
+
+def test_no_delay_is_no_change_to_the_bit():
+    echo = np.random.default_rng(0).normal(size=(2, echo_samples(DEFAULT, 343.0)))
+    expected = spectrogram(echo, DEFAULT, 343.0)
+    np.testing.assert_array_equal(spectrogram(echo, DEFAULT, 343.0, np.zeros(47)), expected)
+
+
+def test_wrong_delays_are_refused():
+    echo = np.zeros((2, echo_samples(DEFAULT, 343.0, 1e-3) - 1))
+    with pytest.raises(ValueError, match=f"needs {echo.shape[1] + 1}"):
+        spectrogram(echo, DEFAULT, 343.0, np.full(47, 1e-3))
+    with pytest.raises(ValueError, match="negative"):
+        spectrogram(echo, DEFAULT, 343.0, np.full(47, -1e-6))
+
+
 def test_compression_on_paper():
     np.testing.assert_allclose(
         compress([0.0, 1e-3, 9e-3, 0.999], 1e-3), [0.0, 6.0206, 20.0, 60.0], atol=1e-4

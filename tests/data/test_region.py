@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from sononerf.acoustics.ears import synthetic_ears
-from sononerf.config import EarSettings
-from sononerf.data.region import EchoEvidence
+from sononerf.config import CallSettings, EarSettings, SpectrogramSettings
+from sononerf.data.region import EchoEvidence, echo_reach
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere
@@ -17,7 +17,7 @@ EARS = synthetic_ears(EarSettings(), FREQUENCY)
 HALF_WINDOW = 0.0054
 
 
-def echoes(position, rotation, places):
+def echoes(position, rotation, places, half=HALF_WINDOW):
     """Each place heard by each ear at half of its path, as long as the analysis window."""
     emitter = position + rotation @ EARS.emitter
     heard = np.zeros((2, len(RANGE), 2))
@@ -26,8 +26,8 @@ def echoes(position, rotation, places):
             there = np.linalg.norm(place - emitter)
             back = np.linalg.norm(place - position - rotation @ offset)
             middle = (there + back) / 2
-            inside = np.abs(RANGE - middle) < HALF_WINDOW
-            window = 0.54 + 0.46 * np.cos(np.pi * (RANGE - middle) / HALF_WINDOW)
+            inside = np.abs(RANGE - middle) < half
+            window = 0.54 + 0.46 * np.cos(np.pi * (RANGE - middle) / half)
             heard[ear, inside] += window[inside, None] / (there * back)
     return heard
 
@@ -47,12 +47,41 @@ def evidence(path, positions, rotations, places, **options):
     for index, (position, rotation) in enumerate(zip(positions, rotations, strict=True)):
         store.write_pose(index, heard(position, rotation))
     store.seal()
-    return EchoEvidence(store, EARS, **options)
+    return EchoEvidence(store, EARS, **{"reach": HALF_WINDOW, **options})
 
 
 def around(count=60, radius=0.4):
     positions = radius * fibonacci_sphere(count)
     return positions, look_at(positions, np.zeros(3))
+
+
+def test_an_echo_is_as_long_as_the_window():
+    def reach(**changes):
+        return echo_reach(CallSettings(), SpectrogramSettings(**changes), 343.0)
+
+    sample = 343.0 / 2 / 1e6
+    assert reach() == pytest.approx(31.5 * sample)
+    assert reach(window=127) == pytest.approx(63 * sample)
+    assert reach(sampling_rate=2e6) == pytest.approx(31.5 * sample / 2)
+    assert echo_reach(CallSettings(), SpectrogramSettings(), 686.0) == pytest.approx(63 * sample)
+
+
+def test_an_echo_of_a_sweep_is_as_long_as_the_sweep_stays_in_the_window():
+    analysis = SpectrogramSettings(window=64, frequency_min=45e3)
+
+    def reach(duration):
+        call = CallSettings(kind="linear", duration=duration, frequency_end=20e3)
+        return echo_reach(call, analysis, 343.0)
+
+    # Slow sweeps stay in the window's main lobe, 31 kHz to either side, for 31 / 130 of the call;
+    # 5 % of the middle are left after nine tenths of that.
+    assert reach(3e-3) == pytest.approx(0.9 * 31.25 / 130 * 3e-3 * 343 / 2, rel=0.05)
+    assert reach(6e-3) == pytest.approx(2 * reach(3e-3), rel=0.03)
+    assert 31.5e-6 * 343 / 2 < reach(0.1e-3) < 63e-6 * 343 / 2  # never shorter than the window
+    call = CallSettings(kind="linear", duration=3e-3, frequency_end=20e3)
+    # Rows that are not called have nothing to be measured.
+    beyond = analysis.model_copy(update={"frequency_max": 300e3})
+    assert echo_reach(call, beyond, 343.0) == pytest.approx(reach(3e-3), rel=0.1)
 
 
 PLACES = np.array([[0.03, -0.02, 0.01], [-0.02, 0.03, -0.02], [0.0, -0.03, 0.03]])
@@ -85,6 +114,21 @@ def test_places_are_needed_and_the_air_between_is_not(tmp_path):
     grid = np.concatenate((probes, np.random.default_rng(0).uniform(-0.1, 0.1, (400, 3))))
     needed = found.needed(grid, 0.002)
     assert needed[:5].tolist() == [True, True, False, False, False]
+
+
+def test_how_long_an_echo_is_says_what_it_explains(tmp_path):
+    """The tails of a sweep's long echoes are no echoes of something else."""
+    long = 0.03
+    place = PLACES[:1]
+
+    def heard(position, rotation):
+        return echoes(position, rotation, place, long)
+
+    right = evidence(tmp_path / "s", *around(), heard, reach=long)
+    short = EchoEvidence(EnsembleStore.open(tmp_path / "s"), EARS, reach=HALF_WINDOW)
+    probes = np.concatenate((place, place + 0.03 * fibonacci_sphere(100)))
+    assert right.needed(probes, 0.002).tolist() == [True] + [False] * 100
+    assert short.needed(probes, 0.002).sum() > 50
 
 
 def test_silence_carves(tmp_path):
@@ -155,8 +199,8 @@ def test_validation_and_test_poses_are_not_asked(tmp_path):
     )
     for index in range(0, 40, 2):  # the others are not even there
         store.write_pose(index, echoes(positions[index], rotations[index], PLACES))
-    assert len(EchoEvidence(store, EARS).sources) == 20
-    few = EchoEvidence(store, EARS, most=5)
+    assert len(EchoEvidence(store, EARS, reach=HALF_WINDOW).sources) == 20
+    few = EchoEvidence(store, EARS, reach=HALF_WINDOW, most=5)
     assert len(few.sources) == 5
     head = (EARS.emitter + EARS.positions.mean(axis=0)) / 2
     expected = positions[[0, 8, 18, 28, 38]] + rotations[[0, 8, 18, 28, 38]] @ head

@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
 from sononerf import plugins
+from sononerf.acoustics.reception import effective_window
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
+from sononerf.experiment import build
 from sononerf.experiment.build import (
     acquisition,
     check_plugins,
@@ -35,6 +38,23 @@ def test_the_acquisition_has_the_axes_of_the_store(tiny, echoes):
     )
     # dB per metre become nepers: 20 log10(e) dB are one.
     assert float(known.absorption[-1]) == pytest.approx(3.3 / 8.686, rel=0.3)  # at 100 kHz
+
+
+def test_the_acquisition_of_a_sweep_is_told_how_long_and_how_late_its_rows_are(tiny):
+    impulse = acquisition(tiny())
+    assert impulse.lag is None
+    torch.testing.assert_close(
+        impulse.window, torch.hamming_window(64, periodic=False).expand(47, -1)
+    )
+    settings = tiny(call={"kind": "hyperbolic"}, spectrogram={"window": 120, "frequency_min": 45e3})
+    known = acquisition(settings)
+    window = effective_window(settings.call, settings.spectrogram)
+    np.testing.assert_allclose(known.window, window, rtol=1e-6)
+    assert known.window.shape[1] > 200
+    assert known.lag.shape == known.ears.shape
+    # 0.4 ms for 110 kHz are 0.6 mm per kHz: a few kHz off the middle of a row that a notch cuts.
+    assert 0.5e-3 < float(known.lag.abs().amax()) < 30e-3
+    assert not torch.equal(known.ears, acquisition(tiny(spectrogram={"window": 120})).ears[:, 18:])
 
 
 @pytest.mark.parametrize(
@@ -106,3 +126,19 @@ def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):
         tiny(region={"lower": (-0.1, -0.1, -0.1), "upper": (0.1, 0.2, 0.3)}), store
     )
     torch.testing.assert_close(chosen[1], torch.tensor([0.1, 0.2, 0.3]))
+
+
+def test_the_region_is_told_how_long_an_echo_is(tiny, echoes, monkeypatch):
+    told = []
+
+    class Asked(build.EchoEvidence):
+        def __init__(self, *given, reach, **options):
+            told.append(reach)
+            super().__init__(*given, reach=reach, **options)
+
+    monkeypatch.setattr(build, "EchoEvidence", Asked)
+    store = EnsembleStore.open(echoes)
+    for settings in (tiny(), tiny(call={"kind": "linear", "duration": 1e-3})):
+        echo_region(settings, store)
+    assert told[0] == pytest.approx(31.5e-6 * 343 / 2)
+    assert told[1] > 3 * told[0]

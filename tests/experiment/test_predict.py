@@ -106,7 +106,6 @@ def test_poses_of_ones_own_need_neither_store_nor_scene(run, tmp_path, monkeypat
         raise AssertionError("asked for the ensemble")
 
     monkeypatch.setattr(predict_module, "store_of", gone)
-    monkeypatch.setattr(predict_module, "load_scene", gone)
     (tmp_path / "poses.csv").write_text(CSV)
     folder = predict(run, poses_csv=tmp_path / "poses.csv", accelerator="cpu")
     assert folder == run / "prediction-poses"

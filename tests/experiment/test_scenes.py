@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import io
 
+import numpy as np
 import pytest
 from PIL import Image
 
@@ -17,7 +18,7 @@ def test_every_scene_says_where_it_is_from_and_what_it_takes(plugin):
     assert {"sphere", "three_spheres", "ua", "mesh", "fixture_bar"} <= rows.keys()
     assert rows["sphere"]["distribution"] == "sononerf"
     assert rows["sphere"]["summary"].startswith("Build a sphere")
-    assert rows["sphere"]["options"] == ["radius"]
+    assert rows["sphere"]["options"] == ["radius", "material"]
     assert (rows["fixture_bar"]["distribution"], rows["fixture_bar"]["version"]) == (
         "sononerf-fixture",
         "1.0",
@@ -59,6 +60,26 @@ def test_scenes_are_drawn_but_those_that_cannot_be(broken, tmp_path, monkeypatch
     assert min(size_of(written[0])) > 100
 
 
-def test_an_ensemble_is_drawn(tiny, echoes, tmp_path):
-    (path,) = draw_ensemble(tiny(), EnsembleStore.open(echoes), tmp_path)
-    assert min(size_of(path)) > 100
+def test_an_ensemble_is_drawn_with_the_echo_of_its_first_test_pose(
+    tiny, echoes, tmp_path, monkeypatch
+):
+    from sononerf.experiment import scenes as scenes_module
+
+    drawn = {}
+    real = scenes_module.echo_png
+
+    def keep(*given, **named):
+        drawn.update(points=given[1], level=given[2], position=given[3], named=named)
+        return real(*given, **named)
+
+    monkeypatch.setattr(scenes_module, "echo_png", keep)
+    store = EnsembleStore.open(echoes)
+    written = draw_ensemble(tiny(), store, tmp_path)
+    assert [path.name for path in written] == ["scene.png", "pose_0010.png"]
+    assert all(min(size_of(path)) > 100 for path in written)
+    assert store.split[10] == 2
+    assert drawn["named"]["title"] == "sphere, pose 10"
+    # The loudest hit of a sphere is where its surface faces the head.
+    loudest = drawn["points"][np.argmax(drawn["level"])]
+    towards = drawn["position"] / np.linalg.norm(drawn["position"])
+    assert np.degrees(np.arccos(loudest @ towards / 0.02)) < 15

@@ -3,6 +3,11 @@
 
 from __future__ import annotations
 
+import logging
+import os
+import signal
+
+import distributed
 import numpy as np
 import pytest
 
@@ -37,6 +42,34 @@ def test_the_hash_covers_all_that_echoes_depend_on_and_nothing_else(tiny):
         {"reconstruction": {"spacing": 0.01}},
     ):
         assert hashed(tiny(**changed)) == base, changed
+
+
+HEADER = "x,y,z,yaw,pitch,roll\n"
+ROWS = [f"0.4,{0.01 * row},0.0,180,{row},0\n" for row in range(8)]
+
+
+def test_a_path_counts_as_the_poses_it_holds(tiny, tmp_path):
+    def of(name, rows, **changes):
+        (tmp_path / name).write_text(HEADER + "".join(rows), encoding="utf-8")
+        path = {"arrangement": "path", "path": str(tmp_path / name), **changes}
+        return hashed(tiny(poses=path))
+
+    base = of("a.csv", ROWS)
+    assert of("b.csv", ROWS) == base
+    assert of("b.csv", ROWS, count=99, radius=9.0) == base  # neither is of a path
+    assert of("a.csv", [*ROWS[:-1], ROWS[-1].replace(",7,0", ",7,1")]) != base
+    assert of("a.csv", [*ROWS[:-1], "0.41" + ROWS[-1][3:]]) != base
+    assert of("a.csv", ROWS[::-1]) != base
+    assert of("a.csv", ROWS, heldout=1) != base
+
+
+def test_a_path_is_simulated_in_its_order(tiny, tmp_path):
+    (tmp_path / "a.csv").write_text(HEADER + "".join(ROWS), encoding="utf-8")
+    settings = tiny(poses={"arrangement": "path", "path": str(tmp_path / "a.csv")})
+    store = simulate(settings, output=tmp_path / "store", workers=1)
+    np.testing.assert_allclose(store.positions[:, 1], 0.01 * np.arange(8))
+    assert np.bincount(store.split).tolist() == [4, 2, 2]
+    assert min(store.read_pose(index).max() for index in range(8)) > 0
 
 
 def test_where_the_store_lies(tiny, tmp_path, monkeypatch):
@@ -88,6 +121,64 @@ def test_an_interrupted_simulation_goes_on(tiny, echoes, tmp_path, monkeypatch):
         np.testing.assert_array_equal(store.read_pose(index), whole.read_pose(index))
     for name in ("reference", "noise_floor_mae_db", "echo_hash"):
         assert store.attributes[name] == whole.attributes[name]
+
+
+def content(store):
+    files = sorted(path for path in store.path.rglob("*") if path.is_file())
+    return {str(path.relative_to(store.path)): path.read_bytes() for path in files}
+
+
+class Stopper:
+    """Calls something after so many poses were written."""
+
+    def __init__(self, monkeypatch):
+        self.real, self.after, self.action, self.written = EnsembleStore.write_pose, -1, None, 0
+        monkeypatch.setattr(EnsembleStore, "write_pose", lambda *given: self.write(*given))
+
+    def arm(self, after, action):
+        self.after, self.action, self.written = after, action, 0
+
+    def write(self, store, index, spectrogram):
+        self.real(store, index, spectrogram)
+        self.written += 1
+        if self.written == self.after:
+            self.action()
+
+
+def test_stops_and_other_numbers_of_workers_change_no_byte(tiny, echoes, tmp_path, monkeypatch):
+    stopper = Stopper(monkeypatch)
+
+    def stop():
+        raise KeyboardInterrupt
+
+    for after, workers in ((3, 1), (4, 2)):
+        stopper.arm(after, stop)
+        with pytest.raises(KeyboardInterrupt):
+            simulate(tiny(), output=tmp_path / "store", workers=workers)
+    stopper.arm(-1, stop)
+    store = simulate(tiny(), output=tmp_path / "store", workers=3)
+    alone = EnsembleStore.open(echoes)
+    assert stopper.written == len(alone) - 3 - 4
+    assert content(store) == content(alone)
+
+
+def test_a_killed_worker_costs_nothing(tiny, tmp_path, monkeypatch):
+    settings = tiny(poses={"count": 20}, simulation={"rays": 4000})
+    alone = simulate(settings, output=tmp_path / "alone", workers=1)
+    stopper = Stopper(monkeypatch)
+    cluster = distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+    )
+    with cluster:
+        before = [worker.pid for worker in cluster.workers.values()]
+        stopper.arm(5, lambda: os.kill(before[0], signal.SIGKILL))
+        store = simulate(settings, output=tmp_path / "shared", scheduler=cluster.scheduler_address)
+    assert stopper.written == len(alone) == 24
+    assert content(store) == content(alone)
 
 
 def test_the_noise_floor_is_that_of_other_rays(echoes, tiny, tmp_path):

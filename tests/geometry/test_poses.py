@@ -6,8 +6,10 @@ from scipy.spatial.transform import Rotation
 from sononerf.errors import InputError
 from sononerf.geometry.poses import (
     Poses,
+    cap_poses,
     euler_from_rotation,
     look_at,
+    random_poses,
     random_sphere_poses,
     read_pose_csv,
     rotation_from_euler,
@@ -95,6 +97,45 @@ def test_random_poses_fill_the_sphere_and_follow_the_generator():
     np.testing.assert_array_equal(one.rotations, two.rotations)
     unit = one.positions / 2.0
     np.testing.assert_allclose(unit.T @ unit / 2000, np.eye(3) / 3, atol=0.03)
+
+
+def test_a_cap_covers_its_area_evenly():
+    axis, half = np.array([1.0, 2.0, -2.0]) / 3.0, np.radians(70.0)
+    straight = {"aim_jitter": 0.0, "generator": np.random.default_rng(0)}
+    poses = cap_poses(400, radius=0.5, axis=3.0 * axis, half_angle=half, **straight)
+    np.testing.assert_allclose(np.linalg.norm(poses.positions, axis=1), 0.5)
+    along = np.sort(poses.positions @ axis / 0.5)
+    # equal areas are equal heights
+    np.testing.assert_allclose(np.diff(along), (1 - np.cos(half)) / 400, rtol=1e-6)
+    assert along[0] > np.cos(half)
+    np.testing.assert_allclose(poses.positions.mean(axis=0) @ axis, 0.25 * (1 + np.cos(half)))
+    np.testing.assert_allclose(poses.rotations[:, :, 0], -poses.positions / 0.5, atol=1e-12)
+
+
+def test_random_poses_are_uniform_in_the_volume_of_their_cone():
+    axis, half = np.array([0.0, 0.6, 0.8]), np.radians(60.0)
+    poses = random_poses(
+        4000,
+        radius=(1.0, 2.0),
+        axis=axis,
+        half_angle=half,
+        aim_jitter=0.0,
+        generator=np.random.default_rng(0),
+    )
+    distance = np.linalg.norm(poses.positions, axis=1)
+    along = poses.positions @ axis / distance
+    # Shares of the volume and of the area are uniform from 0 to 1, and know nothing of each other.
+    shares = np.stack([(distance**3 - 1) / 7, (1 - along) / (1 - np.cos(half))])
+    for share in shares:
+        assert (share.min() > 0, share.max() < 1) == (True, True)
+        counts = np.histogram(share, bins=10, range=(0, 1))[0]
+        np.testing.assert_allclose(counts, 400, atol=4 * np.sqrt(400))
+    assert abs(np.corrcoef(shares)[0, 1]) < 4 / np.sqrt(4000)
+    turn = np.arctan2(poses.positions @ [1.0, 0.0, 0.0], poses.positions @ [0.0, 0.8, -0.6])
+    assert abs(np.exp(1j * turn).mean()) < 4 / np.sqrt(4000)
+    np.testing.assert_allclose(
+        poses.rotations[:, :, 0], -poses.positions / distance[:, None], atol=1e-12
+    )
 
 
 def test_indexing_gives_poses():

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.geometry.surface import corner_normals
+from sononerf.geometry.surface import corner_normals, total_curvature, weight_gradients
 
 
 @pytest.mark.parametrize("subdivisions", [1, 3])
@@ -33,3 +33,56 @@ def test_a_triangle_without_area_spoils_nothing():
     normals = corner_normals(mesh)
     assert np.isfinite(normals).all()
     np.testing.assert_allclose(normals[0], [[0, 0, 1]] * 3, atol=1e-12)
+
+
+def curvature(mesh):
+    return total_curvature(mesh, corner_normals(mesh))
+
+
+@pytest.mark.parametrize("radius", [0.002, 0.015, 15.0])  # the same ball in m, or taken for mm
+def test_curvature_of_a_sphere_is_root_two_over_its_radius(radius):
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    mesh.apply_translation([3.0 * radius, 0.0, 0.0])
+    # A triangle is flatter than the sphere between its corners: chords, up to 0.2 %.
+    np.testing.assert_allclose(curvature(mesh), np.sqrt(2) / radius, rtol=2e-3)
+
+
+def test_curvature_of_a_cylinder_is_one_over_its_radius_and_none_at_its_ends():
+    mesh = trimesh.creation.cylinder(radius=0.02, height=0.1, sections=90)
+    found = curvature(mesh)
+    side = np.abs(mesh.face_normals[:, 2]) < 0.5
+    # 90 flat strips of 4 degrees: the chord is shorter than the arc by 2e-4.
+    np.testing.assert_allclose(found[side], 1 / 0.02, rtol=1e-3)
+    np.testing.assert_allclose(found[~side], 0.0, atol=1e-6)
+
+
+def test_edges_of_a_box_are_no_curvature():
+    np.testing.assert_allclose(curvature(trimesh.creation.box((0.1, 0.2, 0.3))), 0.0, atol=1e-9)
+
+
+def test_curvature_knows_no_inside():
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    turned = trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1])
+    np.testing.assert_allclose(curvature(turned), curvature(mesh), rtol=1e-9)
+
+
+def test_weight_gradients_give_the_barycentric_weights():
+    corners = np.random.default_rng(0).normal(size=(50, 3, 3))
+    second, third = weight_gradients(corners)
+    for corner, weights in enumerate([(0, 0), (1, 0), (0, 1)]):
+        away = corners[:, corner] - corners[:, 0]
+        np.testing.assert_allclose(np.einsum("td,td->t", second, away), weights[0], atol=1e-9)
+        np.testing.assert_allclose(np.einsum("td,td->t", third, away), weights[1], atol=1e-9)
+    # In the triangle's plane: going off it changes nothing.
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    for gradient in (second, third):
+        np.testing.assert_allclose(np.einsum("td,td->t", gradient, sides), 0.0, atol=1e-9)
+
+
+def test_a_triangle_without_area_has_no_gradients_and_no_curvature():
+    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0, 0]]
+    mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [0, 3, 1]], process=False)
+    for gradient in weight_gradients(mesh.triangles.view(np.ndarray)):
+        np.testing.assert_array_equal(gradient[1], 0.0)
+    assert np.isfinite(curvature(mesh)).all()
+    assert curvature(mesh)[1] == 0.0

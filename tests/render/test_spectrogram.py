@@ -43,7 +43,10 @@ def test_any_number_of_ears_and_silence(ears):
 
 
 def test_one_range_and_one_frequency():
-    spectrogram_png([[[5.0]]], [[[0.0]]], [0.4], [40e3])
+    image = spectrogram_image([[[5.0]]], [[[0.0]]], [0.4], [40e3])
+    # One cell fills each panel: the top of the scale, its bottom, and the greatest fall.
+    panels = image[image.shape[0] // 2, [120, 380, 680]].astype(int)
+    np.testing.assert_allclose(panels, [[252, 253, 191], [0, 0, 4], [34, 102, 172]], atol=24)
 
 
 def test_a_difference_shows():

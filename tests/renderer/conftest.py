@@ -111,7 +111,7 @@ def acquisition():
     return Acquisition(
         frequency=torch.from_numpy(Head.frequency),
         range=torch.from_numpy(Head.range),
-        window=torch.from_numpy(Head.window),
+        window=torch.from_numpy(Head.window).expand(3, -1),
         sampling_rate=Head.rate,
         speed_of_sound=Head.speed,
         absorption=torch.from_numpy(Head.alpha),

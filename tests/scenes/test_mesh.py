@@ -6,6 +6,7 @@ import pytest
 import trimesh
 
 from sononerf.errors import InputError, SettingsError
+from sononerf.material import MATERIALS
 from sononerf.scene import load_scene
 
 BOX = trimesh.creation.box((30.0, 20.0, 10.0))
@@ -109,3 +110,26 @@ def test_a_sphere_in_millimetres_taken_for_metres_is_refused(tmp_path):
     trimesh.creation.icosphere(radius=120.0).export(tmp_path / "a.stl")
     with pytest.raises(InputError, match=r"a\.stl: the mesh is 240 m large.*set the unit to mm"):
         load(tmp_path / "a.stl", unit="m")
+
+
+def test_seams_between_patches_are_closed(tmp_path, caplog):
+    seam = trimesh.Trimesh(
+        BOX.triangles.reshape(-1, 3), np.arange(36).reshape(-1, 3), process=False
+    )
+    for name in ("a.obj", "a.ply"):
+        seam.export(tmp_path / name)
+        assert load(tmp_path / name, unit="mm").is_watertight
+    assert not caplog.records
+
+
+def test_faults_of_a_file_are_told_of(tmp_path, caplog):
+    trimesh.Trimesh(BOX.vertices, BOX.faces[:-1, ::-1]).export(tmp_path / "a.stl")
+    load(tmp_path / "a.stl", unit="mm")
+    assert [message.split(" (")[0] for message in caplog.messages] == ["the mesh is open"]
+
+
+def test_the_material_is_that_of_its_name(tmp_path):
+    BOX.export(tmp_path / "a.stl")
+    options = {"path": str(tmp_path / "a.stl"), "unit": "mm"}
+    assert load_scene("mesh", options).material == MATERIALS["rigid"]
+    assert load_scene("mesh", {**options, "material": "leaf"}).material == MATERIALS["leaf"]

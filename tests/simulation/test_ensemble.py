@@ -1,15 +1,21 @@
 # SPDX-License-Identifier: MIT
+import hashlib
+import os
+import signal
+import time
+
 import numpy as np
 import pytest
 import trimesh
 
 from sononerf.config import validate_settings
-from sononerf.errors import InputError, ResourceError, SonoNerfError
-from sononerf.geometry.poses import Poses, look_at
+from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
+from sononerf.geometry.poses import Poses, look_at, write_pose_csv
 from sononerf.scene import Scene, load_scene
 from sononerf.simulation import ensemble
 from sononerf.simulation.ensemble import (
     check_poses,
+    check_reach,
     ensemble_poses,
     pose_seed,
     simulate_ensemble,
@@ -46,6 +52,111 @@ def test_no_set_moves_another_and_the_seed_moves_all():
     other = sets(seed=1)
     assert (base.rotations != other.rotations).any(axis=(1, 2)).all()
     assert (base.positions[7:9] != base.positions[9:11]).any()
+
+
+def test_poses_on_the_sphere_are_those_of_the_first_release():
+    poses, split = ensemble_poses(settings())
+    rounded = [(np.round(v, 9) + 0.0).tobytes() for v in (poses.positions, poses.rotations)]
+    found = hashlib.sha256(b"".join(rounded) + split.tobytes()).hexdigest()
+    assert found == "917fc6f168f229fd2c8784c18f3219f5a59ce2e9f77726648c659fa318f1d5aa"
+
+
+CAP = {"arrangement": "cap", "axis": [0.0, -1.0, 1.0], "half_angle_deg": 40.0}
+VOLUME = {"arrangement": "volume", "radius_max": 0.8}
+
+
+@pytest.mark.parametrize("chosen", [CAP, VOLUME, {**VOLUME, "half_angle_deg": 40.0}])
+def test_all_sets_of_an_arrangement_lie_in_the_same_place(chosen):
+    wanted = {**chosen, "count": 300, "validation": 200, "heldout": 200, "aim_jitter_deg": 0}
+    poses, split = ensemble_poses(settings(poses=wanted))
+    assert np.bincount(split).tolist() == [300, 200, 200]
+    distance = np.linalg.norm(poses.positions, axis=1)
+    axis = np.array(chosen.get("axis", [1.0, 0.0, 0.0]))
+    angle = np.degrees(np.arccos(poses.positions @ axis / np.linalg.norm(axis) / distance))
+    for member in range(3):
+        some = split == member
+        assert angle[some].max() <= chosen.get("half_angle_deg", 180.0) + 1e-9
+        assert angle[some].max() > 0.9 * chosen.get("half_angle_deg", 180.0)
+        if "radius_max" in chosen:
+            assert distance[some].min() > 0.4
+            assert distance[some].max() < 0.8
+            # half of the volume lies beyond this radius; 200 draws give the share to 0.035
+            outer = distance[some] > ((0.4**3 + 0.8**3) / 2) ** (1 / 3)
+            assert outer.mean() == pytest.approx(0.5, abs=0.12)
+        else:
+            np.testing.assert_allclose(distance[some], 0.4)
+    np.testing.assert_allclose(
+        poses.rotations[:, :, 0], -poses.positions / distance[:, None], atol=1e-9
+    )
+    more = ensemble_poses(settings(poses={**wanted, "count": 310, "validation": 0}))[0]
+    np.testing.assert_array_equal(more[310:].positions, poses[500:].positions)
+    other = ensemble_poses(settings(poses={**wanted, "seed": 1}))[0]
+    assert (other[500:].positions != poses[500:].positions).any(axis=1).all()
+
+
+@pytest.fixture
+def flight(tmp_path):
+    def write(rows):
+        positions = np.stack([np.linspace(-0.5, 0.5, rows), *np.full((2, rows), 0.4)], axis=1)
+        poses = Poses(positions, look_at(positions, np.zeros(3)))
+        path = tmp_path / f"flight{rows}.csv"
+        path.write_text(write_pose_csv(poses), encoding="utf-8")
+        return {"arrangement": "path", "path": str(path)}, poses
+
+    return write
+
+
+def test_a_path_keeps_its_order_and_gives_rows_to_each_set(flight):
+    wanted, flown = flight(50)
+    poses, split = ensemble_poses(settings(poses={**wanted, "validation": 4, "heldout": 6}))
+    np.testing.assert_array_equal(poses.positions, flown.positions)
+    np.testing.assert_allclose(poses.rotations, flown.rotations, atol=1e-12)
+    assert np.bincount(split).tolist() == [40, 4, 6]
+    assert (np.diff(np.flatnonzero(split == 2)) > 1).any()  # drawn, not cut off
+    assert (np.diff(np.flatnonzero(split == 1)) > 1).any()
+    more = ensemble_poses(settings(poses={**wanted, "validation": 9, "heldout": 6}))[1]
+    np.testing.assert_array_equal(more == 2, split == 2)
+    other = ensemble_poses(settings(poses={**wanted, "validation": 4, "heldout": 6, "seed": 1}))[1]
+    assert (other != split).any()
+
+
+def test_a_path_too_short_to_train_on_is_refused(flight):
+    wanted, _ = flight(30)
+    with pytest.raises(InputError, match=r"flight30\.csv: 30 poses, .* none is left to train on"):
+        ensemble_poses(settings(poses=wanted))
+    wanted, _ = flight(31)
+    assert np.bincount(ensemble_poses(settings(poses=wanted))[1]).tolist() == [1, 10, 20]
+
+
+def reach(*positions, limits=(0.3, 0.5)):
+    scene = load_scene("sphere", {"radius": 0.1})
+    check_reach(scene, poses_at(*positions), bounces=1, range_min=limits[0], range_max=limits[1])
+
+
+def test_poses_out_of_reach_are_told_of(caplog):
+    far, good, near = [0.0, 0.0, 0.61], [0.0, 0.59, 0.0], [0.11, 0.0, 0.0]
+    reach(good, good)
+    assert not caplog.records
+    reach(far, good, near, far)
+    assert len(caplog.messages) == 2
+    assert "2 of 4 poses (0, 3) are farther" in caplog.messages[0]
+    assert "spectrogram.range_max" in caplog.messages[0]
+    assert "1 of 4 poses (2) are nearer" in caplog.messages[1]
+    assert "spectrogram.range_min" in caplog.messages[1]
+    with pytest.raises(NumericalError, match="no pose received an echo"):
+        reach(far, near)
+
+
+def test_poses_are_checked_fast_in_a_million_triangles():
+    scene = Scene(trimesh.creation.icosphere(subdivisions=8, radius=1.0))
+    assert len(scene.mesh.faces) > 1_300_000
+    places = np.random.default_rng(0).normal(size=(430, 3))
+    places *= 0.9 / np.linalg.norm(places, axis=1, keepdims=True)
+    places[7] *= 1.2  # outside, and within the box
+    started = time.process_time()
+    with pytest.raises(InputError, match=r"429 of 430 poses \(0, 1, 2, 3, 4, 5, 6, 8, 9, 10,"):
+        check_poses(scene, poses_at(*places), offsets=np.eye(3) * 0.01)
+    assert time.process_time() - started < 20.0  # a look at every triangle for each takes minutes
 
 
 def test_pose_seeds_are_those_of_the_pair():
@@ -108,6 +219,35 @@ def test_a_scheduler_that_is_not_there_is_named(small, monkeypatch):
         simulate_ensemble(*small, [0], lambda *_: None, seed=0, scheduler="tcp://127.0.0.1:9")
 
 
+class Deadly:
+    """A simulator that kills the process it runs in, so many times."""
+
+    def __init__(self, folder, times):
+        self.folder, self.times = folder, times
+
+    def spectrogram(self, position, rotation, *, seed):
+        died = len(list(self.folder.iterdir()))
+        if died < self.times and position[0] < 0.0:
+            (self.folder / str(died)).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return np.full((1, 1, 1), position[0], dtype=np.float32)
+
+
+@pytest.mark.slow  # a worker takes seconds to come again
+@pytest.mark.parametrize("times", [5, 99])
+def test_a_pose_is_not_blamed_for_its_workers(tmp_path, caplog, times):
+    # Dask itself gives up on a task after four workers.
+    found, poses = {}, poses_at([1.0, 0.0, 0.0], [-2.0, 0.0, 0.0], [3.0, 0.0, 0.0])
+    task = (Deadly(tmp_path, times), poses, range(3), found.__setitem__)
+    if times == 99:
+        with pytest.raises(ResourceError, match="pose 1: every worker that took it was killed"):
+            simulate_ensemble(*task, seed=0, workers=2)
+    else:
+        simulate_ensemble(*task, seed=0, workers=2)
+        assert {index: values.item() for index, values in found.items()} == {0: 1, 1: -2, 2: 3}
+    assert not caplog.records
+
+
 def poses_at(*positions):
     positions = np.array(positions, dtype=float)
     return Poses(positions, look_at(positions, np.array([9.0, 9.0, 9.0])))
@@ -118,7 +258,7 @@ def test_poses_inside_are_refused_even_where_bodies_overlap():
     two.apply_translation([0.1, 0.0, 0.0])
     scene = Scene(trimesh.util.concatenate([one, two]))
     check_poses(scene, poses_at([0.0, 0.0, 0.101], [-0.09, 0.09, 0.0], [0.3, 0.0, 0.0]))
-    with pytest.raises(InputError, match=r"3 of 4 poses are inside .*: 0, 1, 3;"):
+    with pytest.raises(InputError, match=r"3 of 4 poses \(0, 1, 3\) are inside"):
         # the second lies in both bodies, which a count of crossings takes for outside
         check_poses(scene, poses_at([-0.05, 0, 0], [0.05, 0, 0], [0, 0, 0.2], [0.15, 0, 0]))
     inverted = Scene(trimesh.Trimesh(one.vertices, one.faces[:, ::-1]))
@@ -129,7 +269,9 @@ def test_poses_inside_are_refused_even_where_bodies_overlap():
 def test_only_the_first_ten_are_listed():
     scene = load_scene("sphere", {"radius": 1.0})
     inside = poses_at(*np.linspace(-0.1, 0.1, 12)[:, None] * [1.0, 0.0, 0.0])
-    with pytest.raises(InputError, match=r"12 of 12 .*: 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, \.\.\.;"):
+    with pytest.raises(
+        InputError, match=r"12 of 12 poses \(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, \.\.\.\) are"
+    ):
         check_poses(scene, inside)
 
 
@@ -143,5 +285,5 @@ def test_ears_inside_are_refused():
 
 def test_poses_that_are_no_numbers_are_refused():
     poses = Poses(np.array([[0.4, 0.0, 0.0], [np.nan, 0.0, 0.0]]), np.stack([np.eye(3)] * 2))
-    with pytest.raises(InputError, match="1 of 2 poses are no finite numbers: 1;"):
+    with pytest.raises(InputError, match=r"1 of 2 poses \(1\) are no finite numbers"):
         check_poses(load_scene("sphere"), poses)

@@ -1,66 +1,153 @@
 # SPDX-License-Identifier: MIT
+import itertools
+
 import numpy as np
 import pytest
 
+from sononerf.acoustics.spectrogram import echo_samples
 from sononerf.config import SpectrogramSettings
-from sononerf.simulation.impulse_response import deposit, plan_synthesis, synthesise
+from sononerf.simulation.impulse_response import air_loss, deposit, plan_synthesis, synthesise
 
 SETTINGS = SpectrogramSettings(range_max=0.3)
 
 
 @pytest.fixture(scope="module")
 def synthesis():
-    return plan_synthesis(SETTINGS, 343.0)
+    return plan_synthesis(SETTINGS, echo_samples(SETTINGS, 343.0))
 
 
-def echo_of(synthesis, delay, strength):
-    strength = np.broadcast_to(strength, (1, len(synthesis.nodes)))
-    return synthesise(synthesis, deposit(synthesis, np.array([delay]), strength))
+def echo_of(synthesis, delay, strength, spread=0.0, decay=0.0, basis=None):
+    """Echo of one or more deposits; delay and spread in samples."""
+    delay, spread = np.broadcast_arrays(np.atleast_1d(delay) * 1e-6, np.asarray(spread) * 1e-6)
+    shape = (len(delay), len(synthesis.nodes))
+    bins = synthesis.silence()
+    deposit(synthesis, bins, delay, spread, np.broadcast_to(strength, shape))
+    decay = np.broadcast_to(decay, shape[1])
+    air = air_loss(synthesis, decay)
+    return synthesise(synthesis, bins, air, synthesis.basis if basis is None else basis)
+
+
+def spectrum(echo, frequency, delay=0.0):
+    """With time counted from ``delay``, samples."""
+    time = (np.arange(len(echo)) - delay) * 1e-6
+    return np.exp(-2j * np.pi * np.asarray(frequency)[:, None] * time) @ echo
 
 
 def test_nodes_cover_the_band(synthesis):
     assert len(synthesis.nodes) == 14
     np.testing.assert_allclose(synthesis.nodes[[0, -1]], [5e3, 150e3])
-    low = plan_synthesis(SpectrogramSettings(sampling_rate=200e3, hop=1, window=16), 343.0)
+    low = plan_synthesis(SpectrogramSettings(sampling_rate=200e3, hop=1, window=16), 1000)
     assert low.nodes[-1] == pytest.approx(90e3)
+
+
+def test_each_level_halves_the_bins(synthesis):
+    sizes = synthesis.sizes
+    assert sizes[0] == 4 * synthesis.length
+    assert all(fine == 2 * coarse for fine, coarse in itertools.pairwise(sizes))
+    assert synthesis.silence().shape == (sum(sizes), 14)
 
 
 @pytest.mark.parametrize("sample", [700.0, 700.125, 700.5])
 def test_spectrum_is_jf_times_the_strength_and_the_delay_exact(synthesis, sample):
-    echo = echo_of(synthesis, sample * 1e-6, 2.0)
     frequency = np.array([10e3, 50e3, 100e3, 150e3])
-    phase = np.exp(-2j * np.pi * frequency[:, None] * np.arange(len(echo)) * 1e-6)
-    found = phase @ echo
+    found = spectrum(echo_of(synthesis, sample, 2.0), frequency)
     expected = 2.0 * 1j * frequency * np.exp(-2j * np.pi * frequency * sample * 1e-6)
     # Between two fine bins the level errs by up to 0.7 % at 150 kHz, corrected on average.
     np.testing.assert_allclose(found, expected, rtol=0.008)
 
 
+def test_edges_have_no_factor_jf(synthesis):
+    frequency = np.array([10e3, 50e3, 100e3, 150e3])
+    found = spectrum(echo_of(synthesis, 700.0, 2.0, basis=synthesis.hats), frequency, 700.0)
+    np.testing.assert_allclose(found, 2.0, rtol=0.008)
+
+
 def test_strengths_run_straight_between_nodes(synthesis):
-    slope = synthesis.nodes / 1e5
-    echo = echo_of(synthesis, 700e-6, slope)
     frequency = np.array([20e3, 77e3, 143e3])
-    phase = np.exp(-2j * np.pi * frequency[:, None] * (np.arange(len(echo)) - 700) * 1e-6)
-    np.testing.assert_allclose((phase @ echo).imag, frequency * frequency / 1e5, rtol=0.01)
+    echo = echo_of(synthesis, 700.0, synthesis.nodes / 1e5)
+    found = spectrum(echo, frequency, 700.0)
+    np.testing.assert_allclose(found.imag, frequency * frequency / 1e5, rtol=0.01)
+
+
+@pytest.mark.parametrize("spread", [0.02, 0.11, 0.3, 1.0, 2.5, 7.0, 30.0])
+@pytest.mark.parametrize("sample", [700.0, 701.37])
+def test_mean_delay_is_exact_at_any_spread(synthesis, sample, spread):
+    """Group delay at the lowest frequencies is the mean of the arrival times."""
+    # So low that all phases are small; strengths below the lowest node are those of it.
+    frequency = np.array([50.0, 100.0])
+    echo = echo_of(synthesis, sample, 1.0, spread, basis=synthesis.hats)
+    delay = -np.angle(spectrum(echo, frequency, sample)) / (2 * np.pi * frequency)
+    np.testing.assert_allclose(delay * 1e6, 0.0, atol=1e-3)
+
+
+@pytest.mark.parametrize("spread", [0.1, 0.3, 0.5, 1.0, 1.4, 3.0, 8.0, 20.0])
+def test_a_spread_echo_fades_like_a_gaussian_of_its_width(synthesis, spread):
+    """By (2 pi f s)^2 / 2 at low frequencies, on average over where echoes fall between bins."""
+    frequency = 0.1 / (2 * np.pi * spread * 1e-6)
+    places = 700.0 + 128.0 * np.arange(89) / 89  # evenly over the bins of every level
+    lost = []
+    for place in places:
+        pair = [
+            echo_of(synthesis, place, 1.0, width, basis=synthesis.hats) for width in (spread, 0.0)
+        ]
+        wide, sharp = (np.abs(spectrum(echo, [frequency], place))[0] for echo in pair)
+        lost.append(1.0 - wide / sharp)
+    # One echo keeps half to five quarters of its variance, by its place.
+    assert np.mean(lost) == pytest.approx(0.1**2 / 2, rel=0.05)
+    assert np.max(lost) < 1.4 * 0.1**2 / 2
+
+
+def test_a_wide_spread_is_silent_at_high_frequencies(synthesis):
+    frequency = np.array([20e3, 50e3, 100e3])
+    loud, faint = (
+        np.abs(spectrum(echo_of(synthesis, 700.3, 1.0, width), frequency)) for width in (0.0, 30.0)
+    )
+    assert (faint < np.array([0.12, 0.03, 0.01]) * loud).all()
+
+
+def test_air_takes_what_it_takes_in_the_time(synthesis):
+    """Each node by its own decay; the spread does not matter."""
+    decay = np.linspace(100.0, 800.0, len(synthesis.nodes))
+    frequency = synthesis.nodes[[1, 5, 9]]
+    for spread in (0.0, 2.0):
+        kept = [
+            np.abs(spectrum(echo_of(synthesis, 900.0, 1.0, spread, loss), frequency))
+            for loss in (decay, 0.0)
+        ]
+        expected = np.exp(-decay[[1, 5, 9]] * 900e-6)
+        # A wide bin's decay is taken at its middle.
+        np.testing.assert_allclose(kept[0] / kept[1], expected, rtol=1e-3)
 
 
 def test_a_flat_echo_is_short(synthesis):
-    echo = echo_of(synthesis, 700e-6, 1.0)
+    echo = echo_of(synthesis, 700.0, 1.0)
     far = np.abs(np.arange(len(echo)) - 700) > 60
     # 60 samples are one analysis window; beyond, nothing above -60 dB may smear over ranges.
     assert np.abs(echo[far]).max() < 1e-3 * np.abs(echo).max()
 
 
-def test_late_echoes_are_left_out_and_do_not_wrap(synthesis):
-    assert echo_of(synthesis, (synthesis.samples + 300) * 1e-6, 1.0).max() == 0.0
-    last = echo_of(synthesis, (synthesis.samples + 200) * 1e-6, 1.0)
-    loud = np.abs(echo_of(synthesis, 700e-6, 1.0)).max()
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_late_echoes_are_left_out_and_do_not_wrap(synthesis, spread):
+    assert np.abs(echo_of(synthesis, synthesis.samples + 300, 1.0, spread)).max() == 0.0
+    last = echo_of(synthesis, synthesis.samples + 200, 1.0, spread)
+    assert last.any()
+    loud = np.abs(echo_of(synthesis, 700.0, 1.0, spread)).max()
     assert np.abs(last[:500]).max() < 1e-3 * loud
 
 
-def test_echoes_add(synthesis):
-    count = len(synthesis.nodes)
-    delays = np.array([500e-6, 500e-6, 901.3e-6])
-    together = synthesise(synthesis, deposit(synthesis, delays, np.ones((3, count))))
-    apart = sum(echo_of(synthesis, delay, 1.0) for delay in delays)
-    np.testing.assert_allclose(together, apart, atol=1e-6)
+def test_a_late_echo_takes_nothing_from_the_others(synthesis):
+    strength = np.array([[1.0], [7.0], [2.0]])
+    delays = [500.0, synthesis.samples + 300.0, 901.3]
+    together = echo_of(synthesis, delays, strength, [0.0, 1.0, 3.0])
+    apart = echo_of(synthesis, 500.0, 1.0) + echo_of(synthesis, 901.3, 2.0, 3.0)
+    np.testing.assert_allclose(together, apart, atol=1e-9 * np.abs(apart).max())
+
+
+def test_echoes_add_into_what_is_there(synthesis):
+    bins = synthesis.silence()
+    ones = np.ones((1, len(synthesis.nodes)))
+    for delay in (500e-6, 500e-6, 901.3e-6):
+        deposit(synthesis, bins, np.array([delay]), np.array([4e-7]), ones)
+    together = synthesise(synthesis, bins, np.ones_like(bins), synthesis.basis)
+    apart = 2 * echo_of(synthesis, 500.0, 1.0, 0.4) + echo_of(synthesis, 901.3, 1.0, 0.4)
+    np.testing.assert_allclose(together, apart, atol=1e-9 * np.abs(apart).max())

@@ -1,15 +1,103 @@
 # SPDX-License-Identifier: MIT
+import math
+from dataclasses import replace
+
 import numpy as np
+import pytest
+from scipy.integrate import quad
 
-from sononerf.scene import Material
-from sononerf.simulation.reflection import keep_outside, lobe_exponent, mirror, reflection
+from sononerf.material import RIGID, SONOTRACELAB, Material
+from sononerf.simulation.reflection import (
+    keep_outside,
+    lobe_exponent,
+    mirror,
+    reflection,
+    unfaded,
+)
+
+SPEED = 343.0
 
 
-def test_default_material_has_the_originals_specular_numbers():
-    found = reflection(Material(), [5e3, 20e3, np.sqrt(20e3 * 150e3), 150e3, 200e3])
+def at(material, *frequency):
+    return reflection(material, frequency, speed_of_sound=SPEED)
+
+
+def gain(found, angle=0.0, detour=0.0, curvature=0.0):
+    """Of one hit (F,)."""
+    one = (np.array([value], float) for value in (np.cos(angle), detour, curvature))
+    return np.broadcast_to(found.heard(*one)[0], found.strength.shape)
+
+
+def test_values_run_straight_over_the_logarithm_of_frequency_and_stay_beyond():
+    found = at(SONOTRACELAB, 5e3, 20e3, np.sqrt(20e3 * 150e3), 150e3, 200e3)
     np.testing.assert_allclose(np.degrees(found.lobe_width), [12, 12, 8, 4, 4])
+    np.testing.assert_allclose(np.degrees(found.curved_lobe_width), 70)
     np.testing.assert_allclose(found.strength, [1, 1, 0.85, 0.7, 0.7])
     np.testing.assert_allclose(found.kept, [1, 1, 0.85, 0.7, 0.7])
+    np.testing.assert_allclose(found.curved_strength[[1, 3]], [0.0016, 0.002])
+    np.testing.assert_allclose(found.diffraction[[1, 3]], [0.8, 1.0])
+
+
+def test_what_has_no_curve_of_its_own_follows_the_plain_one():
+    found = at(Material(lobe_width=(0.2, 0.1), strength=(1.0, 0.5)), 20e3, 150e3)
+    np.testing.assert_array_equal(found.curved_lobe_width, found.lobe_width)
+    np.testing.assert_array_equal(found.curved_strength, found.strength)
+    assert not at(replace(RIGID, diffraction=None), 50e3).diffraction.any()
+
+
+def test_a_lobe_falls_off_the_mirror_direction_and_knows_no_detour():
+    found = at(Material((5e4,), (0.2,), (0.5,), (1.0,), diffraction=None), 30e3, 90e3)
+    np.testing.assert_allclose(gain(found), 0.5)
+    np.testing.assert_allclose(gain(found, angle=0.2, detour=0.1), 0.5 * math.exp(-0.5), rtol=1e-6)
+
+
+@pytest.mark.parametrize("frequency", [10e3, 30e3, 80e3])
+def test_a_smooth_surface_has_the_level_of_the_whole_integral(frequency):
+    """Over Fresnel zones: f gain integral of fade(d) e^{-jkd} is that of e^{-jkd} alone."""
+    found = at(RIGID, frequency)
+    k = 2 * np.pi * frequency / SPEED
+
+    def part(function):
+        end = 25.0 / found.fade[0]
+        return quad(lambda d: gain(found, detour=d)[0] * function(k * d), 0.0, end, limit=500)[0]
+
+    _, made_good = unfaded(np.array([frequency]), speed_of_sound=SPEED)
+    whole = (part(np.cos) - 1j * part(np.sin)) * made_good[0]
+    # 1 / jk times jf; phase and all.
+    assert whole == pytest.approx(frequency / k, rel=1e-4)
+    # The angle does not count: the shape alone decides.
+    np.testing.assert_array_equal(gain(found, angle=1.0), gain(found))
+    assert gain(found, detour=8.0 / found.fade[0])[0] < 1e-3 * gain(found)[0]
+
+
+def test_half_is_curved_at_the_transition():
+    """SonoTraceLab's law: 1 / (1 + e^{-8 b (kappa - kappa_0)})."""
+    found = at(SONOTRACELAB, 20e3, 150e3)
+    share = found.curved_share(np.array([0.0, 900.0, 1000.0, 1100.0, 1e5, 1e9]))
+    expected = 1 / (1 + np.exp(-8 * 0.002 * (np.array([0.0, 900.0, 1000.0, 1100.0]) - 1000.0)))
+    np.testing.assert_allclose(share[:4], expected)
+    np.testing.assert_array_equal(share[4:], 1.0)
+    np.testing.assert_allclose(
+        gain(found, curvature=1000.0), (found.strength + found.curved_strength) / 2
+    )
+    np.testing.assert_allclose(gain(found, curvature=1e6), found.curved_strength)
+    np.testing.assert_allclose(gain(found), found.strength, rtol=1e-6)
+    width = np.radians([(12 + 70) / 2, (4 + 70) / 2])
+    lobe = gain(found, angle=0.3, curvature=1000.0) / gain(found, curvature=1000.0)
+    np.testing.assert_allclose(lobe, np.exp(-0.5 * (0.3 / width) ** 2), rtol=1e-6)
+
+
+def test_without_a_transition_nothing_is_curved():
+    found = at(RIGID, 50e3)
+    np.testing.assert_array_equal(found.curved_share(np.array([0.0, 1e9])), 0.0)
+
+
+def test_reach_ends_where_the_widest_lobe_is_seventy_decibels_down():
+    assert at(RIGID, 50e3).reach == math.pi
+    narrow = Material(lobe_width=(0.2, 0.1))
+    reach = at(narrow, 20e3, 150e3).reach
+    assert 20 * math.log10(math.exp(-0.5 * (reach / 0.2) ** 2)) == pytest.approx(-70, abs=1.0)
+    assert at(SONOTRACELAB, 20e3).reach == math.pi  # four times 70 degrees
 
 
 def test_mirror_keeps_along_and_turns_across():

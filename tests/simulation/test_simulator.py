@@ -1,24 +1,29 @@
 # SPDX-License-Identifier: MIT
 import math
 import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.signal
 import trimesh
 
 from sononerf.acoustics.air import air_absorption
 from sononerf.acoustics.spectrogram import compress
 from sononerf.config import validate_settings
+from sononerf.errors import SettingsError
 from sononerf.geometry.poses import look_at, rotation_from_euler
-from sononerf.scene import Material, Scene, load_scene
+from sononerf.material import RIGID, Material
+from sononerf.scene import Scene, load_scene
 from sononerf.simulation.simulator import Simulator
 
 POINT_HEAD = {
     "emitter": [0, 0, 0], "left": [0, 0, 0], "beam_radius": 0, "azimuth_deg": 0,
     "elevation_deg": 0, "width_deg": 180, "notch_depth": 0,
 }  # fmt: skip
-WIDE = Material((1e5,), (math.radians(30),), (1.0,), (1.0,))
-NARROW = Material((1e5,), (math.radians(1),), (1.0,), (1.0,))
+WIDE = Material((1e5,), (math.radians(30),), (1.0,), (1.0,), diffraction=None)
+NARROW = Material((1e5,), (math.radians(1),), (1.0,), (1.0,), diffraction=None)
+PLAIN = replace(RIGID, diffraction=None)
 
 
 def simulator(scene, rays=40_000, **sections):
@@ -58,24 +63,25 @@ def test_first_echo_of_a_sphere_comes_from_its_front():
     assert abs(peak - 0.385) <= np.diff(found.range)[0] / 2 + 5e-6
 
 
-def test_a_wide_plate_is_a_mirror():
+@pytest.mark.parametrize(("material", "error"), [(PLAIN, 0.04), (WIDE, 0.015)])
+def test_a_wide_plate_is_a_mirror(material, error):
     """Image source: pressure 1 / (2 h), air taken off, at any frequency and number of rays."""
     height, frequency = 0.3, np.array([40e3, 60e3, 90e3])
-    scene = Scene(plate([height, -0.4, -0.4], [height + 0.01, 0.4, 0.4]), WIDE)
+    scene = Scene(plate([height, -0.4, -0.4], [height + 0.01, 0.4, 0.4]), material)
     air = 10 ** (-air_absorption(frequency, relative_humidity=0.5) * 2 * height / 20)
     levels = []
-    for rays in (100_000, 200_000):
+    for rays in (200_000, 400_000):
         found = simulator(scene, rays, ears=POINT_HEAD, simulation={"rays": rays, "bounces": 1})
         echo = found.echo(np.zeros(3), np.eye(3), seed=1)
         levels.append(np.abs(spectrum(echo[0], frequency)))
-    # The plate's rim and the lobe's width leave ripples of about one per cent.
-    np.testing.assert_allclose(levels[1], air / (2 * height), rtol=0.015)
-    np.testing.assert_allclose(levels[0], levels[1], rtol=0.005)
+    # Of a lobe, ripples of its width; of a smooth plate, rays by the hundred in the first zone.
+    np.testing.assert_allclose(levels[1], air / (2 * height), rtol=error)
+    np.testing.assert_allclose(levels[0], levels[1], rtol=error)
 
 
 def test_a_corner_answers_like_the_image_behind_its_edge():
     """Two bounces between plates at right angles: pressure k / (2 d) at twice the distance d."""
-    material = Material((1e5,), (math.radians(30),), (1.0,), (0.5,))
+    material = Material((1e5,), (math.radians(30),), (1.0,), (0.5,), diffraction=None)
     one = plate([0.2, -0.5, -0.4], [0.21, 0.25, 0.4])
     two = plate([-0.5, 0.25, -0.4], [0.21, 0.26, 0.4])
     scene = Scene(trimesh.util.concatenate([one, two]), material)
@@ -106,7 +112,7 @@ def test_level_does_not_depend_on_the_number_of_rays():
     few, many = (
         simulator(scene, rays).spectrogram(position, rotation, seed=3) for rays in (30_000, 90_000)
     )
-    assert few.max() == pytest.approx(many.max(), rel=1e-3)
+    assert few.max() == pytest.approx(many.max(), rel=5e-3)
     assert active_error(few, many) < 0.3  # what 30,000 rays scatter by, not 20 log10(3) = 9.5
 
 
@@ -141,7 +147,7 @@ def test_the_mirrored_scene_exchanges_the_ears():
     rotation = look_at(position, np.array([0.0, 0.0, 0.02]))
     one = simulator(Scene(mesh)).spectrogram(position, rotation, seed=5)
     two = simulator(Scene(mirrored)).spectrogram(position, rotation, seed=6)
-    assert active_error(one, two[::-1]) < 0.2
+    assert active_error(one, two[::-1]) < 0.3  # what so few rays scatter by
     assert active_error(one, two) > 1.0
 
 
@@ -149,13 +155,17 @@ def test_what_a_plate_hides_is_not_heard():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.03)
     ball.apply_translation([0.5, 0.0, 0.0])
     hidden = trimesh.util.concatenate([ball, plate([0.3, -0.3, -0.3], [0.31, 0.3, 0.3])])
+    # Without edges: the plate's rim is heard as late as the ball.
     open_, shut = (
-        simulator(Scene(mesh), simulation={"rays": 40_000, "bounces": 1}) for mesh in (ball, hidden)
+        simulator(Scene(mesh, PLAIN), simulation={"rays": 40_000, "bounces": 1})
+        for mesh in (ball, hidden)
     )
     beyond = open_.range > 0.42
     assert open_.spectrogram(np.zeros(3), np.eye(3), seed=0)[:, beyond].max() > 0
     loud = shut.spectrogram(np.zeros(3), np.eye(3), seed=0)
-    assert loud[:, beyond].max() < 3e-4 * loud.max()  # the plate's own decay
+    assert (
+        loud[:, beyond].max() < 1e-3 * loud.max()
+    )  # the tail of the plate; of the ball 40 times it
 
 
 def test_an_ear_behind_a_plate_hears_nothing_though_the_other_does():
@@ -216,3 +226,80 @@ def test_axes_ears_and_speed_are_those_of_the_settings():
     assert magnitude.dtype == np.float32
     warm = simulator(load_scene("sphere"), air={"temperature_c": 40.0})
     assert warm.speed_of_sound == pytest.approx(354.7, abs=0.1)
+
+
+def engines(scene, rays=40_000, **sections):
+    """One simulator by rays, one by Kirchhoff's integral, both as settings choose them."""
+    return [
+        simulator(scene, simulation={"engine": engine, "rays": rays, "bounces": 1}, **sections)
+        for engine in ("rays", "kirchhoff")
+    ]
+
+
+@pytest.mark.parametrize("body", ["sphere", "three_spheres"])
+def test_both_engines_say_the_same_of_glints(body):
+    scene = load_scene(body, {"radius": 0.0286} if body == "sphere" else {})
+    position = np.array([0.35, 0.05, 0.02])
+    pose = position, look_at(position, np.zeros(3))
+    fast, slow = engines(scene)
+    assert (type(fast.engine).__name__, type(slow.engine).__name__) == ("Rays", "Kirchhoff")
+    one, two = (found.spectrogram(*pose, seed=1) for found in (fast, slow))
+    # Kirchhoff's integral itself errs by up to 1 dB for ka above 12 and 2 dB below.
+    for a, b in zip(one, two, strict=True):
+        level = 20 * np.log10(a.max(axis=0) / b.max(axis=0))
+        assert np.abs(level[fast.frequency > 40e3]).max() < 1.5
+    loudest = one[0].max(axis=1).argmax(), two[0].max(axis=1).argmax()
+    assert abs(loudest[0] - loudest[1]) <= 3  # rows of 0.7 mm
+
+
+def test_an_unknown_engine_is_refused():
+    with pytest.raises(SettingsError, match=r"simulation\.engine.*rays.*kirchhoff"):
+        simulator(load_scene("sphere"), simulation={"engine": "magic"})
+
+
+def test_the_call_of_the_settings_is_what_is_emitted():
+    scene, position = load_scene("sphere"), np.array([0.35, 0.0, 0.0])
+    pose = position, look_at(position, np.zeros(3))
+    impulse = simulator(scene, 5000, ears=POINT_HEAD)
+    waveform, magnitude = impulse.receive(*pose, seed=1)
+    np.testing.assert_array_equal(waveform, impulse.echo(*pose, seed=1)[:, : waveform.shape[1]])
+    np.testing.assert_array_equal(magnitude.astype(np.float32), impulse.spectrogram(*pose, seed=1))
+    call = {"kind": "hyperbolic", "duration": 1e-3, "frequency_start": 120e3}
+    sweep = simulator(scene, 5000, ears=POINT_HEAD, call=call)
+    swept, dechirped = sweep.receive(*pose, seed=1)
+    expected = scipy.signal.fftconvolve(
+        sweep.echo(*pose, seed=1), sweep.reception.waveform[None], axes=1
+    )
+    np.testing.assert_allclose(swept, expected[:, : swept.shape[1]], atol=1e-9)
+    # Dechirped, the sphere stands where the impulse shows it.
+    rows = [m[0, :, 40].argmax() for m in (magnitude, dechirped)]
+    assert abs(sweep.range[rows[1]] - impulse.range[rows[0]]) < 0.01
+
+
+def test_the_noise_of_the_settings_is_drawn_from_the_poses_seed():
+    scene, position = load_scene("sphere"), np.array([0.35, 0.0, 0.0])
+    pose = position, look_at(position, np.zeros(3))
+    sections = {"simulation": {"rays": 5000}, "noise": {"snr_db": 20.0, "relative_to": "pose"}}
+    quiet, noisy = simulator(scene, 5000), simulator(scene, **sections)
+    clean = quiet.receive(*pose, seed=1)[0]
+    one, same, other = (noisy.receive(*pose, seed=seed)[0] for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, same)
+    assert not np.array_equal(one, other)
+    np.testing.assert_array_equal(noisy.echo(*pose, seed=1), quiet.echo(*pose, seed=1))
+    assert np.abs(one - clean).std() > 0.0
+    assert (one - clean).std(axis=1).max() < 0.1 * np.abs(clean).max()
+
+
+def test_hits_are_in_decibels_below_the_strongest():
+    found = simulator(load_scene("sphere"), 5000)
+    points, level = found.hits(np.array([0.4, 0.0, 0.0]), rotation_from_euler(np.pi, 0, 0), seed=0)
+    assert len(points) == len(level)
+    assert level.max() == 0.0
+    assert level.min() >= -200.0
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 0.015, atol=1e-5)
+
+
+def test_settings_of_the_rays_go_through():
+    wanted = {"rays": 1234, "bounces": 2, "diffraction_points": 77}
+    engine = simulator(load_scene("sphere"), simulation=wanted).engine
+    assert (engine.rays, engine.bounces, engine.diffraction_points) == (1234, 2, 77)

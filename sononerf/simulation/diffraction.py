@@ -1,0 +1,295 @@
+# SPDX-License-Identifier: MIT
+"""Sound from edges and strongly curved places, as sources of their own."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from sononerf.geometry.directions import GOLDEN_TURN
+from sononerf.geometry.raycast import RayCaster
+from sononerf.geometry.surface import CREASE
+from sononerf.scene import Scene
+from sononerf.simulation.hearing import Hearing, Sound
+from sononerf.simulation.reflection import Reflection
+
+
+@dataclass(frozen=True, eq=False)
+class Edges:
+    """Edges at which a surface turns outwards, or ends.
+
+    Attributes
+    ----------
+    ends : (K, 2, 3) float64, m
+        World frame.
+    away : (K, 3) float64
+        Unit vectors off the surface.
+    inward : (K, 3) float64
+        Unit vectors from the edge along one of its faces.
+    normal : (K, 3) float64
+        Outward normals of that face.
+    open_angle : (K,) float64, rad
+        Of the air around the edge: pi for a plane, 2 pi where a sheet ends.
+    triangle : (K,) int64
+        That face.
+    """
+
+    ends: NDArray[np.float64]
+    away: NDArray[np.float64]
+    inward: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    open_angle: NDArray[np.float64]
+    triangle: NDArray[np.int64]
+
+    @property
+    def length(self) -> NDArray[np.float64]:
+        """Of each edge (K,), m."""
+        return np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1)
+
+
+def diffracting_edges(mesh: trimesh.Trimesh) -> Edges:
+    """Return the edges of a mesh that are sharper than a crease, and convex or open."""
+    vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    normals = np.asarray(mesh.face_normals, dtype=np.float64)
+    angles = np.asarray(mesh.face_adjacency_angles)
+    sharp = np.flatnonzero((angles >= CREASE) & np.asarray(mesh.face_adjacency_convex))
+    pairs = np.asarray(mesh.face_adjacency)[sharp]
+    used = np.asarray(mesh.edges_sorted)
+    _, first, count = np.unique(used, axis=0, return_index=True, return_counts=True)
+    rim = first[count == 1]
+    ends = np.concatenate(
+        [vertices[np.asarray(mesh.face_adjacency_edges)[sharp]], vertices[used[rim]]]
+    )
+    triangle = np.concatenate([pairs[:, 0], np.asarray(mesh.edges_face)[rim]]).astype(np.int64)
+    along = ends[:, 1] - ends[:, 0]
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    middle = vertices[np.asarray(mesh.faces)[triangle]].mean(axis=1)
+    inward = middle - ends[:, 0]
+    inward -= np.einsum("kd,kd->k", inward, along)[:, None] * along
+    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+    # At an edge of two faces back to back, the way off both is the way out of one.
+    away = normals[pairs].sum(axis=1) - 1e-6 * inward[: len(pairs)]
+    away = np.concatenate([away, -inward[len(pairs) :]])
+    return Edges(
+        ends,
+        away / np.linalg.norm(away, axis=1, keepdims=True),
+        inward,
+        normals[triangle],
+        np.concatenate([math.pi + angles[sharp], np.full(len(rim), 2.0 * math.pi)]),
+        triangle,
+    )
+
+
+def wedge_directivity(
+    inward: NDArray[np.float64],
+    normal: NDArray[np.float64],
+    open_angle: NDArray[np.float64],
+    to_source: NDArray[np.float64],
+    to_receiver: NDArray[np.float64],
+    fade: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    r"""Return what the edge of a rigid wedge sends on from a source to a receiver.
+
+    .. math:: -\frac{\nu}{2} \sum_{\pm \pm}
+        \frac{\sin \nu (\pi \pm \theta_1 \pm \theta_2)}
+        {\cosh \nu \eta - \cos \nu (\pi \pm \theta_1 \pm \theta_2)}
+
+    with :math:`\nu = \pi / \theta_w`; times :math:`dz / (2 \pi r_1 r_2)` it is the pressure of a
+    stretch :math:`dz` of the edge, exact for an infinite wedge [1]_.
+
+    Where one of the faces mirrors the source into the receiver the sum has a pole, and the mirror
+    itself is there, fading out over the edge within :math:`1/k` of detour: see
+    :meth:`Reflection.heard`. What it brings is taken from the term with that pole.
+
+    Parameters
+    ----------
+    inward, normal : (N, 3) float64
+        Unit vectors along one face and out of it, square to the edge.
+    open_angle : (N,) float64, rad
+        :math:`\theta_w`, of the air around the edge.
+    to_source, to_receiver : (N, 3) float64, m
+        From the point.
+    fade : (F,) float64, 1/m
+        Of the mirror over the detour.
+
+    Returns
+    -------
+    directivity : (N, F) float64
+        Finite everywhere.
+
+    References
+    ----------
+    .. [1] U. P. Svensson, R. I. Fred and J. Vanderkooy, "An analytic secondary source model of
+       edge diffraction impulse responses", JASA 106, 1999, equations (5) to (7).
+    """
+    along = np.cross(normal, inward)
+    angles, heights, radii, distances = [], [], [], []
+    for vector in (to_source, to_receiver):
+        out, across = (np.einsum("nd,nd->n", vector, axis) for axis in (normal, inward))
+        angles.append(np.mod(np.arctan2(out, across), 2.0 * math.pi))
+        heights.append(np.einsum("nd,nd->n", vector, along))
+        radii.append(np.maximum(np.hypot(out, across), 1e-12))
+        distances.append(np.linalg.norm(vector, axis=1))
+    nu = math.pi / open_angle
+    bent = (distances[0] * distances[1] + heights[0] * heights[1]) / (radii[0] * radii[1])
+    hyperbolic = np.cosh(nu * np.arccosh(np.maximum(bent, 1.0)))
+    total = np.zeros((len(nu), len(fade)))
+    way = distances[0] + distances[1]
+    square = np.square(radii[0]) + np.square(radii[1]) + np.square(heights[0] - heights[1])
+    for one in (-1.0, 1.0):
+        for two in (-1.0, 1.0):
+            angle = math.pi + one * angles[0] + two * angles[1]
+            below = hyperbolic - np.cos(nu * angle)
+            term = np.sin(nu * angle) / np.where(below > 1e-12, below, np.inf)
+            if one == two:
+                both = (
+                    angles[0] + angles[1] if one < 0.0 else 2.0 * open_angle - angles[0] - angles[1]
+                )
+                mirrored = np.sqrt(square - 2.0 * radii[0] * radii[1] * np.cos(both))
+                detour = np.maximum(way - mirrored, 0.0)
+                total -= term[:, None] * np.expm1(np.multiply.outer(detour, -fade))
+            else:
+                total += term[:, None]
+    return -0.5 * nu[:, None] * total
+
+
+class Diffraction:
+    r"""Points on edges and strongly curved places, each standing for the same share of them.
+
+    What counts is by how much the surface turns: for an edge its length times the angle between
+    its faces' normals, for a curved place :math:`\int s \kappa\, dA`, with the share :math:`s` at
+    which its curvature :math:`\kappa` counts as strong. So the level depends neither on the number
+    of points nor on that of triangles. A part :math:`dM` (m) of this adds the pressure
+
+    .. math:: D\, \frac{dM}{2 \pi\, r_1 r_2}\, e^{-j k (r_1 + r_2)}\, B\, E
+
+    where emitter and ear both see it, with the material's strength :math:`D`; on an edge
+    :math:`dM` is the length alone and :math:`D` is multiplied by the directivity of a rigid wedge.
+
+    Parameters
+    ----------
+    scene : Scene
+        Mesh and materials.
+    caster : RayCaster
+        Of the mesh.
+    reflections : tuple of Reflection
+        The materials at the nodes.
+    """
+
+    def __init__(
+        self, scene: Scene, caster: RayCaster, reflections: tuple[Reflection, ...]
+    ) -> None:
+        self._caster = caster
+        self._edges = diffracting_edges(scene.mesh)
+        self._corners = np.asarray(scene.mesh.triangles, dtype=np.float64)
+        part = np.zeros(len(self._corners), dtype=np.int64) if scene.part is None else scene.part
+        self._part = np.concatenate([part[self._edges.triangle], part])
+        self._strength = np.stack([reflection.diffraction for reflection in reflections])
+        self._fade = reflections[0].fade  # the same for all materials
+        share = np.zeros(len(part))
+        for index, reflection in enumerate(reflections):
+            of_part = part == index
+            share[of_part] = reflection.curved_share(caster.curvature[of_part])
+        turned = share * caster.curvature * np.asarray(scene.mesh.area_faces, dtype=np.float64)
+        turn = self._edges.open_angle - math.pi
+        measure = np.concatenate([turn * self._edges.length, turned])
+        silent = np.array([not strength.any() for strength in self._strength])
+        measure[silent[self._part]] = 0.0
+        self._end = np.cumsum(measure)
+
+    def sound(
+        self,
+        hearing: Hearing,
+        position: NDArray[np.float64],
+        rotation: NDArray[np.float64],
+        *,
+        points: int,
+        offset: float,
+    ) -> Sound:
+        """Collect what the ears of a pose hear of edges and curved places.
+
+        Parameters
+        ----------
+        hearing : Hearing
+            Head and air.
+        position : (3,) float64, m
+            Of the head.
+        rotation : (3, 3) float64
+            Head to world.
+        points : int
+            How many, spaced evenly over all that diffracts.
+        offset : float
+            In [0, 1), shifts them.
+
+        Returns
+        -------
+        sound : Sound
+            For :meth:`Hearing.echo` with the synthesis' ``hats``.
+        """
+        sound = hearing.silence()
+        share = self._end[-1] / points
+        if share == 0.0:
+            return sound
+        place, away, along, index = self._places(share, points, offset)
+        emitter, ears = hearing.places(position, rotation)
+        lit = self._caster.visible(place, emitter, normals=away)
+        place, away, along, index = place[lit], away[lit], along[lit], index[lit]
+        emitted = place - emitter
+        length = np.linalg.norm(emitted, axis=1)
+        emitted /= length[:, None]
+        level = hearing.beam(emitted, rotation) * self._strength[self._part[index]]
+        level *= (share * hearing.speed_of_sound / (2.0 * math.pi) / length)[:, None]
+        on_edge = index < len(self._edges.triangle)
+        edge = index[on_edge]
+        wedge = (
+            self._edges.inward[edge], self._edges.normal[edge], self._edges.open_angle[edge],
+            emitter - place[on_edge],
+        )  # fmt: skip
+        turn = self._edges.open_angle[edge] - math.pi
+        for ear, listener in enumerate(ears):
+            weight = np.ones_like(level)
+            weight[on_edge] = wedge_directivity(*wedge, listener - place[on_edge], self._fade)
+            weight[on_edge] /= turn[:, None]
+            seen = self._caster.visible(place, listener, normals=away)
+            towards = listener - place[seen]
+            towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+            spread = np.abs(np.einsum("nd,nd->n", along[seen], emitted[seen] - towards))
+            hearing.add(
+                sound,
+                ear,
+                place[seen],
+                length=length[seen],
+                spread=spread / math.sqrt(12.0),
+                level=level[seen] * weight[seen],
+                position=position,
+                rotation=rotation,
+            )
+        return sound
+
+    def _places(
+        self, share: float, points: int, offset: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+        """Points (N, 3), off the surface (N, 3), the stretch each stands for (N, 3), what it is."""
+        at = (np.arange(points) + offset) * share
+        index = np.searchsorted(self._end, at, side="right")
+        measure = np.diff(self._end, prepend=0.0)[index]
+        fraction = 1.0 - (self._end[index] - at) / measure
+        on_edge = index < len(self._edges.triangle)
+        place, away, along = np.zeros((3, points, 3))
+        chosen = index[on_edge]
+        start, end = self._edges.ends[chosen, 0], self._edges.ends[chosen, 1]
+        place[on_edge] = start + fraction[on_edge, None] * (end - start)
+        away[on_edge] = self._edges.away[chosen]
+        along[on_edge] = (end - start) * np.minimum(share / measure[on_edge], 1.0)[:, None]
+        triangle = index[~on_edge] - len(self._edges.triangle)
+        # Uniform over a triangle: Osada et al., "Shape distributions", ACM TOG 21(4), 2002.
+        root = np.sqrt(fraction[~on_edge])
+        across = np.mod(np.flatnonzero(~on_edge) * GOLDEN_TURN + offset, 1.0)
+        weights = np.stack([1.0 - root, root * (1.0 - across), root * across], axis=1)
+        place[~on_edge] = np.einsum("nc,ncd->nd", weights, self._corners[triangle])
+        away[~on_edge] = self._caster.face_normals[triangle]
+        return place, away, along, index

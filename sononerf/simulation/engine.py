@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: MIT
+"""What the engines share: a scene, a head in air, and the way between them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf.geometry.raycast import RayCaster
+from sononerf.scene import Scene
+from sononerf.simulation.hearing import Hearing
+from sononerf.simulation.reflection import Reflection, reflection
+
+
+class Engine:
+    """From a pose to what the ears hear of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is ensonified.
+    hearing : Hearing
+        Head and air.
+
+    Attributes
+    ----------
+    reflections : tuple of Reflection
+        The scene's materials at the nodes of the synthesis.
+    """
+
+    def __init__(self, scene: Scene, hearing: Hearing) -> None:
+        self.scene = scene
+        self.hearing = hearing
+        nodes = hearing.synthesis.nodes
+        self.reflections: tuple[Reflection, ...] = tuple(
+            reflection(material, nodes, speed_of_sound=hearing.speed_of_sound)
+            for material in scene.materials
+        )
+        self._caster: RayCaster | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The search tree cannot be pickled; who receives the mesh builds it anew.
+        return {**self.__dict__, "_caster": None}
+
+    @property
+    def caster(self) -> RayCaster:
+        """The scene's ray caster, built when it is first needed."""
+        if self._caster is None:
+            self._caster = RayCaster(self.scene.mesh)
+        return self._caster
+
+    def echo(
+        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
+    ) -> NDArray[np.float64]:
+        """Pressure at both ears for a call that is one sample of height 1.
+
+        Parameters
+        ----------
+        position : (3,) float64, m
+            Of the head, world frame.
+        rotation : (3, 3) float64
+            Head to world.
+        seed : int
+            Of whatever is random.
+
+        Returns
+        -------
+        echo : (E, S) float64
+            From the emission to the end of the last analysis frame.
+        """
+        raise NotImplementedError
+
+    def hits(
+        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places that send sound straight back, and how much.
+
+        Parameters
+        ----------
+        position : (3,) float64, m
+            Of the head, world frame.
+        rotation : (3, 3) float64
+            Head to world.
+        seed : int
+            Of whatever is random.
+
+        Returns
+        -------
+        points : (N, 3) float64, m
+            World frame.
+        strength : (N,) float64
+            Relative, zero or more: what a patch of one size sends to both ears.
+        """
+        raise NotImplementedError

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: MIT
+"""What the ears make of sound that comes from points: beam, ears, air, and when it arrives."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf.acoustics.ears import Ears, beam_gain, ear_gain
+from sononerf.simulation.impulse_response import Synthesis, air_loss, deposit, synthesise
+
+MOST_WAITING = 300_000  # echoes; laying them into bins goes over all bins, so it is done seldom
+
+
+class Sound:
+    """What the ears of one pose hear, while it is collected.
+
+    Parameters
+    ----------
+    synthesis : Synthesis
+        Time bins.
+    ears : int
+        How many, E.
+
+    Attributes
+    ----------
+    bins : (E, B, F) float64
+        Filled by :meth:`settle`.
+    """
+
+    def __init__(self, synthesis: Synthesis, ears: int) -> None:
+        self._synthesis = synthesis
+        self.bins = np.stack([synthesis.silence() for _ in range(ears)])
+        self._waiting: list[list[tuple[NDArray[Any], ...]]] = [[] for _ in range(ears)]
+
+    def add(
+        self, ear: int, delay: NDArray[Any], spread: NDArray[Any], strength: NDArray[Any]
+    ) -> None:
+        """Add echoes: delay (N,) s, spread (N,) s, strength (N, F)."""
+        self._waiting[ear].append((delay, spread, strength))
+        if sum(len(echoes[0]) for echoes in self._waiting[ear]) > MOST_WAITING:
+            self.settle(ear)
+
+    def settle(self, ear: int) -> NDArray[np.float64]:
+        """Lay what waits into an ear's bins (B, F), and return them."""
+        if self._waiting[ear]:
+            delay, spread, strength = (
+                np.concatenate(parts, dtype=np.float64)
+                for parts in zip(*self._waiting[ear], strict=True)
+            )
+            self._waiting[ear].clear()
+            deposit(self._synthesis, self.bins[ear], delay, spread, strength)
+        return self.bins[ear]
+
+
+@dataclass(frozen=True, eq=False)
+class Hearing:
+    """A head in air, for which echoes of points are collected.
+
+    Attributes
+    ----------
+    ears : Ears
+        At the nodes of the synthesis.
+    synthesis : Synthesis
+        Time bins and filters.
+    absorption : (F,) float64, dB/m
+        Of the air at the nodes.
+    speed_of_sound : float, m/s
+        Of the air.
+    """
+
+    ears: Ears
+    synthesis: Synthesis
+    absorption: NDArray[np.float64]
+    speed_of_sound: float
+
+    @cached_property
+    def _air(self) -> NDArray[np.float64]:
+        decay = self.absorption * (math.log(10.0) / 20.0) * self.speed_of_sound
+        return air_loss(self.synthesis, decay)
+
+    def places(
+        self, position: NDArray[np.float64], rotation: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the emitter (3,) and the ears (E, 3) of a pose, m, world frame."""
+        return (
+            position + rotation @ self.ears.emitter,
+            position + self.ears.positions @ rotation.T,
+        )
+
+    def silence(self) -> Sound:
+        """Return nothing heard yet."""
+        return Sound(self.synthesis, len(self.ears.positions))
+
+    def beam(
+        self, emitted: NDArray[np.float64], rotation: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Return the beam's gain (N, F) towards directions (N, 3) of the world."""
+        return beam_gain(self.ears, _into_head(emitted, rotation))
+
+    def gain(
+        self, ear: int, towards: NDArray[np.float64], rotation: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Return an ear's gain (N, F) for sound from directions (N, 3) of the world."""
+        return ear_gain(self.ears, ear, _into_head(towards, rotation))
+
+    def add(
+        self,
+        sound: Sound,
+        ear: int,
+        points: NDArray[np.float64],
+        *,
+        length: NDArray[np.float64],
+        spread: NDArray[np.floating[Any]],
+        level: NDArray[np.floating[Any]],
+        position: NDArray[np.float64],
+        rotation: NDArray[np.float64],
+    ) -> None:
+        r"""Add what one ear hears of points.
+
+        A point adds :math:`(j f / c)\, a\, e^{-j k (r_1 + r_2)} / r_2` times the ear's gain and
+        the air's loss to the pressure, with :math:`a` its level and :math:`r_2` the way to the
+        ear.
+
+        Parameters
+        ----------
+        sound : Sound
+            To this it is added.
+        ear : int
+            0 left, 1 right.
+        points : (N, 3) float64, m
+            World frame.
+        length : (N,) float64, m
+            From the emitter to the points, along the path.
+        spread : (N,) float, m
+            Standard deviation of the whole path's length over what a point stands for.
+        level : (N, F) or (N, 1) float, m
+            The beam's gain is part of it.
+        position : (3,) float64, m
+            Of the head.
+        rotation : (3, 3) float64
+            Head to world.
+        """
+        place = position + rotation @ self.ears.positions[ear]
+        towards = points - place
+        distance = np.sqrt(np.einsum("nd,nd->n", towards, towards))
+        towards /= distance[:, None]
+        gain = self.gain(ear, towards, rotation)
+        gain *= level
+        gain /= (self.speed_of_sound * distance).astype(np.float32)[:, None]
+        delay = (length + distance) / self.speed_of_sound
+        sound.add(ear, delay, spread / self.speed_of_sound, gain)
+
+    def echo(
+        self, sound: Sound, basis: NDArray[np.complex128] | None = None
+    ) -> NDArray[np.float64]:
+        """Return the pressure at the ears for a call that is one sample of height 1.
+
+        Parameters
+        ----------
+        sound : Sound
+            What was collected.
+        basis : (K, F) complex128, optional
+            Filters of the synthesis; its ``basis``, for what surfaces send back, where not given.
+
+        Returns
+        -------
+        echo : (E, S) float64
+            At the sampling rate.
+        """
+        filters = self.synthesis.basis if basis is None else basis
+        return np.stack(
+            [
+                synthesise(self.synthesis, sound.settle(ear), self._air, filters)
+                for ear in range(len(sound.bins))
+            ]
+        )
+
+
+def _into_head(vectors: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    turned: NDArray[np.float64] = vectors @ rotation
+    return turned

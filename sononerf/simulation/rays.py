@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: MIT
+"""The fast engine: rays over several bounces, summed as Kirchhoff's integral."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf.geometry.directions import CapSpiral
+from sononerf.scene import Scene
+from sononerf.simulation.diffraction import Diffraction
+from sononerf.simulation.engine import Engine
+from sononerf.simulation.footprint import Real
+from sononerf.simulation.hearing import Hearing, Sound
+from sononerf.simulation.paths import Bounce, aim, echo_paths
+from sononerf.simulation.reflection import coarse_gain, unfaded
+
+DIVIDED_SHARE = 0.6  # of the rays, kept for where a few would be noise
+FINE = 0.3  # rad; a cell over which the path bends by less lacks nothing
+SILENT = 7.0  # e to the minus this is -61 dB
+# When a cell is fine enough, seen at this wavelength: a mirror point in it or near it is resolved
+# once the path bends over the cell by less than a radian.
+RESOLVED_FREQUENCY = 80e3  # Hz
+RESOLVED = 1.0  # rad
+NEAR = 4.0  # rad; a mirror point that far off counts for e to the minus this
+REACHED = 1.0  # sides; how far from the middle of a cell a mirror point may be for its own
+# A bundle wider than this may hold a mirror point of the next bounce that its ray does not show.
+WIDE = 5e-4  # m
+EXPLORE = 0.1  # of what such a bundle may bring, against what one with a mirror point brings
+EARS_APART = 0.03  # m; up to this what holds for the middle between the ears holds for each
+
+
+def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    product: NDArray[np.float64] = np.einsum("nd,nd->n", a, b)
+    return product
+
+
+class Rays(Engine):
+    r"""Echoes by rays.
+
+    Rays fill the cap under which the emitter sees the scene, each standing for the same solid
+    angle :math:`d\Omega`. Every hit is heard by every ear that sees it, with the pressure
+
+    .. math:: \frac{j f}{c}\, \frac{\sqrt{d\Omega\, dA}}{r_2}\, s\,
+        e^{-\theta^2 / 2 w^2}\, e^{-j k (r_1 + r_2)}\, 10^{-\alpha (r_1 + r_2) / 20}\, B\, E \prod q
+
+    where :math:`dA` is the cross-section of the ray's bundle at the hit (:math:`r_1^2 d\Omega`
+    the first time; ray differentials carry it over the bounces), :math:`r_1` the path from the
+    emitter to the hit, :math:`r_2` from there to the ear, :math:`s, w, q` the material's strength,
+    lobe width and the part kept at earlier bounces, :math:`\theta` the angle off the mirror
+    direction, :math:`\alpha` the air's absorption, :math:`B, E` the gains of beam and ear.
+
+    It is Kirchhoff's integral over what is lit,
+    :math:`(j k / 2 \pi) \int p\, \cos\vartheta\, e^{-j k r_2} / r_2\, dS`, with the pressure
+    :math:`p` that geometrical acoustics brings there, :math:`\sqrt{d\Omega / dA}`, and
+    :math:`dA = \cos\vartheta\, dS`: so the level is absolute and does not depend on the number
+    of rays, a plate answers as :math:`1/2h` and a sphere as :math:`a / 2 r^2`. Phase shifts at
+    foci of hollow surfaces are left out.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is ensonified.
+    hearing : Hearing
+        Head and air.
+    rays : int
+        Per pose.
+    bounces : int
+        How often a ray may hit.
+    diffraction_points : int
+        Per pose, where a material diffracts.
+    """
+
+    def __init__(
+        self, scene: Scene, hearing: Hearing, *, rays: int, bounces: int, diffraction_points: int
+    ) -> None:
+        super().__init__(scene, hearing)
+        self.rays = rays
+        self.bounces = bounces
+        vertices = np.asarray(scene.mesh.vertices, dtype=np.float64)
+        self._centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+        self._radius = float(np.linalg.norm(vertices - self._centre, axis=1).max())
+        self._farthest = max(
+            math.inf if of_part.material.lobe_width else SILENT / float(of_part.fade.min())
+            for of_part in self.reflections
+        )
+        synthesis = hearing.synthesis
+        _, gain = unfaded(synthesis.frequency, speed_of_sound=hearing.speed_of_sound)
+        self._smooth = any(of_part.material.lobe_width is None for of_part in self.reflections)
+        self._basis = synthesis.hats * gain[:, None] if self._smooth else synthesis.basis
+        # Beside smooth surfaces lobed ones go through the same filters: their level is theirs.
+        _, gain = unfaded(synthesis.nodes, speed_of_sound=hearing.speed_of_sound)
+        self._lobed_level = synthesis.nodes / np.abs(gain) if self._smooth else 1.0
+        wavenumber = 2.0 * math.pi / hearing.speed_of_sound * synthesis.nodes
+        self._wavenumber = wavenumber.astype(np.float32)
+        self._reach = max(of_part.reach for of_part in self.reflections)
+        self.diffraction_points = diffraction_points
+        self._diffracts = any(reflection.diffraction.any() for reflection in self.reflections)
+        self._diffraction: Diffraction | None = None
+
+    def echo(
+        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
+    ) -> NDArray[np.float64]:
+        """Pressure at both ears for a call that is one sample of height 1.
+
+        Parameters
+        ----------
+        position : (3,) float64, m
+            Of the head, world frame.
+        rotation : (3, 3) float64
+            Head to world.
+        seed : int
+            Turns and shifts the pattern of rays as a whole.
+
+        Returns
+        -------
+        echo : (E, S) float64
+            From the emission to the end of the last analysis frame.
+        """
+        first, second, third = np.random.default_rng(seed).random(3)
+        sound = self.hearing.silence()
+        for bounce in self._paths(position, rotation, (first, second), self.bounces):
+            self._hear(sound, bounce, position, rotation)
+        echo = self.hearing.echo(sound, self._basis)
+        if self._diffracts:
+            if self._diffraction is None:
+                self._diffraction = Diffraction(self.scene, self.caster, self.reflections)
+            edges = self._diffraction.sound(
+                self.hearing, position, rotation, points=self.diffraction_points, offset=third
+            )
+            echo += self.hearing.echo(edges, self.hearing.synthesis.hats)
+        return echo
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_diffraction": None}
+
+    def hits(
+        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places that send sound straight back, and how much; see :meth:`Engine.hits`."""
+        first, second, _ = np.random.default_rng(seed).random(3)
+        points, strength = [np.zeros((0, 3))], [np.zeros(0)]
+        for bounce in self._paths(position, rotation, (first, second), 1):
+            total = np.zeros(len(bounce.ray))
+            level = self._level(bounce) * self.hearing.beam(bounce.emitted, rotation)
+            for place in self.hearing.places(position, rotation)[1]:
+                heard, gain, _ = self._heard(bounce, place)
+                total[heard] += np.square(gain * level[heard]).mean(axis=1)
+            # Of one size: a divided cell is smaller than a whole one.
+            points.append(bounce.points)
+            strength.append(np.sqrt(total) / bounce.solid_angle)
+        return np.concatenate(points), np.concatenate(strength)
+
+    def _paths(
+        self,
+        position: NDArray[np.float64],
+        rotation: NDArray[np.float64],
+        offset: tuple[float, float],
+        bounces: int,
+    ) -> Iterator[Bounce]:
+        emitter, _ = self.hearing.places(position, rotation)
+        axis, half_angle = aim(emitter, self._centre, self._radius)
+        extra = round(self.rays * DIVIDED_SHARE)
+        # Laid out in the head's frame, the pattern turns with head and scene together.
+        cap = CapSpiral(self.rays - extra, axis @ rotation, half_angle, offset, rotation)
+
+        _, ears = self.hearing.places(position, rotation)
+        if np.ptp(ears, axis=0).max() < EARS_APART:
+            ears = ears.mean(axis=0, keepdims=True)
+
+        def judge(bounce: Bounce) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+            audible, doubt = self._judge(bounce, ears[0])
+            for ear in ears[1:]:
+                also, more = self._judge(bounce, ear)
+                audible |= also
+                np.maximum(doubt, more, out=doubt)
+            return audible, doubt
+
+        return echo_paths(self.caster, emitter, cap, bounces=bounces, extra=extra, judge=judge)
+
+    def _judge(
+        self, bounce: Bounce, listener: NDArray[np.float64]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """Which hits can be heard (H,), and by how much each (H,) may be wrong."""
+        away = listener - bounce.points
+        distance = np.sqrt(_dot(away, away))
+        away /= distance[:, None]
+        rise, detour, _, stiffness = bounce.detour(away, distance)
+        # Seen from an ear either may be somewhat different from the middle between the ears.
+        facing = rise * distance > -EARS_APART
+        audible = facing & (detour < 1.25 * self._farthest)
+        k = np.float32(2.0 * math.pi * RESOLVED_FREQUENCY / self.hearing.speed_of_sound)
+        side = math.sqrt(bounce.solid_angle)
+        # Counted in turns of the ray at the emitter, the mirror point is this far from the cell.
+        off = np.sqrt(2.0 * detour / np.maximum(stiffness, np.float32(1e-12))) - REACHED * side
+        least = 0.5 * stiffness * np.square(np.maximum(off, 0.0))
+        turns = k * stiffness * side**2
+        coarse = facing & (turns > RESOLVED) & (k * least < NEAR)
+        width = np.sqrt(bounce.footprint.tube)
+        level = np.float32(bounce.solid_angle) * width
+        doubt = np.zeros(len(level))
+        chosen = np.flatnonzero(coarse)
+        doubt[chosen] = level[chosen] / distance[chosen] * np.exp(-k * least[chosen])
+        doubt[chosen] *= np.minimum(turns[chosen], 10.0)
+        if 1 < bounce.number < self.bounces:
+            # What goes on from here may be heard, however it looks from the head.
+            wide = side * width > WIDE
+            np.maximum(doubt, np.where(wide, EXPLORE / self._radius * level, 0.0), out=doubt)
+        return audible, doubt
+
+    def _hear(
+        self,
+        sound: Sound,
+        bounce: Bounce,
+        position: NDArray[np.float64],
+        rotation: NDArray[np.float64],
+    ) -> None:
+        heard_by = [
+            self._heard(bounce, place) for place in self.hearing.places(position, rotation)[1]
+        ]
+        anyone = np.zeros(len(bounce.ray), dtype=bool)
+        for heard, _, _ in heard_by:
+            anyone[heard] = True
+        chosen = np.flatnonzero(anyone)
+        level = self.hearing.beam(bounce.emitted.take(chosen, axis=0), rotation)
+        level *= self._level(bounce).take(chosen, axis=0)
+        place_of = np.cumsum(anyone) - 1
+        for ear, (heard, gain, spread) in enumerate(heard_by):
+            gain *= level.take(place_of.take(heard), axis=0)
+            self.hearing.add(
+                sound,
+                ear,
+                bounce.points.take(heard, axis=0),
+                length=bounce.length.take(heard),
+                spread=spread,
+                level=gain,
+                position=position,
+                rotation=rotation,
+            )
+
+    def _heard(
+        self, bounce: Bounce, ear: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.floating[Any]], Real]:
+        """Which hits an ear hears (N,), by what gain (N, F), and their paths' spread (N,), m."""
+        away = ear - bounce.points
+        distance = np.sqrt(_dot(away, away))
+        towards = away / distance[:, None]
+        rise, detour, spread, stiffness = bounce.detour(towards, distance)
+        heard = (rise > 0.0) & (detour < self._farthest)
+        if self._reach < math.pi:
+            heard &= _dot(bounce.mirrored, towards) > math.cos(self._reach)
+        near = np.flatnonzero(heard)
+        seen = self.caster.visible(
+            bounce.points.take(near, axis=0), ear, normals=bounce.flat.take(near, axis=0)
+        )
+        near = near[np.flatnonzero(seen)]
+        gain = self._gain(bounce, near, towards.take(near, axis=0), detour.take(near))
+        bend = stiffness.take(near) * np.float32(bounce.solid_angle)
+        coarse = np.flatnonzero(bend * self._wavenumber[-1] > FINE)
+        gain[coarse] *= coarse_gain(np.multiply.outer(bend.take(coarse), self._wavenumber))
+        return near, gain, spread.take(near)
+
+    def _level(self, bounce: Bounce) -> NDArray[np.float64]:
+        """Level without lobe and beam, (H, 1) or (H, F) m."""
+        level = (bounce.solid_angle * np.sqrt(bounce.footprint.tube))[:, None]
+        for earlier in bounce.triangles[:, :-1].T:
+            kept = np.stack([reflection.kept for reflection in self.reflections])
+            if (kept < 1.0).any():
+                level = level * kept[self._part(earlier)]
+        return level
+
+    def _gain(
+        self,
+        bounce: Bounce,
+        heard: NDArray[np.int64],
+        towards: NDArray[np.float64],
+        detour: Real,
+    ) -> NDArray[np.floating[Any]]:
+        """Lobe times strength towards a listener (N, F)."""
+        cosine = _dot(bounce.mirrored.take(heard, axis=0), towards)
+        triangle = bounce.triangles[heard, -1]
+        curvature = self.caster.curvature[triangle]
+        if len(self.reflections) == 1:
+            return self.reflections[0].heard(cosine, detour, curvature)
+        part = self._part(triangle)
+        gain = np.zeros((len(heard), len(self.hearing.synthesis.nodes)), dtype=np.float32)
+        for index, reflection in enumerate(self.reflections):
+            of_part = part == index
+            found = reflection.heard(cosine[of_part], detour[of_part], curvature[of_part])
+            lobed = reflection.material.lobe_width is not None
+            gain[of_part] = found * self._lobed_level if lobed else found
+        return gain
+
+    def _part(self, triangle: NDArray[np.int64]) -> NDArray[np.int64]:
+        part = self.scene.part
+        return np.zeros(len(triangle), dtype=np.int64) if part is None else part[triangle]

@@ -1,0 +1,390 @@
+# SPDX-License-Identifier: MIT
+import pickle
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import trimesh
+
+from sononerf.acoustics.ears import synthetic_ears
+from sononerf.config import EarSettings
+from sononerf.geometry.poses import look_at, rotation_from_euler
+from sononerf.material import RIGID, Material
+from sononerf.scene import Scene, load_scene
+from sononerf.simulation.hearing import Hearing
+from tests.simulation.exact import SPEED, rigid_sphere
+from tests.simulation.listening import (
+    NODES,
+    SYNTHESIS,
+    ball,
+    box,
+    echoes,
+    hearing,
+    level_db,
+    rays,
+    spectrum,
+    wall,
+)
+
+PLAIN = replace(RIGID, diffraction=None)
+BAND = np.linspace(20e3, 100e3, 81)
+
+
+def group_delay(pressure, frequency, expected):
+    """Range (m) from the slope of the phase, against an expected one."""
+    turned = pressure * np.exp(4j * np.pi * frequency * expected / SPEED)
+    return -np.polyfit(frequency, np.unwrap(np.angle(turned)), 1)[0] * SPEED / (4 * np.pi)
+
+
+def bat():
+    head = synthetic_ears(EarSettings(), NODES)
+    return Hearing(head, SYNTHESIS, np.zeros(len(NODES)), SPEED)
+
+
+def difference(one, two, frequency=BAND):
+    """Of spectra, relative to the loudest."""
+    a, b = spectrum(one, frequency), spectrum(two, frequency)
+    return np.abs(a - b).max() / np.abs(b).max()
+
+
+@pytest.mark.parametrize("distance", [0.25, 0.45])
+@pytest.mark.parametrize("radius", [0.015, 0.0286])
+def test_a_sphere_answers_as_geometrical_acoustics_says(radius, distance):
+    """a / (2 r (r - a)) for ka above 5; Morse and Ingard, Theoretical Acoustics, 8.2."""
+    frequency = BAND[2 * np.pi * BAND * radius / SPEED > 5.0]
+    (echo,) = echoes(rays(ball(radius), RIGID, rays=10_000), [distance, 0.0, 0.0])
+    found = spectrum(echo, frequency)
+    # Out on a small sphere the detour is no longer of second order: the fade takes a little more.
+    expected = radius / (2 * distance * (distance - radius))
+    assert np.abs(level_db(found) - level_db(expected)).max() < 0.7
+    assert abs(group_delay(found, frequency, distance - radius)) < 1e-4
+    exact = rigid_sphere(frequency, radius, distance, distance)
+    # What creeps round the sphere ripples the exact level by 1 dB at ka 5.
+    assert np.sqrt(np.mean((level_db(found) - level_db(exact)) ** 2)) < 0.7
+
+
+def test_a_wide_plate_is_a_mirror():
+    """Image source: pressure 1 / (2 h), whatever the number of rays."""
+    plate = wall(0.3, (-0.27, -0.3), (0.31, 0.28))
+    frequency = np.linspace(25e3, 95e3, 71)
+    for count, error in ((40_000, 0.9), (160_000, 0.3)):
+        (echo,) = echoes(rays(plate, PLAIN, rays=count))
+        found = spectrum(echo, frequency, until=0.38)
+        # A first Fresnel zone of few rays: a scatter that falls with their number.
+        assert np.abs(level_db(found) - level_db(1 / 0.6)).max() < error
+        assert abs(group_delay(found, frequency, 0.3)) < 1e-4
+
+
+@pytest.mark.parametrize(
+    ("distance", "emitter", "ear"),
+    [
+        (0.3, (0.0, 0.03, 0.0), (0.02, -0.03, 0.02)),
+        (0.15, (0.0, 0.0, -0.01), (-0.01, 0.01, 0.005)),
+        (0.3, (0.0, 0.1, 0.0), (0.05, -0.12, 0.03)),
+        (0.1, (0.0, 0.0, 0.0), (0.0, 0.1, 0.0)),
+    ],
+)
+def test_emitter_and_ear_apart_hear_a_plate_over_the_mirrored_path(distance, emitter, ear):
+    plate = wall(distance, (-0.5, -0.5), (0.5, 0.5))
+    (echo,) = echoes(rays(plate, PLAIN, hearing(emitter, (ear,)), rays=160_000))
+    length = np.linalg.norm(np.array([2 * distance, 0, 0]) + np.multiply(emitter, [-1, 1, 1]) - ear)
+    frequency = np.linspace(25e3, 95e3, 71)
+    found = spectrum(echo, frequency)
+    assert np.abs(level_db(found) - level_db(1 / length)).max() < 0.4
+    assert abs(group_delay(found, frequency, length / 2)) < 1e-4
+
+
+def test_ears_far_apart_are_both_heard_for():
+    plate, head = wall(0.1, (-0.5, -0.5), (0.5, 0.5)), hearing(ears=((0, 0.1, 0), (0, -0.1, 0)))
+    (alone,) = echoes(rays(plate, PLAIN, rays=160_000))
+    frequency = np.linspace(25e3, 95e3, 15)
+    straight = level_db(spectrum(alone, frequency)) - level_db(1 / 0.2)
+    for echo in echoes(rays(plate, PLAIN, head, rays=160_000)):
+        level = level_db(spectrum(echo, frequency)) - level_db(1 / np.hypot(0.2, 0.1))
+        np.testing.assert_allclose(level, straight, atol=0.3)
+
+
+def glint(source, listener, middle, radius):
+    """Path (m) and pressure of a sphere's mirror point, by the width of the bundle [1]_.
+
+    References
+    ----------
+    .. [1] M. Born and E. Wolf, Principles of Optics, section 4.6: Coddington's equations.
+    """
+    one, two = source - middle, listener - middle
+    one, two = one / np.linalg.norm(one), two / np.linalg.norm(two)
+    square = two - (two @ one) * one
+    square /= np.linalg.norm(square)
+    angle = np.linspace(0.0, np.arccos(one @ two), 200_001)[:, None]
+    points = middle + radius * (np.cos(angle) * one + np.sin(angle) * square)
+    ways = [np.linalg.norm(place - points, axis=1) for place in (source, listener)]
+    best = (ways[0] + ways[1]).argmin()
+    d1, d2 = ways[0][best], ways[1][best]
+    cosine = (points[best] - middle) @ (source - points[best]) / (radius * d1)
+    width = (d1 + d2 + 2 * d1 * d2 / (radius * cosine)) * (d1 + d2 + 2 * d1 * d2 * cosine / radius)
+    return d1 + d2, 1 / np.sqrt(width)
+
+
+def test_a_sphere_in_a_mirror_answers_like_its_image():
+    """Plate, sphere, ear and sphere, plate, ear: each as if from the mirrored head."""
+    middle = np.array([0.12, 0.25, 0.0])
+    both = trimesh.util.concatenate([wall(0.3, (-0.1, -0.25), (0.45, 0.25)), ball(0.02, middle)])
+    length, pressure = glint(np.zeros(3), np.array([0.6, 0.0, 0.0]), middle, 0.02)
+    gate = {"since": length / 2 - 0.02, "until": length / 2 + 0.02}
+    frequency = np.linspace(25e3, 95e3, 71)
+    (single,) = echoes(rays(both, PLAIN, bounces=1))
+    assert (
+        np.abs(spectrum(single, frequency, **gate)).max() < 0.02 * pressure
+    )  # what the gate lets in
+    for bounces in (2, 3):
+        (echo,) = echoes(rays(both, PLAIN, rays=80_000, bounces=bounces))
+        found = spectrum(echo, frequency, **gate)
+        assert np.abs(level_db(found) - level_db(2 * pressure)).max() < 0.5
+        assert abs(group_delay(found, frequency, length / 2)) < 1e-4
+
+
+def test_few_rays_find_the_mirror_points_of_second_bounces():
+    middle = np.array([0.12, 0.25, 0.0])
+    both = trimesh.util.concatenate([wall(0.3, (-0.1, -0.25), (0.45, 0.25)), ball(0.02, middle)])
+    length, pressure = glint(np.zeros(3), np.array([0.6, 0.0, 0.0]), middle, 0.02)
+    gate = {"since": length / 2 - 0.02, "until": length / 2 + 0.02}
+    for seed in (0, 1, 2):
+        (echo,) = echoes(rays(both, PLAIN, rays=20_000, bounces=2), seed=seed)
+        found = spectrum(echo, np.linspace(25e3, 95e3, 71), **gate)
+        assert np.abs(level_db(found) - level_db(2 * pressure)).max() < 1.0
+
+
+def test_a_corner_answers_like_the_image_behind_its_edge_and_loses_what_each_bounce_takes():
+    """Two bounces between plates at right angles: q / (2 d); 'kept' counts once, 'heard' once."""
+    material = replace(PLAIN, reflection=(0.5, 0.5))
+    plates = [box((0.2, -0.5, -0.4), (0.21, 0.25, 0.4)), box((-0.5, 0.25, -0.4), (0.21, 0.26, 0.4))]
+    corner = trimesh.util.concatenate(plates)
+    distance, frequency = np.hypot(0.2, 0.25), np.linspace(25e3, 95e3, 71)
+    for bounces in (2, 3):
+        (echo,) = echoes(rays(corner, material, bounces=bounces))
+        found = spectrum(echo, frequency, since=0.29)
+        assert np.abs(level_db(found) - level_db(0.5 / (2 * distance))).max() < 0.5
+        assert abs(group_delay(found, frequency, distance)) < 1e-4
+
+
+def test_level_does_not_depend_on_the_number_of_rays_nor_on_the_seed():
+    position = np.array([0.3, 0.2, 0.1])
+    rotation = look_at(position, np.zeros(3))
+    scene = load_scene("three_spheres")
+    (many,) = echoes(rays(scene, None, rays=160_000), position, rotation)
+    for count, error in ((10_000, 0.03), (40_000, 0.01)):
+        for seed in (1, 2):
+            (few,) = echoes(rays(scene, None, rays=count), position, rotation, seed)
+            # Glints are resolved to the same degree, by more rays where they are needed.
+            assert difference(few, many) < error
+
+
+def test_more_bounces_only_add():
+    position = np.array([0.3, 0.0, 0.0])
+    rotation = look_at(position, np.zeros(3))
+    scene = load_scene("three_spheres")
+    one, three, silent = (
+        echoes(rays(found, None, bounces=bounces), position, rotation)[0]
+        for found, bounces in (
+            (scene, 1),
+            (scene, 3),
+            (Scene(scene.mesh, replace(RIGID, reflection=(0.0, 0.0))), 3),
+        )
+    )
+    # Another bounce draws rays away from the first: noise of some tenths of a per cent.
+    assert difference(silent, one) < 0.02
+    assert difference(three, one) > 0.02
+
+
+def test_turning_scene_and_head_together_changes_nothing():
+    mesh = load_scene("three_spheres").mesh
+    position = np.array([0.3, 0.2, 0.1])
+    rotation = look_at(position, np.array([0.02, 0.01, 0.0]))
+    one = echoes(rays(mesh, RIGID, bat()), position, rotation)
+    quarter, turn = rotation_from_euler(np.pi / 2, 0.0, 0.0), rotation_from_euler(1.0, 0.5, -0.3)
+    # By a quarter the ball around the bounding box stays and with it every ray; else not quite.
+    for about, shift, error in ((quarter, [1.0, -2.0, 0.5], 1e-5), (turn, [0.5, 0.2, 0.1], 0.02)):
+        moved = trimesh.Trimesh(mesh.vertices @ about.T + shift, mesh.faces, process=False)
+        two = echoes(rays(moved, RIGID, bat()), about @ position + shift, about @ rotation)
+        for a, b in zip(one, two, strict=True):
+            assert difference(a, b) < error
+    assert difference(one[0], one[1]) > 0.1
+
+
+def test_the_mirrored_scene_exchanges_the_ears():
+    mesh = load_scene("three_spheres").mesh
+    mirrored = trimesh.Trimesh(mesh.vertices * [1, -1, 1], mesh.faces[:, ::-1])
+    position = np.array([0.4, 0.0, 0.02])
+    rotation = look_at(position, np.array([0.0, 0.0, 0.02]))
+    one, two = (echoes(rays(m, RIGID, bat()), position, rotation) for m in (mesh, mirrored))
+    assert difference(one[0], two[1]) < 0.02
+    assert difference(one[1], two[0]) < 0.02
+    assert difference(one[0], two[0]) > 0.1
+
+
+@pytest.mark.parametrize("body", ["three_spheres", "box"])
+def test_exchanging_emitter_and_ear_changes_nothing(body):
+    """Reciprocity (Lord Rayleigh, Theory of Sound, section 294), up to the rays' noise."""
+    mesh = box([-0.03] * 3, [0.03] * 3) if body == "box" else load_scene(body).mesh
+    one, two = (0.0, 0.05, 0.02), (-0.03, -0.06, 0.0)
+    position = np.array([0.3, 0.02, 0.01])
+    rotation = look_at(position, np.zeros(3))
+    there, back = (
+        echoes(rays(mesh, RIGID, hearing(a, (b,))), position, rotation, seed)[0]
+        for a, b, seed in ((one, two, 1), (two, one, 2))
+    )
+    assert difference(there, back) < 0.02
+
+
+def test_what_a_plate_hides_is_not_heard():
+    target, plate = ball(0.03, (0.5, 0.0, 0.0)), wall(0.3, (-0.3, -0.3), (0.3, 0.3))
+    both = trimesh.util.concatenate([target, plate])
+    frequency = np.linspace(25e3, 95e3, 71)
+    free, hidden, alone = (
+        spectrum(echoes(rays(m, PLAIN, bounces=2))[0], frequency, since=0.45)
+        for m in (target, both, plate)
+    )
+    assert np.abs(hidden).max() < 0.01 * np.abs(free).max()
+    assert np.abs(alone).max() < 0.01 * np.abs(free).max()
+
+
+def test_each_ear_sees_for_itself():
+    """Before the left ear, at y = 0.2, stands a plate; the emitter sees past it."""
+    target, before = ball(0.03, (0.5, 0.0, 0.0)), wall(0.2, (0.06, -0.1), (0.3, 0.1))
+    head = hearing(ears=((0.0, 0.2, 0.0), (0.0, -0.2, 0.0)))
+    both = trimesh.util.concatenate([target, before])
+    found, free = (echoes(rays(m, PLAIN, head, bounces=1)) for m in (both, target))
+    # Both ears hear the ball at (0.47 + 0.51) / 2.
+    left, right = (np.abs(spectrum(echo, BAND, since=0.45)) for echo in found)
+    assert left.max() < 0.02 * right.max()
+    np.testing.assert_allclose(right, np.abs(spectrum(free[1], BAND)), rtol=0.05)
+
+
+def test_each_part_answers_by_its_material():
+    """One plate before the other, twice as far: gated apart, each by its own strength."""
+    near, far = wall(0.25, (-0.05, -0.05), (0.05, 0.05)), ball(0.1, (0.6, 0.0, 0.2))
+    mesh = trimesh.util.concatenate([near, far])
+    part = np.repeat([0, 1], [len(near.faces), len(far.faces)])
+    loud, soft = PLAIN, replace(PLAIN, strength=(0.25, 0.25))
+    gates = {"near": {"until": 0.4}, "far": {"since": 0.45}}
+
+    def levels(*materials):
+        (echo,) = echoes(rays(Scene(mesh, materials, part), None))
+        return [np.abs(spectrum(echo, BAND, **gate)) for gate in gates.values()]
+
+    both = levels(loud, loud)
+    np.testing.assert_allclose(
+        both[0], np.abs(spectrum(echoes(rays(mesh, loud))[0], BAND, until=0.4))
+    )
+    for materials, factors in (((soft, loud), (0.25, 1.0)), ((loud, soft), (1.0, 0.25))):
+        for found, plain, factor in zip(levels(*materials), both, factors, strict=True):
+            # What of the other's tail gets through the gates.
+            np.testing.assert_allclose(found, factor * plain, rtol=0.01)
+
+
+def test_a_part_weakens_what_bounces_off_it_first():
+    """A corner of two materials: each order of bounces keeps what its first plate keeps."""
+    plates = [box((0.2, -0.5, -0.4), (0.21, 0.25, 0.4)), box((-0.5, 0.25, -0.4), (0.21, 0.26, 0.4))]
+    corner = trimesh.util.concatenate(plates)
+    part = np.repeat([0, 1], [len(plate.faces) for plate in plates])
+    keen, dull = replace(PLAIN, reflection=(1.0, 1.0)), replace(PLAIN, reflection=(0.2, 0.2))
+    mute = replace(dull, strength=(0.0, 0.0))
+    # Both orders share the mirror point at the edge alike; of a mute plate only one is heard.
+    for second, expected in ((dull, (1.0 + 0.2) / 2), (mute, 0.2 / 2)):
+        (echo,) = echoes(rays(Scene(corner, (keen, second), part), None, bounces=2))
+        found = level_db(spectrum(echo, np.linspace(25e3, 95e3, 71), since=0.29))
+        assert np.abs(found - level_db(expected / (2 * np.hypot(0.2, 0.25)))).max() < 1.0
+
+
+def test_a_rough_part_is_weaker_at_high_frequencies_and_lobes_widen():
+    flat = wall(0.3, (-0.27, -0.3), (0.31, 0.28))
+    lobed = Material((1e5,), (0.5,), (1.0,), (1.0,), diffraction=None)
+    frequency = np.array([30e3, 60e3, 90e3])
+    (smooth,), (wide,) = (echoes(rays(flat, m, rays=160_000)) for m in (PLAIN, lobed))
+    # A lobe much wider than the first Fresnel zone is as good as none.
+    error = level_db(spectrum(smooth, frequency)) - level_db(spectrum(wide, frequency))
+    assert np.abs(error).max() < 0.6
+    strong = replace(PLAIN, frequency=(20e3, 100e3), strength=(1.0, 0.1))
+    (rough,) = echoes(rays(flat, strong, rays=160_000))
+    expected = np.interp(np.log(frequency), np.log([20e3, 100e3]), [1.0, 0.1])
+    ratio = np.abs(spectrum(rough, frequency) / spectrum(smooth, frequency))
+    # Strengths run straight over frequency between nodes 11 kHz apart, the material's over its log.
+    np.testing.assert_allclose(ratio, expected, rtol=0.02)
+
+
+def test_the_air_takes_its_part_over_the_whole_path():
+    mesh = ball(0.0286)
+    (without,), (found,) = (
+        echoes(rays(mesh, PLAIN, hearing(absorption=a)), [0.3, 0.0, 0.0]) for a in (0.0, 3.0)
+    )
+    ratio = np.abs(spectrum(found, BAND) / spectrum(without, BAND))
+    np.testing.assert_allclose(ratio, 10 ** (-3.0 * 2 * (0.3 - 0.0286) / 20), rtol=2e-3)
+
+
+def test_hits_lie_on_the_surface_and_are_strongest_at_the_glint():
+    engine = rays(ball(0.0286), RIGID)
+    points, strength = engine.hits(np.array([0.3, 0.0, 0.0]), np.eye(3), seed=0)
+    assert (len(points), strength.min() >= 0.0) == (len(strength), True)
+    # Chords of the triangles lie up to 9 um inside.
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 0.0286, atol=1e-5)
+    np.testing.assert_allclose(points[strength.argmax()], [0.0286, 0.0, 0.0], atol=1e-3)
+    angle = np.arccos(np.clip(points[:, 0] / 0.0286, -1, 1))
+    assert strength[angle > 0.5].max() < 0.05 * strength.max()
+    rings = [
+        np.median(strength[(angle >= a) & (angle < a + 0.05)]) for a in np.arange(0, 0.4, 0.05)
+    ]
+    assert (np.diff(rings) < 0.0).all()
+
+
+def test_hits_of_divided_cells_count_as_those_of_whole_ones():
+    """Few rays are divided about the glint and nowhere else; many are not at all."""
+
+    def profile(count):
+        points, strength = rays(ball(0.0286), PLAIN, rays=count).hits(
+            np.array([0.3, 0.0, 0.0]), np.eye(3), seed=0
+        )
+        angle = np.arccos(np.clip(points[:, 0] / 0.0286, -1, 1))
+        bins = [(angle >= a) & (angle < a + 0.1) for a in (0.0, 0.1, 0.2, 0.3, 0.4)]
+        return np.array([strength[one].mean() for one in bins]) / strength.max()
+
+    # A mean over few points of a steep profile; a division makes cells four times smaller.
+    np.testing.assert_allclose(profile(500), profile(40_000), rtol=0.3)
+
+
+def test_the_pattern_of_rays_turns_with_scene_and_head():
+    mesh, position = ball(0.03, subdivisions=3), np.array([0.3, 0.05, 0.1])
+    turn = rotation_from_euler(1.0, 0.5, -0.3)
+    moved = trimesh.Trimesh(mesh.vertices @ turn.T, mesh.faces, process=False)
+    rotation = look_at(position, np.zeros(3))
+    one = rays(mesh, PLAIN, rays=2000).hits(position, rotation, seed=3)[0]
+    two = rays(moved, PLAIN, rays=2000).hits(turn @ position, turn @ rotation, seed=3)[0]
+    np.testing.assert_allclose(two, one @ turn.T, atol=1e-6)
+
+
+def test_silence_behind_the_head_and_beyond_the_last_frame():
+    turned = rotation_from_euler(np.pi, 0.0, 0.0)
+    behind = echoes(rays(ball(0.03, (0.3, 0, 0)), PLAIN, hearing()), rotation=turned)[0]
+    ahead = echoes(rays(ball(0.03, (0.3, 0, 0)), PLAIN, hearing()))[0]
+    # Heads that hear alike all around: only the pattern's place differs.
+    assert difference(behind, ahead) < 0.02
+    (late,) = echoes(rays(ball(0.03, (1.5, 0, 0)), PLAIN))
+    assert np.abs(late).max() == 0.0
+
+
+def test_a_seed_says_the_same_each_time_and_pickled():
+    engine = rays(load_scene("three_spheres"), None, bat(), rays=5000)
+    position = np.array([0.0, 0.4, 0.0])
+    pose = position, look_at(position, np.zeros(3))
+    one, two, other = (echoes(engine, *pose, seed=seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one, two)
+    assert not np.array_equal(one, other)
+    again = pickle.loads(pickle.dumps(engine))
+    np.testing.assert_array_equal(echoes(again, *pose, seed=1), one)
+
+
+def test_a_pickled_engine_with_edges_says_the_same():
+    engine = rays(box([-0.03] * 3, [0.03] * 3), RIGID, rays=1000)
+    expected = echoes(engine, [0.2, 0.1, 0.1])
+    assert np.abs(expected).max() > 0.0
+    again = pickle.loads(pickle.dumps(engine))
+    np.testing.assert_array_equal(echoes(again, [0.2, 0.1, 0.1]), expected)
