@@ -26,8 +26,9 @@ class Material:
     r"""How a surface reflects, at nodes over frequency.
 
     Between the nodes values run straight over the logarithm of frequency; beyond them they stay.
-    Where the surface is strongly curved, lobe and strength go over to the curved ones by the
-    share :math:`s = 1 / (1 + e^{-8 b (\kappa - \kappa_0)})` of the total curvature
+    A curve of one value holds at all nodes. Where the surface is strongly curved, lobe and strength
+    go over to the curved ones by the share :math:`s = 1 / (1 + e^{-8 b (\kappa - \kappa_0)})`
+    of the total curvature
     :math:`\kappa = \sqrt{k_1^2 + k_2^2}` (SonoTraceLab's law, with curvature in 1/m).
 
     Attributes
@@ -56,13 +57,13 @@ class Material:
 
     frequency: Curve = (20e3, 150e3)
     lobe_width: Curve | None = None
-    strength: Curve = (1.0, 1.0)
-    reflection: Curve = (1.0, 1.0)
+    strength: Curve = (1.0,)
+    reflection: Curve = (1.0,)
     curved_lobe_width: Curve | None = None
     curved_strength: Curve | None = None
     transition_curvature: float = math.inf
     transition_slope: float = 0.002
-    diffraction: Curve | None = (1.0, 1.0)
+    diffraction: Curve | None = (1.0,)
 
     def __post_init__(self) -> None:
         nodes = np.asarray(self.frequency, dtype=np.float64)
@@ -73,6 +74,9 @@ class Material:
             curve = getattr(self, name)
             if curve is None:
                 continue
+            if len(curve) == 1:
+                curve = tuple(curve) * len(nodes)
+                object.__setattr__(self, name, curve)
             values = np.asarray(curve, dtype=np.float64)
             if values.shape != nodes.shape:
                 raise ValueError(

@@ -66,7 +66,7 @@ def test_no_height_is_no_roughness():
         ({"frequency": (NAN, 1.0)}, "ascending"),
         ({"frequency": (1.0, math.inf)}, "ascending"),
         ({"frequency": ()}, "ascending"),
-        ({"strength": (1.0,)}, "material strength has 1 values, frequency 2"),
+        ({"strength": (1.0, 1.0, 1.0)}, "material strength has 3 values, frequency 2"),
         ({"strength": (1.0, -0.1)}, r"material strength is \[1.0, -0.1\], expected 0 to inf"),
         ({"strength": (1.0, math.inf)}, "strength"),
         ({"strength": (1.0, NAN)}, "strength"),
@@ -95,3 +95,10 @@ def test_materials_that_make_no_sense_are_refused_in_one_line(arguments, match):
 def test_one_node_is_enough():
     Material((1e5,), (0.5,), (1.0,), (1.0,), diffraction=None)
     Material((1e5,), None, (1.0,), (1.0,), diffraction=(1.0,))
+
+
+def test_one_value_holds_at_all_nodes():
+    found = Material((2e4, 5e4, 1e5), lobe_width=(0.2,), strength=(1.0, 0.8, 0.5))
+    assert found.lobe_width == (0.2, 0.2, 0.2)
+    assert found.reflection == found.diffraction == (1.0, 1.0, 1.0)
+    assert Material((5e4,)).strength == (1.0,)

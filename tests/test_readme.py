@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The commands that the README shows are ones that there are."""
+"""The commands that README and guides show are ones that there are."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from sononerf.plugins import SCENES, registered
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
-OTHERS = {".", "tensorboard", "pip", "git", "cd"}  # not ours to test
+GUIDES = "\n".join(path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("docs/*.md")))
+OTHERS = {".", "tensorboard", "pip", "git", "cd", "dask", "diff"}  # not ours to test
 
 
-def blocks(kind):
-    return re.findall(rf"^```{kind}\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
+def blocks(kind, text=TEXT + GUIDES):
+    return re.findall(rf"^```{kind}\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
 
 
 def commands():
@@ -57,6 +58,8 @@ def test_a_command_exists(words):
         config = parameters.get("config")
         if config is not None:
             load_settings(ROOT / config, parameters["overrides"] or ())
+    elif program == "python":
+        assert (ROOT / arguments[0]).is_file()
     else:
         assert program in OTHERS
 
@@ -68,8 +71,16 @@ def test_a_command_that_there_is_not_is_seen():
 
 
 def test_the_files_and_scenes_it_names_are_there():
-    for path in set(re.findall(r"configs/[\w/]+\.yaml", TEXT)):
+    for path in set(re.findall(r"(?:configs|docs)/[\w/]+\.\w+", TEXT)):
         assert (ROOT / path).is_file(), path
+
+
+@pytest.mark.parametrize("code", blocks("python", GUIDES))
+def test_the_code_of_the_guides_runs(code):
+    exec(compile(code, "guide", "exec"), {})
+
+
+def test_the_scene_of_a_file_is_there():
     assert {"mesh"} <= {plugin.name for plugin in registered(SCENES)}
 
 

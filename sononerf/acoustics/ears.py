@@ -279,7 +279,7 @@ def ear_gain(ears: Ears, ear: int, directions_head: NDArray[np.float64]) -> NDAr
 
 
 def _look_up(ears: Ears, table: int, directions: NDArray[np.float64]) -> NDArray[np.float32]:
-    x, y, z = directions.T
+    x, y, z = np.ascontiguousarray(directions.T, dtype=np.float32)
     column, across = _place(ears.azimuth, np.arctan2(y, x))
     row, upward = _place(ears.elevation, np.arctan2(z, np.hypot(x, y)))
     width = len(ears.azimuth)
@@ -298,10 +298,11 @@ def _look_up(ears: Ears, table: int, directions: NDArray[np.float64]) -> NDArray
 
 
 def _place(
-    nodes: NDArray[np.float64], values: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    nodes: NDArray[np.float64], values: NDArray[np.float32]
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Index of the node below, and the fraction of the way to the next."""
-    steps = (values - nodes[0]) / (nodes[-1] - nodes[0]) * (len(nodes) - 1)
-    steps = np.clip(steps, 0.0, len(nodes) - 1.0)
+    per_step = np.float32((len(nodes) - 1) / (nodes[-1] - nodes[0]))
+    steps = (values - np.float32(nodes[0])) * per_step
+    steps = np.clip(steps, np.float32(0.0), np.float32(len(nodes) - 1))
     index = np.minimum(steps.astype(np.int64), len(nodes) - 2)
-    return index, steps - index
+    return index, steps - index.astype(np.float32)

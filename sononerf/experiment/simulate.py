@@ -28,7 +28,7 @@ from sononerf.simulation.ensemble import (
     ensemble_poses,
     simulate_ensemble,
 )
-from sononerf.simulation.simulator import Simulator
+from sononerf.simulation.simulator import VERSION, Simulator
 
 REFERENCE_RATIO = 1e-3
 """The reported decibels start 60 dB below the greatest magnitude of the training poses."""
@@ -45,7 +45,7 @@ def echo_hash(settings: Settings, scene: Scene) -> str:
     place is another ensemble, the same table at another place is not.
     """
     plain = settings.plain()
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(f"simulator {VERSION}".encode())
     digest.update(json.dumps([plain[name] for name in HASHED_SECTIONS], sort_keys=True).encode())
     poses, split = ensemble_poses(settings)
     for values in (poses.positions, poses.rotations):

@@ -17,7 +17,7 @@ from sononerf.simulation.footprint import Footprint, Real, across, dots, land
 from sononerf.simulation.reflection import keep_outside, mirror
 
 SPLIT = 2  # along each side of a divided cell
-CHUNK = 16_384  # rays; what is known of so many stays near the processor
+CHUNK = 49_152  # rays; fewer and calls add up, more and they leave the processor's cache
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +206,9 @@ def trace(
         shift -= dots(shift, ahead)[:, None] * ahead  # what goes along the ray is no move of it
         ray, emitted = ray.take(further), emitted.take(further, axis=0)
         length = length.take(further) + hits.distance
-        triangles = np.concatenate([triangles[further], hits.triangle[:, None]], axis=1)
+        triangles = np.concatenate(
+            [triangles.take(further, axis=0), hits.triangle[:, None]], axis=1
+        )
 
 
 def _single(vectors: NDArray[np.float64]) -> Real:
@@ -261,6 +263,9 @@ def echo_paths(
             chunk = directions[start : start + CHUNK]
             for bounce in trace(caster, emitter, chunk, bounces, solid_angle=solid_angle):
                 bounce = replace(bounce, ray=bounce.ray + start)
+                if extra < SPLIT**2:
+                    found.append(bounce)  # none can be divided any more
+                    continue
                 audible, doubt = judge(bounce)
                 # A ray hits once a time, so none stands here twice.
                 weight[bounce.ray] = np.maximum(weight[bounce.ray], doubt)

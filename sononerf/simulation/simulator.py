@@ -18,6 +18,7 @@ from sononerf.simulation.impulse_response import plan_synthesis
 from sononerf.simulation.kirchhoff import Kirchhoff
 from sononerf.simulation.rays import Rays
 
+VERSION = 2  # to be raised when the same settings give other echoes: stores are told apart by it
 DEFAULT_SPEED = 343.0  # m/s
 DEFAULT_TEMPERATURE = 20.0  # °C, for absorption where only the speed is fixed
 

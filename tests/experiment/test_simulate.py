@@ -44,6 +44,14 @@ def test_the_hash_covers_all_that_echoes_depend_on_and_nothing_else(tiny):
         assert hashed(tiny(**changed)) == base, changed
 
 
+def test_another_simulator_makes_another_ensemble(tiny, monkeypatch):
+    settings = tiny()
+    scene = load_scene(settings.scene.name, settings.scene.options)
+    before = echo_hash(settings, scene)
+    monkeypatch.setattr(simulate_module, "VERSION", simulate_module.VERSION + 1)
+    assert echo_hash(settings, scene) != before
+
+
 HEADER = "x,y,z,yaw,pitch,roll\n"
 ROWS = [f"0.4,{0.01 * row},0.0,180,{row},0\n" for row in range(8)]
 
