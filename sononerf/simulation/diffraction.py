@@ -54,6 +54,10 @@ class Edges:
 def diffracting_edges(mesh: trimesh.Trimesh) -> Edges:
     """Return the edges of a mesh that are sharper than a crease, and convex or open."""
     vertices = np.asarray(mesh.vertices, dtype=np.float64)
+    # A triangle without area, however its corners lie, has no side to diffract on.
+    kept = np.flatnonzero(~_thin(vertices[np.asarray(mesh.faces)]))
+    if len(kept) < len(mesh.faces):
+        mesh = trimesh.Trimesh(vertices, np.asarray(mesh.faces)[kept], process=False)
     normals = np.asarray(mesh.face_normals, dtype=np.float64)
     angles = np.asarray(mesh.face_adjacency_angles)
     sharp = np.flatnonzero((angles >= CREASE) & np.asarray(mesh.face_adjacency_convex))
@@ -80,8 +84,17 @@ def diffracting_edges(mesh: trimesh.Trimesh) -> Edges:
         inward,
         normals[triangle],
         np.concatenate([math.pi + angles[sharp], np.full(len(rim), 2.0 * math.pi)]),
-        triangle,
+        kept[triangle],
     )
+
+
+def _thin(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which triangles (T, 3, 3) are a millionth as high as long, or less."""
+    sides = np.roll(corners, -1, axis=1) - corners
+    longest = np.square(sides).sum(axis=2).max(axis=1)
+    twice_area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    thin: NDArray[np.bool_] = twice_area <= 1e-6 * longest
+    return thin
 
 
 def wedge_directivity(

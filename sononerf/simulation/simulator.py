@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import logging
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,6 +19,8 @@ from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.impulse_response import plan_synthesis
 from sononerf.simulation.kirchhoff import Kirchhoff
 from sononerf.simulation.rays import Rays
+
+logger = logging.getLogger("sononerf")
 
 VERSION = 2  # to be raised when the same settings give other echoes: stores are told apart by it
 DEFAULT_SPEED = 343.0  # m/s
@@ -80,6 +84,11 @@ class Simulator:
         wanted = settings.simulation
         engine: Engine
         if wanted.engine == "kirchhoff":
+            if any(material.lobe_width is not None for material in scene.materials):
+                logger.warning(
+                    "simulation.engine=kirchhoff takes surfaces as smooth; the material's lobes "
+                    "are left out, simulation.engine=rays has them"
+                )
             engine = Kirchhoff(scene, hearing, frequency_max=1.1 * analysis.frequency_max)
         else:
             engine = Rays(

@@ -320,3 +320,21 @@ def test_strongly_curved_places_scatter_by_their_share_of_turning():
     mean = np.exp(-4j * np.pi * np.outer(slow, way) / SPEED).mean(axis=1)
     expected = measure / (2 * math.pi * 0.3**2) * mean
     np.testing.assert_allclose(spectrum(found, slow), expected, rtol=0.03)
+
+
+def test_triangles_without_area_change_nothing():
+    """Slivers of three points in line, on an edge and afloat, and corners that coincide."""
+    corners = np.asarray(CUBE.vertices)
+    one, two = corners[np.asarray(CUBE.edges_unique)[0]]
+    extra = np.array(
+        [one, (one + two) / 2, two, [0.1, 0.1, 0.1], [0.1, 0.1, 0.11], [0.1, 0.1, 0.13]]
+    )
+    first = len(corners)
+    slivers = [[first, first + 1, first + 2], [first + 3, first + 4, first + 5], [0, 0, 1]]
+    dirty = trimesh.Trimesh(
+        np.vstack([corners, extra]), np.vstack([CUBE.faces, slivers]), process=False
+    )
+    clean = trimesh.Trimesh(corners, CUBE.faces, process=False)
+    expected = edges_only(clean, [0.2, 0.17, 0.22])
+    found = edges_only(dirty, [0.2, 0.17, 0.22])
+    np.testing.assert_allclose(found, expected, atol=1e-9 * np.abs(expected).max())

@@ -303,3 +303,9 @@ def test_settings_of_the_rays_go_through():
     wanted = {"rays": 1234, "bounces": 2, "diffraction_points": 77}
     engine = simulator(load_scene("sphere"), simulation=wanted).engine
     assert (engine.rays, engine.bounces, engine.diffraction_points) == (1234, 2, 77)
+
+
+@pytest.mark.parametrize(("material", "lines"), [("rigid", 0), ("sonotracelab", 1)])
+def test_kirchhoff_says_that_it_leaves_lobes_out(material, lines, caplog):
+    simulator(load_scene("sphere", {"material": material}), simulation={"engine": "kirchhoff"})
+    assert len([r for r in caplog.records if "lobes are left out" in r.getMessage()]) == lines
