@@ -93,8 +93,8 @@ def test_materials_that_make_no_sense_are_refused_in_one_line(arguments, match):
 
 
 def test_one_node_is_enough():
-    Material((1e5,), (0.5,), (1.0,), (1.0,), diffraction=None)
-    Material((1e5,), None, (1.0,), (1.0,), diffraction=(1.0,))
+    assert Material((1e5,), (0.5,), (0.9,), (1.0,), diffraction=None).strength == (0.9,)
+    assert Material((1e5,), None, (1.0,), (0.8,), diffraction=(1.0,)).reflection == (0.8,)
 
 
 def test_one_value_holds_at_all_nodes():

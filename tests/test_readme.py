@@ -77,7 +77,10 @@ def test_the_files_and_scenes_it_names_are_there():
 
 @pytest.mark.parametrize("code", blocks("python", GUIDES))
 def test_the_code_of_the_guides_runs(code):
-    exec(compile(code, "guide", "exec"), {})
+    names = {}
+    exec(compile(code, "guide", "exec"), names)
+    assert names["waveform"].any()
+    assert names["magnitude"].shape == (2, len(names["simulator"].range), 47)
 
 
 def test_the_scene_of_a_file_is_there():

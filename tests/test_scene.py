@@ -47,7 +47,7 @@ def test_sizes_that_speak_of_another_unit_are_refused(size, unit):
 
 @pytest.mark.parametrize("size", [99.0, 1.1e-3])
 def test_sizes_within_the_bounds_pass(size):
-    Scene(box(size))
+    assert Scene(box(size)).mesh.extents.max() == pytest.approx(size)
 
 
 @pytest.mark.parametrize(

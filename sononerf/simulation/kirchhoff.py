@@ -124,22 +124,7 @@ class Kirchhoff(Engine):
         *,
         seed: int,  # noqa: ARG002  (nothing is random)
     ) -> NDArray[np.float64]:
-        """Pressure at both ears for a call that is one sample of height 1.
-
-        Parameters
-        ----------
-        position : (3,) float64, m
-            Of the head, world frame.
-        rotation : (3, 3) float64
-            Head to world.
-        seed : int
-            Without effect; nothing is random.
-
-        Returns
-        -------
-        echo : (E, S) float64
-            From the emission to the end of the last analysis frame.
-        """
+        """Pressure at both ears; see :meth:`Engine.echo`."""
         emitter, ears = self.hearing.places(position, rotation)
         sound = self.hearing.silence()
         for elements in self._elements(emitter, ears):

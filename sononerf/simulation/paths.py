@@ -201,9 +201,8 @@ def trace(
         hits = caster.first_hit(hits.points + caster.lift * flat, onward)
         further = hits.ray
         incoming, turn = onward.take(further, axis=0), turned.take(further, axis=2)
-        ahead = _single(incoming)
+        # What of it goes along the ray is lost where the bundle lands.
         shift = footprint.shift.take(further, axis=2) + hits.distance.astype(np.float32) * turn
-        shift -= dots(shift, ahead)[:, None] * ahead  # what goes along the ray is no move of it
         ray, emitted = ray.take(further), emitted.take(further, axis=0)
         length = length.take(further) + hits.distance
         triangles = np.concatenate(

@@ -45,21 +45,22 @@ class Rays(Engine):
     Rays fill the cap under which the emitter sees the scene, each standing for the same solid
     angle :math:`d\Omega`. Every hit is heard by every ear that sees it, with the pressure
 
-    .. math:: \frac{j f}{c}\, \frac{\sqrt{d\Omega\, dA}}{r_2}\, s\,
-        e^{-\theta^2 / 2 w^2}\, e^{-j k (r_1 + r_2)}\, 10^{-\alpha (r_1 + r_2) / 20}\, B\, E \prod q
+    .. math:: \frac{j f}{c}\, \frac{\sqrt{d\Omega\, dA}}{r_2}\, s\, l\,
+        e^{-j k (r_1 + r_2)}\, 10^{-\alpha (r_1 + r_2) / 20}\, B\, E \prod q
 
     where :math:`dA` is the cross-section of the ray's bundle at the hit (:math:`r_1^2 d\Omega`
     the first time; ray differentials carry it over the bounces), :math:`r_1` the path from the
-    emitter to the hit, :math:`r_2` from there to the ear, :math:`s, w, q` the material's strength,
-    lobe width and the part kept at earlier bounces, :math:`\theta` the angle off the mirror
-    direction, :math:`\alpha` the air's absorption, :math:`B, E` the gains of beam and ear.
+    emitter to the hit, :math:`r_2` from there to the ear, :math:`s, q` the material's strength and
+    the part kept at earlier bounces, :math:`l` its lobe, or of a smooth surface the fade about the
+    mirror point (:meth:`Reflection.heard`), :math:`\alpha` the air's absorption, :math:`B, E` the
+    gains of beam and ear.
 
     It is Kirchhoff's integral over what is lit,
     :math:`(j k / 2 \pi) \int p\, \cos\vartheta\, e^{-j k r_2} / r_2\, dS`, with the pressure
     :math:`p` that geometrical acoustics brings there, :math:`\sqrt{d\Omega / dA}`, and
     :math:`dA = \cos\vartheta\, dS`: so the level is absolute and does not depend on the number
     of rays, a plate answers as :math:`1/2h` and a sphere as :math:`a / 2 r^2`. Phase shifts at
-    foci of hollow surfaces are left out.
+    foci of hollow surfaces are left out, but for those after the last bounce.
 
     Parameters
     ----------
@@ -90,11 +91,12 @@ class Rays(Engine):
         )
         synthesis = hearing.synthesis
         _, gain = unfaded(synthesis.frequency, speed_of_sound=hearing.speed_of_sound)
-        self._smooth = any(of_part.material.lobe_width is None for of_part in self.reflections)
-        self._basis = synthesis.hats * gain[:, None] if self._smooth else synthesis.basis
+        self._smooth = np.array([r.material.lobe_width is None for r in self.reflections])
+        any_smooth = bool(self._smooth.any())
+        self._basis = synthesis.hats * gain[:, None] if any_smooth else synthesis.basis
         # Beside smooth surfaces lobed ones go through the same filters: their level is theirs.
         _, gain = unfaded(synthesis.nodes, speed_of_sound=hearing.speed_of_sound)
-        self._lobed_level = synthesis.nodes / np.abs(gain) if self._smooth else 1.0
+        self._lobed_level = synthesis.nodes / np.abs(gain) if any_smooth else 1.0
         wavenumber = 2.0 * math.pi / hearing.speed_of_sound * synthesis.nodes
         self._wavenumber = wavenumber.astype(np.float32)
         self._reach = max(of_part.reach for of_part in self.reflections)
@@ -105,22 +107,7 @@ class Rays(Engine):
     def echo(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
     ) -> NDArray[np.float64]:
-        """Pressure at both ears for a call that is one sample of height 1.
-
-        Parameters
-        ----------
-        position : (3,) float64, m
-            Of the head, world frame.
-        rotation : (3, 3) float64
-            Head to world.
-        seed : int
-            Turns and shifts the pattern of rays as a whole.
-
-        Returns
-        -------
-        echo : (E, S) float64
-            From the emission to the end of the last analysis frame.
-        """
+        """Pressure at both ears; the seed turns and shifts the pattern of rays as a whole."""
         first, second, third = np.random.default_rng(seed).random(3)
         sound = self.hearing.silence()
         for bounce in self._paths(position, rotation, (first, second), self.bounces):
@@ -260,7 +247,8 @@ class Rays(Engine):
         near = near[np.flatnonzero(seen)]
         gain = self._gain(bounce, near, towards.take(near, axis=0), detour.take(near))
         bend = stiffness.take(near) * np.float32(bounce.solid_angle)
-        coarse = np.flatnonzero(bend * self._wavenumber[-1] > FINE)
+        coarse = bend * self._wavenumber[-1] > FINE
+        coarse = np.flatnonzero(coarse & self._smooth[self._part(bounce.triangles[near, -1])])
         gain[coarse] *= coarse_gain(np.multiply.outer(bend.take(coarse), self._wavenumber))
         return near, gain, spread.take(near)
 
@@ -291,8 +279,7 @@ class Rays(Engine):
         for index, reflection in enumerate(self.reflections):
             of_part = part == index
             found = reflection.heard(cosine[of_part], detour[of_part], curvature[of_part])
-            lobed = reflection.material.lobe_width is not None
-            gain[of_part] = found * self._lobed_level if lobed else found
+            gain[of_part] = found if self._smooth[index] else found * self._lobed_level
         return gain
 
     def _part(self, triangle: NDArray[np.int64]) -> NDArray[np.int64]:

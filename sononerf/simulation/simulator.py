@@ -112,22 +112,7 @@ class Simulator:
     def echo(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
     ) -> NDArray[np.float64]:
-        """Pressure at both ears for a call that is one sample of height 1.
-
-        Parameters
-        ----------
-        position : (3,) float64, m
-            Of the head, world frame.
-        rotation : (3, 3) float64
-            Head to world.
-        seed : int
-            Of whatever is random; rays turn and shift their pattern as a whole.
-
-        Returns
-        -------
-        echo : (E, S) float64
-            From the emission to the end of the last analysis frame.
-        """
+        """Pressure at both ears for an impulse; see :meth:`Engine.echo`."""
         return self.engine.echo(position, rotation, seed=seed)
 
     def spectrogram(

@@ -65,10 +65,12 @@ def test_what_is_shown_is_the_first_validation_pose(training, monkeypatch):
 
 
 def test_nothing_without_poses_or_without_tensorboard(training, monkeypatch):
-    monkeypatch.setattr(images_module, "spectrogram_image", None)
+    drawn = []
+    monkeypatch.setattr(images_module, "spectrogram_image", lambda *given: drawn.append(given))
     made = training(logger=True)
     made.trainer.callbacks.append(callback(made, poses=[]))
     made.train()
     made = training()
     made.trainer.callbacks.append(callback(made))
     made.train()
+    assert drawn == []

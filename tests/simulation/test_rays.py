@@ -388,3 +388,18 @@ def test_a_pickled_engine_with_edges_says_the_same():
     assert np.abs(expected).max() > 0.0
     again = pickle.loads(pickle.dumps(engine))
     np.testing.assert_array_equal(echoes(again, [0.2, 0.1, 0.1]), expected)
+
+
+@pytest.mark.parametrize(("lobe_width", "corrected"), [(None, True), ((0.5,), False)])
+def test_only_smooth_surfaces_are_made_good_for_coarse_cells(lobe_width, corrected, monkeypatch):
+    """A lobe is no integral over Fresnel zones: there is nothing that coarse cells take from it."""
+    asked = []
+
+    def counting(bend):
+        asked.append(len(bend))
+        return np.ones_like(bend)
+
+    monkeypatch.setattr("sononerf.simulation.rays.coarse_gain", counting)
+    material = replace(PLAIN, lobe_width=lobe_width)
+    echoes(rays(ball(0.03), material, rays=300), [0.3, 0.0, 0.0])
+    assert (sum(asked) > 0) == corrected
