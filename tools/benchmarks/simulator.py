@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: MIT
+"""What the simulator costs, and how much its random rays leave to chance."""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import statistics
+import sys
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf.acoustics.spectrogram import compress
+from sononerf.config import Settings, validate_settings
+from sononerf.reconstruction.prediction import mae_db
+from sononerf.scene import load_scene
+from sononerf.simulation.ensemble import ensemble_poses, pose_seed
+from sononerf.simulation.simulator import Simulator
+
+REFERENCE_RATIO = 1e-3  # the reported decibels start 60 dB below the greatest magnitude
+
+
+class Recorder:
+    """Keeps what the ray caster asks of Embree, to ask it again without anything else."""
+
+    def __init__(self, engine: Any) -> None:
+        self.engine = engine
+        self.asked: list[tuple[str, tuple[NDArray[np.float32], ...]]] = []
+
+    def first(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> Any:
+        """Pass on, and keep."""
+        given = origins.astype(np.float32), directions.astype(np.float32)
+        self.asked.append(("INTERSECT", given))
+        return self.engine.first(origins, directions)
+
+    def blocked(self, origins: NDArray[np.float64], spans: NDArray[np.float64]) -> Any:
+        """Pass on, and keep."""
+        given = origins.astype(np.float32), spans.astype(np.float32)
+        self.asked.append(("OCCLUDED", given))
+        return self.engine.blocked(origins, spans)
+
+    def replay(self) -> tuple[float, int]:
+        """Return the seconds that the same rays take, and how many they are."""
+        scene, total = self.engine._scene, 0
+        start = time.perf_counter()
+        for query, (origins, directions) in self.asked:
+            extra = {"dists": np.ones(len(origins), np.float32)} if query == "OCCLUDED" else {}
+            scene.run(origins, directions, query=query, **extra)
+            total += len(origins)
+        return time.perf_counter() - start, total
+
+
+def settings_for(arguments: argparse.Namespace, **simulation: Any) -> Settings:
+    """Return the defaults, but for what was asked for."""
+    simulation = {"bounces": arguments.bounces, **simulation}
+    plain = {"scene": {"name": arguments.scene}, "simulation": simulation}
+    return validate_settings(plain, "benchmark")
+
+
+def simulate(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Time the simulator against Embree alone, pose by pose in turn."""
+    settings = settings_for(arguments, rays=arguments.rays)
+    scene = load_scene(arguments.scene)
+    simulator = Simulator.from_settings(scene, settings)
+    poses, _ = ensemble_poses(settings)
+    recorder = Recorder(simulator.engine.caster._engine)
+    whole, bare, rays = [], [], []
+    for index in range(-1, min(arguments.poses, len(poses))):
+        number = max(index, 0)
+        pose = poses.positions[number], poses.rotations[number]
+        seed = pose_seed(0, number)
+        start = time.perf_counter()
+        simulator.spectrogram(*pose, seed=seed)
+        seconds = time.perf_counter() - start
+        simulator.engine.caster._engine = recorder
+        recorder.asked.clear()
+        simulator.spectrogram(*pose, seed=seed)
+        simulator.engine.caster._engine = recorder.engine
+        alone, count = recorder.replay()
+        if index >= 0:  # the first call of all builds tables
+            whole.append(seconds)
+            bare.append(alone)
+            rays.append(count)
+        print(f"\r{index + 1} of {arguments.poses}", end="", file=sys.stderr, flush=True)
+    print(file=sys.stderr)
+    return {
+        "scene": arguments.scene,
+        "triangles": len(scene.mesh.faces),
+        "rays": arguments.rays,
+        "bounces": arguments.bounces,
+        "poses": len(whole),
+        "total_s": sum(whole),
+        "embree_s": sum(bare),
+        "ratio": sum(whole) / sum(bare),
+        "pose_median_s": statistics.median(whole),
+        "embree_rays_per_pose": sum(rays) / len(rays),
+        "peak_memory_bytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+    }
+
+
+def noise(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Compare simulations of the test poses that differ in their rays alone."""
+    scene = load_scene(arguments.scene)
+    default = settings_for(arguments)
+    rays = default.simulation.rays
+    poses, split = ensemble_poses(default)
+    chosen = np.flatnonzero(split == 2)[: arguments.poses]
+
+    def spectrograms(count: int, seed: int) -> NDArray[np.float64]:
+        simulator = Simulator.from_settings(scene, settings_for(arguments, rays=count))
+        return np.stack(
+            [
+                simulator.spectrogram(
+                    poses.positions[i], poses.rotations[i], seed=pose_seed(seed, int(i))
+                )
+                for i in chosen
+            ]
+        )
+
+    first = spectrograms(rays, 0)
+    reference = REFERENCE_RATIO * float(first.max())
+    level = compress(first, reference)
+    found: dict[str, Any] = {"scene": arguments.scene, "rays": rays, "poses": len(chosen)}
+    for name, count, seed in (
+        ("other_seed", rays, 1),
+        ("twice_the_rays", 2 * rays, 2),
+        ("16_times_the_rays", 16 * rays, 3),
+    ):
+        other = compress(spectrograms(count, seed), reference)
+        active = (level >= 3.0) | (other >= 3.0)
+        found[name] = {
+            "mae_db": mae_db(level, other),
+            "mae_db_active": mae_db(level, other, active=True),
+            "mean_level_db_active": float((other - level)[active].mean()),
+        }
+        print(name, found[name], file=sys.stderr, flush=True)
+    return found
