@@ -238,6 +238,8 @@ class FitSettings(_Section):
     staircase_factor: Annotated[float, Field(gt=0, le=1)] = 0.97
     staircase_epochs: Count = 20
     loss: Literal["l1", "l2", "l1_4l2"] = "l1"
+    early_range_db: Annotated[float, Field(gt=0, le=200)] = 30.0  # second bounces lie below it
+    early_share: Annotated[float, Field(ge=0, le=1)] = 0.75
     silent_weight: Annotated[float, Field(ge=0)] = 1.0
     gradient_clip: Positive | None = None
     seed: Seed = 0

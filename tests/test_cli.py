@@ -185,7 +185,7 @@ def test_the_numbers_are_those_of_schema_one(smoke):
     assert metrics["geometry"].keys() == geometry
     assert metrics["geometry"]["fscore"].keys() == {"0.001", "0.002", "0.005"}
     assert metrics["baseline"]["backprojection"].keys() == geometry
-    assert metrics["baseline"]["voxels"] is None
+    assert metrics["baseline"]["voxels"].keys() == geometry
     assert metrics["cost"].keys() == {
         *("simulate_s", "fit_s", "reconstruct_s", "steps", "points_evaluated"),
         *("peak_memory_bytes", "device", "parameters"),
@@ -198,7 +198,9 @@ def test_it_learns(smoke):
     events = EventAccumulator(str(smoke.run / "tensorboard"))
     events.Reload()
     losses = [scalar.value for scalar in events.Scalars("train/loss")]
-    assert np.mean(losses[-3:]) < 0.6 * np.mean(losses[:3])
+    # For three quarters of the fit the loss hears the loud echoes alone, then the faint ones too.
+    early = losses[: len(losses) * 3 // 4]
+    assert np.mean(early[-3:]) < 0.6 * np.mean(early[:3])
     errors = [scalar.value for scalar in events.Scalars("val/mae_db")]
     assert errors == sorted(errors, reverse=True)
     assert {"spectrogram", "mip/x"} <= set(events.Tags()["images"])

@@ -105,7 +105,6 @@ def test_losses_by_hand(loss, monkeypatch):
 def test_the_fit_may_compress_otherwise():
     """40 dB instead of 60: the floor is ten times as high, and the error a part of 40."""
     found = module(Given(PREDICTED), dynamic_range_db=40.0)
-    assert found.fit_reference == pytest.approx(0.01)
 
     def level(x):
         return 20 * math.log10(1 + x / 0.01)
@@ -113,6 +112,55 @@ def test_the_fit_may_compress_otherwise():
     pairs = zip(PREDICTED.flatten().tolist(), MEASURED.flatten().tolist(), strict=True)
     expected = np.mean([abs(level(p) - level(m)) / 40 for p, m in pairs])
     assert float(found._loss(PREDICTED, MEASURED).detach()) == pytest.approx(expected, rel=1e-4)
+
+
+def level_above(reference, value):
+    return 20 * math.log10(1 + value / reference)
+
+
+def test_the_fit_first_hears_what_is_loud(monkeypatch):
+    found = module(Given(PREDICTED), early_range_db=30.0, early_share=0.75)
+    assert [found.range_db(step) for step in (0, 74, 75, 100)] == [30.0, 30.0, 60.0, 60.0]
+    # Never farther down than later, and from the first step where no share is early.
+    assert module(Given(PREDICTED), early_range_db=90.0, early_share=1.0).range_db(5) == 60.0
+    assert module(Given(PREDICTED), early_range_db=30.0, early_share=0.0).range_db(0) == 60.0
+    # Of 100 steps the loss hears 30 dB in the 74th, and 60 dB from the 75th.
+    monkeypatch.setattr(found.renderer, "prepare", lambda *_: False)
+    pairs = list(zip(PREDICTED.flatten().tolist(), MEASURED.flatten().tolist(), strict=True))
+    for step, span, reference in ((74, 30, 0.001 * 10**1.5), (75, 60, 0.001)):
+        monkeypatch.setattr(type(found), "global_step", step)
+        values = logged(found, monkeypatch)
+        expected = np.mean(
+            [abs(level_above(reference, p) - level_above(reference, m)) / span for p, m in pairs]
+        )
+        found.training_step(batch(MEASURED), 0)
+        assert values["train/loss"] == pytest.approx(expected, rel=1e-4)
+    assert expected == pytest.approx(LOSSES["l1"], rel=1e-4)
+
+
+def test_what_is_silent_at_first_is_judged_by_what_is_heard_at_first():
+    """20 dB above a floor 30 dB lower is 2.3 dB above the higher one."""
+    quiet = torch.full((1, 1, 1, 1), 0.001 * 9)
+    measured = torch.cat((torch.zeros(1, 1, 1, 1), torch.ones(1, 1, 1, 1)), dim=3)
+    predicted = torch.cat((quiet, torch.ones(1, 1, 1, 1)), dim=3)
+    found = module(Given(predicted), early_range_db=30.0, early_share=1.0, silent_weight=0.5)
+    assert 0 < level_above(10**-1.5, 0.009) < 3
+    expected = 0.5 * level_above(10**-1.5, 0.009) / 30 / 1.5
+    assert float(found._loss(predicted, measured).detach()) == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_field_hears_how_far_the_fit_is_before_it_is_asked(monkeypatch):
+    found = module(Given(PREDICTED), total_steps=40)
+    logged(found, monkeypatch)
+    calls = []
+    monkeypatch.setattr(found.field, "advance", lambda *given: calls.append(("advance", *given)))
+    monkeypatch.setattr(
+        found.renderer, "prepare", lambda *given: calls.append(("prepare", given[2]))
+    )
+    for step in (0, 7):
+        monkeypatch.setattr(type(found), "global_step", step)
+        found.training_step(batch(MEASURED), 0)
+    assert calls == [("advance", 0, 40), ("prepare", 0), ("advance", 7, 40), ("prepare", 7)]
 
 
 def test_silent_cells_may_weigh_less():

@@ -146,6 +146,8 @@ def module_for(
         renderer,
         reference=reference,
         dynamic_range_db=settings.spectrogram.dynamic_range_db,
+        early_range_db=fit.early_range_db,
+        early_share=fit.early_share,
         possible=possible,
         learning_rate=fit.learning_rate or field.learning_rate,
         total_steps=total_steps,
@@ -158,3 +160,11 @@ def module_for(
         silent_weight=fit.silent_weight,
         seed=fit.seed,
     )
+
+
+def heard_from(renderer: Renderer, store: EnsembleStore) -> Tensor:
+    """Return where the training poses listened, half way from emitter to ears, (P, 3) m."""
+    train = store.indices("train")
+    middle = ((renderer.emitter + renderer.ear_positions.mean(0)) / 2).double().cpu().numpy()
+    rotations = np.asarray(store.rotations)[train]
+    return _tensor(np.asarray(store.positions)[train] + rotations @ middle)

@@ -27,7 +27,13 @@ from sononerf.config import Settings
 from sononerf.data.datamodule import EchoDataModule
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import NumericalError, ResourceError, StoppedError
-from sononerf.experiment.build import check_plugins, echo_region, field_and_renderer, module_for
+from sononerf.experiment.build import (
+    check_plugins,
+    echo_region,
+    field_and_renderer,
+    heard_from,
+    module_for,
+)
 from sononerf.experiment.run_folder import RunFolder
 from sononerf.experiment.simulate import simulate, store_path
 from sononerf.module import EchoModule
@@ -36,6 +42,8 @@ from sononerf.scene import load_scene
 from sononerf.weights import save_weights
 
 WAIT_SECONDS = 0.5
+LEAST_STEPS = 60
+"""A pass over few poses takes fewer steps than a field needs: an epoch is then several."""
 
 
 def quiet_lightning() -> None:
@@ -169,7 +177,7 @@ def fit(
 def _length(settings: Settings, per_pass: int) -> tuple[int, int]:
     """Return steps per epoch and steps in all."""
     steps = settings.fit.steps_per_epoch
-    per_epoch = per_pass if steps == "auto" else steps
+    per_epoch = max(per_pass, LEAST_STEPS) if steps == "auto" else steps
     total = per_epoch * settings.fit.epochs
     if settings.fit.max_steps is not None:
         total = min(total, settings.fit.max_steps)
@@ -284,6 +292,7 @@ def _finish(
         return
     state = {f"field.{k}": v for k, v in module.field.state_dict().items()}
     state |= {f"renderer.{k}": v for k, v in module.renderer.state_dict().items()}
+    state["heard_from"] = heard_from(module.renderer, store)
     run.write_metrics(
         "cost",
         {

@@ -41,6 +41,7 @@ class Fitted:
     settings: Settings
     module: EchoModule
     echo_hash: str
+    heard_from: torch.Tensor  # (P, 3) m, the training poses' heads
 
 
 def load_fitted(path: Path) -> Fitted:
@@ -63,8 +64,9 @@ def load_fitted(path: Path) -> Fitted:
         reference = float(description["reference"])
         echoes = str(description["echo_hash"])
         region = state["field.region"]
+        heard_from = state["heard_from"]
     except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path / 'model.json'}: incomplete ({error}); repeat the fit") from None
+        raise InputError(f"{path}: incomplete ({error}); repeat the fit") from None
     except SettingsError as error:
         raise IncompatibleError(f"settings of another version: {error}") from None
     field, renderer = field_and_renderer(settings, region)
@@ -79,7 +81,7 @@ def load_fitted(path: Path) -> Fitted:
                 f"{settings.renderer.kind} of this version: {str(error).splitlines()[-1].strip()}"
             ) from None
     module.eval()
-    return Fitted(settings, module, echoes)
+    return Fitted(settings, module, echoes, heard_from)
 
 
 def store_of(fitted: Fitted) -> EnsembleStore:

@@ -4,23 +4,31 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import torch
 import trimesh
+from numpy.typing import NDArray
 
 from sononerf import storage
+from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, NumericalError, SonoNerfError
+from sononerf.experiment.build import acquisition
 from sononerf.experiment.predict import Fitted, load_fitted, store_of
 from sononerf.experiment.run_folder import RunFolder
 from sononerf.progress import Progress
 from sononerf.reconstruction.baseline import backprojection, best_level_surface
+from sononerf.reconstruction.confidence import poses_that_saw
 from sononerf.reconstruction.mesh import MeshFormat, mesh_bytes
 from sononerf.reconstruction.metrics import geometry_metrics
 from sononerf.reconstruction.read_out import reconstruct as read_out
-from sononerf.reconstruction.volume import vti_bytes
-from sononerf.render.mesh import mesh_png, side_by_side_png
+from sononerf.reconstruction.truth import TrueSurface
+from sononerf.reconstruction.volume import Volume, vti_bytes
+from sononerf.reconstruction.voxels import voxel_fit
+from sononerf.render.mesh import confidence_png, mesh_png, side_by_side_png
 from sononerf.render.projection import mip_pngs
 from sononerf.scene import load_scene
 
@@ -65,14 +73,19 @@ def reconstruct(
     with progress.task("reconstructing", 1000) as task, torch.inference_mode():
         found = read_out(
             fitted.module.field,
+            heard_from=fitted.heard_from,
             spacing=spacing or options.spacing,
             level=options.level if level is None else level,
             method=options.method,
             directions=options.directions,
             progress=lambda done, total: task.advance(1000 * done // total - task.done),
         )
+    seen = None if found.glints is None else poses_that_saw(found.mesh, found.glints)
     for kind in FORMATS:
-        storage.commit_bytes(folder / f"mesh.{kind}", mesh_bytes(found.mesh, kind))
+        data = mesh_bytes(found.mesh, kind, confidence=seen)
+        storage.commit_bytes(folder / f"mesh.{kind}", data)
+    if seen is not None:
+        storage.commit_bytes(folder / "confidence.png", confidence_png(found.mesh, seen))
     storage.commit_bytes(folder / "volume.vti", vti_bytes(found.volume))
     for axis, picture in mip_pngs(found.volume).items():
         storage.commit_bytes(folder / f"mip_{axis}.png", picture)
@@ -99,7 +112,7 @@ def true_mesh(fitted: Fitted) -> trimesh.Trimesh | None:
 
 
 def evaluate(path: Path, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Compare a reconstruction with the true scene, and the backprojection baseline likewise.
+    """Compare a reconstruction with the true scene, and the baselines likewise.
 
     Parameters
     ----------
@@ -123,13 +136,15 @@ def evaluate(path: Path, *, progress: Progress | None = None) -> dict[str, Any]:
     geometry: dict[str, Any] | None = None
     baseline: dict[str, Any] = {"backprojection": None, "voxels": None}
     if truth is not None:
-        with progress.task("evaluating", 2) as task:
+        with progress.task("evaluating", 3) as task:
             mesh = _read_mesh(folder / "mesh.ply")
             level = storage.read_json(folder / "read_out.json")["level"]
-            geometry = {**geometry_metrics(mesh, truth), "level": level}
+            true = TrueSurface(truth)
+            geometry = {**geometry_metrics(mesh, true), "level": level}
             task.advance()
-            baseline["backprojection"] = _backprojection(fitted, truth)
-            task.advance()
+            for name, volume in _baselines(fitted):
+                baseline[name] = _at_best_level(volume, true)
+                task.advance()
     run.write_metrics("geometry", geometry)
     run.write_metrics("baseline", baseline)
     return run.read_metrics()
@@ -145,22 +160,42 @@ def _read_mesh(path: Path) -> trimesh.Trimesh:
     return mesh
 
 
-def _backprojection(fitted: Fitted, truth: trimesh.Trimesh) -> dict[str, Any] | None:
+def _baselines(fitted: Fitted) -> Iterator[tuple[str, Volume]]:
+    """Yield what needs no learning, read out on one grid: backprojection and voxel fit."""
     store = store_of(fitted)
     train = store.indices("train")
+    known = acquisition(fitted.settings)
     lower, upper = (corner.double().numpy() for corner in fitted.module.field.region)
-    renderer = fitted.module.renderer
-    volume = backprojection(
-        (store.read_pose(int(index)) for index in train),
+    given = (
         store.positions[train],
         store.rotations[train],
         store.range,
         lower,
         upper,
         float((upper - lower).max()) / BASELINE_VOXELS,
-        emitter_offset=renderer.emitter.double().numpy(),
-        ear_offsets=renderer.ear_positions.double().numpy(),
     )
+    emitter, ears = known.emitter.double().numpy(), known.ear_positions.double().numpy()
+    yield (
+        "backprojection",
+        backprojection(_heard(store, train), *given, emitter_offset=emitter, ear_offsets=ears),
+    )
+    fitted_voxels = voxel_fit(
+        _heard(store, train),
+        *given,
+        emitter_offset=emitter,
+        ear_offsets=ears,
+        # Of a sweep each row has a window of its own; where rows are added up, their mean.
+        window=known.window.double().square().mean(dim=0).numpy(),
+        window_step=known.speed_of_sound / known.sampling_rate / 2,
+    )
+    yield "voxels", fitted_voxels
+
+
+def _heard(store: EnsembleStore, indices: NDArray[np.int64]) -> Iterator[NDArray[np.float32]]:
+    return (store.read_pose(int(index)) for index in indices)
+
+
+def _at_best_level(volume: Volume, truth: TrueSurface) -> dict[str, Any] | None:
     try:
         mesh, level = best_level_surface(volume, truth)
     except NumericalError:

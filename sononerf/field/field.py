@@ -79,6 +79,20 @@ class Field(nn.Module):
         self.occupancy = near > 0
         self.cell = torch.full_like(self.cell, cell)
 
+    def advance(self, step: int, total: int) -> None:
+        """Hear how far the fit is, before each training step; a field may change with that.
+
+        What changes has to lie in a buffer, so that a loaded field is the fitted one.
+
+        Parameters
+        ----------
+        step : int
+            Number of the training step, from 0.
+        total : int
+            How many steps the fit has.
+        """
+        del step, total
+
     @property
     def resolution(self) -> float:
         """Spacing in metres that resolves the field."""
@@ -121,6 +135,57 @@ class Field(nn.Module):
         """
         response: Tensor = self(positions.expand(directions.shape), directions)
         return response if bins is None else response[..., bins]
+
+    @torch.no_grad()
+    def audible(self, positions: Tensor, directions: Tensor) -> Tensor:
+        """Return which places answer at all towards which directions.
+
+        Parameters
+        ----------
+        positions : (N, 3) float, m
+            Places, world frame.
+        directions : (P, N, 3) float
+            Unit vectors to the emitter, for several poses.
+
+        Returns
+        -------
+        audible : (P, N) bool
+            False only where the answer may be left out.
+        """
+        del positions
+        return torch.ones_like(directions[..., 0], dtype=torch.bool)
+
+    def echo(
+        self,
+        positions: Tensor,
+        directions: Tensor,
+        bins: Tensor | None,
+        place: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return what places answer, and from how much nearer than they lie.
+
+        Parameters
+        ----------
+        positions : (N, 3) float, m
+            Places, world frame.
+        directions : (M, 3) float
+            Unit vectors to the emitter.
+        bins : (B,) int or None
+            Which frequencies; all where None.
+        place : (M,) int or None
+            Which place each direction is for, so that what a place is need be found out once
+            for all directions; each its own where None.
+
+        Returns
+        -------
+        reflectivity : (M, B) float or complex
+            As of :meth:`select`.
+        lead : (M,) float, m
+            A place that stands for a piece of curved surface answers off its axis from another
+            point of it, which lies this much nearer.
+        """
+        there = positions if place is None else positions[place]
+        return self.select(there, directions, bins), torch.zeros_like(directions[:, 0])
 
     def inside(self, positions: Tensor) -> Tensor:
         """Return which places lie in the region, its faces included, (...,) bool."""

@@ -14,6 +14,12 @@ from torch import Tensor, nn
 from sononerf.field.field import Field
 
 LOG_STRENGTH_FLOOR = -18.0
+QUIETEST = -5.0
+"""A lobe is left out where it is this much below its own peak, as a natural logarithm: -43 dB."""
+CURVED_AFTER = 0.4
+"""Share of the fit after which places may be curved: before, they are not where they belong."""
+RADIUS_UNIT = 0.015
+"""What one unit of the learned number is in metres: how fast the radii are learned."""
 
 
 class GridField(Field):
@@ -25,6 +31,11 @@ class GridField(Field):
     interpolated values; :math:`m` points along the surface normal and its length is the
     lobe's concentration; :math:`\kappa_f` sharpens the lobe with frequency and :math:`s_f`
     is one spectrum for the whole field.
+
+    A lobe stands for a piece of surface between two vertices, which is curved: at an angle
+    :math:`\theta` off the axis the echo comes from :math:`R(x) (1 - \cos\theta)` nearer. Without
+    the radius of curvature :math:`R`, learned late, all echoes off the axis would be too far, and
+    the places would move outward to make up for it.
 
     Parameters
     ----------
@@ -45,6 +56,7 @@ class GridField(Field):
     learning_rate = 0.05
     knows_directions = True
     origin: Tensor
+    curved: Tensor
 
     def __init__(
         self,
@@ -64,12 +76,13 @@ class GridField(Field):
             spacing = min(max(spacing, finest), coarsest)
         self.spacing = spacing
         self.register_buffer("origin", region[0].clone())
+        self.register_buffer("curved", torch.zeros(()))
         self.grids = nn.ParameterList()
         for level in range(levels):
             step = spacing * 2**level
             size = [math.ceil(float(e) / step - 1e-6) + 1 for e in extent]
-            # Channels: log strength, lobe vector (x, y, z); grid_sample wants (Z, Y, X).
-            self.grids.append(nn.Parameter(torch.zeros(1, 4, size[2], size[1], size[0])))
+            # Channels: log strength, lobe vector (x, y, z), radius; grid_sample wants (Z, Y, X).
+            self.grids.append(nn.Parameter(torch.zeros(1, 5, size[2], size[1], size[0])))
         self.spectrum = nn.Parameter(torch.zeros(len(frequency)))
         self.sharpness = nn.Parameter(torch.zeros(len(frequency)))
 
@@ -78,9 +91,13 @@ class GridField(Field):
         """Vertex spacing of the finest level in metres."""
         return self.spacing
 
+    def advance(self, step: int, total: int) -> None:
+        """Let places be curved once they are about where they belong."""
+        self.curved.fill_(float(step >= CURVED_AFTER * total))
+
     def code(self, positions: Tensor) -> Tensor:
-        """Read log strength and lobe vector at (N, 3) places: (N, 4)."""
-        total = positions.new_zeros(positions.shape[0], 4)
+        """Read log strength, lobe vector and radius of curvature at (N, 3) places: (N, 5)."""
+        total = positions.new_zeros(positions.shape[0], 5)
         for level, grid in enumerate(self.grids):
             step = self.spacing * 2**level
             size = positions.new_tensor([grid.shape[4], grid.shape[3], grid.shape[2]]) - 1
@@ -94,7 +111,7 @@ class GridField(Field):
     def _log_response(self, code: Tensor, directions: Tensor, bins: Tensor | None) -> Tensor:
         spectrum = self.spectrum if bins is None else self.spectrum[bins]
         sharpness = (self.sharpness if bins is None else self.sharpness[bins]).exp()
-        strength, lobe = code[:, 0], code[:, 1:]
+        strength, lobe = code[:, 0], code[:, 1:4]
         # The small number keeps the gradient finite where there is no lobe yet.
         length = (lobe.square().sum(-1) + 1e-6).sqrt()
         tilt = (directions * lobe).sum(-1) - length  # (..., N), zero on the axis
@@ -106,6 +123,30 @@ class GridField(Field):
         """Return the reflectivity of (N, 3) places towards (..., N, 3) directions."""
         response = self._log_response(self.code(positions), directions, bins).exp()
         return response * self.inside(positions)[:, None]
+
+    @torch.no_grad()
+    def audible(self, positions: Tensor, directions: Tensor) -> Tensor:
+        """Return which places answer towards which directions, (P, N) bool."""
+        lobe = self.code(positions)[:, 1:4]
+        tilt = (directions * lobe).sum(-1) - lobe.norm(dim=-1)
+        return tilt * self.sharpness.min().exp() > QUIETEST
+
+    def echo(
+        self,
+        positions: Tensor,
+        directions: Tensor,
+        bins: Tensor | None,
+        place: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the reflectivity, (M, B), and how much nearer it comes from, (M,) m."""
+        code, inside = self.code(positions), self.inside(positions)
+        if place is not None:
+            code, inside = code[place], inside[place]
+        response = self._log_response(code, directions, bins).exp()
+        lobe = code[:, 1:4].detach()  # the range must not turn the lobes
+        cosine = (directions * lobe).sum(-1) / lobe.norm(dim=-1).clamp_min(1e-6)
+        lead = RADIUS_UNIT * self.curved * code[:, 4] * (1 - cosine)
+        return response * inside[:, None], lead
 
     def forward(self, positions: Tensor, directions: Tensor) -> Tensor:
         """Return the reflectivity, (..., F) float."""
@@ -122,10 +163,10 @@ class GridField(Field):
         """
         del directions
         code = self.code(positions)
-        length = code[:, 1:].norm(dim=-1)
+        length = code[:, 1:4].norm(dim=-1)
         concentration = length[:, None] * self.sharpness.exp()
         mean = -torch.expm1(-4 * concentration) / (4 * concentration).clamp_min(1e-12)
         mean = torch.where(concentration > 1e-6, mean, torch.ones_like(mean))
         power = (2 * (code[:, :1].clamp_min(LOG_STRENGTH_FLOOR) + self.spectrum)).exp() * mean
         energy = power.sum(-1) * self.inside(positions)
-        return energy, code[:, 1:] / length.clamp_min(1e-12)[:, None]
+        return energy, code[:, 1:4] / length.clamp_min(1e-12)[:, None]

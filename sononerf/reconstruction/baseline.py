@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import trimesh
@@ -11,12 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import NumericalError
 from sononerf.reconstruction.isosurface import isosurface
-from sononerf.reconstruction.solid import (
-    outer_surface,
-    sample_outer_surface,
-    sample_surface,
-    signed_distance,
-)
+from sononerf.reconstruction.nearest import Nearest
+from sononerf.reconstruction.solid import sample_surface
+from sononerf.reconstruction.truth import TrueSurface
 from sononerf.reconstruction.volume import Volume, grid_over
 
 # Levels tried by `best_level_surface`, as shares of the voxels that lie above, and what it scores.
@@ -75,6 +72,37 @@ def backprojection(
     ResourceError
         If the grid would not fit in memory.
     """
+    emitters, receivers, axis = places_heard_from(
+        positions, rotations, ranges, emitter_offset=emitter_offset, ear_offsets=ear_offsets
+    )
+    volume = grid_over(lower, upper, spacing)
+    points = volume.points().astype(np.float32)
+    step = float(np.diff(axis).mean())
+    total = np.zeros(len(points))
+    profiles = range_profiles(spectrograms, (*receivers.shape[:2], len(axis)))
+    for energy, emitter, ears in zip(profiles, emitters, receivers, strict=True):
+        outward = _distance(points, emitter)
+        for profile, receiver in zip(energy, ears, strict=True):
+            half = (outward + _distance(points, receiver)) * np.float32(0.5)
+            total += _interpolated(profile, half, axis[0], step)
+    return volume.with_values((total / max(len(emitters), 1)).reshape(volume.shape))
+
+
+def places_heard_from(
+    positions: ArrayLike,
+    rotations: ArrayLike,
+    ranges: ArrayLike,
+    *,
+    emitter_offset: ArrayLike,
+    ear_offsets: ArrayLike,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return where emitters (P, 3) and ears (P, E, 3) are in the world, and the ranges (R,), in m.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit or the ranges are not evenly spaced.
+    """
     heads = np.asarray(positions, dtype=np.float64)
     turns = np.asarray(rotations, dtype=np.float64)
     axis = np.asarray(ranges, dtype=np.float64)
@@ -86,29 +114,44 @@ def backprojection(
     steps = np.diff(axis)
     if len(axis) < 2 or not (steps > 0).all() or np.ptp(steps) > 1e-3 * steps.mean():
         raise ValueError("ranges: expected two or more, ascending and evenly spaced")
-    volume = grid_over(lower, upper, spacing)
-    points = volume.points().astype(np.float32)
     emitters = heads + turns @ np.asarray(emitter_offset, dtype=np.float64)
-    receivers = heads[:, None] + np.einsum("pij,ej->pei", turns, ears)
-    total = np.zeros(len(points))
+    return emitters, heads[:, None] + np.einsum("pij,ej->pei", turns, ears), axis
+
+
+def range_profiles(
+    spectrograms: Iterable[ArrayLike], shape: tuple[int, int, int]
+) -> Iterator[NDArray[np.float64]]:
+    """Yield each pose's energy, summed over frequency, (E, R).
+
+    Parameters
+    ----------
+    spectrograms : iterable of (E, R, F) float
+        Linear magnitude, one per pose; read one at a time.
+    shape : (P, E, R)
+        What is expected.
+
+    Raises
+    ------
+    ValueError
+        If there are more, fewer or other ones.
+    NumericalError
+        If one is not finite.
+    """
+    poses, ears, slices = shape
     count = 0
     for count, spectrogram in enumerate(spectrograms, start=1):
         magnitude = np.asarray(spectrogram)
-        if count > len(heads) or magnitude.shape[:2] != (len(ears), len(axis)):
+        if count > poses or magnitude.shape[:2] != (ears, slices):
             raise ValueError(
                 f"spectrogram {count - 1}: shape {magnitude.shape}, expected "
-                f"({len(ears)}, {len(axis)}, F), one for each of {len(heads)} poses"
+                f"({ears}, {slices}, F), one for each of {poses} poses"
             )
-        energy = np.square(magnitude, dtype=np.float64).sum(axis=2)  # (E, R)
+        energy = np.square(magnitude, dtype=np.float64).sum(axis=2)
         if not np.isfinite(energy).all():
             raise NumericalError(f"the spectrogram of pose {count - 1} is not finite")
-        outward = _distance(points, emitters[count - 1])
-        for ear, receiver in enumerate(receivers[count - 1]):
-            half = (outward + _distance(points, receiver)) * np.float32(0.5)
-            total += _interpolated(energy[ear], half, axis[0], float(steps.mean()))
-    if count != len(heads):
-        raise ValueError(f"spectrograms: {count}, expected one for each of {len(heads)} poses")
-    return volume.with_values((total / max(count, 1)).reshape(volume.shape))
+        yield energy
+    if count != poses:
+        raise ValueError(f"spectrograms: {count}, expected one for each of {poses} poses")
 
 
 def _distance(points: NDArray[np.float32], place: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -132,7 +175,9 @@ def _interpolated(
     return value
 
 
-def best_level_surface(volume: Volume, truth: trimesh.Trimesh) -> tuple[trimesh.Trimesh, float]:
+def best_level_surface(
+    volume: Volume, truth: trimesh.Trimesh | TrueSurface
+) -> tuple[trimesh.Trimesh, float]:
     """Extract the surface at the level that suits a baseline best, *knowing the truth*.
 
     A baseline has no rule for its level. Rather than put it at a disadvantage it is given the best
@@ -143,7 +188,7 @@ def best_level_surface(volume: Volume, truth: trimesh.Trimesh) -> tuple[trimesh.
     ----------
     volume : Volume
         Greater values are inside.
-    truth : Trimesh
+    truth : Trimesh or TrueSurface
         The true surface.
 
     Returns
@@ -158,8 +203,8 @@ def best_level_surface(volume: Volume, truth: trimesh.Trimesh) -> tuple[trimesh.
     NumericalError
         If no level gives a surface.
     """
-    target, _ = sample_outer_surface(truth, LEVEL_SAMPLES, seed=0)
-    surface = outer_surface(truth)
+    true = truth if isinstance(truth, TrueSurface) else TrueSurface(truth)
+    target, _ = true.samples(LEVEL_SAMPLES, 0)
     best: tuple[float, trimesh.Trimesh, float] | None = None
     for level in np.unique(np.quantile(volume.values, 1 - LEVEL_SHARES)):
         try:
@@ -167,8 +212,8 @@ def best_level_surface(volume: Volume, truth: trimesh.Trimesh) -> tuple[trimesh.
         except NumericalError:
             continue
         points, _ = sample_surface(mesh, LEVEL_SAMPLES, np.random.default_rng(0))
-        precision = (np.abs(signed_distance(points, surface)) <= LEVEL_DISTANCE).mean()
-        recall = (np.abs(signed_distance(target, mesh)) <= LEVEL_DISTANCE).mean()
+        precision = true.nearest.near(points, LEVEL_DISTANCE).mean()
+        recall = Nearest(mesh).near(target, LEVEL_DISTANCE).mean()
         score = float(2 * precision * recall / max(precision + recall, 1e-12))
         if best is None or score > best[0]:
             best = score, mesh, float(level)

@@ -10,19 +10,18 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sononerf.reconstruction.nearest import Nearest
 from sononerf.reconstruction.occupancy import volumes
 from sononerf.reconstruction.prediction import mae_db, prediction_metrics
 from sononerf.reconstruction.solid import (
     Solid,
     count_parts,
     outer_surface,
-    outer_surface_of,
     sample_outer_surface,
-    sample_solid,
     sample_surface,
-    signed_distance,
     solid_from_mesh,
 )
+from sononerf.reconstruction.truth import TrueSurface
 
 __all__ = [
     "geometry_metrics",
@@ -35,7 +34,7 @@ __all__ = [
 
 def geometry_metrics(
     reconstructed: trimesh.Trimesh,
-    truth: trimesh.Trimesh,
+    truth: trimesh.Trimesh | TrueSurface,
     *,
     samples: int = 100_000,
     seed: int = 0,
@@ -49,8 +48,10 @@ def geometry_metrics(
 
     Parameters
     ----------
-    reconstructed, truth : Trimesh
+    reconstructed : Trimesh
         Metres, world frame.
+    truth : Trimesh or TrueSurface
+        Likewise; where several are compared with it, the latter.
     samples : int
         Points drawn from each surface.
     seed : int
@@ -86,22 +87,22 @@ def geometry_metrics(
     """
     if samples < 1:
         raise ValueError(f"samples: {samples}, expected 1 or more")
-    true = solid_from_mesh(truth, drop_cavities=True)
+    true = truth if isinstance(truth, TrueSurface) else TrueSurface(truth)
     found = solid_from_mesh(reconstructed, drop_cavities=False)
     surface = trimesh.util.concatenate(found.parts)
-    true_points, true_normals = sample_solid(true, samples, seed)
+    true_points, true_normals = true.samples(samples, seed)
     points, face = sample_surface(surface, samples, np.random.default_rng([seed, 1]))
     normals = np.asarray(surface.face_normals)[face]
-    to_truth = np.abs(signed_distance(points, outer_surface_of(true)))
-    to_found = np.abs(signed_distance(true_points, surface))
+    to_truth = true.nearest.distance(points)
+    to_found = Nearest(surface).distance(true_points)
     return {
         "chamfer_m": float(to_truth.mean() + to_found.mean()) / 2,
         "fscore": {f"{limit:g}": _fscore(to_truth, to_found, limit) for limit in thresholds},
-        "thickness_bias_m": _thickness_bias(true, points, to_truth),
-        **_volume_metrics(found, true),
+        "thickness_bias_m": _thickness_bias(true.solid, points, to_truth),
+        **_volume_metrics(found, true.solid),
         "normal_consistency": _normal_consistency(points, normals, true_points, true_normals),
         "components": count_parts(found),
-        "components_true": count_parts(true),
+        "components_true": true.components,
     }
 
 
@@ -137,8 +138,17 @@ def _normal_consistency(
     true_points: NDArray[np.float64],
     true_normals: NDArray[np.float64],
 ) -> float:
-    there = cKDTree(true_points).query(points)[1]
-    back = cKDTree(points).query(true_points)[1]
+    there, back = _nearest_of(true_points, points), _nearest_of(points, true_points)
     forward = np.abs((normals * true_normals[there]).sum(axis=1)).mean()
     backward = np.abs((true_normals * normals[back]).sum(axis=1)).mean()
     return float(forward + backward) / 2
+
+
+def _nearest_of(points: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return which of the points is nearest to each place, (N,)."""
+    # Neighbours one after another: what one needs of the tree is still at hand for the next.
+    cells = ((places - places.min(axis=0)) / max(float(np.ptp(places)), 1e-12) * 64).astype(np.intp)
+    order = np.lexsort(cells.T)
+    found = np.zeros(len(places), np.intp)
+    found[order] = cKDTree(points).query(places[order])[1]
+    return found

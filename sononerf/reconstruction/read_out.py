@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,9 +12,12 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from torch import Tensor
 
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
+from sononerf.geometry.raycast import RayCaster
+from sononerf.reconstruction.glints import Glints, find_glints, trust
 from sononerf.reconstruction.isosurface import automatic_level, isosurface
 from sononerf.reconstruction.oriented import oriented_surface
 from sononerf.reconstruction.volume import Volume, grid_over, volume_from_function
@@ -22,6 +26,16 @@ Array = NDArray[np.float64]
 FAINTEST = 1e-7
 """Places this far below the loudest take no part in the oriented surface."""
 CHUNK = 16_384
+SMOOTHING = 1.75
+"""Of the surface through glints, voxels."""
+CLEARANCE = 0.008
+"""How far in front of a glint its line of sight has to be free, m."""
+HIDDEN = 0.02
+"""What a glint still weighs that its pose cannot see: a second bounce."""
+LOOKS = 1
+"""How often the surface is drawn anew without those."""
+FEWEST_POSES = 100
+"""The glints of fewer lie too far apart to bear one another out."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +46,13 @@ class Reconstruction:
     volume: Volume
     level: float
     method: Literal["oriented", "isosurface"]
+    glints: Glints | None = None
 
 
 def reconstruct(
     field: Field,
     *,
+    heard_from: Tensor | None = None,
     spacing: float | None = None,
     level: float | Literal["auto"] = "auto",
     method: Literal["auto", "oriented", "isosurface"] = "auto",
@@ -49,6 +65,9 @@ def reconstruct(
     ----------
     field : Field
         What was fitted.
+    heard_from : (P, 3) float or None, m
+        Where it was fitted to be heard from. With enough of it the oriented surface runs where
+        the field sounds from; without, where its places lie, which is quicker and a millimetre less exact.
     spacing : float or None, m
         Voxel size; half of the field's own resolution where None.
     level : float or "auto"
@@ -88,11 +107,26 @@ def reconstruct(
     if not float(volume.values.max()) > 0:
         raise NumericalError("no surface: the field is silent everywhere")
     if method == "oriented":
-        mesh, _, found = _oriented(field, lower, upper, step, level, directions)
-    else:
-        found = automatic_level(volume) if level == "auto" else level
-        mesh = isosurface(volume, found)
-    return Reconstruction(mesh, volume, found, method)
+        places, energy, axis = _places(field, lower, upper, directions)
+        if heard_from is not None and len(heard_from) >= FEWEST_POSES:
+            glints = find_glints(field, places, heard_from.to(places))
+            sources = _numbers(heard_from)
+            # A field that is hardly fitted may have glints that make no surface.
+            with suppress(NumericalError):
+                mesh, _, found = _glint_surface(glints, sources, lower, upper, step, level)
+                return Reconstruction(mesh, volume, found, method, glints)
+        mesh, _, found = oriented_surface(
+            *(_numbers(places), _numbers(energy), _numbers(axis)),
+            *(lower, upper, step),
+            level=level,
+        )
+        return Reconstruction(mesh, volume, found, method)
+    found = automatic_level(volume) if level == "auto" else level
+    return Reconstruction(isosurface(volume, found), volume, found, method)
+
+
+def _numbers(values: Tensor) -> Array:
+    return np.asarray(values.double().cpu().numpy())
 
 
 def _loudness(
@@ -112,14 +146,10 @@ def _loudness(
     return loudness
 
 
-def _oriented(
-    field: Field,
-    lower: Array,
-    upper: Array,
-    step: float,
-    level: float | Literal["auto"],
-    directions: int,
-) -> tuple[trimesh.Trimesh, Volume, float]:
+def _places(
+    field: Field, lower: Array, upper: Array, directions: int
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the field's own vertices that are not silent, with energies and axes."""
     points = grid_over(lower, upper, field.resolution).points()
     # From the region's corner, where the field's own vertices lie.
     points = points - points[0] + lower
@@ -132,12 +162,37 @@ def _oriented(
         axes.append(axis)
     energy, axis = torch.cat(energies), torch.cat(axes)
     loud = energy > FAINTEST * energy.max()
-    return oriented_surface(
-        places[loud].double().cpu().numpy(),
-        energy[loud].double().cpu().numpy(),
-        axis[loud].double().cpu().numpy(),
-        lower,
-        upper,
-        step,
-        level=level,
-    )
+    return places[loud], energy[loud], axis[loud]
+
+
+def _glint_surface(
+    glints: Glints,
+    sources: Array,
+    lower: Array,
+    upper: Array,
+    step: float,
+    level: float | Literal["auto"],
+) -> tuple[trimesh.Trimesh, Volume, float]:
+    """Draw the surface through the glints that their poses can see."""
+    weights = glints.power * trust(glints)
+    if not weights.sum() > 0:
+        weights = glints.power  # too few poses to bear one another out
+    seen = np.ones(len(weights), dtype=bool)
+    for look in range(LOOKS + 1):
+        found = oriented_surface(
+            glints.points,
+            weights * np.where(seen, 1.0, HIDDEN),
+            glints.normals,
+            *(lower, upper, step),
+            smoothing=SMOOTHING,
+            level=level,
+        )
+        if look == LOOKS:
+            break
+        before = seen
+        seen = RayCaster(found[0]).visible(
+            glints.points + CLEARANCE * glints.normals, sources[glints.pose]
+        )
+        if (seen == before).all():
+            break
+    return found

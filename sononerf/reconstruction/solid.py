@@ -4,39 +4,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sononerf.errors import NumericalError
+from sononerf.reconstruction.nearest import SLACK, Nearest, polydata
 from sononerf.reconstruction.parts import split_parts, submesh
 
 # Rejection keeps what lies outside; after so many rounds there is no outer surface to be found.
 MAX_ROUNDS = 100
 
 
-def polydata(mesh: trimesh.Trimesh) -> Any:
-    """Return a mesh as pyvista's PolyData."""
-    import pyvista
-
-    faces = np.asarray(mesh.faces)
-    threes = np.full((len(faces), 1), 3, dtype=faces.dtype)
-    return pyvista.PolyData(np.asarray(mesh.vertices), np.hstack([threes, faces]).ravel())
-
-
 def signed_distance(points: NDArray[np.float64], mesh: trimesh.Trimesh) -> NDArray[np.float64]:
     """Return the exact distance of points (N, 3) to a mesh, (N,) m, negative inside."""
-    import pyvista
-
-    if not len(points):
-        return np.zeros(0)
-    cloud = pyvista.PolyData(np.asarray(points, dtype=np.float64))
-    distances = cloud.compute_implicit_distance(polydata(mesh))["implicit_distance"]
-    return np.asarray(distances, dtype=np.float64)
+    return Nearest(mesh).signed(points)
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,10 +38,15 @@ class Solid:
     bodies: list[trimesh.Trimesh]
     sheets: list[trimesh.Trimesh]
 
-    @property
+    @cached_property
     def parts(self) -> list[trimesh.Trimesh]:
         """All parts, closed ones first."""
         return [*self.bodies, *self.sheets]
+
+    @cached_property
+    def nearest(self) -> list[Nearest]:
+        """Distances to each part, in the same order."""
+        return [Nearest(part) for part in self.parts]
 
     @property
     def closed(self) -> bool:
@@ -74,7 +63,7 @@ class Solid:
                 continue
             low, high = body.bounds
             near = np.flatnonzero(((points > low) & (points < high)).all(axis=1) & ~inside)
-            inside[near] = signed_distance(points[near], body) < 0
+            inside[near] = self.nearest[index].signed(points[near]) < 0
         return inside
 
 
@@ -228,11 +217,11 @@ def sample_solid(
     for _ in range(MAX_ROUNDS):
         points, face = sample_surface(whole, max(1000, missing), generator)
         keep = np.ones(len(points), bool)
-        for index, (body, (low, high)) in enumerate(zip(solid.bodies, boxes, strict=True)):
+        for index, (low, high) in enumerate(boxes):
             near = np.flatnonzero(
                 ((points > low) & (points < high)).all(axis=1) & (owner[face] != index) & keep
             )
-            keep[near] = signed_distance(points[near], body) >= 0
+            keep[near] = solid.nearest[index].signed(points[near]) >= 0
         found.append((points[keep], face[keep]))
         missing -= int(keep.sum())
         if missing <= 0:
@@ -248,41 +237,62 @@ def count_parts(solid: Solid, *, min_area_fraction: float = 0.01) -> int:
     Parts with less than ``min_area_fraction`` of the largest part's area are not counted.
     """
     parts = solid.parts
-    boxes = np.array([part.bounds for part in parts])
-    joined = [
-        (i, j)
-        for i in range(len(parts))
-        for j in range(i + 1, len(parts))
-        if (boxes[i, 0] <= boxes[j, 1]).all()
-        and (boxes[j, 0] <= boxes[i, 1]).all()
-        and _overlap(solid, i, j)
-    ]
-    rows, columns = np.array(joined, dtype=np.intp).reshape(-1, 2).T
-    graph = coo_array((np.ones(len(rows), bool), (rows, columns)), shape=(len(parts),) * 2)
-    labels = connected_components(graph, directed=False)[1]
-    areas = np.bincount(labels, weights=[part.area for part in parts])
+    group = np.arange(len(parts))
+    for i, j in _pairs_whose_boxes_meet(parts):
+        # Two that hang together by way of others need not be looked at.
+        if group[i] != group[j] and _overlap(solid, i, j):
+            group[group == group[j]] = group[i]
+    areas = np.bincount(group, weights=[part.area for part in parts])
     return int((areas > min_area_fraction * areas.max()).sum())
+
+
+def _pairs_whose_boxes_meet(parts: list[trimesh.Trimesh]) -> list[tuple[int, int]]:
+    """Return the pairs of parts whose bounding boxes share a place."""
+    boxes = np.array([part.bounds for part in parts])
+    found = []
+    for i in range(len(parts) - 1):
+        rest = boxes[i + 1 :]
+        meet = ((boxes[i, 0] <= rest[:, 1]) & (rest[:, 0] <= boxes[i, 1])).all(axis=1)
+        found += [(i, i + 1 + int(j)) for j in np.flatnonzero(meet)]
+    return found
 
 
 def _overlap(solid: Solid, i: int, j: int) -> bool:
     """Return whether two parts' surfaces cross, or one lies inside the other."""
-    first, second = solid.parts[i], solid.parts[j]
-    for inner, outer, index in ((first, second, j), (second, first, i)):
-        if index < len(solid.bodies):
-            low, high = outer.bounds
-            corners = np.asarray(inner.vertices)
+    # The later one is the smaller: of two nested ones it lies inside.
+    for inner, outer in ((j, i), (i, j)):
+        if outer < len(solid.bodies):
+            low, high = solid.parts[outer].bounds
+            corners = np.asarray(solid.parts[inner].vertices)
             near = corners[((corners >= low) & (corners <= high)).all(axis=1)]
-            if (signed_distance(near, outer) < 0).any():
+            # A single corner settles it more often than not.
+            if (solid.nearest[outer].signed(near[:1]) < 0).any():
+                return True
+            if (solid.nearest[outer].signed(near[1:]) < 0).any():
                 return True
     # Triangles may cross though no corner lies inside; only those near both can.
-    low = np.maximum(first.bounds[0], second.bounds[0])
-    high = np.minimum(first.bounds[1], second.bounds[1])
-    near_both = []
-    for part in (first, second):
-        triangles = np.asarray(part.triangles)
-        near_box = (triangles.min(axis=1) <= high) & (triangles.max(axis=1) >= low)
-        near_both.append(submesh(part, near_box.all(axis=1)))
-    if not all(len(part.faces) for part in near_both):
+    one, two = _triangles_near(solid, i, j), _triangles_near(solid, j, i)
+    if not (len(one.faces) and len(two.faces)):
         return False
-    one, two = (polydata(part) for part in near_both)
-    return bool(one.collision(two, contact_mode=1)[1])
+    return bool(polydata(one).collision(polydata(two), contact_mode=1)[1])
+
+
+def _triangles_near(solid: Solid, index: int, other: int) -> trimesh.Trimesh:
+    """Return those of a part's triangles that can cross one of another part's.
+
+    What two triangles share is nearer to a corner of each than that one's longest side.
+    """
+    part, target = solid.parts[index], solid.parts[other]
+    low = np.maximum(part.bounds[0], target.bounds[0])
+    high = np.minimum(part.bounds[1], target.bounds[1])
+    triangles = np.asarray(part.triangles)
+    chosen = ((triangles.min(axis=1) <= high) & (triangles.max(axis=1) >= low)).all(axis=1)
+    faces = np.asarray(part.faces)
+    used = np.unique(faces[chosen])
+    reach = float(part.edges_unique_length.max() + target.edges_unique_length.max())
+    distance = np.full(len(part.vertices), np.inf)
+    distance[used] = solid.nearest[other].corners.query(
+        np.asarray(part.vertices)[used], distance_upper_bound=reach * (1 + SLACK)
+    )[0]
+    chosen &= (distance[faces] < np.inf).any(axis=1)
+    return submesh(part, chosen)

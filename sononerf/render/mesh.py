@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sononerf.errors import NumericalError
+from sononerf.reconstruction.confidence import MANY_POSES, confidence_colours
 from sononerf.render.figure import png_from_pixels
 from sononerf.render.shading import (
     DEFAULT_VIEW,
@@ -107,6 +108,69 @@ def side_by_side_png(
         halves.append(np.asarray(half))
     gap = np.full((size[1], 4, 3), 255, np.uint8)
     return png_from_pixels(np.hstack([halves[0], gap, halves[1]]))
+
+
+def confidence_png(
+    mesh: trimesh.Trimesh,
+    counts: ArrayLike,
+    *,
+    size: tuple[int, int] = (960, 720),
+    view: ArrayLike = DEFAULT_VIEW,
+) -> bytes:
+    """Draw a mesh in the colours of its confidence, with a bar that tells what they mean.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        Metres.
+    counts : (V,) int
+        How many poses heard the surface around each vertex.
+    size : (int, int)
+        Width and height in pixels.
+    view : (3,) float
+        Direction from the mesh to the camera, world frame; z is up.
+
+    Returns
+    -------
+    data : bytes
+        A PNG file.
+
+    Raises
+    ------
+    ValueError
+        If size, view or counts have a wrong shape.
+    NumericalError
+        If the mesh is empty or not finite.
+    """
+    _require_drawable(mesh, "the mesh")
+    if np.shape(counts) != (len(mesh.vertices),):
+        raise ValueError(f"counts: shape {np.shape(counts)}, expected one per vertex")
+    camera = camera_for(mesh.vertices, size=size, view=view, fill=0.74)
+    picture = Image.fromarray(_picture(mesh, camera, confidence_colours(counts)))
+    _draw_colour_bar(picture)
+    return png_from_pixels(np.asarray(picture))
+
+
+def _draw_colour_bar(picture: Image.Image) -> None:
+    """Draw what the colours of a confidence mean near the lower left corner, in place."""
+    width, height = picture.size
+    margin, length, thick = height // 24, width // 4, max(6, height // 55)
+    left, bottom = margin, height - margin
+    share = np.linspace(0, 1, length)
+    colours = confidence_colours(np.expm1(share * np.log1p(MANY_POSES)))
+    bar = np.broadcast_to(np.round(255 * colours).astype(np.uint8), (thick, length, 3))
+    draw = ImageDraw.Draw(picture)
+    font = ImageFont.load_default(max(11, height // 40))
+    line = round(1.3 * font.getbbox("0")[3])
+    top = bottom - line - thick
+    picture.paste(Image.fromarray(np.ascontiguousarray(bar)), (left, top))
+    draw.rectangle([(left, top), (left + length - 1, top + thick - 1)], outline=INK)
+    for poses in (0, 3, 10, 30, MANY_POSES):
+        x = left + np.log1p(poses) / np.log1p(MANY_POSES) * (length - 1)
+        draw.line([(x, top + thick), (x, top + thick + 4)], fill=INK, width=1)
+        text = f"{poses}+" if poses == MANY_POSES else str(poses)
+        draw.text((x, bottom), text, fill=INK, font=font, anchor="ms")
+    draw.text((left, top - 6), "poses that heard this place", fill=INK, font=font, anchor="ls")
 
 
 def _require_drawable(mesh: trimesh.Trimesh, name: str) -> None:

@@ -249,36 +249,47 @@ class ProfileRenderer(Renderer):
         sources = position[:, None] + torch.einsum(
             "pij,ej->pei", rotation, torch.cat((self.emitter[None], self.ear_positions))
         )  # (P, 1 + E, 3): emitter, then ears
-        rays = places - sources[:, :, None]  # (P, 1 + E, N, 3)
-        length = rays.square().sum(-1).clamp_min(1e-12).sqrt()
-        unit = rays / length[..., None]
-        head = torch.einsum("pij,peni->penj", rotation, unit)
-        response = field.select(places, -unit[:, 0], bins)  # (P, N, B)
+        with torch.no_grad():
+            ray = places - sources[:, :1]  # (P, N, 3)
+            out = ray.square().sum(-1).clamp_min(1e-12).sqrt()
+            pose, place = field.audible(places, ray / -out[..., None]).nonzero(as_tuple=True)
+            # From here on a row for each pair of a pose and a place that answers it.
+            unit, out = ray[pose, place] / out[pose, place, None], out[pose, place]
+            beam = look_up(self.beam[bins], _in_head(rotation[pose], unit)).square()
+        there = places[place]
+        response, lead = field.echo(places, -unit, bins, place)  # (M, B), (M,)
         squared = response.abs().square() if response.is_complex() else response.square()
-        self.points_evaluated += squared.shape[0] * squared.shape[1]
-        beam = look_up(self.beam[bins], head[:, 0]).square()
-        loss = -2 * self.absorption[bins] * (length[:, 0] + length[:, 1:].mean(1))[..., None]
-        common = squared * beam * loss.exp()
-        spread = (length[:, :1] * length[:, 1:]).square().reciprocal()  # (P, E, N)
-        if weight is not None:
-            spread = spread * weight
-        middle = ((length[:, :1] + length[:, 1:]) / 2 - self.first) / self.bin
+        self.points_evaluated += len(there)
         count, ears, width = len(position), len(self.ears), len(bins)
-        rows = torch.arange(count * ears * width, device=places.device).reshape(count, ears, width)
         profiles = places.new_zeros(count * ears * width * self.bins)
         for ear in range(ears):
-            gain = look_up(self.ears[ear, bins], head[:, 1 + ear]).square()
-            place = middle[:, ear, :, None]  # (P, N, 1) or (P, N, B)
-            if self.lag is not None:
-                place = place + look_up(self.lag[ear, bins], head[:, 1 + ear]) / self.bin
-            left = place.floor()
-            audible = (left >= 0) & (left < self.bins - 1)
-            echo = common * gain * (spread[:, ear, :, None] * audible)  # (P, N, B)
-            index = rows[:, ear, None] * self.bins + left.long().clamp(0, self.bins - 2)
-            near = echo * (1 - (place - left))
+            with torch.no_grad():
+                ray = there - sources[pose, 1 + ear]
+                back = ray.square().sum(-1).clamp_min(1e-12).sqrt()
+                head = _in_head(rotation[pose], ray / back[:, None])
+                loss = torch.exp(-2 * self.absorption[bins] * (out + back)[:, None])
+                known = look_up(self.ears[ear, bins], head).square() * beam * loss
+                known /= (out * back).square()[:, None]
+                if weight is not None:
+                    known *= weight[place, None]
+                middle = ((out + back) / 2 - self.first)[:, None] / self.bin
+                if self.lag is not None:
+                    middle = middle + look_up(self.lag[ear, bins], head) / self.bin
+            at = middle - lead[:, None] / self.bin  # (M, 1) or (M, B)
+            left = at.detach().floor()
+            heard = (left >= 0) & (left < self.bins - 1)
+            echo = squared * (known * heard)
+            row = (pose * ears + ear)[:, None] * width + torch.arange(width, device=pose.device)
+            index = row * self.bins + left.long().clamp(0, self.bins - 2)
+            near = echo * (1 - (at - left))
             profiles = profiles + _Deposit.apply(near, index, len(profiles))
             profiles = profiles + _Deposit.apply(echo - near, index + 1, len(profiles))
         return profiles.reshape(count, ears, width, self.bins)
+
+
+def _in_head(rotation: Tensor, directions: Tensor) -> Tensor:
+    """Turn world directions (M, 3) into head frames (M, 3, 3)."""
+    return (rotation * directions[:, :, None]).sum(1)
 
 
 def lattice_over(region: Tensor, spacing: float) -> Tensor:

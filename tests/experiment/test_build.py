@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -17,10 +19,12 @@ from sononerf.experiment.build import (
     check_plugins,
     echo_region,
     field_and_renderer,
+    heard_from,
     module_for,
 )
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
+from sononerf.field.hash import HashField
 from sononerf.renderer.profile import ProfileRenderer
 from sononerf.renderer.shell import ShellRenderer
 
@@ -62,6 +66,7 @@ def test_the_acquisition_of_a_sweep_is_told_how_long_and_how_late_its_rows_are(t
     [
         ("grid", "profile", (GridField, ProfileRenderer)),
         ("fourier", "shell", (FourierField, ShellRenderer)),
+        ("hash", "profile", (HashField, ProfileRenderer)),
     ],
 )
 def test_any_field_with_any_renderer(tiny, field, renderer, kinds):
@@ -73,6 +78,31 @@ def test_any_field_with_any_renderer(tiny, field, renderer, kinds):
     module = module_for(settings, *made, reference=1e-3, total_steps=7, steps_per_epoch=3)
     assert (module.total_steps, module.steps_per_epoch) == (7, 3)
     assert module.learning_rate == made[0].learning_rate
+
+
+def test_the_module_is_told_what_is_heard_at_first(tiny):
+    settings = tiny(fit={"early_range_db": 25.0, "early_share": 0.5})
+    module = module_for(settings, *field_and_renderer(settings, BOX), reference=1.0, total_steps=8)
+    whole = settings.spectrogram.dynamic_range_db
+    assert [module.range_db(step) for step in (0, 3, 4)] == [25.0, 25.0, whole]
+
+
+def test_training_poses_hear_from_half_way_between_emitter_and_ears():
+    renderer = SimpleNamespace(
+        emitter=torch.tensor([0.002, 0.0, -0.010]),
+        ear_positions=torch.tensor([[-0.010, 0.010, 0.005], [-0.010, -0.004, 0.005]]),
+    )
+    left = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # looks along y
+    store = SimpleNamespace(
+        positions=np.array([[9.0, 9.0, 9.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]),
+        rotations=np.array([np.eye(3), left, np.eye(3)]),
+        indices=lambda split: {"train": np.array([1, 2])}[split],
+    )
+    # The ears' middle is (-10, 3, 5) mm, half way to it from the emitter (-4, 1.5, -2.5) mm.
+    expected = [[1 - 0.0015, 2 - 0.004, 3 - 0.0025], [-0.004, 0.0015, -0.0025]]
+    found = heard_from(renderer, store)
+    assert found.dtype == torch.float32
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
 
 
 def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):

@@ -10,6 +10,7 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
@@ -19,6 +20,7 @@ from sononerf.callbacks.checkpoint import SIGNALS, CheckpointCallback
 from sononerf.callbacks.preview import PreviewCallback
 from sononerf.callbacks.progress import ProgressCallback
 from sononerf.checkpoint_io import DurableCheckpointIO
+from sononerf.data.store import EnsembleStore
 from sononerf.errors import (
     IncompatibleError,
     InputError,
@@ -28,6 +30,7 @@ from sononerf.errors import (
     StoppedError,
 )
 from sononerf.experiment import fit as fit_module
+from sononerf.experiment.build import acquisition
 from sononerf.experiment.fit import fit, peak_memory_bytes, require_accelerator
 from sononerf.module import EchoModule
 
@@ -361,18 +364,42 @@ def test_what_a_fit_cost_is_counted_over_its_parts(tiny, tmp_path, interrupt, mo
 
 
 @pytest.mark.parametrize(
-    ("changes", "steps", "epochs"),
+    ("changes", "least", "steps", "epochs"),
     [
-        ({"steps_per_epoch": "auto"}, 12, 3),  # 8 poses, 2 at a time
-        ({"steps_per_epoch": "auto", "batch_poses": 3}, 9, 3),
-        ({"max_steps": 6}, 6, 1),
-        ({"max_steps": 2}, 2, 1),  # shorter than an epoch: it is the epoch then
+        ({"steps_per_epoch": "auto"}, 1, 12, 3),  # 8 poses, 2 at a time
+        ({"steps_per_epoch": "auto", "batch_poses": 3}, 1, 9, 3),
+        ({"steps_per_epoch": "auto"}, 5, 15, 3),  # a pass is shorter than an epoch may be
+        ({"max_steps": 6}, 60, 6, 1),
+        ({"max_steps": 2}, 60, 2, 1),  # shorter than an epoch: it is the epoch then
     ],
 )
-def test_the_smaller_bound_ends_the_fit(tiny, tmp_path, changes, steps, epochs):
+def test_the_smaller_bound_ends_the_fit(tiny, tmp_path, monkeypatch, changes, least, steps, epochs):
+    monkeypatch.setattr(fit_module, "LEAST_STEPS", least)
     run(tiny(fit=changes), tmp_path / "run")
     held = what_a_run_holds(tmp_path / "run")
     assert (held["steps"], len(held["epochs"])) == (steps, epochs)
+
+
+@pytest.mark.parametrize(
+    ("steps", "per_pass", "expected"),
+    [("auto", 4, (60, 180)), ("auto", 61, (61, 183)), (4, 61, (4, 12)), (4, 1, (4, 12))],
+)
+def test_an_epoch_has_at_least_sixty_steps_unless_the_settings_say_how_many(
+    tiny, steps, per_pass, expected
+):
+    assert fit_module._length(tiny(fit={"steps_per_epoch": steps}), per_pass) == expected
+
+
+def test_a_run_holds_where_its_training_poses_listened(finished, echoes, tiny):
+    store = EnsembleStore.open(echoes)
+    held = safetensors.torch.load_file(finished / "model.safetensors")["heard_from"]
+    known = acquisition(tiny())
+    middle = ((known.emitter + known.ear_positions.mean(0)) / 2).double().numpy()
+    train = store.indices("train")
+    assert held.shape == (8, 3)
+    for row, index in zip(held.numpy(), train, strict=True):
+        expected = store.positions[index] + store.rotations[index] @ middle
+        np.testing.assert_allclose(row, expected, rtol=0, atol=1e-6)
 
 
 def test_provenance_names_no_people_machines_or_folders(finished):

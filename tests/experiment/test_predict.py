@@ -16,6 +16,7 @@ from sononerf.errors import IncompatibleError, InputError, ResourceError
 from sononerf.experiment import predict as predict_module
 from sononerf.experiment.fit import fit
 from sononerf.experiment.predict import load_fitted, predict, store_of
+from sononerf.weights import load_weights, save_weights
 
 CSV = "x,y,z,yaw,pitch,roll\n-0.4,0,0,0,0,0\n0,0,0.4,0,90,0\n"
 AXES = {"range_m", "frequency_hz", "reference", "pose", "position", "rotation"}
@@ -166,6 +167,24 @@ def test_a_wrong_description_is_told(run, change, error, message):
         predict(run, accelerator="cpu")
     assert "\n" not in str(caught.value)
     assert not (run / "prediction").exists()
+
+
+@pytest.mark.parametrize("name", ["heard_from", "field.region"])
+def test_weights_without_what_is_needed_are_told(run, name):
+    state, description = load_weights(run)
+    del state[name]
+    save_weights(run, state, description)
+    with pytest.raises(InputError, match=rf"incomplete \('{name}'\); repeat the fit") as caught:
+        load_fitted(run)
+    assert "\n" not in str(caught.value)
+    assert "model.json" not in str(caught.value)  # which is whole
+
+
+def test_what_is_loaded_knows_where_it_was_heard_from(run, echoes):
+    store = EnsembleStore.open(echoes)
+    heads = load_fitted(run).heard_from
+    # A head is some centimetres large.
+    np.testing.assert_allclose(heads, store.positions[store.indices("train")], atol=0.03)
 
 
 def test_damaged_or_missing_weights_are_told(run, tmp_path):

@@ -134,3 +134,25 @@ def test_a_field_that_says_nothing_is_none():
         bare(REGION, REGION)
     with pytest.raises(NotImplementedError):
         _ = bare.resolution
+
+
+def test_unless_a_field_says_so_every_place_answers_from_where_it_lies(field, device):
+    places = torch.tensor([[0.0, 0.0, 0.1], [0.0, 0.0, 0.3], [0.05, 0.02, 0.15]]).double()
+    places, directions = places.to(device), AXIS.to(device).expand(3, 3)
+    bins = torch.tensor([2, 0], device=device)
+    assert field.audible(places, directions.expand(2, 3, 3)).tolist() == [[True] * 3] * 2
+    response, lead = field.echo(places, directions, bins)
+    assert torch.equal(response, field.select(places, directions, bins))
+    assert lead.tolist() == [0.0] * 3
+    place = torch.tensor([2, 0, 0], device=device)
+    named, lead = field.echo(places, directions, bins, place)
+    assert torch.equal(named, field.select(places[place], directions, bins))
+    assert lead.shape == (3,)
+
+
+def test_how_far_the_fit_is_changes_nothing_unless_a_field_says_so(field):
+    before = {name: value.clone() for name, value in field.state_dict().items()}
+    field.advance(3, 10)
+    after = field.state_dict()
+    assert before.keys() == after.keys()
+    assert all(torch.equal(before[name], after[name]) for name in before)

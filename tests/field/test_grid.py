@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from sononerf.field.field import Field, sphere_directions
-from sononerf.field.grid import LOG_STRENGTH_FLOOR, GridField
+from sononerf.field.grid import LOG_STRENGTH_FLOOR, RADIUS_UNIT, GridField
 
 REGION = torch.tensor([[-0.03, 0.01, 0.2], [0.021, 0.05, 0.227]], dtype=torch.float64)
 FREQUENCY = torch.tensor([30e3, 50e3, 70e3], dtype=torch.float64)
@@ -69,8 +69,8 @@ def test_linear_functions_are_read_exactly():
     """Trilinear interpolation, on each level by its own, sides that no level divides."""
     field = grid()
     generator = torch.Generator().manual_seed(1)
-    slopes = torch.randn(2, 4, 3, generator=generator, dtype=torch.float64)
-    offsets = torch.randn(2, 4, generator=generator, dtype=torch.float64)
+    slopes = torch.randn(2, 5, 3, generator=generator, dtype=torch.float64)
+    offsets = torch.randn(2, 5, generator=generator, dtype=torch.float64)
     with torch.no_grad():
         for level, values in enumerate(field.grids):
             step = 0.01 * 2**level
@@ -92,7 +92,7 @@ def test_the_grids_cover_the_region():
     assert sizes == [(7, 5, 4), (4, 3, 3), (3, 2, 2)]
     # A side that divides gets no vertex too many from rounding.
     whole = torch.tensor([[-0.1] * 3, [0.2] * 3], dtype=torch.float64)
-    assert tuple(grid(whole, spacing=0.1, levels=1).grids[0].shape) == (1, 4, 4, 4, 4)
+    assert tuple(grid(whole, spacing=0.1, levels=1).grids[0].shape) == (1, 5, 4, 4, 4)
 
 
 def test_the_spacing_is_found_from_the_number_of_vertices():
@@ -111,7 +111,7 @@ def test_the_lobe_formula():
     sharpness = torch.tensor([0.0, 0.5, -0.5], dtype=torch.float64)
     with torch.no_grad():
         field.grids[0][:, 0] = -1.5
-        field.grids[0][0, 1:] = lobe[:, None, None, None]
+        field.grids[0][0, 1:4] = lobe[:, None, None, None]
         field.spectrum.copy_(spectrum)
         field.sharpness.copy_(sharpness)
     directions = torch.cat((lobe[None] / 3, sphere_directions(8, REGION)))
@@ -143,7 +143,7 @@ def test_strength_has_a_floor():
 def test_energy_and_axis_are_those_of_a_dense_sphere():
     field = fill(grid(), seed=3)
     with torch.no_grad():
-        field.grids[0][:, 1:] *= 4  # concentrations up to 20
+        field.grids[0][:, 1:4] *= 4  # concentrations up to 20
     places = torch.cat((places_in(8), REGION[1:] + 0.01))
     dense = sphere_directions(20_000, REGION)
     power = field.select(places, dense[:, None].expand(-1, len(places), 3), None).square()
@@ -187,11 +187,114 @@ def test_moving_region_and_places_together_changes_nothing():
     torch.testing.assert_close(moved, one(places, directions)[order])
 
 
+def around(axis, angles):
+    """Unit vectors at these angles off an axis, (N, 3)."""
+    axis = axis / axis.norm()
+    aside = torch.linalg.cross(axis, axis.new_tensor([0.3, -0.5, 0.8]))
+    aside = aside / aside.norm()
+    return angles.cos()[:, None] * axis + angles.sin()[:, None] * aside
+
+
+def bent(radius):
+    """One lobe everywhere, on a surface of this radius of curvature."""
+    field = grid(levels=1)
+    lobe = torch.tensor([2.0, -4.0, 4.0], dtype=torch.float64)
+    with torch.no_grad():
+        field.grids[0][0, 1:4] = lobe[:, None, None, None]
+        field.grids[0][0, 4] = radius / RADIUS_UNIT
+    return field, lobe
+
+
+@pytest.mark.parametrize("radius", [0.03, -0.01])
+def test_off_its_axis_a_curved_place_is_heard_nearer(radius):
+    """By R (1 - cos θ), here up to straight behind; of a hollow, R < 0, farther."""
+    field, lobe = bent(radius)
+    angles = torch.tensor([0.0, 0.1, math.pi / 3, math.pi / 2, math.pi], dtype=torch.float64)
+    given = places_in(5), around(lobe, angles), None
+    for step, curved in ((0, False), (39, False), (40, True), (100, True), (3, False)):
+        field.advance(step, 100)
+        lead = field.echo(*given)[1].detach()
+        expected = radius * (1 - angles.cos()) * curved
+        torch.testing.assert_close(lead, expected, rtol=0, atol=1e-12)
+        assert lead[2] == pytest.approx(radius / 2 * curved)
+    assert float(grid().curved) == 0  # of a new field
+
+
+def test_an_echo_is_what_select_answers():
+    field = fill(grid())
+    places = torch.cat((places_in(20), REGION[1:] + 0.01))
+    directions = sphere_directions(21, REGION)
+    for bins in (None, torch.tensor([2, 0])):
+        response, lead = field.echo(places, directions, bins)
+        assert torch.equal(response, field.select(places, directions, bins))
+        assert lead.shape == (21,)
+
+
+def test_places_may_be_named_once_for_many_directions():
+    field = fill(grid())
+    field.advance(1, 1)
+    places = torch.cat((places_in(5), REGION[1:] + 0.01))
+    place, directions = torch.tensor([4, 0, 0, 5, 2, 4]), sphere_directions(6, REGION)
+    for bins in (None, torch.tensor([1])):
+        for found, expected in zip(
+            field.echo(places, directions, bins, place),
+            field.echo(places[place], directions, bins),
+            strict=True,
+        ):
+            torch.testing.assert_close(found, expected, rtol=1e-12, atol=0)
+
+
+def test_the_range_bends_places_and_turns_no_lobe():
+    field = fill(grid())
+    field.advance(1, 1)
+    response, lead = field.echo(places_in(9), sphere_directions(9, REGION), None)
+    lead.sum().backward(retain_graph=True)
+    for values in field.grids:
+        assert values.grad[:, 4].abs().max() > 0
+        assert values.grad[:, :4].abs().max() == 0
+    field.zero_grad()
+    response.sum().backward()
+    for values in field.grids:
+        assert (values.grad[:, :4].abs().amax(dim=(0, 2, 3, 4)) > 0).all()
+        assert values.grad[:, 4].abs().max() == 0
+
+
+def test_a_place_without_a_lobe_has_finite_gradients_of_its_range():
+    field = grid()
+    field.advance(1, 1)
+    sum(
+        part.sum() for part in field.echo(places_in(5), sphere_directions(5, REGION), None)
+    ).backward()
+    assert all(p.grad.isfinite().all() for p in field.parameters() if p.grad is not None)
+
+
+def test_what_is_left_out_is_43_db_below_its_own_peak():
+    """In every frequency: the widest lobe decides."""
+    field, lobe = bent(0.0)
+    with torch.no_grad():
+        field.sharpness.copy_(torch.tensor([0.4, -0.3, 0.1]))
+        field.spectrum.copy_(torch.tensor([3.0, -2.0, 0.0]))
+    angles = torch.linspace(0, math.pi, 400, dtype=torch.float64)
+    places, directions = places_in(2), around(lobe, angles)[:, None].expand(-1, 2, 3)
+    heard = field.audible(places, directions)
+    assert (heard.shape, heard.dtype) == ((400, 2), torch.bool)
+    response = field.select(places, directions, None)
+    below = 20 * (response / response[0]).amax(-1).log10()  # of the frequency that keeps most
+    assert below[~heard].max() < -43.0
+    assert below[heard].min() > -43.9  # -43.4, less one step of the angle
+    assert 100 < int(heard[:, 0].sum()) < 300
+
+
 def test_weights_and_what_is_kept_are_read_back():
     field = fill(grid())
+    field.advance(1, 1)
     field.keep(REGION[:1] + 0.01, field.resolution)
     other = grid()
     other.load_state_dict(field.state_dict())
     places, directions = places_in(200), sphere_directions(200, REGION)
     assert torch.equal(other(places, directions), field(places, directions))
     assert 0 < int((other(places, directions) > 0).any(-1).sum()) < 200
+    assert torch.equal(
+        other.echo(places, directions, None)[1], field.echo(places, directions, None)[1]
+    )
+    assert field.echo(places, directions, None)[1].abs().max() > 0

@@ -147,3 +147,37 @@ def test_what_is_no_mesh_is_refused():
     line = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], process=False)
     with pytest.raises(NumericalError, match="no area"):
         sample_outer_surface(line, 10)
+
+
+def parts_by_all_pairs(solid):
+    """Parts of balls by what is known of them: they meet where their centres are near enough."""
+    centres = np.array([part.vertices.mean(axis=0) for part in solid.parts])
+    radii = np.sqrt([part.area / (4 * np.pi) for part in solid.parts])
+    group = np.arange(len(centres))
+    for i in range(len(centres)):
+        for j in range(i):
+            if np.linalg.norm(centres[i] - centres[j]) < radii[i] + radii[j]:
+                group[group == group[j]] = group[i]
+    areas = np.bincount(group, weights=radii**2)
+    return int((areas > 0.01 * areas.max()).sum())
+
+
+def test_many_balls_of_all_sizes_hang_together_as_they_should():
+    generator = np.random.default_rng(0)
+    radii = 10 ** generator.uniform(-1, 0, 30)
+    balls = [sphere(r, generator.uniform(-2.5, 2.5, 3), 2) for r in radii]
+    solid = solid_from_mesh(trimesh.util.concatenate(balls), drop_cavities=True)
+    assert count_parts(solid) == parts_by_all_pairs(solid) > 1
+
+
+def test_groups_that_meet_late_become_one():
+    # The largest at one end, the next at the other: the middle joins two groups of two.
+    row = [
+        sphere(1 - 0.01 * size, (1.9 * place, 0, 0), 3) for place, size in enumerate((0, 3, 2, 1))
+    ]
+    assert count_parts(solid_from_mesh(trimesh.util.concatenate(row), drop_cavities=True)) == 1
+
+
+def test_a_crumb_may_bridge_two_parts():
+    bodies = [sphere(1, subdivisions=3), sphere(1, (2.1, 0, 0), 3), sphere(0.09, (1.05, 0, 0), 3)]
+    assert count_parts(solid_from_mesh(trimesh.util.concatenate(bodies), drop_cavities=True)) == 1

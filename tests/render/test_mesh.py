@@ -7,7 +7,7 @@ import trimesh
 from PIL import Image
 
 from sononerf.errors import NumericalError
-from sononerf.render.mesh import mesh_png, side_by_side_png
+from sononerf.render.mesh import confidence_png, mesh_png, side_by_side_png
 
 SIZE = (240, 180)
 
@@ -67,3 +67,19 @@ def test_nothing_to_draw_is_an_error(ball):
     broken = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], process=False)
     with pytest.raises(NumericalError, match="not finite"):
         mesh_png(broken)
+
+
+def test_confidence_is_drawn_bright_where_many_poses_heard(ball):
+    counts = np.where(ball.vertices[:, 2] < 0, 100, 0)  # though light falls from above
+    data = confidence_png(ball, counts, size=(480, 360))
+    assert data == confidence_png(ball.copy(), counts, size=(480, 360))
+    drawn = pixels(data).astype(int)
+    assert drawn.shape == (360, 480, 3)
+    assert drawn[270, 240, 0] > drawn[100, 240, 0] + 50
+    # The bar in the lower left corner runs from dark to bright yellow.
+    yellow = drawn[..., 0] - drawn[..., 2] > 90
+    assert yellow[300:, :150].any()
+    with pytest.raises(ValueError, match="one per vertex"):
+        confidence_png(ball, counts[:-1])
+    with pytest.raises(NumericalError, match="empty"):
+        confidence_png(trimesh.Trimesh(), [])
