@@ -67,7 +67,8 @@ def reconstruct(
         What was fitted.
     heard_from : (P, 3) float or None, m
         Where it was fitted to be heard from. With enough of it the oriented surface runs where
-        the field sounds from; without, where its places lie, which is quicker and a millimetre less exact.
+        the field sounds from; without, where its places lie, which is quicker and a millimetre
+        less exact.
     spacing : float or None, m
         Voxel size; half of the field's own resolution where None.
     level : float or "auto"
