@@ -12,14 +12,12 @@ from pydantic import Field as Option
 from torch import Tensor, nn
 
 from sononerf.field.field import Field
-from sononerf.field.grid import LOG_STRENGTH_FLOOR
+from sononerf.field.grid import LOG_STRENGTH_FLOOR, QUIETEST
 
 PRIMES = (1, 2654435761, 805459861)
 """What the numbers of a vertex along x, y and z are multiplied by; Müller et al. 2022, eq. 4."""
 CHUNK = 65_536
 """How many places are read out at once."""
-QUIETEST = -5.0
-"""A lobe is left out where it is this much below its own peak, as a natural logarithm: -43 dB."""
 CALM = 0.1
 """How far Adam's step moves a weight that all places share, beside one of a single vertex."""
 
