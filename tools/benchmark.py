@@ -8,6 +8,7 @@
     python tools/benchmark.py dechirp
     python tools/benchmark.py shapes [--count 20] [--first 0] [--seconds 60]
     python tools/benchmark.py poses [--scene three_spheres] [--counts 12 25 50 100 200 400]
+    python tools/benchmark.py paper [--scene three_spheres] [--minutes 60] [--steps N]
 
 ``simulate``: seconds per pose, against those that embreex alone needs for the same rays, those for
 visibility included, and the greatest memory. ``noise``: by how much two simulations differ that
@@ -16,9 +17,10 @@ have other rays, 16 times as many, or twice as many; with the reported decibels,
 in the rows of a dechirped sweep.
 
 ``shapes``: the whole default experiment for shapes that nobody chose, each from its seed.
-``poses``: the same for one scene and ever more calls. Both leave runs, a table as JSON and logs in
-a folder (``--output``), share ensembles (``--data``), go on where they were interrupted, and lay
-KEY=VALUE over the settings.
+``poses``: the same for one scene and ever more calls. ``paper``: how much sooner the default gets
+to the held-out error to which the paper's own field, renderer and training come in so many minutes,
+or steps. All three leave runs, a table as JSON and logs in a folder (``--output``), share ensembles
+(``--data``), go on where they were interrupted, and lay KEY=VALUE over the settings (``--set``).
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # the parts of this command, and the tests' exact solutions
 
+from tools.benchmarks.paper import paper  # noqa: E402
 from tools.benchmarks.physics import dechirp, physics  # noqa: E402
 from tools.benchmarks.poses import COUNTS, poses  # noqa: E402
 from tools.benchmarks.shapes import shapes  # noqa: E402
@@ -50,7 +53,7 @@ def main() -> None:
             command.add_argument("--bounces", type=int, default=3)
         if run is simulate:
             command.add_argument("--rays", type=int, default=300_000)
-    for series in (shapes, poses):
+    for series in (shapes, poses, paper):
         command = commands.add_parser(series.__name__, help=(series.__doc__ or "").split("\n")[0])
         command.set_defaults(run=series)
         if series is shapes:
@@ -58,8 +61,13 @@ def main() -> None:
             command.add_argument("--first", type=int, default=0, help="the first seed")
         else:
             command.add_argument("--scene", default="three_spheres")
+        if series is poses:
             command.add_argument("--counts", type=int, nargs="+", default=COUNTS)
-        command.add_argument("--seconds", type=float, default=60.0, help="longer fits are marked")
+        if series is paper:
+            command.add_argument("--minutes", type=float, default=60.0, help="of the paper's fit")
+            command.add_argument("--steps", type=int, help="of the paper's fit; none are timed")
+        else:
+            command.add_argument("--seconds", type=float, default=60.0, help="longer are marked")
         command.add_argument("--output", type=Path, help="folder of runs and table")
         command.add_argument("--data", type=Path, help="folder of the ensembles; DIR/data")
         command.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings")

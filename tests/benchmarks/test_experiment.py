@@ -212,3 +212,28 @@ def test_a_killed_command_is_a_failed_one(monkeypatch, tmp_path):
     child(monkeypatch, -9)
     with pytest.raises(RuntimeError, match="exit code -9: nothing was said"):
         run_experiment(tmp_path / "run", tmp_path / "data", SETTINGS)
+
+
+def test_a_command_that_wrote_enough_has_not_failed(monkeypatch, tmp_path):
+    child(monkeypatch, 5, said="error: no surface", metrics={"prediction": {"mae_db": 0.8}})
+    chosen = (tmp_path / "run", tmp_path / "data", SETTINGS)
+    assert run_experiment(*chosen, enough="prediction")["prediction"] == {"mae_db": 0.8}
+    child(monkeypatch, 5, said="error: no surface")
+    for section in ("baseline", None):
+        with pytest.raises(RuntimeError, match="no surface"):
+            run_experiment(*chosen, enough=section)
+    # One that was stopped goes on another time.
+    child(monkeypatch, 130)
+    with pytest.raises(KeyboardInterrupt):
+        run_experiment(*chosen, enough="prediction")
+
+
+def test_another_file_is_run_with_its_own_settings(monkeypatch, tmp_path):
+    commands = child(monkeypatch, 0)
+    config = CONFIG.with_name("smoke.yaml")
+    run_experiment(tmp_path / "a", tmp_path / "data", [], config=config)
+    run_experiment(tmp_path / "b", tmp_path / "data", [])
+    assert [command[4] for command in commands] == [str(config), str(CONFIG)]
+    first, second = (command[5] for command in commands)
+    assert first.startswith(f"data.store={tmp_path / 'data' / 'three_spheres'}-")
+    assert first != second  # other poses, other echoes

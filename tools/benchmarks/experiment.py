@@ -9,7 +9,8 @@ import signal
 import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,8 +64,15 @@ COLUMNS = (
 )
 
 
-def run_experiment(folder: Path, data: Path, settings: Sequence[str]) -> dict[str, Any]:
-    """Run the default experiment as a user would, in a process of its own.
+def run_experiment(
+    folder: Path,
+    data: Path,
+    settings: Sequence[str],
+    *,
+    config: Path = CONFIG,
+    enough: str | None = None,
+) -> dict[str, Any]:
+    """Run an experiment as a user would, in a process of its own.
 
     Parameters
     ----------
@@ -73,7 +81,12 @@ def run_experiment(folder: Path, data: Path, settings: Sequence[str]) -> dict[st
     data : Path
         Of the ensembles, each by its hash, so that runs of the same echoes share one.
     settings : sequence of str
-        ``KEY=VALUE``, laid over the defaults.
+        ``KEY=VALUE``, laid over the file.
+    config : Path
+        The settings file; the defaults' where none is given.
+    enough : str or None
+        The section of ``metrics.json`` that is asked for: a command that wrote it has not failed,
+        whatever came after, as where a short fit holds no surface yet.
 
     Returns
     -------
@@ -89,7 +102,7 @@ def run_experiment(folder: Path, data: Path, settings: Sequence[str]) -> dict[st
     KeyboardInterrupt
         If it was stopped.
     """
-    chosen = load_settings(CONFIG, settings)
+    chosen = load_settings(config, settings)
     run = RunFolder(folder)
     if run.config.is_file():
         run.check(chosen)
@@ -100,7 +113,7 @@ def run_experiment(folder: Path, data: Path, settings: Sequence[str]) -> dict[st
     store = data / default_store(chosen, echo_hash(chosen, scene)).name
     log = folder.with_name(f"{folder.name}.log")
     storage.make_folder(folder.parent)
-    command = [sys.executable, "-m", "sononerf.cli", "fit", str(CONFIG), *settings]
+    command = [sys.executable, "-m", "sononerf.cli", "fit", str(config), *settings]
     command += [f"data.store={store}", "--output", str(folder)]
     # The child saves what it has when it is interrupted; it is waited for.
     before = signal.getsignal(signal.SIGINT)
@@ -113,11 +126,28 @@ def run_experiment(folder: Path, data: Path, settings: Sequence[str]) -> dict[st
         signal.signal(signal.SIGINT, before)
     if code in STOPPED:
         raise KeyboardInterrupt
-    if code:
+    if code and (enough is None or enough not in run.read_metrics()):
         lines = log.read_text(encoding="utf-8", errors="replace").split("\n")
         last = next((line for line in reversed(lines) if line.strip()), "nothing was said")
         raise RuntimeError(f"exit code {code}: {last.strip()}")
     return run.read_metrics()
+
+
+@contextmanager
+def ending(output: Path) -> Iterator[None]:
+    """End a series with one line where its runs cannot go on; its finished runs are kept."""
+    try:
+        yield
+    except (SonoNerfError, RuntimeError) as error:
+        raise SystemExit(f"error: {error}") from None
+    except KeyboardInterrupt:
+        raise SystemExit(f"{output}: stopped; the same command goes on") from None
+
+
+def origin() -> dict[str, str]:
+    """Return what a table was made with."""
+    machine = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    return {"sononerf": __version__, "machine": machine}
 
 
 def row_of(metrics: Mapping[str, Any]) -> Row:
@@ -171,27 +201,18 @@ def run_series(
     """
     rows: list[Row] = []
     for name, head, settings in experiments:
-        try:
-            metrics = run_experiment(output / name, data or output / "data", settings)
-            row = {**head, **row_of(metrics)}
-            row["over"] = row["fit_s"] is not None and row["fit_s"] > seconds
-        except SonoNerfError as error:  # would be the same for all, and cost a table that is there
-            raise SystemExit(f"error: {error}") from None
-        except RuntimeError as error:
-            row = {**head, "failed": str(error), "over": False}
-        except KeyboardInterrupt:
-            raise SystemExit(f"{output}: stopped; the same command goes on") from None
+        with ending(output):  # wrong settings would be so for all, and cost a table that is there
+            try:
+                metrics = run_experiment(output / name, data or output / "data", settings)
+                row = {**head, **row_of(metrics)}
+                row["over"] = row["fit_s"] is not None and row["fit_s"] > seconds
+            except RuntimeError as error:
+                row = {**head, "failed": str(error), "over": False}
         rows.append({**row, "settings": list(settings)})
         print(f"{output / name}: {row.get('failed', 'done')}", file=sys.stderr, flush=True)
         storage.commit_json(
             output / file,
-            {
-                "sononerf": __version__,
-                "machine": f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores",
-                "seconds": seconds,
-                **summary(rows),
-                "rows": rows,
-            },
+            {**origin(), "seconds": seconds, **summary(rows), "rows": rows},
         )
         after(rows)
     return f"{table(rows)}\nwrote {output / file}"
@@ -226,11 +247,7 @@ def table(rows: Sequence[Row]) -> str:
     for name in ("median", "worst"):
         lines.append([_shown(column, found[name], "") for column in columns])
         lines[-1][0] = name
-    widths = [max(len(line[index]) for line in lines) for index in range(len(columns))]
-    text = [
-        "  ".join(word.rjust(width) for word, width in zip(line, widths, strict=True)).rstrip()
-        for line in lines
-    ]
+    text = aligned(lines)
     for number, row in enumerate(rows, start=1):
         text[number] += f"  failed: {row['failed']}" if "failed" in row else ""
         text[number] += "  over" if row["over"] else ""
@@ -239,6 +256,15 @@ def table(rows: Sequence[Row]) -> str:
         f"{found['over']} over the time, {found['failed']} failed"
     )
     return "\n".join(text)
+
+
+def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows of words as lines of text, each column at the right of its place."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return [
+        "  ".join(word.rjust(width) for word, width in zip(line, widths, strict=True)).rstrip()
+        for line in lines
+    ]
 
 
 def _shown(column: Column, row: Mapping[str, Any], absent: str = "-") -> str:
