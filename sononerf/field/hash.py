@@ -11,15 +11,12 @@ import torch.nn.functional as F
 from pydantic import Field as Option
 from torch import Tensor, nn
 
-from sononerf.field.field import Field
-from sononerf.field.grid import LOG_STRENGTH_FLOOR, QUIETEST
+from sononerf.field.lobe import CALM, CODE, CalmLayer, LobeField, hidden_layers
 
 PRIMES = (1, 2654435761, 805459861)
 """What the numbers of a vertex along x, y and z are multiplied by; Müller et al. 2022, eq. 4."""
 CHUNK = 65_536
 """How many places are read out at once."""
-CALM = 0.1
-"""How far Adam's step moves a weight that all places share, beside one of a single vertex."""
 
 
 class _Blend(torch.autograd.Function):
@@ -41,34 +38,14 @@ class _Blend(torch.autograd.Function):
         return total.T, None, None
 
 
-class _Layer(nn.Linear):
-    """A layer that moves calmly: with steps as large as a vertex takes, a whole field may die."""
-
-    def __init__(self, start: int, end: int) -> None:
-        super().__init__(start, end)
-        with torch.no_grad():
-            self.weight.div_(CALM)
-            self.bias.zero_()
-
-    def forward(self, x: Tensor) -> Tensor:
-        return F.linear(x, self.weight * CALM, self.bias * CALM)
-
-
-class HashField(Field):
-    r"""Lobes read out of a multi-resolution hash grid by a small network.
-
-    .. math::
-        \rho(x, u, f) = \exp\big(a(x) + \kappa_f (m(x) \cdot u - |m(x)|) + s_f
-        + c(x) \cdot b_f\big)
+class HashField(LobeField):
+    """Lobes read out of a multi-resolution hash grid by a small network.
 
     Each level is a cubic lattice with a feature vector per vertex. A level whose vertices fit
     into the table has one entry for each of them; in a finer one vertices share entries, by a
     hash of their numbers [1]_. The levels' features, interpolated trilinearly, go through two
-    hidden layers, and past them, into the log strength :math:`a`, the lobe vector :math:`m` (along
-    the surface normal, as long as the lobe is concentrated) and the coefficients :math:`c` of a
-    correction in a basis of ``rank`` spectra :math:`b`. :math:`\kappa_f` sharpens the lobe with
-    frequency and :math:`s_f` is one spectrum for the whole field. A fit begins with the coarsest
-    level; the finer ones follow one after the other.
+    hidden layers, and past them, into what the places are. A fit begins with the coarsest level;
+    the finer ones follow one after the other.
 
     Parameters
     ----------
@@ -89,7 +66,8 @@ class HashField(Field):
     width : int
         Width of the hidden layers.
     rank : int
-        Number of spectra of the correction; at most one less than there are frequencies.
+        Number of spectra that places add by coefficients of their own; at most one less than
+        there are frequencies.
     released : float
         The part of the fit after which all levels take part.
 
@@ -99,8 +77,6 @@ class HashField(Field):
        multiresolution hash encoding", ACM Transactions on Graphics 41(4):102, 2022.
     """
 
-    learning_rate = 0.05
-    knows_directions = True
     progress: Tensor
     _last: Tensor
     _factors: Tensor
@@ -119,7 +95,7 @@ class HashField(Field):
         rank: Annotated[int, Option(ge=0, le=64)] = 6,
         released: Annotated[float, Option(gt=0, le=1)] = 0.4,
     ) -> None:
-        super().__init__(region, frequency)
+        super().__init__(region, frequency, rank)
         self.spacings = [finest * growth ** (levels - 1 - level) for level in range(levels)]
         self.released = released
         self._mask = 2**log2_entries - 1
@@ -138,19 +114,14 @@ class HashField(Field):
         self.register_buffer("_factors", torch.tensor(factors), persistent=False)
         self.register_buffer("progress", torch.ones(()))
         self.table = nn.Parameter(torch.zeros(self._first[-1], features).uniform_(-1e-4, 1e-4))
-        rank = min(rank, len(frequency) - 1)
-        self.hidden = nn.Sequential(
-            _Layer(levels * features, width), nn.ReLU(), _Layer(width, width), nn.ReLU()
-        )
-        self.out = _Layer(width + levels * features, 4 + rank)
+        self.hidden = hidden_layers(levels * features, width)
+        self.out = CalmLayer(width + levels * features, CODE + self.rank)
         with torch.no_grad():
-            # At first each level adds to strength and lobe as if it held nothing else.
-            self.out.weight[:, width:] = torch.eye(4 + rank, features).repeat(1, levels) / CALM
-        self.spectrum = nn.Parameter(torch.zeros(len(frequency)))
-        self.sharpness = nn.Parameter(torch.zeros(len(frequency)))
-        # Cosines over the frequencies to begin with, the slowest first.
-        phase = (torch.arange(len(frequency)) + 0.5) * (math.pi / len(frequency))
-        self.basis = nn.Parameter(torch.cos(torch.arange(1, rank + 1)[:, None] * phase))
+            # At first each level adds to strength and lobe as if it held nothing else. Nothing is
+            # curved until it is learned, and that begins late.
+            start = torch.eye(CODE + self.rank, features).repeat(1, levels)
+            self.out.weight[:, width:] = start / CALM
+            self.out.weight[CODE - 1] = 0.0
 
     @property
     def resolution(self) -> float:
@@ -158,7 +129,8 @@ class HashField(Field):
         return self.spacings[-1]
 
     def advance(self, step: int, total: int) -> None:
-        """Release levels; how far that has come is kept with the weights."""
+        """Release levels, and let places be curved; how far that has come is kept."""
+        super().advance(step, total)
         self.progress.fill_(step / total)
 
     def release(self) -> Tensor:
@@ -205,77 +177,15 @@ class HashField(Field):
         return (read * self.release()[:, None, None]).transpose(0, 1).flatten(1)
 
     def code(self, positions: Tensor) -> Tensor:
-        """Return log strength, lobe vector and coefficients of (N, 3) places, (N, 4 + rank)."""
+        """Read what (N, 3) places are, (N, 5 + rank); see the base class."""
         features = self.encode(positions)
         code: Tensor = self.out(torch.cat((self.hidden(features), features), dim=1))
         return code
 
-    def _log_strength(self, code: Tensor, bins: Tensor | slice) -> Tensor:
-        """Return the log reflectivity along the lobe's axis, (N, B)."""
-        correction = code[:, 4:] @ self.basis[:, bins] + self.spectrum[bins]
-        return code[:, :1].clamp_min(LOG_STRENGTH_FLOOR) + correction
-
-    def select(self, positions: Tensor, directions: Tensor, bins: Tensor | None) -> Tensor:
-        """Return the reflectivity of (N, 3) places towards (..., N, 3) directions."""
-        return self._response(self.code(positions), self.inside(positions), directions, bins)
-
-    def echo(
-        self,
-        positions: Tensor,
-        directions: Tensor,
-        bins: Tensor | None,
-        place: Tensor | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """Return the reflectivity, (M, B), and no lead; see the base class."""
-        code, inside = self.code(positions), self.inside(positions)
-        if place is not None:
-            code, inside = code[place], inside[place]
-        response = self._response(code, inside, directions, bins)
-        return response, torch.zeros_like(directions[:, 0])
-
-    def _response(
-        self, code: Tensor, inside: Tensor, directions: Tensor, bins: Tensor | None
-    ) -> Tensor:
-        which = slice(None) if bins is None else bins
-        lobe = code[:, 1:4]
-        # The small number keeps the gradient finite where there is no lobe.
-        tilt = (directions * lobe).sum(-1) - (lobe.square().sum(-1) + 1e-6).sqrt()
-        away = tilt[..., None] * self.sharpness[which].exp()
-        response = (self._log_strength(code, which) + away).exp()
-        return response * inside[:, None]
-
-    @torch.no_grad()
-    def audible(self, positions: Tensor, directions: Tensor) -> Tensor:
-        """Return which of (N, 3) places answer towards which (P, N, 3) directions, (P, N) bool."""
-        lobe = self.code(positions)[:, 1:4]
-        tilt = (directions * lobe).sum(-1) - lobe.norm(dim=-1)
-        return tilt * self.sharpness.min().exp() > QUIETEST
-
-    def forward(self, positions: Tensor, directions: Tensor) -> Tensor:
-        """Return the reflectivity, (..., F) float."""
-        shape = torch.broadcast_shapes(positions.shape, directions.shape)
-        flat = positions.expand(shape).reshape(-1, 3)
-        response = self.select(flat, directions.expand(shape).reshape(-1, 3), None)
-        return response.reshape(*shape[:-1], response.shape[-1])
-
     @torch.no_grad()
     def oriented(self, positions: Tensor, directions: int) -> tuple[Tensor, Tensor]:
-        r"""Return energy and axis from the lobe itself, exact where a lattice would be too coarse.
-
-        The mean over the sphere of :math:`e^{2k(\cos - 1)}` is :math:`(1 - e^{-4k})/(4k)`.
-        """
-        del directions
-        # One part after the other: eight corners per level and place take room.
-        parts = [self._oriented(part) for part in positions.split(CHUNK)]
+        """Return energy and axis; one part after the other, for eight corners each take room."""
+        whole = super().oriented
+        parts = [whole(part, directions) for part in positions.split(CHUNK)]
         energy, axis = (torch.cat(part) for part in zip(*parts, strict=True))
-        return energy * self.inside(positions), axis
-
-    def _oriented(self, positions: Tensor) -> tuple[Tensor, Tensor]:
-        code = self.code(positions)
-        lobe = code[:, 1:4]
-        length = lobe.norm(dim=-1, keepdim=True)
-        concentration = length * self.sharpness.exp()
-        mean = -torch.expm1(-4 * concentration) / (4 * concentration).clamp_min(1e-12)
-        mean = torch.where(concentration > 1e-6, mean, torch.ones_like(mean))
-        power = (2 * self._log_strength(code, slice(None))).exp() * mean
-        return power.sum(-1), lobe / length.clamp_min(1e-12)
+        return energy, axis

@@ -1,49 +1,12 @@
 # SPDX-License-Identifier: MIT
-import math
-
 import pytest
 import torch
 
-import sononerf.field.hash as hash_module
 from sononerf.field.field import sphere_directions
-from sononerf.field.grid import LOG_STRENGTH_FLOOR
 from sononerf.field.hash import HashField
+from tests.field.lobes import FREQUENCY, REGION, SHARED, fill, hashed, places_in
 
-# 51, 40 and 27 mm: in steps of 10 mm 7 x 5 x 4 vertices, in steps of 20 mm 4 x 3 x 3.
-REGION = torch.tensor([[-0.03, 0.01, 0.2], [0.021, 0.05, 0.227]], dtype=torch.float64)
-FREQUENCY = torch.tensor([30e3, 50e3, 70e3], dtype=torch.float64)
 SIZES = [(4, 3, 3), (7, 5, 4)]
-# Tables of 64 entries: the coarse level's 36 vertices have their own, the fine one's 140 share.
-SHARED = {"log2_entries": 6}
-
-
-def hashed(region=REGION, frequency=FREQUENCY, *, seed=0, **options):
-    torch.manual_seed(seed)
-    given = {"finest": 0.01, "levels": 2, "width": 8, **options}
-    return HashField(region, frequency, **given).double()
-
-
-def places_in(count, region=REGION, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    part = torch.rand(count, 3, generator=generator, dtype=torch.float64)
-    return region[0] + part * (region[1] - region[0])
-
-
-def fill(field, seed=0, size=0.5):
-    generator = torch.Generator().manual_seed(seed)
-    with torch.no_grad():
-        for parameter in field.parameters():
-            values = torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
-            parameter.copy_(size * values)
-    return field
-
-
-def say(field, code):
-    """Make a field put out the same code everywhere."""
-    with torch.no_grad():
-        field.out.weight.zero_()
-        field.out.bias.copy_(torch.as_tensor(code) / hash_module.CALM)
-    return field
 
 
 def vertices(level):
@@ -54,31 +17,10 @@ def vertices(level):
     return numbers, REGION[0] + step * torch.tensor(numbers, dtype=torch.float64)
 
 
-def test_shape_keeps_the_batch():
-    field = fill(hashed())
-    places, directions = places_in(6).reshape(2, 3, 3), sphere_directions(6, REGION)
-    assert field(places, directions.reshape(2, 3, 3)).shape == (2, 3, 3)
-    assert field(places, directions[0]).shape == (2, 3, 3)
-    assert field.select(places[0], directions.reshape(2, 3, 3), None).shape == (2, 3, 3)
-    assert field(places[:0], directions[0]).shape == (0, 3, 3)
-    assert [part.shape for part in field.oriented(places[0, :0], 8)] == [(0,), (0, 3)]
-
-
-def test_device_and_type_follow_the_field(device):
-    field = hashed(REGION.float(), **SHARED).float().to(device)
-    places = places_in(5).float().to(device)
-    response = field(places, sphere_directions(5, places))
-    assert (response.device, response.dtype) == (places.device, torch.float32)
-    assert not response.is_complex()
-    energy, axis = field.oriented(places, 8)
-    assert (energy.device, axis.dtype) == (places.device, torch.float32)
-    assert fill(hashed())(places_in(5), sphere_directions(5, REGION)).dtype == torch.float64
-
-
 @pytest.mark.parametrize("log2_entries", [17, 4], ids=["own", "shared"])
 def test_gradients(log2_entries):
     options = {"finest": 0.025, "features": 2, "width": 4, "released": 0.5}
-    field = fill(hashed(log2_entries=log2_entries, **options))
+    field = fill(hashed(log2_entries=log2_entries, **options), size=0.5)
     field.advance(1, 5)  # the fine level takes part with two fifths
     places = torch.cat((places_in(4), places_in(1) + 1))
     directions = sphere_directions(5, REGION)
@@ -100,6 +42,20 @@ def test_a_new_field_is_one_everywhere_and_moves_from_the_first_step():
     for name, parameter in field.named_parameters():
         assert parameter.grad.isfinite().all(), name
         assert parameter.grad.abs().max() > 0, name
+
+
+@pytest.mark.parametrize("features", [4, 6])
+def test_nothing_is_curved_until_it_is_learned(features):
+    """Whatever the features have become when it begins."""
+    field = hashed(features=features)
+    with torch.no_grad():
+        field.table.normal_()
+    field.advance(4, 10)
+    lead = field.echo(places_in(20), sphere_directions(20, REGION), None)[1]
+    assert lead.abs().max() == 0
+    lead.sum().backward()
+    moved = field.out.weight.grad.abs().amax(1) > 0
+    assert moved.tolist() == [i == 4 for i in range(7)]
 
 
 def test_linear_functions_are_read_exactly():
@@ -197,118 +153,6 @@ def test_a_level_that_is_not_released_says_nothing():
     assert not torch.allclose(field(places, directions), early)
 
 
-def test_the_lobe_formula():
-    r"""exp(a + e^k (m·u - |m|) + s + c·b) from numbers put in by hand."""
-    field = hashed()
-    lobe = torch.tensor([1.0, -2.0, 2.0], dtype=torch.float64)
-    spectrum = torch.tensor([0.1, -0.2, 0.3], dtype=torch.float64)
-    sharpness = torch.tensor([0.0, 0.5, -0.5], dtype=torch.float64)
-    basis = torch.tensor([[1.0, 2.0, 3.0], [-1.0, 0.0, 4.0]], dtype=torch.float64)
-    say(field, [-1.5, *lobe, 0.2, -0.1])
-    with torch.no_grad():
-        field.spectrum.copy_(spectrum)
-        field.sharpness.copy_(sharpness)
-        field.basis.copy_(basis)
-    directions = torch.cat((lobe[None] / 3, sphere_directions(8, REGION)))
-    place = places_in(1).expand(9, 3)
-    correction = [0.2 * one - 0.1 * two for one, two in basis.T.tolist()]
-    expected = [
-        [
-            math.exp(-1.5 + math.exp(k) * (float(u @ lobe) - 3.0) + s + c)
-            for k, s, c in zip(sharpness.tolist(), spectrum.tolist(), correction, strict=True)
-        ]
-        for u in directions
-    ]
-    # A small number under the root keeps its gradient finite: 1e-6 / (2 |m|) in the exponent.
-    expected = torch.tensor(expected, dtype=torch.float64)
-    torch.testing.assert_close(field(place, directions), expected, rtol=1e-6, atol=0)
-    bins = torch.tensor([2, 1])
-    some = field.select(place, directions, bins)
-    torch.testing.assert_close(some, expected[:, bins], rtol=1e-6, atol=0)
-
-
-def test_strength_has_a_floor():
-    field = say(hashed(), [-1000.0] + [0.0] * 5)
-    found = field(places_in(1), sphere_directions(1, REGION))
-    expected = torch.full_like(found, math.exp(LOG_STRENGTH_FLOOR))
-    torch.testing.assert_close(found, expected, rtol=1.1e-3, atol=0)  # |m| = sqrt(1e-6) there
-
-
-def test_the_correction_begins_with_slow_cosines_that_leave_the_mean_alone():
-    frequency = torch.linspace(10e3, 100e3, 47, dtype=torch.float64)
-    basis = hashed(frequency=frequency, rank=6).basis.detach()
-    assert basis.shape == (6, 47)
-    # Orthogonal to each other and to a constant; one of them has 47 / 2 for a square.
-    assert basis.sum(1).abs().max() < 1e-4
-    expected = 23.5 * torch.eye(6, dtype=torch.float64)
-    torch.testing.assert_close(basis @ basis.T, expected, rtol=0, atol=1e-4)
-    turns = (basis[:, 1:] * basis[:, :-1] < 0).sum(1)
-    assert turns.tolist() == [1, 2, 3, 4, 5, 6]
-    # No more than a spectrum has shapes.
-    assert hashed(rank=6).basis.shape == (2, 3)
-    single = hashed(frequency=FREQUENCY[:1])
-    assert single.basis.shape == (0, 1)
-    assert single(places_in(2), sphere_directions(2, REGION)).shape == (2, 1)
-    assert hashed(rank=0).out.out_features == 4
-
-
-def test_inaudible_is_what_is_faint_at_every_frequency():
-    field = fill(hashed(**SHARED), seed=3)
-    with torch.no_grad():
-        field.out.bias[1:4] = torch.tensor([30.0, -80.0, 50.0])
-    places, directions = places_in(20), sphere_directions(600, REGION).reshape(30, 20, 3)
-    lobe = field.code(places)[:, 1:4]
-    peak = field.select(places, lobe / lobe.norm(dim=1, keepdim=True), None)
-    faint = (field.select(places, directions, None) < math.exp(-5) * peak).all(-1)
-    assert torch.equal(field.audible(places, directions), ~faint)
-    assert 0.1 < float(faint.double().mean()) < 0.9
-
-
-def test_energy_and_axis_are_those_of_a_dense_sphere(monkeypatch):
-    monkeypatch.setattr(hash_module, "CHUNK", 4)  # in parts, as a large lattice is
-    field = fill(hashed(**SHARED), seed=3)
-    with torch.no_grad():
-        field.out.bias[1:4] = torch.tensor([30.0, -80.0, 50.0])  # concentrations up to 20
-    places = torch.cat((places_in(8), REGION[1:] + 0.01))
-    dense = sphere_directions(20_000, REGION)
-    power = field.select(places, dense[:, None].expand(-1, len(places), 3), None).square()
-    energy, axis = field.oriented(places, 32)
-    # |m| against sqrt(|m|² + 1e-6), and the lattice itself: a part in ten thousand.
-    torch.testing.assert_close(energy, power.mean(0).sum(-1), rtol=1e-4, atol=0)
-    assert energy[-1] == 0
-    moment = torch.einsum("dnf,di->ni", power, dense)
-    moment /= moment.norm(dim=1, keepdim=True).clamp_min(1e-30)
-    torch.testing.assert_close(axis[:-1], moment[:-1], rtol=0, atol=1e-4)
-
-
-def test_without_a_lobe_the_energy_is_that_of_all_directions():
-    energy, axis = say(hashed(), [0.0] * 6).oriented(places_in(2), 32)
-    torch.testing.assert_close(energy, torch.full_like(energy, 3.0))
-    assert axis.abs().max() == 0
-
-
-def test_zero_outside_the_region_and_where_not_kept():
-    field = fill(hashed())
-    outside = REGION.mean(0) + torch.diag(REGION[1] - REGION[0])
-    assert field(outside, sphere_directions(3, REGION)).abs().max() == 0
-    vertex = REGION[:1] + 0.01 * torch.tensor([[2, 1, 1]])
-    field.keep(vertex, field.resolution)
-    probe = torch.cat((vertex + 0.0049, vertex - 0.0049, vertex + 0.0051))
-    response = field(probe, sphere_directions(3, REGION)).abs().amax(-1)
-    assert (response > 0).tolist() == [True, True, False]
-    assert (field.oriented(probe, 8)[0] > 0).tolist() == [True, True, False]
-
-
-def test_moving_region_and_places_together_changes_nothing():
-    shift = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
-    one, two = fill(hashed(**SHARED)), fill(hashed(REGION + shift, **SHARED))
-    places, directions = places_in(20), sphere_directions(20, REGION)
-    torch.testing.assert_close(one(places, directions), two(places + shift, directions))
-    order = torch.randperm(20, generator=torch.Generator().manual_seed(0))
-    moved = one(places[order], directions[order])
-    torch.testing.assert_close(moved, one(places, directions)[order])
-
-
 def test_the_seed_decides_the_parameters():
     states = [hashed(seed=seed).state_dict() for seed in (0, 0, 1)]
     assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
@@ -341,13 +185,14 @@ COLOUR = torch.tensor([[-0.5, 0.0, 0.5]])
 def true_code(places):
     radius = places.norm(dim=1, keepdim=True).clamp_min(1e-9)
     strength = -((radius - 0.012) / 0.005).square()
-    return torch.cat((strength, 4 * places / radius, places[:, :1] / 0.02), dim=1)
+    flat = torch.zeros_like(radius)
+    return torch.cat((strength, 4 * places / radius, flat, places[:, :1] / 0.02), dim=1)
 
 
 def true_response(places, directions):
     code = true_code(places)
     away = (directions * code[:, 1:4]).sum(1, keepdim=True) - 4
-    return (code[:, :1] + away * SHARPNESS + SPECTRUM + code[:, 4:] @ COLOUR).exp()
+    return (code[:, :1] + away * SHARPNESS + SPECTRUM + code[:, 5:] @ COLOUR).exp()
 
 
 def ball(**options):
@@ -369,7 +214,7 @@ def miss(field):
 
 
 def truth_on_vertices():
-    field = ball(levels=1, features=5)
+    field = ball(levels=1, features=6)
     axis = torch.arange(11) * 0.004 - 0.02
     z, y, x = torch.meshgrid(axis, axis, axis, indexing="ij")
     with torch.no_grad():

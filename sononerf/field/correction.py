@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: MIT
+"""What a lobe cannot say: a small network that corrects its log strength."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from sononerf.field.lobe import CalmLayer, hidden_layers
+
+LARGEST = 3.0
+"""No correction is larger, as a natural logarithm: 26 dB."""
+
+
+def harmonics(directions: Tensor) -> Tensor:
+    """Return the real spherical harmonics up to degree 3.
+
+    Parameters
+    ----------
+    directions : (..., 3) float
+        Unit vectors.
+
+    Returns
+    -------
+    harmonics : (..., 16) float
+        By degree; the mean of their squares over the sphere is one, of products zero.
+
+    References
+    ----------
+    .. [1] M. A. Blanco, M. Flórez, M. Bermejo, "Evaluation of the rotation matrices in the basis
+       of real spherical harmonics", Journal of Molecular Structure: THEOCHEM 419:19-27, 1997.
+    """
+    x, y, z = directions.unbind(-1)
+    polynomials = (
+        (1.0, torch.ones_like(x)),
+        *((3.0, first) for first in (x, y, z)),
+        *((15.0, second) for second in (x * y, y * z, z * x, (x * x - y * y) / 2)),
+        (5.0, (3 * z * z - 1) / 2),
+        (7.0, z * (5 * z * z - 3) / 2),
+        *((21 / 8, third * (5 * z * z - 1)) for third in (x, y)),
+        *((105.0, third * z) for third in (x * y, (x * x - y * y) / 2)),
+        (35 / 8, x * (x * x - 3 * y * y)),
+        (35 / 8, y * (3 * x * x - y * y)),
+    )
+    return torch.stack([math.sqrt(square) * value for square, value in polynomials], dim=-1)
+
+
+class Correction(nn.Module):
+    r"""A network's addition to the log strength: zero at first, and never beyond ``LARGEST``.
+
+    Its inputs are sines and cosines of the position, in wavelengths from twice the region's
+    longest side down by halves to no less than four times the spacing, and the spherical
+    harmonics of the direction; of its output :math:`y` it returns :math:`L \tanh(y / L)`.
+
+    Parameters
+    ----------
+    region : (2, 3) float, m
+        Lower and upper corner of the box, world frame.
+    spacing : float, m
+        Of the field that is corrected.
+    width : int
+        Width of the two hidden layers.
+    count : int
+        Number of frequencies.
+    """
+
+    origin: Tensor
+    waves: Tensor
+
+    def __init__(self, region: Tensor, spacing: float, width: int, count: int) -> None:
+        super().__init__()
+        finest = 4 * spacing
+        longest = max(2 * float((region[1] - region[0]).max()), finest)
+        octaves = math.floor(math.log2(longest / finest) + 1e-6) + 1
+        # Both follow from the field's region and options, so they need not be kept.
+        self.register_buffer("origin", region[0].clone(), persistent=False)
+        waves = 2 * math.pi / longest * 2.0 ** torch.arange(octaves)
+        self.register_buffer("waves", waves, persistent=False)  # rad/m
+        self.hidden = hidden_layers(6 * octaves + 16, width)
+        self.out = CalmLayer(width, count)
+        nn.init.zeros_(self.out.weight)
+
+    def forward(self, positions: Tensor, directions: Tensor, bins: Tensor | None) -> Tensor:
+        """Return what to add to the log strength.
+
+        Differentiable in the parameters.
+
+        Parameters
+        ----------
+        positions : (N, 3) float, m
+            Places, world frame.
+        directions : (..., N, 3) float
+            Unit vectors to the emitter.
+        bins : (B,) int or None
+            Which frequencies; all where None.
+
+        Returns
+        -------
+        correction : (..., N, B) float
+        """
+        phase = ((positions - self.origin)[..., None] * self.waves).flatten(-2)
+        place = torch.cat((phase.sin(), phase.cos()), dim=-1).expand(*directions.shape[:-1], -1)
+        hidden = self.hidden(torch.cat((place, harmonics(directions)), dim=-1))
+        wanted = self.out(hidden, slice(None) if bins is None else bins)
+        return LARGEST * torch.tanh(wanted / LARGEST)

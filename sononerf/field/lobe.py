@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: MIT
+"""What a reflection lobe is, and the field that has one at every place."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from sononerf.field.field import Field
+
+LOG_STRENGTH_FLOOR = -18.0
+QUIETEST = -5.0
+"""A lobe is left out where it is this much below its own peak, as a natural logarithm: -43 dB."""
+CURVED_AFTER = 0.4
+"""Share of the fit after which places may be curved: before, they are not where they belong."""
+RADIUS_UNIT = 0.015
+"""What one unit of the learned number is in metres: how fast the radii are learned."""
+CODE = 5
+"""Numbers of a place before the coefficients: log strength, lobe vector (x, y, z), radius."""
+CALM = 0.1
+"""How far Adam's step moves a weight that all places share, beside one of a single vertex."""
+
+
+class CalmLayer(nn.Linear):
+    """A layer that moves calmly: with steps as large as a vertex takes, a whole field may die.
+
+    Parameters
+    ----------
+    start, end : int
+        Numbers in and out.
+    """
+
+    def __init__(self, start: int, end: int) -> None:
+        super().__init__(start, end)
+        with torch.no_grad():
+            self.weight.div_(CALM)
+            self.bias.zero_()
+
+    def forward(self, x: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
+        """Return some of the numbers, all by default: (..., start) to (..., B)."""
+        return F.linear(x, self.weight[rows] * CALM, self.bias[rows] * CALM)
+
+
+def hidden_layers(start: int, width: int) -> nn.Sequential:
+    """Return two hidden layers that move calmly."""
+    return nn.Sequential(CalmLayer(start, width), nn.ReLU(), CalmLayer(width, width), nn.ReLU())
+
+
+class LobeField(Field):
+    r"""A reflection lobe at every place.
+
+    .. math::
+        \rho(x, u, f) = \exp\big(a(x) + \kappa_f (m(x) \cdot u - |m(x)|) + s_f
+        + c(x) \cdot b_f\big)
+
+    :math:`a` is the log strength; the lobe vector :math:`m` points along the surface normal and
+    its length is the lobe's concentration; :math:`\kappa_f` sharpens the lobe with frequency;
+    :math:`s_f` is one spectrum for the whole field, to which each place adds ``rank`` spectra
+    :math:`b` by coefficients :math:`c` of its own.
+
+    A lobe stands for a piece of surface between two vertices, which is curved: at an angle
+    :math:`\theta` off the axis the echo comes from :math:`R(x) (1 - \cos\theta)` nearer. Without
+    the radius of curvature :math:`R`, learned late, all echoes off the axis would be too far, and
+    the places would move outward to make up for it. A place without a lobe has no axis to be off,
+    so the lead fades with the lobe, by :math:`1 - e^{-|m|^2}`, which is seen below :math:`|m| = 2`.
+
+    Parameters
+    ----------
+    region : (2, 3) float, m
+        Lower and upper corner of the box, world frame.
+    frequency : (F,) float, Hz
+        Frequencies of the answer.
+    rank : int
+        Number of spectra that places add by coefficients of their own; at most one less than
+        there are frequencies.
+    """
+
+    learning_rate = 0.05
+    knows_directions = True
+    curved: Tensor
+
+    def __init__(self, region: Tensor, frequency: Tensor, rank: int) -> None:
+        super().__init__(region, frequency)
+        count = len(frequency)
+        self.rank = min(rank, count - 1)
+        self.register_buffer("curved", torch.zeros(()))
+        self.spectrum = nn.Parameter(torch.zeros(count))
+        self.sharpness = nn.Parameter(torch.zeros(count))
+        # Cosines over the frequencies to begin with, the slowest first.
+        phase = (torch.arange(count) + 0.5) * (math.pi / count)
+        basis = torch.cos(torch.arange(1, self.rank + 1)[:, None] * phase)
+        self.basis = nn.Parameter(basis) if self.rank else None
+
+    def code(self, positions: Tensor) -> Tensor:
+        """Read what (N, 3) places are, (N, 5 + rank).
+
+        Log strength, lobe vector, radius of curvature in ``RADIUS_UNIT``, coefficients.
+        """
+        raise NotImplementedError
+
+    def advance(self, step: int, total: int) -> None:
+        """Let places be curved once they are about where they belong."""
+        self.curved.fill_(float(step >= CURVED_AFTER * total))
+
+    def _spectrum(self, code: Tensor, bins: Tensor | slice) -> Tensor:
+        """Return the log spectrum along the axis: (B,), or (N, B) where places have their own."""
+        if self.basis is None:
+            return self.spectrum[bins]
+        return self.spectrum[bins] + code[:, CODE:] @ self.basis[:, bins]
+
+    def _log_response(
+        self, code: Tensor, positions: Tensor, directions: Tensor, bins: Tensor | None
+    ) -> Tensor:
+        """Return the log reflectivity of (N, 3) places towards (..., N, 3), (..., N, B)."""
+        del positions
+        which = slice(None) if bins is None else bins
+        lobe = code[:, 1:4]
+        # The small number keeps the gradient finite where there is no lobe yet.
+        length = (lobe.square().sum(-1) + 1e-6).sqrt()
+        tilt = (directions * lobe).sum(-1) - length  # (..., N), zero on the axis
+        away = tilt[..., None] * self.sharpness[which].exp()
+        return code[:, :1].clamp_min(LOG_STRENGTH_FLOOR) + away + self._spectrum(code, which)
+
+    def select(self, positions: Tensor, directions: Tensor, bins: Tensor | None) -> Tensor:
+        """Return the reflectivity of (N, 3) places towards (..., N, 3) directions."""
+        response = self._log_response(self.code(positions), positions, directions, bins).exp()
+        return response * self.inside(positions)[:, None]
+
+    @torch.no_grad()
+    def audible(self, positions: Tensor, directions: Tensor) -> Tensor:
+        """Return which places answer towards which directions, (P, N) bool; by the lobe alone."""
+        lobe = self.code(positions)[:, 1:4]
+        tilt = (directions * lobe).sum(-1) - lobe.norm(dim=-1)
+        return tilt * self.sharpness.min().exp() > QUIETEST
+
+    def echo(
+        self,
+        positions: Tensor,
+        directions: Tensor,
+        bins: Tensor | None,
+        place: Tensor | None = None,
+    ) -> tuple[Tensor, Tensor]:
+        """Return the reflectivity, (M, B), and how much nearer it comes from, (M,) m."""
+        code, inside = self.code(positions), self.inside(positions)
+        if place is not None:
+            code, inside, positions = code[place], inside[place], positions[place]
+        response = self._log_response(code, positions, directions, bins).exp()
+        lobe = code[:, 1:4].detach()  # the range must not turn the lobes
+        length = lobe.norm(dim=-1)
+        cosine = (directions * lobe).sum(-1) / length.clamp_min(1e-6)
+        off = (1 - cosine) * (1 - (-length.square()).exp())
+        return response * inside[:, None], RADIUS_UNIT * self.curved * code[:, 4] * off
+
+    def forward(self, positions: Tensor, directions: Tensor) -> Tensor:
+        """Return the reflectivity, (..., F) float."""
+        shape = torch.broadcast_shapes(positions.shape, directions.shape)
+        flat = positions.expand(shape).reshape(-1, 3)
+        response = self.select(flat, directions.expand(shape).reshape(-1, 3), None)
+        return response.reshape(*shape[:-1], response.shape[-1])
+
+    @torch.no_grad()
+    def oriented(self, positions: Tensor, directions: int) -> tuple[Tensor, Tensor]:
+        r"""Return energy and axis of the lobe alone, exact where a lattice would be too coarse.
+
+        The mean over the sphere of :math:`e^{2k(\cos - 1)}` is :math:`(1 - e^{-4k})/(4k)`.
+        """
+        del directions
+        code = self.code(positions)
+        length = code[:, 1:4].norm(dim=-1)
+        concentration = length[:, None] * self.sharpness.exp()
+        mean = -torch.expm1(-4 * concentration) / (4 * concentration).clamp_min(1e-12)
+        mean = torch.where(concentration > 1e-6, mean, torch.ones_like(mean))
+        strength = code[:, :1].clamp_min(LOG_STRENGTH_FLOOR)
+        power = (2 * (strength + self._spectrum(code, slice(None)))).exp() * mean
+        energy = power.sum(-1) * self.inside(positions)
+        return energy, code[:, 1:4] / length.clamp_min(1e-12)[:, None]
