@@ -253,6 +253,12 @@ class PreviewSettings(_Section):
     voxels: Annotated[int, Field(ge=8, le=512)] = 48  # along the region's longest side
 
 
+class PredictionSettings(_Section):
+    """What a prediction is made of, beside the rendered field."""
+
+    traced: Literal["auto", "off"] = "auto"  # echoes off the mesh, as far as validation bears out
+
+
 class ReconstructionSettings(_Section):
     """The read-out of the finished field."""
 
@@ -279,6 +285,7 @@ class Settings(_Section):
     renderer: RendererSettings = RendererSettings()
     fit: FitSettings = FitSettings()
     preview: PreviewSettings = PreviewSettings()
+    prediction: PredictionSettings = PredictionSettings()
     reconstruction: ReconstructionSettings = ReconstructionSettings()
 
     @model_validator(mode="after")

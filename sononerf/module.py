@@ -21,7 +21,7 @@ ACTIVE_DB = 3.0
 """A cell is active where measurement or prediction reaches this."""
 
 
-def decibels(magnitude: Tensor, reference: float) -> Tensor:
+def decibels(magnitude: Tensor, reference: float | Tensor) -> Tensor:
     """Compress: 20 log10(1 + m / m0), in dB; zero for silence."""
     return 20.0 * torch.log10(1.0 + magnitude / reference)
 
@@ -40,9 +40,9 @@ class EchoModule(lightning.LightningModule):
     dynamic_range_db : float
         How far below the loudest cell the fit's own compression starts.
     early_range_db : float
-        The same at first, so that the loud echoes, which come straight from a surface, settle
-        before the faint ones, many of which are second bounces, can draw places to where nothing
-        is. No more than ``dynamic_range_db`` is used.
+        How far below each pose's own loudest cell it starts at first, so that the loud echoes,
+        which come straight from a surface, settle before the faint ones, many of which are second
+        bounces, can draw places to where nothing is. No more than ``dynamic_range_db`` is used.
     early_share : float
         The share of the fit that this is for.
     possible : callable or None
@@ -122,6 +122,7 @@ class EchoModule(lightning.LightningModule):
         step = self.global_step
         torch.manual_seed(seed_of(self.seed, 3, step))
         self.field.advance(step, self.total_steps)
+        self.renderer.advance(step, self.total_steps)
         if self.renderer.prepare(self.field, self.possible, step):
             with torch.no_grad():
                 self.renderer.calibrate(self(batch), batch.spectrum)
@@ -146,7 +147,7 @@ class EchoModule(lightning.LightningModule):
 
     def _loss(self, predicted: Tensor, measured: Tensor) -> Tensor:
         span = self.range_db(self.global_step)
-        reference = self.reference * 10 ** ((REPORT_RANGE_DB - span) / 20)
+        reference = self._reference(measured, span)
         target = decibels(measured, reference)
         error = (decibels(predicted, reference) - target) / span
         if self.loss == "l1":
@@ -160,6 +161,16 @@ class EchoModule(lightning.LightningModule):
             weight = torch.where(silent, self.silent_weight, 1.0)
             return (cost * weight).sum() / weight.sum()
         return cost.mean()
+
+    def _reference(self, measured: Tensor, span: float) -> Tensor:
+        """Return the magnitude at which the loss starts to hear, broadcastable over the batch."""
+        least = measured.new_tensor(self.reference * 10 ** ((REPORT_RANGE_DB - span) / 20))
+        if span == self.dynamic_range_db or not self.renderer.whole_poses:
+            return least
+        # By the pose's own loudest echo: the flash of a flat face must not silence all others.
+        faintest = self.reference * 10 ** ((REPORT_RANGE_DB - self.dynamic_range_db) / 20)
+        loudest = measured.amax(dim=(1, 2, 3), keepdim=True)
+        return (loudest * 10 ** (-span / 20)).clamp_min(faintest)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Stop before a gradient that is no number reaches the parameters."""

@@ -27,8 +27,11 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sononerf import cli, storage
 from sononerf.callbacks import preview, spectrogram_images
+from sononerf.experiment import fit as fit_module
 from sononerf.experiment import predict as predict_module
 from sononerf.experiment import reconstruct as reconstruct_module
+from sononerf.experiment import retrace as retrace_module
+from sononerf.experiment.run_folder import RunFolder
 from sononerf.reconstruction import baseline
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
@@ -120,6 +123,7 @@ def test_every_promised_file_is_there(smoke):
         "metrics.json",
         "model.safetensors",
         "model.json",
+        "retrace.safetensors",
         "checkpoints/last.ckpt",
         "prediction/spectrograms.npz",
         *(f"prediction/pose_{number:04d}.png" for number in (52, 53, 54)),
@@ -175,6 +179,7 @@ def test_the_numbers_are_those_of_schema_one(smoke):
     both = ("mae_db", "mean_predictor_mae_db", "noise_floor_mae_db")
     assert metrics["prediction"].keys() == {
         *("split", "poses", "log_spectral_distance_db", "psnr_db", "ssim", "pearson"),
+        *("rendered_mae_db", "rendered_mae_db_active", "traced_share"),
         *both,
         *(f"{name}_active" for name in both),
     }
@@ -192,6 +197,7 @@ def test_the_numbers_are_those_of_schema_one(smoke):
     }
     assert metrics["cost"]["steps"] == 120
     finite_or_null(metrics)
+    assert 0 <= metrics["prediction"]["traced_share"] <= 1
 
 
 def test_it_learns(smoke):
@@ -281,11 +287,17 @@ def test_reconstruct_with_spacing_and_level(at_home, tmp_path):
     assert tree(at_home.run) == before
 
 
+learn_retrace = retrace_module.learn_retrace
+
+
 @pytest.fixture
 def fit_alone(monkeypatch):
     """Let `fit` leave out what follows the fit; return what it would have called."""
     called = []
-    monkeypatch.setattr(predict_module, "predict", lambda *run, **options: called.append("predict"))
+    for module, name in ((retrace_module, "learn_retrace"), (predict_module, "predict")):
+        monkeypatch.setattr(
+            module, name, lambda run, *, accelerator, progress, name=name: called.append(name)
+        )
     for name in ("reconstruct", "evaluate"):
         monkeypatch.setattr(
             reconstruct_module,
@@ -311,8 +323,28 @@ def test_what_follows_the_fit_is_made_up_for(fit_alone, clean):
     done(*command)
     model = (clean / "run" / "model.json").stat()
     done(*command)  # as after a stop between the fit and its end
-    assert fit_alone == ["predict", "reconstruct", "evaluate"] * 2
+    assert fit_alone == ["reconstruct", "learn_retrace", "predict", "evaluate"] * 2
     assert (clean / "run" / "model.json").stat() == model
+
+
+def test_nothing_is_predicted_where_nothing_is_held_out(fit_alone, clean, monkeypatch):
+    monkeypatch.setattr(fit_module, "fit", lambda settings, path, **options: RunFolder(path))
+    done("fit", SMOKE, "poses.heldout=0", "--output", "run")
+    assert fit_alone == ["reconstruct", "learn_retrace", "evaluate"]
+
+
+def test_a_surface_that_cannot_be_traced_is_told_and_no_fault(fit_alone, clean, monkeypatch):
+    monkeypatch.setattr(retrace_module, "learn_retrace", learn_retrace)
+
+    def speck(run, *, progress):
+        mesh = trimesh.creation.icosphere(radius=1e-5)
+        (run / "reconstruction").mkdir()
+        (run / "reconstruction" / "mesh.ply").write_bytes(mesh.export(file_type="ply"))
+
+    monkeypatch.setattr(reconstruct_module, "reconstruct", speck)
+    result = done("fit", SMOKE, *SHORT, "--accelerator", "cpu", "--output", "run")
+    assert "no echoes are traced off the mesh: the mesh is " in result.err
+    assert fit_alone == ["predict", "evaluate"]
 
 
 def test_a_plugins_scene_goes_the_whole_way(plugin, quick, tmp_path, monkeypatch):
@@ -512,6 +544,20 @@ def test_runs_that_are_damaged(smoke, clean, command, name):
     before = tree(clean)
     assert name in refused(3, command, "run")
     assert tree(clean) == before
+
+
+def test_a_damaged_surface_to_trace_echoes_off(smoke, clean):
+    Path("run").mkdir()
+    for file in ("model.safetensors", "model.json"):
+        shutil.copy(smoke.run / file, "run")
+    data = (smoke.run / "retrace.safetensors").read_bytes()
+    (clean / "run" / "retrace.safetensors").write_bytes(data[: len(data) // 2])
+    Path("mine.csv").write_text("x,y,z,yaw,pitch,roll\n-0.4,0,0,0,0,0\n")
+    message = refused(3, "predict", "run", "--poses", "mine.csv", "--output", "out")
+    assert len(message.splitlines()) == 1
+    assert "run/retrace.safetensors: damaged" in message
+    assert "sononerf fit" in message
+    assert not Path("out/spectrograms.npz").exists()
 
 
 @pytest.mark.parametrize(

@@ -38,6 +38,7 @@ def test_defaults_of_the_design(write):
     assert (settings.poses.radius, settings.poses.aim_jitter_deg) == (0.4, 15.0)
     assert (settings.field.kind, settings.renderer.kind) == ("grid", "profile")
     assert settings.fit.steps_per_epoch == "auto"
+    assert settings.prediction.traced == "auto"
 
 
 def test_precedence(write):
@@ -52,6 +53,14 @@ def test_what_is_dumped_reads_back(write):
     )
     assert load_settings(write(config.dump_yaml(settings), "b.yaml")) == settings
     assert Settings.model_validate(settings.plain()) == settings
+
+
+def test_off_is_a_word_and_no_truth_value(write):
+    path = write(SCENE + "prediction: {traced: off}\n")
+    settings = load_settings(path)
+    assert settings.prediction.traced == "off"
+    assert load_settings(write(SCENE, "b.yaml"), ["prediction.traced=off"]) == settings
+    assert load_settings(write(config.dump_yaml(settings), "c.yaml")) == settings
 
 
 def test_settings_do_not_change(write):
@@ -85,6 +94,8 @@ def test_settings_do_not_change(write):
         ("noise.snr_db=loud", ["noise.snr_db: found 'loud'"]),
         ("noise.snr_db=[1, 2, 3]", ["noise.snr_db"]),
         ("noise.snr=3", ["noise.snr: unknown key", "did you mean snr_db?"]),
+        ("prediction.traced=on", ["prediction.traced: found 'on'", "'auto' or 'off'"]),
+        ("prediction.trace=off", ["prediction.trace: unknown key", "did you mean traced?"]),
     ],
 )
 def test_a_wrong_value_is_told_with_file_key_and_way_out(write, key, words):

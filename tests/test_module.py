@@ -124,10 +124,11 @@ def test_the_fit_first_hears_what_is_loud(monkeypatch):
     # Never farther down than later, and from the first step where no share is early.
     assert module(Given(PREDICTED), early_range_db=90.0, early_share=1.0).range_db(5) == 60.0
     assert module(Given(PREDICTED), early_range_db=30.0, early_share=0.0).range_db(0) == 60.0
-    # Of 100 steps the loss hears 30 dB in the 74th, and 60 dB from the 75th.
+    # Of 100 steps the loss hears 30 dB below the pose's loudest, 0.999, in the 74th, and 60 dB
+    # below that of all poses from the 75th.
     monkeypatch.setattr(found.renderer, "prepare", lambda *_: False)
     pairs = list(zip(PREDICTED.flatten().tolist(), MEASURED.flatten().tolist(), strict=True))
-    for step, span, reference in ((74, 30, 0.001 * 10**1.5), (75, 60, 0.001)):
+    for step, span, reference in ((74, 30, 0.999 * 10**-1.5), (75, 60, 0.001)):
         monkeypatch.setattr(type(found), "global_step", step)
         values = logged(found, monkeypatch)
         expected = np.mean(
@@ -149,6 +150,56 @@ def test_what_is_silent_at_first_is_judged_by_what_is_heard_at_first():
     assert float(found._loss(predicted, measured).detach()) == pytest.approx(expected, rel=1e-4)
 
 
+# Three poses, both ears each: a flash, echoes 40 dB below it, and hardly anything.
+POSES = torch.tensor([1.0, 0.01, 1e-4])[:, None, None, None] * torch.tensor(
+    [[[1.0, 0.1], [0.02, 0.5]], [[0.3, 0.05], [0.7, 0.2]]]
+)
+
+
+@pytest.mark.parametrize("dynamic", [60.0, 50.0])
+def test_each_pose_is_first_heard_by_its_own_loudest_echo(dynamic):
+    """But no farther down than the whole fit hears."""
+    found = module(
+        Given(0.5 * POSES), early_range_db=30.0, early_share=1.0, dynamic_range_db=dynamic
+    )
+    faintest = 10 ** (-dynamic / 20)
+    references = [max(loudest * 10**-1.5, faintest) for loudest in (1.0, 0.01, 1e-4)]
+    assert references[1] == pytest.approx(max(0.01 * 10**-1.5, faintest))
+    errors = [
+        [abs(level_above(reference, 0.5 * m) - level_above(reference, m)) / 30 for m in values]
+        for values, reference in zip(POSES.flatten(1).tolist(), references, strict=True)
+    ]
+    loss = float(found._loss(0.5 * POSES, POSES).detach())
+    assert loss == pytest.approx(np.mean(errors), rel=1e-4)
+    # With the flash of the first pose as the measure of all, the others would be silence.
+    common = [
+        [abs(level_above(10**-1.5, 0.5 * m) - level_above(10**-1.5, m)) / 30 for m in values]
+        for values in POSES.flatten(1).tolist()
+    ]
+    assert np.mean(errors[1]) > 5 * np.mean(common[1])
+
+
+def test_a_pose_first_weighs_as_much_whatever_else_is_in_the_batch():
+    found = module(Given(POSES), early_range_db=30.0, early_share=1.0)
+    alone = [float(found._loss(0.5 * one, one).detach()) for one in POSES.split(1)]
+    assert float(found._loss(0.5 * POSES, POSES).detach()) == pytest.approx(np.mean(alone))
+
+
+def test_single_slices_are_first_heard_by_the_loudest_of_all():
+    """They do not tell how loud their poses are."""
+
+    class Slices(Given):
+        whole_poses = False
+
+    found = module(Slices(0.5 * POSES), early_range_db=30.0, early_share=1.0)
+    errors = [
+        abs(level_above(10**-1.5, 0.5 * m) - level_above(10**-1.5, m)) / 30
+        for m in POSES.flatten().tolist()
+    ]
+    loss = float(found._loss(0.5 * POSES, POSES).detach())
+    assert loss == pytest.approx(np.mean(errors), rel=1e-4)
+
+
 def test_the_field_hears_how_far_the_fit_is_before_it_is_asked(monkeypatch):
     found = module(Given(PREDICTED), total_steps=40)
     logged(found, monkeypatch)
@@ -161,6 +212,20 @@ def test_the_field_hears_how_far_the_fit_is_before_it_is_asked(monkeypatch):
         monkeypatch.setattr(type(found), "global_step", step)
         found.training_step(batch(MEASURED), 0)
     assert calls == [("advance", 0, 40), ("prepare", 0), ("advance", 7, 40), ("prepare", 7)]
+
+
+def test_the_renderer_hears_how_far_the_fit_is_before_it_prepares(monkeypatch):
+    found = module(Given(PREDICTED), total_steps=40)
+    logged(found, monkeypatch)
+    calls = []
+    for name in ("advance", "prepare", "calibrate"):
+        monkeypatch.setattr(
+            found.renderer, name, lambda *given, n=name: calls.append((n, given[-2:])) or True
+        )
+    monkeypatch.setattr(type(found), "global_step", 7)
+    found.training_step(batch(MEASURED), 0)
+    assert [name for name, _ in calls] == ["advance", "prepare", "calibrate"]
+    assert calls[0][1] == (7, 40)
 
 
 def test_silent_cells_may_weigh_less():
@@ -364,6 +429,36 @@ def test_training_lowers_the_loss_and_repeats(store, tmp_path):
     assert metrics["val/mae_db"] < 0.3 * 60 * losses[0]
     again, _, _ = fit(store, ProfileRenderer(REGION, ACQUISITION), tmp_path, 40)
     assert again == losses
+
+
+def test_a_fit_with_phase_sets_the_gain_anew_when_phase_comes(store, tmp_path, monkeypatch):
+    calibrated = []
+    plain = ProfileRenderer.calibrate
+
+    def calibrate(renderer, predicted, measured):
+        plain(renderer, predicted, measured)
+        calibrated.append((bool(renderer.phased), float(renderer.log_gain.detach())))
+
+    monkeypatch.setattr(ProfileRenderer, "calibrate", calibrate)
+    renderer = ProfileRenderer(REGION, ACQUISITION, mode="coherent")
+    losses, _, found = fit(store, renderer, tmp_path, 10)
+    assert [phased for phased, _ in calibrated] == [False, True]
+    assert calibrated[0][1] != calibrated[1][1]
+    assert np.isfinite(losses).all()
+    # What was fitted with phase is loaded with phase, and a step of it sets no gain.
+    again = module(ProfileRenderer(REGION, ACQUISITION, mode="coherent"), total_steps=10)
+    again.load_state_dict(found.state_dict())
+    logged(again, monkeypatch)
+    monkeypatch.setattr(type(again), "global_step", 8)
+    given = batch(torch.ones(2, 2, 150, 3))
+    given = RangeSlices(
+        given.pose, torch.tensor([[0.24, 0.0, 0.0]] * 2),
+        torch.diag(torch.tensor([-1.0, -1.0, 1.0])).expand(2, 3, 3), *given[3:],
+    )  # fmt: skip
+    assert torch.equal(again.predict_step(given, 0), found.predict_step(given, 0))
+    again.training_step(given, 0)
+    assert len(calibrated) == 2
+    assert again.renderer.phased
 
 
 def test_training_on_single_slices_lowers_the_loss(store, tmp_path):

@@ -207,6 +207,17 @@ class WholePoses(Dataset[RangeSlices]):
     def __len__(self) -> int:
         return len(self.positions)
 
+    def only(self, rows: Tensor) -> WholePoses:
+        """Return some of them, given their rows."""
+        return WholePoses(
+            self.positions[rows],
+            self.rotations[rows],
+            self.rows.shape[1],
+            len(self.bins),
+            self.reader,
+            self.numbers[rows],
+        )
+
     def __getitem__(self, index: int) -> RangeSlices:
         """Return one pose as a batch of one."""
         measured = torch.zeros(1, 0, self.rows.shape[1], len(self.bins))

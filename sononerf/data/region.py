@@ -16,6 +16,7 @@ from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import NumericalError
+from sononerf.geometry.hull import EchoHull
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -38,6 +39,9 @@ UNEXPLAINED_SHARE = 0.02
 ROUNDS = 4
 ECHO_END = 0.05
 """An echo ends where its magnitude is this part of its middle's; a Hamming window ends earlier."""
+OUTSIDE = (0.3, 0.0005)
+"""How far a place of a fit's lattice may lie outside of what first echoes leave: this part of how
+far it speaks for its surroundings, and so many metres for the error of a first echo's range."""
 LOOKS = 4
 COARSE = 28
 """Cells along the longest side of each look."""
@@ -49,6 +53,14 @@ class Evidence(NamedTuple):
 
     possible: Mask  # (N,)
     energy: Array  # (N,) mean share of a pose's sound that comes from the place's range
+
+
+def echo_power(call: CallSettings, analysis: SpectrogramSettings) -> Array:
+    """Power of a point echo over time, (W,), one value per sample, over the rows it sounds in."""
+    window = effective_window(call, analysis)
+    swept = covered(call, frequency_axis(analysis))
+    power: Array = ((window[swept] if swept.any() else window[:1]) ** 2).mean(axis=0)
+    return power
 
 
 def echo_reach(call: CallSettings, analysis: SpectrogramSettings, speed_of_sound: float) -> float:
@@ -68,10 +80,7 @@ def echo_reach(call: CallSettings, analysis: SpectrogramSettings, speed_of_sound
     >>> round(echo_reach(CallSettings(), SpectrogramSettings(), 343.0), 4)
     0.0054
     """
-    window = effective_window(call, analysis)
-    swept = covered(call, frequency_axis(analysis))
-    power = (window[swept] if swept.any() else window[:1]) ** 2
-    sounding = np.flatnonzero(power.mean(axis=0) >= ECHO_END**2)
+    sounding = np.flatnonzero(echo_power(call, analysis) >= ECHO_END**2)
     return float(sounding[-1] - sounding[0]) / 2.0 * speed_of_sound / 2.0 / analysis.sampling_rate
 
 
@@ -86,6 +95,8 @@ class EchoEvidence:
         Gains and places of emitter and ears.
     reach : float, m
         How far in range one echo sounds to either side of its middle.
+    hull : EchoHull or None
+        What the first echoes leave, where it is known.
     most : int
         How many poses are asked at most, evenly spread over the training poses.
 
@@ -95,8 +106,17 @@ class EchoEvidence:
         If no pose heard anything.
     """
 
-    def __init__(self, store: EnsembleStore, ears: Ears, *, reach: float, most: int = 400) -> None:
+    def __init__(
+        self,
+        store: EnsembleStore,
+        ears: Ears,
+        *,
+        reach: float,
+        hull: EchoHull | None = None,
+        most: int = 400,
+    ) -> None:
         self.reach = reach
+        self.hull = hull
         indices = np.asarray(store.indices("train"))
         indices = indices[np.linspace(0, len(indices) - 1, min(most, len(indices))).astype(int)]
         self.range = np.asarray(store.range, dtype=np.float64)
@@ -229,6 +249,26 @@ class EchoEvidence:
             lower, upper = kept.min(axis=0) - spacing / 2, kept.max(axis=0) + spacing / 2
         return np.stack((lower - margin, upper + margin))
 
+    def left(self, points: Array, tolerance: float) -> Mask:
+        """Return the places that no pose rules out, (N,).
+
+        Parameters
+        ----------
+        points : (N, 3) float, m
+            Places, world frame.
+        tolerance : float, m
+            How far a place speaks for its surroundings.
+        """
+        # Silence of a mirror tells nothing, but of what is nearest the hull knows.
+        lax = 1.0 if self.hull is not None else SILENT_SHARES[-1]
+        possible = self.about(points, tolerance, silent_share=lax).possible
+        return possible & self._in_hull(points, OUTSIDE[0] * tolerance + OUTSIDE[1])
+
+    def _in_hull(self, points: Array, outside: float) -> Mask:
+        if self.hull is None:
+            return np.ones(len(points), dtype=bool)
+        return np.asarray(self.hull.clearance(points)[0] >= -outside)
+
     def needed(self, points: Array, tolerance: float) -> Mask:
         """Return the places that explain the sound, the best focused first.
 
@@ -239,10 +279,11 @@ class EchoEvidence:
         """
         unexplained = self.power.copy()
         keep = np.zeros(len(points), dtype=bool)
+        inside = self._in_hull(points, tolerance)
         for silent_share in SILENT_SHARES:
             for _ in range(ROUNDS):
                 evidence = self.about(points, tolerance, unexplained, silent_share)
-                energy = np.where(evidence.possible, evidence.energy, 0.0)
+                energy = np.where(evidence.possible & inside, evidence.energy, 0.0)
                 before = int(keep.sum())
                 if energy.max() > 0:
                     keep |= energy >= AGREEMENT * energy.max()

@@ -16,10 +16,12 @@ from sononerf.acoustics.ears import analysed_ears, synthetic_ears
 from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import Settings
-from sononerf.data.region import EchoEvidence, echo_reach
+from sononerf.data.first_echo import first_echoes
+from sononerf.data.region import WITNESS_GAIN, EchoEvidence, echo_power, echo_reach
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError
 from sononerf.field.field import Field
+from sononerf.geometry.hull import EchoHull
 from sononerf.module import EchoModule
 from sononerf.renderer.renderer import Acquisition, Possible, Renderer
 from sononerf.simulation.simulator import DEFAULT_SPEED, DEFAULT_TEMPERATURE
@@ -62,19 +64,66 @@ def acquisition(settings: Settings) -> Acquisition:
     )
 
 
-def echo_region(settings: Settings, store: EnsembleStore) -> tuple[Tensor, Possible]:
+def echo_hull(settings: Settings, store: EnsembleStore) -> EchoHull:
+    """Return the space that the first echoes of the training poses leave."""
+    known = acquisition(settings)
+    first = first_echoes(
+        store,
+        echo_power(settings.call, settings.spectrogram),
+        known.speed_of_sound / known.sampling_rate / 2,
+    )
+    if known.lag is not None:
+        first = first - float(known.lag.max())  # rows of a sweep may hear it that much too far off
+    train = store.indices("train")
+    positions = np.asarray(store.positions, dtype=np.float64)[train]
+    rotations = np.asarray(store.rotations, dtype=np.float64)[train]
+    ears = known.ear_positions.double().numpy()
+    return EchoHull(
+        emitters=positions + rotations @ known.emitter.double().numpy(),
+        receivers=positions[:, None] + np.einsum("pij,ej->pei", rotations, ears),
+        first=first,
+        axes=rotations[:, :, 0],
+        within=_beam_cosine(known),
+    )
+
+
+def _beam_cosine(known: Acquisition) -> float:
+    """Return the cosine to the head's axis down to which a pose hears in every direction."""
+    gain = (known.beam * known.ears.amax(dim=0)).amax(dim=0).double()
+    gain /= gain.max()
+    rows, columns = gain.shape
+    elevation = torch.linspace(-math.pi / 2, math.pi / 2, rows).double()[:, None]
+    azimuth = torch.linspace(-math.pi, math.pi, columns).double()
+    ahead = elevation.cos() * azimuth.cos()
+    deaf = ahead[gain < WITNESS_GAIN]
+    return float(deaf.max()) if len(deaf) else -1.0
+
+
+def echo_region(
+    settings: Settings, store: EnsembleStore, hull: EchoHull | None = None
+) -> tuple[Tensor, Possible]:
     """Return the box that is fitted, from the settings or the echoes, and what is possible in it.
+
+    Parameters
+    ----------
+    settings : Settings
+        The experiment.
+    store : EnsembleStore
+        Its echoes.
+    hull : EchoHull or None
+        What the first echoes leave; found anew where None.
 
     Returns
     -------
     region : (2, 3) float, m
         Lower and upper corner.
     possible : callable
-        Which places the echoes leave possible.
+        Which places the echoes leave possible, given how far a place speaks for its surroundings.
     """
+    hull = hull or echo_hull(settings, store)
     ears = synthetic_ears(settings.ears, frequency_axis(settings.spectrogram))
     reach = echo_reach(settings.call, settings.spectrogram, _speed(settings))
-    evidence = EchoEvidence(store, ears, reach=reach, most=200)
+    evidence = EchoEvidence(store, ears, reach=reach, hull=hull, most=200)
     set_region = settings.region
     if set_region.lower is not None and set_region.upper is not None:
         box = np.asarray((set_region.lower, set_region.upper))
@@ -82,10 +131,10 @@ def echo_region(settings: Settings, store: EnsembleStore) -> tuple[Tensor, Possi
         box = evidence.box()
 
     def possible(places: Tensor, tolerance: float) -> Tensor:
-        needed = evidence.needed(places.double().cpu().numpy(), tolerance)
-        if not needed.any():
-            needed[:] = True  # the box is right by the user's word
-        return torch.as_tensor(needed, device=places.device)
+        left = evidence.left(places.double().cpu().numpy(), tolerance)
+        if not left.any():
+            left[:] = True  # the box is right by the user's word
+        return torch.as_tensor(left, device=places.device)
 
     return _tensor(box), possible
 
@@ -160,11 +209,3 @@ def module_for(
         silent_weight=fit.silent_weight,
         seed=fit.seed,
     )
-
-
-def heard_from(renderer: Renderer, store: EnsembleStore) -> Tensor:
-    """Return where the training poses listened, half way from emitter to ears, (P, 3) m."""
-    train = store.indices("train")
-    middle = ((renderer.emitter + renderer.ear_positions.mean(0)) / 2).double().cpu().numpy()
-    rotations = np.asarray(store.rotations)[train]
-    return _tensor(np.asarray(store.positions)[train] + rotations @ middle)

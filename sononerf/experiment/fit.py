@@ -9,9 +9,11 @@ import sys
 import time
 import warnings
 from contextlib import suppress
+from dataclasses import fields
 from pathlib import Path
 
 import lightning
+import numpy as np
 import torch
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import TensorBoardLogger
@@ -29,13 +31,14 @@ from sononerf.data.store import EnsembleStore
 from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.experiment.build import (
     check_plugins,
+    echo_hull,
     echo_region,
     field_and_renderer,
-    heard_from,
     module_for,
 )
 from sononerf.experiment.run_folder import RunFolder
 from sononerf.experiment.simulate import simulate, store_path
+from sononerf.geometry.hull import EchoHull
 from sononerf.module import EchoModule
 from sononerf.progress import Progress
 from sononerf.scene import load_scene
@@ -195,7 +198,8 @@ def _fit(
 ) -> None:
     quiet_lightning()
     keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
-    region, possible = echo_region(settings, store)
+    hull = echo_hull(settings, store)
+    region, possible = echo_region(settings, store, hull)
     corners = (1000 * region).round().int().tolist()
     progress.say(f"region {corners[0]} to {corners[1]} mm")
     field, renderer = field_and_renderer(settings, region)
@@ -258,7 +262,7 @@ def _fit(
             default_root_dir=run.path,
         )
         trainer.fit(module, data, ckpt_path=run.checkpoint if resumed else None, weights_only=True)
-        _finish(settings, run, store, module, keeper.elapsed, trainer)
+        _finish(settings, run, store, hull, module, keeper.elapsed, trainer)
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         # What follows is for the first process alone; metrics would wait for the others.
         torch.distributed.destroy_process_group()
@@ -281,6 +285,7 @@ def _finish(
     settings: Settings,
     run: RunFolder,
     store: EnsembleStore,
+    hull: EchoHull,
     module: EchoModule,
     seconds: float,
     trainer: lightning.Trainer,
@@ -292,7 +297,7 @@ def _finish(
         return
     state = {f"field.{k}": v for k, v in module.field.state_dict().items()}
     state |= {f"renderer.{k}": v for k, v in module.renderer.state_dict().items()}
-    state["heard_from"] = heard_from(module.renderer, store)
+    state |= {f"hull.{f.name}": _double(getattr(hull, f.name)) for f in fields(hull)}
     run.write_metrics(
         "cost",
         {
@@ -314,6 +319,10 @@ def _finish(
             "echo_hash": store.attributes["echo_hash"],
         },
     )
+
+
+def _double(values: object) -> torch.Tensor:
+    return torch.as_tensor(np.asarray(values, dtype=np.float64))
 
 
 def peak_memory_bytes() -> int:

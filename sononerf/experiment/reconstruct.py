@@ -17,7 +17,7 @@ from sononerf import storage
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, NumericalError, SonoNerfError
 from sononerf.experiment.build import acquisition
-from sononerf.experiment.predict import Fitted, load_fitted, store_of
+from sononerf.experiment.fitted import Fitted, load_fitted, store_of
 from sononerf.experiment.run_folder import RunFolder
 from sononerf.progress import Progress
 from sononerf.reconstruction.baseline import backprojection, best_level_surface
@@ -32,6 +32,12 @@ from sononerf.render.mesh import confidence_png, mesh_png, side_by_side_png
 from sononerf.render.projection import mip_pngs
 from sononerf.scene import load_scene
 
+OPEN = {
+    "sheet": "the surface is a sheet: {0.thin_share:.0%} of it has its other side right behind it",
+    "one-sided": "the surface is open: what no pose can have heard, {0.unseen_share:.0%} of it, "
+    "is left out",
+}
+"""What is said of surfaces that are no body's skin."""
 FORMATS: tuple[MeshFormat, ...] = ("ply", "stl", "glb")
 BASELINE_VOXELS = 64
 """Along the region's longest side; finer than the window's length in any scene of ours."""
@@ -73,7 +79,7 @@ def reconstruct(
     with progress.task("reconstructing", 1000) as task, torch.inference_mode():
         found = read_out(
             fitted.module.field,
-            heard_from=fitted.heard_from,
+            hull=fitted.hull,
             spacing=spacing or options.spacing,
             level=options.level if level is None else level,
             method=options.method,
@@ -94,8 +100,15 @@ def reconstruct(
     storage.commit_bytes(folder / "view.png", view)
     storage.commit_json(
         folder / "read_out.json",
-        {"method": found.method, "level": found.level, "spacing_m": found.volume.spacing},
+        {
+            "method": found.method,
+            "level": found.level,
+            "spacing_m": found.volume.spacing,
+            "surface": None if found.openness is None else found.openness.kind,
+        },
     )
+    if found.openness is not None and found.openness.kind in OPEN:
+        progress.say(OPEN[found.openness.kind].format(found.openness))
     if output is None:
         RunFolder(path).write_metrics(
             "cost", {"reconstruct_s": time.monotonic() - started}, merge=True
@@ -137,7 +150,7 @@ def evaluate(path: Path, *, progress: Progress | None = None) -> dict[str, Any]:
     baseline: dict[str, Any] = {"backprojection": None, "voxels": None}
     if truth is not None:
         with progress.task("evaluating", 3) as task:
-            mesh = _read_mesh(folder / "mesh.ply")
+            mesh = read_mesh(folder / "mesh.ply")
             level = storage.read_json(folder / "read_out.json")["level"]
             true = TrueSurface(truth)
             geometry = {**geometry_metrics(mesh, true), "level": level}
@@ -150,7 +163,14 @@ def evaluate(path: Path, *, progress: Progress | None = None) -> dict[str, Any]:
     return run.read_metrics()
 
 
-def _read_mesh(path: Path) -> trimesh.Trimesh:
+def read_mesh(path: Path) -> trimesh.Trimesh:
+    """Read a reconstructed surface back.
+
+    Raises
+    ------
+    InputError
+        If it is damaged or empty.
+    """
     try:
         mesh = trimesh.load_mesh(path, file_type="ply")
     except Exception as error:  # trimesh's readers raise whatever they met first

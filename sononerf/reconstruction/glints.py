@@ -61,6 +61,10 @@ class Glints:
     power: Array
     pose: NDArray[np.intp]
 
+    def where(self, kept: NDArray[np.bool_]) -> Glints:
+        """Return those for which (G,) is true."""
+        return Glints(self.points[kept], self.normals[kept], self.power[kept], self.pose[kept])
+
 
 @torch.no_grad()
 def find_glints(

@@ -203,6 +203,7 @@ def oriented_surface(
     *,
     smoothing: float = 1.25,
     level: float | Literal["auto"] = "auto",
+    bound: NDArray[np.float64] | None = None,
 ) -> tuple[trimesh.Trimesh, Volume, float]:
     """Read a closed surface out of points with energies and normals.
 
@@ -223,6 +224,9 @@ def oriented_surface(
     level : float or "auto"
         Indicator on the surface. ``"auto"`` is its mean at the points themselves, about 0.5; a
         greater level gives a thinner body.
+    bound : (X, Y, Z) float or None, m
+        How deep inside of what is possible each voxel of :func:`grid_over` lies; the surface stays
+        where this is zero or more.
 
     Returns
     -------
@@ -252,7 +256,15 @@ def oriented_surface(
     chi = _solve_poisson(cloud, weights, max(smoothing, MIN_SMOOTHING * cloud.pitch))
     chi = _levelled(cloud, weights, chi)
     used = float(np.average(cloud.read(chi), weights=weights)) if level == "auto" else float(level)
-    indicator = Volume(chi[1:-1, 1:-1, 1:-1].astype(np.float64), grid.origin, spacing)
+    values = chi[1:-1, 1:-1, 1:-1].astype(np.float64)
+    if bound is not None:
+        # As steep as the indicator itself where it runs through the points: what is steeper on one
+        # side than on the other is drawn in the wrong place between voxels.
+        slopes = np.gradient(chi)
+        steep = cloud.read(np.sqrt(sum(slope**2 for slope in slopes), dtype=np.float32))
+        slope = float(np.average(steep, weights=weights)) / spacing
+        values = np.minimum(values, used + slope * bound)
+    indicator = Volume(values, grid.origin, spacing)
     mesh = isosurface(indicator, used)
     reach = SUPPORT_RADIUS * cloud.pitch * spacing
     mesh = supported_parts(mesh, place, energy, reach=reach, spacing=spacing)

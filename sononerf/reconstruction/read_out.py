@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,14 +11,23 @@ import numpy as np
 import torch
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
+from sononerf.geometry.hull import EchoHull
 from sononerf.geometry.raycast import RayCaster
 from sononerf.reconstruction.glints import Glints, find_glints, trust
 from sononerf.reconstruction.isosurface import automatic_level, isosurface
+from sononerf.reconstruction.openness import (
+    THIN,
+    Openness,
+    judge_openness,
+    without_unseen,
+)
 from sononerf.reconstruction.oriented import oriented_surface
+from sononerf.reconstruction.outline import clearance_volume, outline
 from sononerf.reconstruction.volume import Volume, grid_over, volume_from_function
 
 Array = NDArray[np.float64]
@@ -34,25 +42,34 @@ HIDDEN = 0.02
 """What a glint still weighs that its pose cannot see: a second bounce."""
 LOOKS = 1
 """How often the surface is drawn anew without those."""
-FEWEST_POSES = 100
-"""The glints of fewer lie too far apart to bear one another out."""
+AHEAD = 0.002
+"""Glints so far in front of a pose's first echo are none, m."""
+INFLATED = 1.0
+"""By so much a sheet is drawn too thick at first, voxels to each side."""
+BACKED = 0.5
+"""More than this part of a sheet's points have some of the other side within its thickness."""
+BACK_TO_BACK = -0.7
+"""Cosine between the normals of the two sides of a sheet, at most."""
+OUTLINE = 0.5
+"""What all points of the outline weigh, beside the glints."""
 
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """What a field was read out to."""
+    """What a field was read out to; glints and openness where it was heard from known poses."""
 
     mesh: trimesh.Trimesh
     volume: Volume
     level: float
     method: Literal["oriented", "isosurface"]
     glints: Glints | None = None
+    openness: Openness | None = None
 
 
 def reconstruct(
     field: Field,
     *,
-    heard_from: Tensor | None = None,
+    hull: EchoHull | None = None,
     spacing: float | None = None,
     level: float | Literal["auto"] = "auto",
     method: Literal["auto", "oriented", "isosurface"] = "auto",
@@ -65,10 +82,10 @@ def reconstruct(
     ----------
     field : Field
         What was fitted.
-    heard_from : (P, 3) float or None, m
-        Where it was fitted to be heard from. With enough of it the oriented surface runs where
-        the field sounds from; without, where its places lie, which is quicker and a millimetre
-        less exact.
+    hull : EchoHull or None
+        Where it was fitted to be heard from, and what the first echoes leave. With it the oriented
+        surface runs where the field sounds from and, where that is silent, along the hull;
+        without, where the field's places lie, which is a millimetre less exact.
     spacing : float or None, m
         Voxel size; half of the field's own resolution where None.
     level : float or "auto"
@@ -109,13 +126,14 @@ def reconstruct(
         raise NumericalError("no surface: the field is silent everywhere")
     if method == "oriented":
         places, energy, axis = _places(field, lower, upper, directions)
-        if heard_from is not None and len(heard_from) >= FEWEST_POSES:
-            glints = find_glints(field, places, heard_from.to(places))
-            sources = _numbers(heard_from)
-            # A field that is hardly fitted may have glints that make no surface.
-            with suppress(NumericalError):
-                mesh, _, found = _glint_surface(glints, sources, lower, upper, step, level)
-                return Reconstruction(mesh, volume, found, method, glints)
+        if hull is not None:
+            sources = torch.as_tensor(hull.sources, dtype=places.dtype, device=places.device)
+            glints = find_glints(field, places, sources)
+            mesh, _, found = _glint_surface(glints, hull, lower, upper, step, level)
+            openness = judge_openness(mesh, hull.sources)
+            if openness.kind == "one-sided":
+                mesh = without_unseen(mesh, openness)
+            return Reconstruction(mesh, volume, found, method, glints, openness)
         mesh, _, found = oriented_surface(
             *(_numbers(places), _numbers(energy), _numbers(axis)),
             *(lower, upper, step),
@@ -168,32 +186,51 @@ def _places(
 
 def _glint_surface(
     glints: Glints,
-    sources: Array,
+    hull: EchoHull,
     lower: Array,
     upper: Array,
     step: float,
     level: float | Literal["auto"],
 ) -> tuple[trimesh.Trimesh, Volume, float]:
-    """Draw the surface through the glints that their poses can see."""
-    weights = glints.power * trust(glints)
-    if not weights.sum() > 0:
-        weights = glints.power  # too few poses to bear one another out
+    """Draw the surface through the glints that their poses can see, and along the hull."""
+    glints = glints.where(hull.clearance(glints.points)[0] >= -AHEAD)
+    trusted = trust(glints)
+    weights = glints.power * trusted
+    clearance = clearance_volume(hull, lower, upper, step)
+    points, normals = outline(hull, clearance, glints, trusted)
+    total = weights.sum() or 1.0
+    silent = np.full(len(points), OUTLINE * total / max(len(points), 1))
+    where = np.concatenate((glints.points, points))
+    normals = np.concatenate((glints.normals, normals))
+    # The two sides of a sheet would cancel: drawn on a thicker one, which is then thinned again.
+    inflated = INFLATED * step if _is_sheet(where, normals) else 0.0
     seen = np.ones(len(weights), dtype=bool)
     for look in range(LOOKS + 1):
-        found = oriented_surface(
-            glints.points,
-            weights * np.where(seen, 1.0, HIDDEN),
-            glints.normals,
+        mesh, indicator, used = oriented_surface(
+            where + inflated * normals,
+            np.concatenate((weights * np.where(seen, 1.0, HIDDEN), silent)),
+            normals,
             *(lower, upper, step),
             smoothing=SMOOTHING,
             level=level,
+            bound=np.asarray(clearance.values + inflated, dtype=np.float64),
         )
+        if inflated:
+            mesh.vertices = mesh.vertices - inflated * mesh.vertex_normals
         if look == LOOKS:
             break
         before = seen
-        seen = RayCaster(found[0]).visible(
-            glints.points + CLEARANCE * glints.normals, sources[glints.pose]
+        seen = RayCaster(mesh).visible(
+            glints.points + CLEARANCE * glints.normals, hull.sources[glints.pose]
         )
         if (seen == before).all():
             break
-    return found
+    return mesh, indicator, used
+
+
+def _is_sheet(points: Array, normals: Array) -> bool:
+    """Return whether most points have others right behind them that face the other way."""
+    pairs = cKDTree(points).query_pairs(THIN, output_type="ndarray")
+    opposite = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(axis=1) < BACK_TO_BACK
+    backed = np.unique(pairs[opposite])
+    return len(backed) > BACKED * len(points)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -18,6 +18,16 @@ KERNEL_SKIRT = 31e-6
 """The kernel reaches so much further than the window, s: beam and ears lengthen an echo."""
 KERNEL_FLOOR = -9.0
 """What the squared kernel starts with beyond the window, as a natural logarithm."""
+
+
+COHERENT_AFTER = 0.5
+"""Mode ``coherent`` sums with phase after this share of the fit: before, it would find no way."""
+
+
+OPAQUE = 0.05
+"""A place casts a shadow where it has this part of the strongest energy in its surroundings."""
+FREE = 0.012
+"""So far in front of a place nothing shades it, m: a surface is some places thick."""
 
 
 class _Deposit(torch.autograd.Function):
@@ -47,7 +57,12 @@ class ProfileRenderer(Renderer):
     off. Spreading and absorption are known physics and stay out of the field. The kernel
     :math:`W_f` starts as the square of a point echo in its row, the analysis window or what that
     makes of a sweep, and is learned on. Summing power ignores interference between glints inside
-    one window.
+    one window. Mode ``coherent`` sums pressures instead, each with the phase of its own way,
+    through the root of the kernel:
+
+    .. math::
+        S_e(f, r)^2 = n_f^2 + g^2 \left|\sum_i \sqrt{W_f(r - r_i)}\, \rho(x_i, u_i, f)
+        \frac{B(f) E_e(f) e^{-\alpha_f (d_i + d_i^e)}}{d_i\, d_i^e} e^{-4 \pi j f r_i / c}\right|^2
 
     Parameters
     ----------
@@ -55,6 +70,12 @@ class ProfileRenderer(Renderer):
         Lower and upper corner of the box that holds the field.
     acquisition : Acquisition
         How the measured spectra came to be.
+    mode : {"power", "coherent"}
+        What is summed. ``coherent`` costs about twice as much, starts as ``power``, and asks for
+        places that are right to a fraction of a wavelength.
+    occlusion : bool
+        Whether strong places hide from a pose what lies behind them. Where lobes are learned from
+        all around they have learned that already.
     oversampling : int
         Bins of the profile per range slice.
     points : int
@@ -75,29 +96,41 @@ class ProfileRenderer(Renderer):
 
     lattice: Tensor
     alive: Tensor
+    opaque: Tensor
     energy: Tensor
     spacing: Tensor
     absorption: Tensor
     lag: Tensor | None
+    phased: Tensor
+    wave: Tensor
 
     def __init__(
         self,
         region: Tensor,
         acquisition: Acquisition,
         *,
+        mode: Literal["power", "coherent"] = "power",
+        occlusion: bool = False,
         oversampling: Annotated[int, Option(ge=1, le=16)] = 2,
         points: Annotated[int, Option(ge=1)] = 25_000,
         uniform: Annotated[float, Option(gt=0, le=1)] = 0.4,
         start: Annotated[int, Option(ge=1)] = 40_000,
         prune_every: Annotated[int, Option(ge=0)] = 100,
-        prune_below: Annotated[float, Option(ge=0, lt=1)] = 3e-5,
+        prune_below: Annotated[float, Option(ge=0, lt=1)] = 1e-6,
         surroundings: Annotated[float, Option(gt=0)] = 0.03,
     ) -> None:
         super().__init__(region, acquisition)
         self.points, self.uniform, self.start = points, uniform, start
         self.prune_every, self.prune_below = prune_every, prune_below
         self.surroundings = surroundings
+        self.occlusion = occlusion
+        self._turned = False
         self.oversampling = oversampling
+        self.mode = mode
+        self.register_buffer("phased", torch.zeros(()))
+        self.register_buffer(
+            "wave", 4 * math.pi * acquisition.frequency / acquisition.speed_of_sound
+        )
         step = float(acquisition.range[1] - acquisition.range[0])
         self.bin = step / oversampling
         per_sample = acquisition.speed_of_sound / acquisition.sampling_rate / 2
@@ -121,11 +154,12 @@ class ProfileRenderer(Renderer):
         self.register_buffer("lattice", torch.zeros(0, 3))
         self.register_buffer("alive", torch.zeros(0, dtype=torch.bool))
         self.register_buffer("energy", torch.zeros(0))
+        self.register_buffer("opaque", torch.zeros(0, dtype=torch.bool))
         self.register_buffer("spacing", torch.zeros(()))
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         # The lattice's size is found by the fit, so a loaded one replaces ours whole.
-        for name in ("lattice", "alive", "energy"):
+        for name in ("lattice", "alive", "opaque", "energy"):
             if prefix + name in state_dict:
                 found = getattr(self, name).new_zeros(state_dict[prefix + name].shape)
                 setattr(self, name, found)
@@ -136,6 +170,14 @@ class ProfileRenderer(Renderer):
         """How many places a step evaluates per pose."""
         return min(int(self.alive.sum()), self.points) if len(self.alive) else None
 
+    def advance(self, step: int, total: int) -> None:
+        """Sum with phase from some step on, if at all."""
+        self._turned = (
+            self.mode == "coherent" and not self.phased and step >= COHERENT_AFTER * total
+        )
+        if self._turned:
+            self.phased.fill_(1.0)
+
     @torch.no_grad()
     def prepare(self, field: Field, possible: Possible | None, step: int) -> bool:
         """Lay the lattice at the first step; drop what has no energy and refine every so often."""
@@ -143,14 +185,14 @@ class ProfileRenderer(Renderer):
             self._lay(field, possible)
             return True
         if not self.prune_every or not step or step % self.prune_every:
-            return False
+            return self._turned
         self._prune(field)
         field.keep(self.lattice[self.alive], float(self.spacing))
         if float(self.spacing) > 1.5 * field.resolution:
-            self._refine()
+            self._refine(possible)
             field.keep(self.lattice, float(self.spacing))
             return True
-        return False
+        return self._turned
 
     def _lay(self, field: Field, possible: Possible | None) -> None:
         """Begin as finely as ``start`` allows; to ask about every fine place would take long."""
@@ -167,7 +209,7 @@ class ProfileRenderer(Renderer):
         self._replace(places, spacing)
         field.keep(self.lattice, spacing)
 
-    def _refine(self) -> None:
+    def _refine(self, possible: Possible | None) -> None:
         """Halve the spacing around what is alive."""
         half = float(self.spacing) / 2
         cell = ((self.lattice[self.alive] - self.region[0]) / half).round().long()
@@ -176,11 +218,15 @@ class ProfileRenderer(Renderer):
         size = ((self.region[1] - self.region[0]) / half + 1e-3).floor().long() + 1
         cells = (cell[:, None] + around).reshape(-1, 3)
         cells = cells[((cells >= 0) & (cells < size)).all(dim=1)].unique(dim=0)
-        self._replace(self.region[0] + cells * half, half)
+        places = self.region[0] + cells * half
+        if possible is not None:
+            places = places[possible(places, half * math.sqrt(3) / 2)]
+        self._replace(places, half)
 
     def _replace(self, places: Tensor, spacing: float) -> None:
         self.lattice = places
         self.alive = places.new_ones(len(places), dtype=torch.bool)
+        self.opaque = torch.zeros_like(self.alive)
         self.energy = places.new_ones(len(places))
         self.spacing = self.spacing.new_tensor(spacing)
 
@@ -196,6 +242,27 @@ class ProfileRenderer(Renderer):
         most = most.scatter_reduce(0, flat, self.energy, "amax").reshape(1, 1, *size[::-1])
         most = F.max_pool3d(most, 3, 1, 1).reshape(-1)[flat]
         self.alive = self.alive & (self.energy > self.prune_below * most)
+        self.opaque = self.alive & (self.energy > OPAQUE * most)
+
+    def _hidden(self, places: Tensor, towards: Tensor) -> Tensor:
+        """Return which of (M, 3) places have an opaque one on their way towards (M, 3)."""
+        if not bool(self.opaque.any()):
+            return torch.zeros(len(places), dtype=torch.bool, device=places.device)
+        size = ((self.region[1] - self.region[0]) / self.spacing).round().long() + 1
+        stride = torch.stack((size[1] * size[2], size[2], torch.ones_like(size[2])))
+        shadow = torch.zeros(int(size.prod()), dtype=torch.bool, device=places.device)
+        cell = ((self.lattice[self.opaque] - self.region[0]) / self.spacing).round().long()
+        shadow[(cell.clamp(min=0).minimum(size - 1) * stride).sum(-1)] = True
+        length = float((self.region[1] - self.region[0]).norm())
+        hidden = torch.zeros(len(places), dtype=torch.bool, device=places.device)
+        for far in torch.arange(FREE, length, float(self.spacing)).tolist():
+            cell = ((places + far * towards - self.region[0]) / self.spacing).round().long()
+            inside = ((cell >= 0) & (cell < size)).all(dim=-1)
+            if not bool(inside.any()):
+                break
+            index = (cell.clamp(min=0).minimum(size - 1) * stride).sum(-1)
+            hidden |= inside & shadow[index]
+        return hidden
 
     def _draw(self) -> tuple[Tensor, Tensor | None]:
         """Return the places of this step and, where they are a sample, their weights."""
@@ -219,12 +286,14 @@ class ProfileRenderer(Renderer):
         index, weight = self._draw()
         if bins is None:
             bins = torch.arange(len(self.frequency), device=self.frequency.device)
-        power = self._profile(field, self.lattice[index], weight, position, rotation, bins)
-        half = self.log_kernel[bins].exp()
+        profile = self._profile(field, self.lattice[index], weight, position, rotation, bins)
+        phased = bool(self.phased)
+        half = (self.log_kernel[bins] / (2 if phased else 1)).exp()
         kernel = torch.cat((half.flip(1), torch.ones_like(half[:, :1]), half), dim=1)
         heard = F.conv1d(
-            power.flatten(0, 1), kernel[:, None], stride=self.oversampling, groups=len(bins)
-        ).reshape(*power.shape[:-1], -1)  # (P, E, B, R)
+            profile.flatten(0, 2), kernel[:, None], stride=self.oversampling, groups=len(bins)
+        ).reshape(*profile.shape[:-1], -1)  # (1 or 2, P, E, B, R)
+        heard = heard.square().sum(0) if phased else heard[0]
         gain = (2 * (self.log_gain + self.log_spectrum[bins])).exp()
         noise = (2 * self.log_noise[bins]).exp()
         heard = heard * gain[:, None] + noise[:, None]
@@ -245,7 +314,7 @@ class ProfileRenderer(Renderer):
         rotation: Tensor,
         bins: Tensor,
     ) -> Tensor:
-        """Return the power in fine range bins, (P, E, B, K)."""
+        """Return what fine range bins hold: power (1, P, E, B, K) or pressure (2, P, E, B, K)."""
         sources = position[:, None] + torch.einsum(
             "pij,ej->pei", rotation, torch.cat((self.emitter[None], self.ear_positions))
         )  # (P, 1 + E, 3): emitter, then ears
@@ -254,14 +323,19 @@ class ProfileRenderer(Renderer):
             out = ray.square().sum(-1).clamp_min(1e-12).sqrt()
             pose, place = field.audible(places, ray / -out[..., None]).nonzero(as_tuple=True)
             # From here on a row for each pair of a pose and a place that answers it.
+            if self.occlusion:
+                free = ~self._hidden(places[place], ray[pose, place] / -out[pose, place, None])
+                pose, place = pose[free], place[free]
             unit, out = ray[pose, place] / out[pose, place, None], out[pose, place]
             beam = look_up(self.beam[bins], _in_head(rotation[pose], unit)).square()
         there = places[place]
         response, lead = field.echo(places, -unit, bins, place)  # (M, B), (M,)
+        phased = bool(self.phased)
         squared = response.abs().square() if response.is_complex() else response.square()
         self.points_evaluated += len(there)
         count, ears, width = len(position), len(self.ears), len(bins)
-        profiles = places.new_zeros(count * ears * width * self.bins)
+        size = count * ears * width * self.bins
+        profiles = places.new_zeros((2 if phased else 1) * size)
         for ear in range(ears):
             with torch.no_grad():
                 ray = there - sources[pose, 1 + ear]
@@ -271,20 +345,26 @@ class ProfileRenderer(Renderer):
                 known = look_up(self.ears[ear, bins], head).square() * beam * loss
                 known /= (out * back).square()[:, None]
                 if weight is not None:
-                    known *= weight[place, None]
+                    known *= weight[place, None] ** (2 if phased else 1)
                 middle = ((out + back) / 2 - self.first)[:, None] / self.bin
                 if self.lag is not None:
                     middle = middle + look_up(self.lag[ear, bins], head) / self.bin
             at = middle - lead[:, None] / self.bin  # (M, 1) or (M, B)
             left = at.detach().floor()
             heard = (left >= 0) & (left < self.bins - 1)
-            echo = squared * (known * heard)
+            if phased:
+                turn = self.wave[bins] * ((out + back) / 2 - lead)[:, None]
+                pressure = response * torch.polar((known * heard).sqrt(), -turn)
+                echoes = [pressure.real, pressure.imag]
+            else:
+                echoes = [squared * (known * heard)]
             row = (pose * ears + ear)[:, None] * width + torch.arange(width, device=pose.device)
             index = row * self.bins + left.long().clamp(0, self.bins - 2)
-            near = echo * (1 - (at - left))
-            profiles = profiles + _Deposit.apply(near, index, len(profiles))
-            profiles = profiles + _Deposit.apply(echo - near, index + 1, len(profiles))
-        return profiles.reshape(count, ears, width, self.bins)
+            for part, echo in enumerate(echoes):
+                near, at_part = echo * (1 - (at - left)), index + part * size
+                profiles = profiles + _Deposit.apply(near, at_part, len(profiles))
+                profiles = profiles + _Deposit.apply(echo - near, at_part + 1, len(profiles))
+        return profiles.reshape(-1, count, ears, width, self.bins)
 
 
 def _in_head(rotation: Tensor, directions: Tensor) -> Tensor:

@@ -117,6 +117,15 @@ class Renderer(nn.Module):
         self.log_gain = nn.Parameter(torch.zeros(()))
         self.register_buffer("points_evaluated", torch.zeros((), dtype=torch.long))
 
+    def advance(self, step: int, total: int) -> None:
+        """Learn how far a fit has come; called before each training step.
+
+        Parameters
+        ----------
+        step, total : int
+            Number of the step, and of all.
+        """
+
     def prepare(self, field: Field, possible: Possible | None, step: int) -> bool:
         """Choose where the field is evaluated next; called before each training step.
 

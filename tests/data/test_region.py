@@ -3,11 +3,14 @@ import numpy as np
 import pytest
 
 from sononerf.acoustics.ears import synthetic_ears
+from sononerf.acoustics.reception import effective_window
+from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.config import CallSettings, EarSettings, SpectrogramSettings
-from sononerf.data.region import EchoEvidence, echo_reach
+from sononerf.data.region import EchoEvidence, echo_power, echo_reach
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.geometry.hull import EchoHull
 from sononerf.geometry.poses import look_at
 
 STEP = 0.001
@@ -64,6 +67,21 @@ def test_an_echo_is_as_long_as_the_window():
     assert reach(window=127) == pytest.approx(63 * sample)
     assert reach(sampling_rate=2e6) == pytest.approx(31.5 * sample / 2)
     assert echo_reach(CallSettings(), SpectrogramSettings(), 686.0) == pytest.approx(63 * sample)
+
+
+def test_the_power_of_an_echo_is_that_of_the_rows_it_sounds_in():
+    power = echo_power(CallSettings(), SpectrogramSettings())
+    np.testing.assert_allclose(power, np.hamming(64) ** 2, rtol=1e-12)
+    # Of a sweep down to 40 kHz the rows below hold nothing: they are left out.
+    call, analysis = CallSettings(kind="linear", frequency_end=40e3), SpectrogramSettings()
+    rows = effective_window(call, analysis)[frequency_axis(analysis) >= 40e3]
+    np.testing.assert_allclose(echo_power(call, analysis), (rows**2).mean(axis=0), rtol=1e-12)
+    assert len(rows) < len(effective_window(call, analysis))
+    # Where no row is called at all, the first stands for all.
+    beyond = SpectrogramSettings(frequency_min=20e3, frequency_max=30e3)
+    np.testing.assert_allclose(
+        echo_power(call, beyond), effective_window(call, beyond)[0] ** 2, rtol=1e-12
+    )
 
 
 def test_an_echo_of_a_sweep_is_as_long_as_the_sweep_stays_in_the_window():
@@ -154,6 +172,73 @@ def test_a_face_that_answers_few_poses_is_kept(tmp_path):
     for place in (face, ball):
         assert (box[0] <= place).all()
         assert (box[1] >= place).all()
+
+
+def hull_of(places, positions, rotations):
+    """What the first echoes of some places leave."""
+    emitters = positions + rotations @ EARS.emitter
+    receivers = positions[:, None] + np.einsum("pij,ej->pei", rotations, EARS.positions)
+    ways = np.linalg.norm(receivers[:, :, None] - places, axis=-1)
+    ways = (ways + np.linalg.norm(emitters[:, None] - places, axis=-1)[:, None]) / 2
+    return EchoHull(emitters, receivers, ways.min(axis=2), rotations[:, :, 0])
+
+
+def test_what_is_left_lies_behind_every_first_echo(tmp_path):
+    """One of a hundred poses is enough; without the hull a share of them is asked for."""
+    positions, rotations = around(100)
+    few = np.arange(100) < 1
+    ball = np.array([[0.0, 0.0, 0.0]])
+    hull = hull_of(ball, positions, rotations)
+    found = evidence(tmp_path / "s", positions, rotations, ball, hull=hull)
+    plain = EchoEvidence(EnsembleStore.open(tmp_path / "s"), EARS, reach=HALF_WINDOW)
+    clear = EchoHull(
+        hull.emitters, hull.receivers, np.where(few[:, None], hull.first, -np.inf), hull.axes
+    )
+    asked = EchoEvidence(EnsembleStore.open(tmp_path / "s"), EARS, reach=HALF_WINDOW, hull=clear)
+    towards = positions[0] / np.linalg.norm(positions[0])
+    offsets = np.array([-0.004, 0.0, 0.001, 0.0014, 0.0017, 0.003])
+    probes = offsets[:, None] * towards
+    # Three tenths of how far a place speaks for its surroundings, and half a millimetre.
+    clearance = clear.clearance(probes)[0]
+    np.testing.assert_allclose(clearance, -offsets, atol=2e-4)  # ears lie 10 mm off the axis
+    assert asked.left(probes, 0.003).tolist() == [True, True, True, True, False, False]
+    assert asked.left(probes, 0.010).tolist() == [True] * 6
+    # Half of the window before its middle an echo is heard already, without the hull.
+    assert plain.left(probes, 0.003).all()
+    assert not found.left(probes, 0.003)[-2:].any()
+
+
+def test_a_silent_face_is_left_by_first_echoes(tmp_path):
+    """Three quarters of its witnesses hear what stands behind: the hull knows it all the same."""
+    positions, rotations = around(100)
+    face, ball = np.array([0.05, 0.0, 0.0]), np.array([-0.03, 0.0, 0.0])
+    ahead = positions[:, 0] / 0.4 > np.cos(np.radians(25))
+
+    def heard(position, rotation):
+        index = int(np.linalg.norm(positions - position, axis=1).argmin())
+        return echoes(position, rotation, [ball, face] if ahead[index] else [ball])
+
+    hull = hull_of(np.stack((face, ball)), positions, rotations)
+    first = np.where(ahead[:, None], hull.first, -np.inf)
+    knows = EchoHull(hull.emitters, hull.receivers, first, hull.axes)
+    found = evidence(tmp_path / "s", positions, rotations, heard, hull=knows)
+    plain = EchoEvidence(EnsembleStore.open(tmp_path / "s"), EARS, reach=HALF_WINDOW)
+    assert found.left(face[None], 0.001).tolist() == [True]
+    assert plain.left(face[None], 0.001).tolist() == [False]
+
+
+def test_nothing_outside_the_hull_is_needed(tmp_path):
+    """Else the place where a sound is repeated would be, say a second bounce before the body."""
+    positions, rotations = around()
+    ghost = np.array([[0.09, 0.0, 0.0]])
+    hull = hull_of(PLACES, positions, rotations)
+    grid = np.concatenate((PLACES, ghost))
+    places = np.concatenate((PLACES, ghost))
+    found = evidence(tmp_path / "s", positions, rotations, places, hull=hull)
+    plain = EchoEvidence(EnsembleStore.open(tmp_path / "s"), EARS, reach=HALF_WINDOW)
+    assert plain.needed(grid, 0.002).all()
+    assert found.needed(grid, 0.002).tolist() == [True, True, True, False]
+    assert found.box(margin=0.0)[1, 0] < 0.08 < plain.box(margin=0.0)[1, 0]
 
 
 def test_poses_that_hear_nothing_carve_nothing(tmp_path):

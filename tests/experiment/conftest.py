@@ -10,6 +10,7 @@ import pytest
 from sononerf.callbacks import spectrogram_images
 from sononerf.config import validate_settings
 from sononerf.experiment import build
+from sononerf.experiment.fit import fit
 from sononerf.experiment.simulate import simulate
 
 TINY = {
@@ -19,7 +20,7 @@ TINY = {
     "spectrogram": {"range_min": 0.34, "range_max": 0.45},
     "field": {"options": {"finest": 0.01, "levels": 2}},
     # Lattices are sampled, pruned and refined within few steps, so that all of a fit's state moves.
-    "renderer": {"options": {"prune_every": 3, "points": 300, "start": 200}},
+    "renderer": {"options": {"prune_every": 3, "points": 30, "start": 50, "prune_below": 0.3}},
     "fit": {"epochs": 3, "steps_per_epoch": 4, "batch_poses": 2, "batch_frequencies": 2},
     "preview": {"voxels": 8},
 }
@@ -60,3 +61,13 @@ def without_pictures():
         patch.setattr(build, "analysed_ears", functools.cache(build.analysed_ears))
         patch.setattr(spectrogram_images.SpectrogramImages, "on_epoch", lambda *given: None)
         yield
+
+
+@pytest.fixture(scope="session")
+def fitted_run(tiny_settings, tmp_path_factory):
+    """The tiny experiment, fitted; for reading alone."""
+    path = tmp_path_factory.mktemp("fitted") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(spectrogram_images.SpectrogramImages, "on_epoch", lambda *given: None)
+        fit(tiny_settings(), path, accelerator="cpu", workers=1)
+    return path

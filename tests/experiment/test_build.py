@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,20 +12,23 @@ import torch
 
 from sononerf import plugins
 from sononerf.acoustics.reception import effective_window
+from sononerf.data.region import OUTSIDE
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
 from sononerf.experiment import build
 from sononerf.experiment.build import (
     acquisition,
     check_plugins,
+    echo_hull,
     echo_region,
     field_and_renderer,
-    heard_from,
     module_for,
 )
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.field.hash import HashField
+from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.geometry.hull import EchoHull
 from sononerf.renderer.profile import ProfileRenderer
 from sononerf.renderer.shell import ShellRenderer
 
@@ -87,22 +91,85 @@ def test_the_module_is_told_what_is_heard_at_first(tiny):
     assert [module.range_db(step) for step in (0, 3, 4)] == [25.0, 25.0, whole]
 
 
-def test_training_poses_hear_from_half_way_between_emitter_and_ears():
-    renderer = SimpleNamespace(
+def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeypatch):
+    known = dataclasses.replace(
+        acquisition(tiny()),
         emitter=torch.tensor([0.002, 0.0, -0.010]),
         ear_positions=torch.tensor([[-0.010, 0.010, 0.005], [-0.010, -0.004, 0.005]]),
     )
+    monkeypatch.setattr(build, "acquisition", lambda settings: known)
     left = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # looks along y
     store = SimpleNamespace(
         positions=np.array([[9.0, 9.0, 9.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]),
         rotations=np.array([np.eye(3), left, np.eye(3)]),
         indices=lambda split: {"train": np.array([1, 2])}[split],
     )
-    # The ears' middle is (-10, 3, 5) mm, half way to it from the emitter (-4, 1.5, -2.5) mm.
+    heard = np.array([[0.4, 0.41], [-np.inf, 0.39]])
+    asked = []
+    monkeypatch.setattr(build, "first_echoes", lambda *given: asked.append(given) or heard)
+    hull = echo_hull(tiny(), store)
+    expected = [[1.0, 2.002, 2.99], [0.002, 0.0, -0.01]]
+    np.testing.assert_allclose(hull.emitters, expected, rtol=0, atol=1e-7)
+    expected = [[0.99, 1.99, 3.005], [1.004, 1.99, 3.005]]
+    np.testing.assert_allclose(hull.receivers[0], expected, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(hull.receivers[1], known.ear_positions, rtol=0, atol=1e-7)
+    # Half way: the ears' middle is (-10, 3, 5) mm, that to it from the emitter (-4, 1.5, -2.5) mm.
     expected = [[1 - 0.0015, 2 - 0.004, 3 - 0.0025], [-0.004, 0.0015, -0.0025]]
-    found = heard_from(renderer, store)
-    assert found.dtype == torch.float32
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(hull.sources, expected, rtol=0, atol=1e-7)
+    np.testing.assert_array_equal(hull.first, heard)
+    np.testing.assert_array_equal(hull.axes, [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    (given,) = asked
+    assert given[0] is store
+    np.testing.assert_allclose(given[1], np.hamming(64) ** 2, rtol=1e-12)
+    assert given[2] == pytest.approx(343.0 / 2 / 1e6)
+    for values in (hull.emitters, hull.receivers, hull.first, hull.axes):
+        assert values.dtype == np.float64
+    # A row of a sweep may hear an echo too far off, so all are taken to be that much nearer.
+    late = torch.full_like(known.ears, -0.001)
+    late[1, 3, 40, 100] = 0.004
+    known = dataclasses.replace(known, lag=late)
+    np.testing.assert_allclose(echo_hull(tiny(), store).first, heard - 0.004, rtol=0, atol=1e-9)
+
+
+def test_the_hull_of_a_sphere_holds_it_and_little_more(tiny, echoes):
+    """The front of a sphere is its nearest point."""
+    hull = echo_hull(tiny(), EnsembleStore.open(echoes))
+    assert hull.first.shape == (8, 2)
+    front = hull.clearance(0.02 * hull.sources / np.linalg.norm(hull.sources, axis=1)[:, None])[0]
+    # Beam and ears lengthen an echo, so it rises a little earlier, which is the safe side; places
+    # of a fit's lattice are allowed half a millimetre for it.
+    assert (front > -0.0001).all()
+    assert (front < OUTSIDE[1]).all()
+    assert (hull.clearance(0.0199 * fibonacci_sphere(200))[0] > 0).all()
+    assert (hull.clearance(0.021 * hull.sources / 0.4)[0] < 0).all()
+
+
+def test_a_pose_speaks_for_where_it_hears_in_every_direction(tiny):
+    """A gain of a tenth of the best ends a cone of 60 degrees; to the left it reaches farther."""
+    known = acquisition(tiny())
+    count, rows, columns = known.beam.shape
+    elevation = torch.linspace(-90, 90, rows).deg2rad()[:, None]
+    azimuth = torch.linspace(-180, 180, columns).deg2rad()
+    ahead = elevation.cos() * azimuth.cos()
+    beam = torch.where(ahead > 0.5, 2.0, 0.1)
+    beam[:, (azimuth > 0.6) & (azimuth < 1.8)] = 1.0
+    flat = dataclasses.replace(
+        known, beam=beam.expand(count, -1, -1), ears=torch.ones_like(known.ears)
+    )
+    # The tables have a direction every few degrees.
+    assert build._beam_cosine(flat) == pytest.approx(0.5, abs=0.04)
+    assert build._beam_cosine(flat) <= 0.5
+    everywhere = dataclasses.replace(flat, beam=torch.full_like(known.beam, 3.0))
+    assert build._beam_cosine(everywhere) == -1.0
+    # What one ear or one frequency hears is heard.
+    ears = torch.zeros_like(known.ears)
+    ears[1, 5] = 1.0
+    halves = dataclasses.replace(everywhere, ears=ears)
+    assert build._beam_cosine(halves) == -1.0
+    real = build._beam_cosine(known)
+    assert -1.0 < real < 1.0
+    gain = (known.beam * known.ears.amax(0)).amax(0)
+    assert float(gain[ahead > real].min()) >= 0.1 * float(gain.max())
 
 
 def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):
@@ -172,3 +239,25 @@ def test_the_region_is_told_how_long_an_echo_is(tiny, echoes, monkeypatch):
         echo_region(settings, store)
     assert told[0] == pytest.approx(31.5e-6 * 343 / 2)
     assert told[1] > 3 * told[0]
+
+
+def test_what_is_possible_is_what_the_hull_leaves(tiny, echoes):
+    store = EnsembleStore.open(echoes)
+    hull = echo_hull(tiny(), store)
+    own, given = (echo_region(tiny(), store, each) for each in (None, hull))
+    torch.testing.assert_close(own[0], given[0])
+    places = own[0][0] + torch.rand(2000, 3) * (own[0][1] - own[0][0])
+    found = given[1](places, 0.002)
+    assert torch.equal(own[1](places, 0.002), found)
+    clearance = hull.clearance(places.double().numpy())[0]
+    # Three tenths of how far a place speaks for its surroundings, and half a millimetre.
+    assert clearance[found.numpy()].min() >= -0.0011
+    assert (clearance < -0.0011).any()
+    # The middle of the sphere is where nobody hears anything come from, and the front is.
+    front = 0.02 * hull.sources / np.linalg.norm(hull.sources, axis=1)[:, None]
+    assert given[1](torch.as_tensor(front).float(), 0.002).all()
+    # A hull that leaves nothing is not believed over the settings' own box.
+    box = {"lower": (-0.1,) * 3, "upper": (0.1,) * 3}
+    empty = EchoHull(hull.emitters, hull.receivers, hull.first + 1.0, hull.axes)
+    _, possible = echo_region(tiny(region=box), store, empty)
+    assert possible(places, 0.002).all()

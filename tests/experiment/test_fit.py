@@ -30,7 +30,7 @@ from sononerf.errors import (
     StoppedError,
 )
 from sononerf.experiment import fit as fit_module
-from sononerf.experiment.build import acquisition
+from sononerf.experiment.build import acquisition, echo_hull
 from sononerf.experiment.fit import fit, peak_memory_bytes, require_accelerator
 from sononerf.module import EchoModule
 
@@ -392,14 +392,31 @@ def test_an_epoch_has_at_least_sixty_steps_unless_the_settings_say_how_many(
 
 def test_a_run_holds_where_its_training_poses_listened(finished, echoes, tiny):
     store = EnsembleStore.open(echoes)
-    held = safetensors.torch.load_file(finished / "model.safetensors")["heard_from"]
+    held = safetensors.torch.load_file(finished / "model.safetensors")
     known = acquisition(tiny())
-    middle = ((known.emitter + known.ear_positions.mean(0)) / 2).double().numpy()
     train = store.indices("train")
-    assert held.shape == (8, 3)
-    for row, index in zip(held.numpy(), train, strict=True):
-        expected = store.positions[index] + store.rotations[index] @ middle
-        np.testing.assert_allclose(row, expected, rtol=0, atol=1e-6)
+    assert held["hull.emitters"].shape == held["hull.axes"].shape == (8, 3)
+    assert held["hull.receivers"].shape == (8, 2, 3)
+    for row, index in enumerate(train):
+        turn = store.rotations[index]
+        emitter = store.positions[index] + turn @ known.emitter.double().numpy()
+        ears = store.positions[index] + known.ear_positions.double().numpy() @ turn.T
+        np.testing.assert_allclose(held["hull.emitters"][row], emitter, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(held["hull.receivers"][row], ears, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(held["hull.axes"][row], turn[:, 0], rtol=0, atol=1e-12)
+
+
+def test_a_run_holds_what_its_training_poses_heard_first(finished, echoes, tiny):
+    hull = echo_hull(tiny(), EnsembleStore.open(echoes))
+    held = safetensors.torch.load_file(finished / "model.safetensors")
+    names = {name for name in held if name.startswith("hull.")}
+    assert names == {f"hull.{name}" for name in vars(hull)}
+    for name, value in vars(hull).items():
+        assert held[f"hull.{name}"].dtype == torch.float64
+        np.testing.assert_array_equal(held[f"hull.{name}"], value)
+    # The sphere's front, 20 mm before its middle, within what its echo is not an impulse.
+    way = np.linalg.norm(hull.sources, axis=1) - 0.02
+    np.testing.assert_allclose(held["hull.first"].mean(dim=1), way, atol=0.0005)
 
 
 def test_provenance_names_no_people_machines_or_folders(finished):

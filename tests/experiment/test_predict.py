@@ -3,19 +3,23 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import shutil
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
 from sononerf.experiment import predict as predict_module
+from sononerf.experiment.build import echo_hull
 from sononerf.experiment.fit import fit
-from sononerf.experiment.predict import load_fitted, predict, store_of
+from sononerf.experiment.fitted import load_fitted, store_of
+from sononerf.experiment.predict import predict
 from sononerf.weights import load_weights, save_weights
 
 CSV = "x,y,z,yaw,pitch,roll\n-0.4,0,0,0,0,0\n0,0,0.4,0,90,0\n"
@@ -169,7 +173,10 @@ def test_a_wrong_description_is_told(run, change, error, message):
     assert not (run / "prediction").exists()
 
 
-@pytest.mark.parametrize("name", ["heard_from", "field.region"])
+HULL = ["hull.emitters", "hull.receivers", "hull.first", "hull.axes", "hull.within"]
+
+
+@pytest.mark.parametrize("name", [*HULL, "field.region"])
 def test_weights_without_what_is_needed_are_told(run, name):
     state, description = load_weights(run)
     del state[name]
@@ -182,9 +189,28 @@ def test_weights_without_what_is_needed_are_told(run, name):
 
 def test_what_is_loaded_knows_where_it_was_heard_from(run, echoes):
     store = EnsembleStore.open(echoes)
-    heads = load_fitted(run).heard_from
+    heads = load_fitted(run).hull.sources
     # A head is some centimetres large.
     np.testing.assert_allclose(heads, store.positions[store.indices("train")], atol=0.03)
+
+
+def test_what_is_loaded_knows_what_first_echoes_leave(run, echoes, tiny):
+    """An ear that heard nothing goes with the weights like all others."""
+    hull = echo_hull(tiny(), EnsembleStore.open(echoes))
+    state, description = load_weights(run)
+    state["hull.first"][3, 1] = -torch.inf
+    save_weights(run, state, description)
+    loaded = load_fitted(run).hull
+    assert loaded.within == hull.within
+    assert isinstance(loaded.within, float)
+    for name in ("emitters", "receivers", "axes"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(hull, name))
+    assert loaded.first[3, 1] == -np.inf
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (50, 3))
+    heard = hull.first.copy()
+    heard[3, 1] = -np.inf
+    expected = dataclasses.replace(hull, first=heard).clearance(points)
+    np.testing.assert_array_equal(loaded.clearance(points), expected)
 
 
 def test_damaged_or_missing_weights_are_told(run, tmp_path):
@@ -209,8 +235,6 @@ def test_the_ensemble_that_is_gone_or_another(run, tiny, echoes, tmp_path):
 
 
 def test_a_gpu_that_is_not_there(run, monkeypatch):
-    import torch
-
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     with pytest.raises(ResourceError):

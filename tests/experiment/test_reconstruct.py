@@ -16,8 +16,14 @@ from PIL import Image
 from sononerf.errors import InputError, NumericalError
 from sononerf.experiment import reconstruct as reconstruct_module
 from sononerf.experiment.fit import fit
+from sononerf.experiment.fitted import load_fitted
 from sononerf.experiment.reconstruct import evaluate, reconstruct
+from sononerf.progress import Progress
 from sononerf.reconstruction import baseline
+from sononerf.reconstruction import read_out as read_out_module
+from sononerf.reconstruction.openness import Openness
+from sononerf.reconstruction.read_out import Reconstruction
+from sononerf.reconstruction.volume import Volume
 from sononerf.scene import Scene
 
 GEOMETRY = {
@@ -74,6 +80,7 @@ def test_every_file_is_there_and_readable(run):
     assert folder == run / "reconstruction"
     assert sorted(p.name for p in folder.iterdir()) == sorted(
         ["mesh.ply", "mesh.stl", "mesh.glb", "volume.vti", "view.png", "read_out.json"]
+        + ["confidence.png"]
         + [f"mip_{axis}.png" for axis in "xyz"]
     )
     meshes = {kind: trimesh.load_mesh(folder / f"mesh.{kind}") for kind in ("ply", "stl", "glb")}
@@ -103,6 +110,57 @@ def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
     same = reconstruct(run, spacing=0.007, level=level, output=tmp_path / "same")
     assert (fine / "mesh.ply").read_bytes() == (same / "mesh.ply").read_bytes()
     assert not (run / "metrics.json").exists()
+
+
+@pytest.fixture
+def judged(run, tmp_path, no_projections, monkeypatch):
+    """Reconstruct a ball, judged as asked; return the folder and what was said."""
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
+    volume = Volume(np.zeros((2, 2, 2), np.float32), np.zeros(3), 0.01)
+
+    def make(openness):
+        found = Reconstruction(ball, volume, 1.0, "oriented", None, openness)
+        monkeypatch.setattr(reconstruct_module, "read_out", lambda *given, **options: found)
+        monkeypatch.setattr(reconstruct_module, "side_by_side_png", lambda *meshes: b"")
+        said = []
+        progress = Progress(quiet=True)
+        monkeypatch.setattr(progress, "say", said.append)
+        name = "none" if openness is None else openness.kind
+        return reconstruct(run, output=tmp_path / name, progress=progress), said
+
+    return make
+
+
+def test_what_kind_of_surface_it_is_is_written_and_of_open_ones_it_is_said(judged):
+    nothing = np.zeros(0, dtype=bool)
+    folder, said = judged(Openness(nothing, unseen_share=0.384, thin_share=0.01))
+    assert read_out(folder)["surface"] == "one-sided"
+    assert said == ["the surface is open: what no pose can have heard, 38% of it, is left out"]
+    folder, said = judged(Openness(nothing, unseen_share=0.02, thin_share=0.926))
+    assert read_out(folder)["surface"] == "sheet"
+    assert said == ["the surface is a sheet: 93% of it has its other side right behind it"]
+    for openness, name in ((Openness(nothing, 0.02, 0.01), "closed"), (None, None)):
+        folder, said = judged(openness)
+        assert read_out(folder)["surface"] == name
+        assert said == []
+
+
+def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, monkeypatch):
+    asked = []
+    plain = read_out_module.judge_openness
+
+    def judge(mesh, sources):
+        asked.append(sources)
+        return plain(mesh, sources)
+
+    monkeypatch.setattr(read_out_module, "judge_openness", judge)
+    folder = reconstruct(run, spacing=0.02)
+    np.testing.assert_allclose(asked[0], load_fitted(run).hull.sources)
+    assert len(asked) == 1
+    kind = read_out(folder)["surface"]
+    assert kind in ("closed", "sheet", "one-sided")
+    # Only what was heard from one side is cut open.
+    assert trimesh.load_mesh(folder / "mesh.ply").is_watertight == (kind != "one-sided")
 
 
 def test_a_level_above_everything_has_no_surface(run):

@@ -183,3 +183,14 @@ def test_where_little_is_heard_little_is_trusted():
     expected = (1 / 2) ** 2 * (1 / (1 + FEW_SUPPORT * usual)) ** 2
     np.testing.assert_allclose(found[-2:], expected, rtol=0.05)
     assert found[-1] < 0.01 * found[:300].min()
+
+
+def test_some_of_the_glints():
+    true = on_a_sphere()
+    kept = true.points[:, 0] > true.points[:, 0].mean()
+    some = true.where(kept)
+    for name in ("points", "normals", "power", "pose"):
+        np.testing.assert_array_equal(getattr(some, name), getattr(true, name)[kept])
+    none = true.where(np.zeros(len(kept), dtype=bool))
+    assert none.points.shape == none.normals.shape == (0, 3)
+    assert trust(none).shape == (0,)

@@ -6,6 +6,7 @@ from sononerf.errors import NumericalError, ResourceError
 from sononerf.reconstruction import volume as volume_module
 from sononerf.reconstruction.oriented import oriented_surface
 from sononerf.reconstruction.parts import split_parts
+from sononerf.reconstruction.volume import grid_over
 
 RADIUS, LATTICE, SPACING = 0.015, 0.004, 0.0025
 L_SHAPE = RADIUS * np.array([[0, 2.49, 2.45], [0, 2.47, -0.83], [0, -1.80, -0.83]])
@@ -105,6 +106,45 @@ def test_ghosts_are_no_parts():
         points, np.where(ghost, 0.002, 1.0) * energies, normals, lower, upper, SPACING
     )
     assert len(split_parts(mesh)) == 2
+
+
+def on_a_sphere(count=4000):
+    normals = np.random.default_rng(0).normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return RADIUS * normals, np.ones(count), normals, np.full(3, -0.02), np.full(3, 0.02), 0.001
+
+
+def test_the_surface_stays_within_its_bound():
+    """A plane cuts the sphere, and what lies behind it is as it was."""
+    surface = on_a_sphere()
+    plain, _, level = oriented_surface(*surface)
+    at = 0.4 * RADIUS
+    x = grid_over(*surface[3:]).points()[:, 0]
+    bound = (at - x).reshape(grid_over(*surface[3:]).shape)
+    mesh, indicator, used = oriented_surface(*surface, bound=bound)
+    assert used == level
+    assert mesh.is_watertight
+    assert (indicator.values[bound < 0] < used).all()
+    assert mesh.vertices[:, 0].max() == pytest.approx(at, abs=1e-5)
+    # The cut is a disc, but for its rim, which is rounded by a voxel.
+    disc = mesh.area_faces[mesh.face_normals[:, 0] > 0.99].sum()
+    assert disc == pytest.approx(np.pi * (RADIUS**2 - at**2), rel=0.1)
+    behind = mesh.vertices[mesh.vertices[:, 0] < at - 0.004]
+    before = plain.vertices[plain.vertices[:, 0] < at - 0.004]
+    np.testing.assert_allclose(np.sort(behind, axis=0), np.sort(before, axis=0), atol=1e-6)
+
+
+@pytest.mark.parametrize("off", [-0.001, 0.0, 0.02])
+def test_a_bound_along_the_surface_moves_it_no_farther(off):
+    """On either side of both the steeper counts, so they must be equally steep where they meet."""
+    surface = on_a_sphere()
+    grid = grid_over(*surface[3:])
+    depth = RADIUS + off - np.linalg.norm(grid.points(), axis=1)
+    mesh, _, _ = oriented_surface(*surface, bound=depth.reshape(grid.shape))
+    radii = np.linalg.norm(mesh.vertices, axis=1)
+    # Straight lines between voxels of 1 mm on spheres of 15 mm lie 0.5² / 30 mm within at most.
+    assert radii.mean() == pytest.approx(RADIUS + min(off, 0.0), abs=1e-5)
+    assert radii.max() < RADIUS + max(min(off, 0.0), -0.001) + 3e-4
 
 
 def test_half_a_sphere_is_closed():

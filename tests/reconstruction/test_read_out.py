@@ -6,6 +6,7 @@ import torch
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field, sphere_directions
 from sononerf.field.grid import GridField
+from sononerf.geometry.hull import EchoHull
 from sononerf.reconstruction import read_out
 from sononerf.reconstruction.glints import Glints
 from sononerf.reconstruction.read_out import reconstruct
@@ -70,10 +71,24 @@ def sources_around(count=300, distance=0.4):
     return MIDDLE + distance * sphere_directions(count, MIDDLE)
 
 
+def hull_of_the_sphere(count=300, radius=RADIUS):
+    """What the first echoes of the sphere leave, called and heard from one place each."""
+    sources = sources_around(count).double().numpy()
+    ways = sources - MIDDLE.double().numpy()
+    away = np.linalg.norm(ways, axis=1, keepdims=True)
+    return EchoHull(sources, sources[:, None], away - radius, -ways / away)
+
+
+def deaf(sources):
+    """Known places of poses that heard no first echo."""
+    count = len(sources)
+    return EchoHull(sources, sources[:, None], np.full((count, 1), -np.inf), 0 * sources)
+
+
 @pytest.mark.parametrize("off", [-0.0015, 0.0, 0.0008])
 def test_the_surface_runs_where_the_field_sounds_from(off):
     field = sounding(RADIUS + off)
-    found = reconstruct(field, heard_from=sources_around())
+    found = reconstruct(field, hull=hull_of_the_sphere())
     assert found.method == "oriented"
     assert found.mesh.is_watertight
     assert sorted(found.glints.pose) == list(range(300))
@@ -87,11 +102,46 @@ def test_the_surface_runs_where_the_field_sounds_from(off):
     np.testing.assert_array_equal(without.volume.values, found.volume.values)
 
 
-def test_the_glints_of_few_poses_make_no_surface():
-    field = sounding(RADIUS + 0.0008)
-    few = reconstruct(field, heard_from=sources_around(read_out.FEWEST_POSES - 1))
-    assert few.glints is None
-    np.testing.assert_array_equal(few.mesh.vertices, reconstruct(field).mesh.vertices)
+def test_where_the_field_is_silent_the_surface_runs_along_the_hull():
+    """The back of a sphere answers nobody: first echoes close it."""
+    field = sounding(RADIUS)
+    with torch.no_grad():
+        field.grids[0][0, 0, :, :, :13] = -20.0
+    hull = hull_of_the_sphere()
+    found = reconstruct(field, hull=hull)
+    # Lobes end 60 degrees off their axis, which is no more than 60 degrees off the x axis.
+    assert found.glints.points[:, 0].min() > float(MIDDLE[0]) - 0.6 * RADIUS
+    assert found.mesh.is_watertight
+    # Between heads 82 mm apart, 3 mm as seen on the sphere, hull and sphere part by 1.8²/30 mm.
+    assert np.abs(radii(found.mesh) - RADIUS).max() < 0.0006
+    silent = found.mesh.triangles_center[:, 0] < float(MIDDLE[0]) - 0.004
+    assert np.abs(radii(found.mesh) - RADIUS)[silent].mean() < 0.0003
+    # Without the hull there is half a body.
+    glints = reconstruct(field, hull=deaf(hull.sources))
+    assert glints.mesh.volume < 0.8 * found.mesh.volume
+
+
+def test_a_surface_never_lies_before_a_first_echo():
+    """A field that sounds from 1.5 mm too near: the hull has the last word."""
+    field = sounding(RADIUS)
+    near = RADIUS - 0.0015
+    hull = hull_of_the_sphere(radius=near)
+    found = reconstruct(field, hull=hull)
+    # Marching cubes draws straight lines between voxels, 1.5 mm apart on a sphere of 13.5 mm:
+    # 0.75² / 27 mm on either side.
+    assert hull.clearance(found.mesh.vertices)[0].min() > -0.00005
+    assert radii(reconstruct(field, hull=deaf(hull.sources)).mesh).mean() > RADIUS - 0.0002
+
+
+def test_few_poses_leave_a_body_that_holds_the_true_one():
+    """Twenty glints make no surface, but what twenty first echoes leave does."""
+    hull = hull_of_the_sphere(20)
+    found = reconstruct(sounding(RADIUS), hull=hull)
+    assert found.mesh.is_watertight
+    assert hull.clearance(found.mesh.vertices)[0].min() > -0.0001
+    # Between 20 heads, 0.8 rad apart, the hull rises by 0.5² / 2 of the radius.
+    assert RADIUS - 0.0005 < radii(found.mesh).min()
+    assert radii(found.mesh).max() < 1.2 * RADIUS
 
 
 def with_ghosts():
@@ -117,12 +167,49 @@ def test_what_a_pose_cannot_have_seen_grows_no_bump(monkeypatch, hidden):
     if hidden:  # the ghosts are such that they would
         monkeypatch.setattr(read_out, "HIDDEN", hidden)
     corner = np.full(3, 0.0303)
-    mesh, _, _ = read_out._glint_surface(*with_ghosts(), -corner, corner, 0.0015, "auto")
+    glints, sources = with_ghosts()
+    mesh, _, _ = read_out._glint_surface(glints, deaf(sources), -corner, corner, 0.0015, "auto")
     farthest = np.linalg.norm(mesh.vertices, axis=1).max()
     if hidden:
         assert farthest > RADIUS + 0.006
     else:
         assert farthest < RADIUS + 0.0006
+
+
+@pytest.mark.parametrize("glints", ["none", "lone"])
+def test_without_glints_to_trust_the_surface_runs_along_the_hull(glints):
+    """Of a field that is hardly fitted all glints may lie before first echoes, or far apart."""
+    hull = hull_of_the_sphere()
+    middle = MIDDLE.double().numpy()
+    corners = RADIUS / 3**0.5 * np.array([[1.0, 1.0, 1.0], [-1.0, -1.0, -1.0]])
+    points = middle + (3 if glints == "none" else 1) * corners
+    given = Glints(points, corners / RADIUS, np.ones(2), np.arange(2))
+    mesh, _, _ = read_out._glint_surface(given, hull, *REGION.double().numpy(), 0.0015, "auto")
+    assert mesh.is_watertight
+    # Hull and sphere part by 0.17 mm between heads; drawing it takes as much again.
+    assert np.abs(radii(mesh) - RADIUS).max() < 0.0004
+
+
+@pytest.mark.parametrize("ahead", [0.004, 1.0])
+def test_what_lies_before_a_first_echo_is_no_glint(monkeypatch, ahead):
+    """The ghosts lie 6 mm before the first echoes of the poses behind the sphere."""
+    monkeypatch.setattr(read_out, "HIDDEN", 1.0)
+    monkeypatch.setattr(read_out, "AHEAD", ahead)
+    monkeypatch.setattr(read_out, "OUTLINE", 0.0)
+    plain = read_out.oriented_surface
+
+    def unbound(*given, bound, **options):
+        assert bound.min() < -0.01
+        return plain(*given, **options)
+
+    monkeypatch.setattr(read_out, "oriented_surface", unbound)
+    glints, sources = with_ghosts()
+    first = np.linalg.norm(sources, axis=1, keepdims=True) - RADIUS
+    hull = EchoHull(sources, sources[:, None], first, -sources / 0.4)
+    corner = np.full(3, 0.0303)
+    mesh, _, _ = read_out._glint_surface(glints, hull, -corner, corner, 0.0015, "auto")
+    farthest = np.linalg.norm(mesh.vertices, axis=1).max()
+    assert (farthest < RADIUS + 0.0006) == (ahead < 0.006)
 
 
 @pytest.mark.parametrize("spacing", [None, 0.0025])

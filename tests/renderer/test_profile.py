@@ -172,7 +172,7 @@ def heard_from_bins(renderer, monkeypatch):
     """Power in each slice from one unit of power in each fine bin, (K, R, F)."""
     unit = torch.eye(renderer.bins, dtype=torch.float64)[:, None, None]
     with monkeypatch.context() as patch:
-        patch.setattr(renderer, "_profile", lambda *_: unit.expand(-1, 1, 3, -1))
+        patch.setattr(renderer, "_profile", lambda *_: unit.expand(-1, 1, 3, -1)[None])
         some = torch.zeros(renderer.bins, 3, dtype=torch.float64)
         heard = renderer(None, some, some, rows(poses=renderer.bins))
     return (heard[:, 0].square()).detach().numpy()
@@ -398,6 +398,49 @@ def test_the_lattice_is_refined_where_there_is_energy(acquisition, formula):
     assert not field.inside(expected + 0.013).any()
     heard = renderer(field, *tensors(POSITION[0], ROTATION[0]), rows())
     assert heard.max() > 1
+
+
+def test_a_lattice_that_is_refined_stays_within_what_is_possible(acquisition, formula):
+    """The neighbours of what is alive are asked about, each as finely as it is laid."""
+    region = torch.tensor([[-0.024] * 3, [0.024] * 3], dtype=torch.float64)
+    field = formula(region, acquisition.frequency, ball, spacing=0.002)
+    asked = []
+
+    def left(places, tolerance):
+        asked.append(tolerance)
+        return places[:, 0] <= 0.25 * tolerance
+
+    renderer = quiet(ProfileRenderer(region, acquisition, start=400, prune_every=10))
+    for step, spacing in ((0, 0.008), (10, 0.004), (20, 0.002), (30, 0.002)):
+        renderer.prepare(field, left, step)
+        assert float(renderer.spacing) == pytest.approx(spacing)
+        half = spacing * math.sqrt(3) / 2  # of a cell's diagonal
+        assert asked[-1] == pytest.approx(half)
+        assert renderer.lattice[:, 0].max() <= 0.25 * half
+    assert len(asked) == 3
+    assert field.inside(torch.tensor([[-0.004, 0.0, 0.0]], dtype=torch.float64)).all()
+    # All that is loud and possible is there.
+    fine = lattice_over(region, 0.002)
+    expected = fine[(fine.norm(dim=1) < 0.0062) & (fine[:, 0] <= 0.25 * half)]
+    found = renderer.lattice[renderer.alive]
+    assert len(found) == len(expected)
+    assert torch.cdist(found, expected).amin(1).max() < 1e-6
+
+
+def test_a_place_60_db_below_its_surroundings_is_dropped(acquisition, formula):
+    """And one 50 dB below them is not: such is the edge of a face beside its flash."""
+    region = torch.tensor([[0.0] * 3, [0.02, 0.0, 0.0]], dtype=torch.float64)
+    magnitude = torch.tensor([1.0, 10 ** (-50 / 20), 10 ** (-65 / 20)], dtype=torch.float64)
+
+    def three(places, directions):
+        value = magnitude[(places[..., 0] / 0.01).round().long().clamp(0, 2)]
+        return value[..., None].expand(*directions.shape[:-1], 3)
+
+    field = formula(region, acquisition.frequency, three, spacing=0.01)
+    renderer = ProfileRenderer(region, acquisition, prune_every=1).double()
+    renderer.prepare(field, None, 0)
+    renderer.prepare(field, None, 1)
+    assert renderer.alive.tolist() == [True, True, False]
 
 
 def test_what_is_weak_but_alone_is_kept(acquisition, formula):

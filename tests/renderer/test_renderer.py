@@ -65,6 +65,17 @@ def test_only_the_first_step_calibrates_and_rendering_is_each_ones_own(acquisiti
         renderer(None, REGION, REGION, REGION)
 
 
+@pytest.mark.parametrize("kind", [Renderer, ShellRenderer, ProfileRenderer])
+def test_how_far_a_fit_has_come_matters_to_no_renderer_unless_it_is_told_to(acquisition, kind):
+    renderer = kind(REGION, acquisition)
+    before = {name: value.clone() for name, value in renderer.state_dict().items()}
+    for step in (0, 5, 9):
+        assert renderer.advance(step, 10) is None
+    after = renderer.state_dict()
+    assert before.keys() == after.keys()
+    assert all(torch.equal(after[name], before[name]) for name in before)
+
+
 FIELDS = {
     "grid": lambda region, f: GridField(region, f, spacing=0.02, levels=2),
     "angles": lambda region, f: FourierField(region, f, inputs="angles", octaves=4, width=16),

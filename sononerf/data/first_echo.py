@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: MIT
+"""When each ear heard its first echo."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf.data.store import EnsembleStore
+
+Array = NDArray[np.float64]
+FAINTEST_DB = 40.0
+"""Below the pose's loudest. What is fainter may be the skirt of the window, no echo."""
+ONSET_DB = 10.0
+"""Below an echo's top: where it has risen to this its place is read, for there the next one, which
+may follow closely, has not begun."""
+
+
+def first_echoes(store: EnsembleStore, window: Array, step: float) -> Array:
+    """Return the range of the first echo at each ear of each training pose.
+
+    Parameters
+    ----------
+    store : EnsembleStore
+        A sealed ensemble; only its training poses are looked at.
+    window : (W,) float
+        Power of a point echo over range.
+    step : float, m
+        Between its values.
+
+    Returns
+    -------
+    first : (P, E) float, m
+        Minus infinity where nothing was heard.
+    """
+    rise = _rise(window) * step
+    axis = np.asarray(store.range, dtype=np.float64)
+    floor = float(store.attributes["reference"]) ** 2
+    heard = []
+    for index in store.indices("train"):
+        power = np.square(store.read_pose(int(index)), dtype=np.float64).mean(axis=-1)
+        heard.append([_first(profile, axis, floor) + rise for profile in power])
+    return np.asarray(heard)
+
+
+def _rise(window: Array) -> float:
+    """Return how many steps lie between an echo's onset and its middle."""
+    middle = int(window.argmax())
+    before = np.flatnonzero(window[: middle + 1] < window[middle] * 10 ** (-ONSET_DB / 10))
+    return middle - _crossing(window, int(before[-1]), window[middle]) if len(before) else 0.0
+
+
+def _first(power: Array, axis: Array, floor: float) -> float:
+    """Return the range at which the first echo has risen to the onset."""
+    inner = power[1:-1]
+    least = max(floor, power.max() * 10 ** (-FAINTEST_DB / 10))
+    tops = (inner >= power[:-2]) & (inner > power[2:]) & (inner > least)
+    if not tops.any() or (power[0] > least and power[0] >= power[1]):
+        return -np.inf  # nothing was heard, or something whose end alone was heard
+    top = int(tops.argmax()) + 1
+    before = np.flatnonzero(power[:top] < power[top] * 10 ** (-ONSET_DB / 10))
+    if not len(before):
+        return -np.inf  # it began before the first slice
+    return float(np.interp(_crossing(power, int(before[-1]), power[top]), range(len(axis)), axis))
+
+
+def _crossing(power: Array, before: int, top: float) -> float:
+    """Return where, between one index and the next, the decibels rise through the onset."""
+    low, high = np.log10(np.maximum(power[before : before + 2], 1e-30 * top))
+    wanted = np.log10(top) - ONSET_DB / 10
+    return before + float((wanted - low) / (high - low))

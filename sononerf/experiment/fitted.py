@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: MIT
+"""A fitted run: what it was fitted with, and what it renders."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import lightning
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch.utils.data import DataLoader
+
+from sononerf.config import Settings, validate_settings
+from sononerf.data.range_slices import PoseReader, WholePoses
+from sononerf.data.store import EnsembleStore
+from sononerf.errors import IncompatibleError, InputError, SettingsError
+from sononerf.experiment.build import field_and_renderer, module_for
+from sononerf.experiment.fit import quiet_lightning, require_accelerator
+from sononerf.experiment.simulate import default_store
+from sononerf.geometry.hull import EchoHull
+from sononerf.module import EchoModule
+from sononerf.progress import Progress
+from sononerf.renderer.renderer import Renderer
+from sononerf.weights import DESCRIPTION_NAME, load_weights
+
+Split = Literal["train", "val", "test"]
+HULL = ("emitters", "receivers", "first", "axes", "within")
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted field as its run's two files describe it."""
+
+    settings: Settings
+    module: EchoModule
+    echo_hash: str
+    hull: EchoHull  # where the training poses were, and what their first echoes leave
+
+
+def load_fitted(path: Path) -> Fitted:
+    """Read a fitted field from ``model.safetensors`` and ``model.json`` alone; runs no code.
+
+    Raises
+    ------
+    InputError
+        If they are missing or damaged.
+    IncompatibleError
+        If they do not fit together or need a newer version.
+    """
+    if not (path / DESCRIPTION_NAME).is_file():
+        raise InputError(
+            f"{path}: no fitted run (no {DESCRIPTION_NAME}); make or finish one with `sononerf fit`"
+        )
+    state, description = load_weights(path)
+    try:
+        settings = validate_settings(description["settings"], str(path / "model.json"))
+        reference = float(description["reference"])
+        echoes = str(description["echo_hash"])
+        region = state["field.region"]
+        hull = _hull(state)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: incomplete ({error}); repeat the fit") from None
+    except SettingsError as error:
+        raise IncompatibleError(f"settings of another version: {error}") from None
+    field, renderer = field_and_renderer(settings, region)
+    module = module_for(settings, field, renderer, reference=reference)
+    for part, prefix in ((field, "field."), (renderer, "renderer.")):
+        own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+        try:
+            part.load_state_dict(own)
+        except RuntimeError as error:
+            raise IncompatibleError(
+                f"{path / 'model.safetensors'}: does not fit {settings.field.kind} and "
+                f"{settings.renderer.kind} of this version: {str(error).splitlines()[-1].strip()}"
+            ) from None
+    module.eval()
+    return Fitted(settings, module, echoes, hull)
+
+
+def _hull(state: dict[str, torch.Tensor]) -> EchoHull:
+    read = {name: state[f"hull.{name}"].double().numpy() for name in HULL}
+    return EchoHull(
+        read["emitters"], read["receivers"], read["first"], read["axes"], float(read["within"])
+    )
+
+
+def store_of(fitted: Fitted) -> EnsembleStore:
+    """Open the ensemble that a field was fitted to.
+
+    Raises
+    ------
+    InputError
+        If it is not where the settings say.
+    IncompatibleError
+        If another one lies there.
+    """
+    settings = fitted.settings
+    path = settings.data.store or default_store(settings, fitted.echo_hash)
+    if not path.exists():
+        raise InputError(
+            f"{path}: the ensemble of this run is not there; make it again with "
+            "`sononerf simulate RUN/config.yaml`, or predict poses of your own with --poses"
+        )
+    store = EnsembleStore.open(path)
+    if store.attributes.get("echo_hash") != fitted.echo_hash:
+        raise IncompatibleError(f"{path}: holds other echoes than those of this run")
+    return store
+
+
+def poses_of(store: EnsembleStore, split: Split, renderer: Renderer) -> WholePoses:
+    """Return the poses of a split, one by one, with what was measured there."""
+    numbers = torch.as_tensor(store.indices(split))
+    return WholePoses(
+        torch.as_tensor(store.positions)[numbers],
+        torch.as_tensor(store.rotations)[numbers],
+        len(renderer.range),
+        len(renderer.frequency),
+        PoseReader(store, 1),
+        numbers,
+    )
+
+
+def render_poses(
+    fitted: Fitted, poses: WholePoses, *, accelerator: str = "auto", progress: Progress
+) -> NDArray[np.float32]:
+    """Render poses one by one, (P, E, R, F) linear magnitude."""
+    quiet_lightning()
+    require_accelerator(accelerator)
+    rendered: list[NDArray[np.float32]] = []
+
+    class Gather(lightning.Callback):
+        def on_predict_batch_end(
+            self,
+            trainer: lightning.Trainer,
+            pl_module: lightning.LightningModule,
+            outputs: torch.Tensor,
+            *rest: object,
+        ) -> None:
+            del trainer, pl_module, rest
+            rendered.append(outputs.float().cpu().numpy())
+            task.advance()
+
+    with progress.task("predicting", len(poses)) as task:
+        trainer = lightning.Trainer(
+            accelerator=accelerator,
+            devices=1,
+            logger=False,
+            callbacks=[Gather()],
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
+        trainer.predict(fitted.module, DataLoader(poses, batch_size=None), return_predictions=False)
+    return np.concatenate(rendered)

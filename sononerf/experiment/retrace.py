@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: MIT
+"""Echoes traced off a run's own reconstruction, as a second opinion beside the rendered ones."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+import trimesh
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+
+from sononerf import storage
+from sononerf.acoustics.spectrogram import compress
+from sononerf.config import NoiseSettings, Settings
+from sononerf.data.range_slices import WholePoses
+from sononerf.errors import InputError, SonoNerfError
+from sononerf.experiment.fitted import load_fitted, poses_of, render_poses, store_of
+from sononerf.experiment.reconstruct import read_mesh
+from sononerf.progress import Progress
+from sononerf.reconstruction.retrace import best_share, calmed, gain_db
+from sononerf.scene import Scene
+from sononerf.simulation.simulator import Simulator
+from sononerf.weights import DESCRIPTION_NAME
+
+NAME = "retrace.safetensors"
+RAYS = 30_000
+"""Per pose; ten times as many move the error by less than a hundredth of a decibel."""
+GAIN_POSES = 12
+"""Training poses that the gain is taken from."""
+
+
+@dataclass(frozen=True, eq=False)
+class Retrace:
+    """What echoes are traced off, and how far they are believed.
+
+    Attributes
+    ----------
+    mesh : Trimesh
+        The surface, m.
+    gain_db : (F,) float, dB
+        What is added to the traced level.
+    share : float
+        Part of the traced prediction in the whole, 0 to 1.
+    """
+
+    mesh: trimesh.Trimesh
+    gain_db: NDArray[np.float64]
+    share: float
+
+
+def learn_retrace(
+    path: Path, *, accelerator: str = "auto", progress: Progress | None = None
+) -> float:
+    """Find out how far echoes traced off a run's mesh are to be believed, and keep it.
+
+    The gain per frequency comes from training poses, the share from the validation poses; the
+    held-out ones are not looked at. Writes ``RUN/retrace.safetensors``.
+
+    Parameters
+    ----------
+    path : Path
+        A run that was reconstructed.
+    accelerator : {"auto", "cpu", "gpu"}
+        What the field is rendered on.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    share : float
+        Zero where there are no validation poses, or nothing can be traced off the mesh.
+    """
+    progress = progress or Progress(quiet=True)
+    fitted = load_fitted(path)
+    store, reference = store_of(fitted), fitted.module.reference
+    renderer = fitted.module.renderer
+    mesh = calmed(read_mesh(path / "reconstruction" / "mesh.ply"))
+    untold = np.zeros(len(renderer.frequency))
+    training = poses_of(store, "train", renderer)
+    validation = poses_of(store, "val", renderer)
+    if fitted.settings.prediction.traced == "off" or not len(validation):
+        return _keep(path, Retrace(mesh, untold, 0.0))
+    numbers = np.linspace(0, len(training) - 1, min(GAIN_POSES, len(training))).astype(int)
+    some = training.only(torch.as_tensor(numbers))
+    heard = compress(_measured(some), reference)
+    try:
+        bare = Retrace(mesh, untold, 1.0)
+        traced = trace_poses(fitted.settings, bare, some, progress=progress)
+        gain = gain_db(heard, compress(traced, reference))
+        tuned = Retrace(mesh, gain, 1.0)
+        traced = trace_poses(fitted.settings, tuned, validation, progress=progress)
+    except SonoNerfError as error:  # a mesh may be sound for the eye and unfit for the simulator
+        progress.say(f"no echoes are traced off the mesh: {error}")
+        return _keep(path, Retrace(mesh, untold, 0.0))
+    rendered = render_poses(fitted, validation, accelerator=accelerator, progress=progress)
+    share = best_share(_measured(validation), rendered, traced, reference)
+    return _keep(path, Retrace(mesh, gain, share))
+
+
+def _measured(poses: WholePoses) -> NDArray[np.float32]:
+    return np.concatenate([poses[i].spectrum.numpy() for i in range(len(poses))])
+
+
+def trace_poses(
+    settings: Settings, retrace: Retrace, poses: WholePoses, *, progress: Progress
+) -> NDArray[np.float64]:
+    """Trace echoes off the surface, (P, E, R, F) linear magnitude; noise is left out."""
+    simulator = Simulator.from_settings(
+        _scene(retrace.mesh),
+        settings.model_copy(
+            update={
+                "simulation": settings.simulation.model_copy(
+                    update={"engine": "rays", "rays": RAYS}
+                ),
+                "noise": NoiseSettings(),
+            }
+        ),
+    )
+    gain = 10 ** (retrace.gain_db / 20)
+    traced = []
+    with progress.task("tracing", len(poses)) as task:
+        for position, rotation in zip(poses.positions, poses.rotations, strict=True):
+            place, turn = position.double().numpy(), rotation.double().numpy()
+            traced.append(simulator.spectrogram(place, turn, seed=settings.fit.seed) * gain)
+            task.advance()
+    return np.stack(traced)
+
+
+def _scene(mesh: trimesh.Trimesh) -> Scene:
+    """Return a scene of our own mesh; what a user should know of a mesh is of no use here."""
+    talker = logging.getLogger("sononerf")
+    before = talker.level
+    talker.setLevel(logging.ERROR)
+    try:
+        return Scene(mesh)
+    finally:
+        talker.setLevel(before)
+
+
+def _keep(path: Path, retrace: Retrace) -> float:
+    tensors = {
+        "vertices": torch.as_tensor(np.array(retrace.mesh.vertices, dtype=np.float64)),
+        "faces": torch.as_tensor(np.array(retrace.mesh.faces, dtype=np.int64)),
+        "gain_db": torch.as_tensor(retrace.gain_db),
+        "share": torch.tensor(retrace.share, dtype=torch.float64),
+    }
+    data = safetensors.torch.save(tensors, metadata={"model": _model(path)})
+    storage.commit_bytes(path / NAME, data)
+    return retrace.share
+
+
+def _model(path: Path) -> str:
+    return str(storage.read_json(path / DESCRIPTION_NAME)["sha256"])
+
+
+def load_retrace(path: Path) -> Retrace | None:
+    """Read ``RUN/retrace.safetensors``; None where there is none, or it is of another fit.
+
+    Raises
+    ------
+    InputError
+        If it is damaged.
+    """
+    file = path / NAME
+    if not file.is_file():
+        return None
+    try:
+        with safe_open(str(file), "pt") as opened:
+            found = {name: opened.get_tensor(name) for name in opened.keys()}
+            model = (opened.metadata() or {}).get("model")
+        if model != _model(path):
+            return None
+        faces, vertices = found["faces"].numpy(), found["vertices"].numpy()
+        gain, share = found["gain_db"].numpy(), float(found["share"])
+        if not (np.isfinite(vertices).all() and np.isfinite(gain).all() and 0 <= share <= 1):
+            raise ValueError("numbers out of bounds")
+        if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
+            raise ValueError("a triangle names no vertex")
+        return Retrace(trimesh.Trimesh(vertices, faces, process=False), gain, share)
+    except (SafetensorError, KeyError, ValueError, OSError) as error:
+        raise InputError(
+            f"{file}: damaged ({error}); remove it, and `sononerf fit` makes it anew"
+        ) from None

@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: MIT
+"""The space that first echoes leave: nothing lies nearer to a pose than what it heard first.
+
+The point of a body that is nearest to a pose faces it, be it part of a smooth surface, an edge or a
+corner, so it always answers. What is nearer than a pose's first echo is therefore empty, whatever
+the body's shape and however silent its faces are from elsewhere. What all poses leave is to sound
+what the visual hull [1]_ is to silhouettes: for a convex body, heard from all around, its surface.
+
+References
+----------
+.. [1] A. Laurentini, "The visual hull concept for silhouette-based image understanding", 1994.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+CHUNK = 8192
+
+
+@dataclass(frozen=True, eq=False)
+class EchoHull:
+    """Where something can be, for all that first echoes tell.
+
+    Attributes
+    ----------
+    emitters : (P, 3) float, m
+        Where each pose calls from, world frame.
+    receivers : (P, E, 3) float, m
+        Where its ears are.
+    first : (P, E) float, m
+        Range of the first echo that each ear heard: half of the way out and back; minus infinity
+        where it tells nothing.
+    axes : (P, 3) float
+        Which way each head looks, unit vectors.
+    within : float
+        A pose speaks for places towards which the cosine to its axis is at least this.
+    """
+
+    emitters: Array
+    receivers: Array
+    first: Array
+    axes: Array
+    within: float = -1.0
+
+    @property
+    def sources(self) -> Array:
+        """Half way between emitter and ears, (P, 3) m."""
+        middle: Array = (self.emitters + self.receivers.mean(axis=1)) / 2
+        return middle
+
+    def clearance(self, points: ArrayLike) -> tuple[Array, NDArray[np.intp]]:
+        """Return how far points lie behind the first echoes, and which pose leaves them least.
+
+        Parameters
+        ----------
+        points : (N, 3) float, m
+            World frame.
+
+        Returns
+        -------
+        clearance : (N,) float, m
+            Negative where a pose says that nothing is there; plus infinity where none speaks. Its
+            slope is at most one.
+        pose : (N,) int
+            The pose that says so.
+        """
+        where = np.asarray(points, dtype=np.float64)
+        parts = [self._clearance(where[i : i + CHUNK]) for i in range(0, len(where), CHUNK)]
+        if not parts:
+            return np.zeros(0), np.zeros(0, dtype=np.intp)
+        return np.concatenate([c for c, _ in parts]), np.concatenate([p for _, p in parts])
+
+    def _clearance(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
+        out = _distances(points, self.emitters)
+        # Both ears bound the place: the nearer bound counts.
+        left = np.full(out.shape, np.inf)
+        for ear in range(self.receivers.shape[1]):
+            back = _distances(points, self.receivers[:, ear])
+            np.minimum(left, (out + back) / 2 - self.first[:, ear], out=left)
+        if self.within > -1.0:
+            ahead = points @ self.axes.T - (self.emitters * self.axes).sum(axis=1)
+            left[ahead < self.within * out] = np.inf
+        pose = left.argmin(axis=1)
+        return left[np.arange(len(points)), pose], pose
+
+
+def _distances(points: Array, others: Array) -> Array:
+    """Return (N, P) distances; a product of matrices is several times faster than differences."""
+    squared = (points**2).sum(axis=1)[:, None] + (others**2).sum(axis=1)
+    squared -= 2 * points @ others.T
+    distances: Array = np.sqrt(squared.clip(0))
+    return distances

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: MIT
+"""A fitted run is what its two files say, and its poses are those of its ensemble."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from sononerf.config import validate_settings
+from sononerf.data.store import EnsembleStore
+from sononerf.errors import IncompatibleError, InputError, ResourceError
+from sononerf.experiment.fitted import load_fitted, poses_of, render_poses, store_of
+from sononerf.progress import Progress
+from sononerf.weights import load_weights
+
+QUIET = Progress(quiet=True)
+
+pytestmark = pytest.mark.usefixtures("without_pictures")
+
+
+@pytest.fixture
+def run(fitted_run, tmp_path):
+    """The run with nothing but its two files, somewhere else."""
+    path = tmp_path / "elsewhere"
+    path.mkdir()
+    for name in ("model.safetensors", "model.json"):
+        shutil.copy(fitted_run / name, path)
+    return path
+
+
+def change(path, **values):
+    description = json.loads((path / "model.json").read_text())
+    (path / "model.json").write_text(json.dumps({**description, **values}))
+
+
+def test_what_is_loaded_is_what_was_fitted(run, tiny, echoes):
+    found = load_fitted(run)
+    assert found.settings == tiny()
+    attributes = EnsembleStore.open(echoes).attributes
+    assert found.echo_hash == attributes["echo_hash"]
+    assert found.module.reference == attributes["reference"]
+    assert not found.module.training
+    state, _ = load_weights(run)
+    for part, prefix in ((found.module.field, "field."), (found.module.renderer, "renderer.")):
+        own = part.state_dict()
+        assert {f"{prefix}{name}" for name in own} == {n for n in state if n.startswith(prefix)}
+        for name, tensor in own.items():
+            assert torch.equal(tensor, state[prefix + name]), name
+
+
+def test_the_hull_is_of_the_training_poses_alone(run, echoes):
+    hull = load_fitted(run).hull
+    store = EnsembleStore.open(echoes)
+    train = store.indices("train")
+    assert hull.emitters.dtype == hull.first.dtype == np.float64
+    # A head is some centimetres large.
+    np.testing.assert_allclose(hull.emitters, store.positions[train], atol=0.03)
+    np.testing.assert_allclose(hull.receivers.mean(axis=1), store.positions[train], atol=0.03)
+    np.testing.assert_allclose(hull.axes, store.rotations[train][:, :, 0], atol=1e-6)
+    assert hull.first.shape == (len(train), 2)
+    assert type(hull.within) is float
+    assert -1 <= hull.within <= 1
+
+
+def test_the_ensemble_is_found_where_the_settings_or_its_hash_say(run, echoes, tmp_path):
+    fitted = load_fitted(run)
+    assert store_of(fitted).path == echoes
+    section = fitted.settings.data.model_dump()
+    plain = {**fitted.settings.plain(), "data": {**section, "store": None}}
+    change(run, settings=validate_settings(plain, "plain").plain())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path)
+        with pytest.raises(InputError, match=rf"sphere-{fitted.echo_hash[:8]}\w*: .*is not there"):
+            store_of(load_fitted(run))
+
+
+def test_an_ensemble_of_other_echoes_is_refused(run):
+    change(run, echo_hash="0" * 64)
+    with pytest.raises(IncompatibleError, match="holds other echoes"):
+        store_of(load_fitted(run))
+
+
+@pytest.mark.parametrize(("split", "count"), [("train", 8), ("val", 2), ("test", 2)])
+def test_poses_of_a_split_with_what_was_measured_there(run, split, count):
+    fitted = load_fitted(run)
+    store = store_of(fitted)
+    poses = poses_of(store, split, fitted.module.renderer)
+    numbers = store.indices(split)
+    assert len(poses) == len(numbers) == count
+    for row, number in enumerate(numbers.tolist()):
+        found = poses[row]
+        assert found.pose.tolist() == [number]
+        np.testing.assert_allclose(found.position[0], store.positions[number], rtol=1e-6)
+        np.testing.assert_allclose(found.rotation[0], store.rotations[number], atol=1e-6)
+        np.testing.assert_array_equal(found.spectrum[0], store.read_pose(number))
+        assert (found.rows.shape[1], len(found.bins)) == store.read_pose(number).shape[1:]
+
+
+def test_a_split_without_poses_has_none(run, monkeypatch):
+    fitted = load_fitted(run)
+    store = store_of(fitted)
+    monkeypatch.setattr(store, "indices", lambda split: np.zeros(0, dtype=np.int64))
+    assert len(poses_of(store, "val", fitted.module.renderer)) == 0
+
+
+def test_rendering_goes_pose_by_pose_and_in_order(run):
+    fitted = load_fitted(run)
+    renderer = fitted.module.renderer
+    poses = poses_of(store_of(fitted), "train", renderer).only(torch.tensor([4, 1, 6]))
+    rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
+    assert rendered.dtype == np.float32
+    assert rendered.shape == (3, 2, len(renderer.range), len(renderer.frequency))
+    assert (rendered >= 0).all()
+    for row in range(3):
+        alone = poses.only(torch.tensor([row]))
+        again = render_poses(fitted, alone, accelerator="cpu", progress=QUIET)
+        np.testing.assert_array_equal(again[0], rendered[row])
+    assert np.abs(rendered[0] - rendered[1]).max() > 0
+
+
+def test_rendering_does_not_look_at_what_was_measured(run, monkeypatch):
+    fitted = load_fitted(run)
+    poses = poses_of(store_of(fitted), "val", fitted.module.renderer)
+    rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
+    read = EnsembleStore.read_pose
+    monkeypatch.setattr(EnsembleStore, "read_pose", lambda *given: 0 * read(*given))
+    again = poses_of(store_of(fitted), "val", fitted.module.renderer)
+    deaf = render_poses(fitted, again, accelerator="cpu", progress=QUIET)
+    np.testing.assert_array_equal(deaf, rendered)
+
+
+def test_a_gpu_that_is_not_there(run, monkeypatch):
+    fitted = load_fitted(run)
+    poses = poses_of(store_of(fitted), "val", fitted.module.renderer)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    with pytest.raises(ResourceError):
+        render_poses(fitted, poses, accelerator="gpu", progress=QUIET)

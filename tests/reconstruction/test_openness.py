@@ -1,0 +1,250 @@
+# SPDX-License-Identifier: MIT
+"""Closed surfaces, sheets, and what was heard from one side alone."""
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from sononerf.field.fourier import FourierField
+from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.geometry.hull import EchoHull
+from sononerf.reconstruction import openness, read_out
+from sononerf.reconstruction.openness import (
+    FACING,
+    LIFT,
+    THIN,
+    Openness,
+    judge_openness,
+    without_unseen,
+)
+
+RADIUS, DISTANCE = 0.02, 0.4
+CAP = np.radians(30)
+
+
+def sphere():
+    return trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+
+
+def all_around(count=200):
+    return DISTANCE * fibonacci_sphere(count)
+
+
+def cap(angle=CAP):
+    """Poses around the x axis, dense at the cap's edge, which alone says how far they see."""
+    turn = np.linspace(0, 2 * np.pi, 120, endpoint=False)
+    rings = [
+        np.stack((0 * turn + np.cos(a), np.sin(a) * np.cos(turn), np.sin(a) * np.sin(turn)), axis=1)
+        for a in (0.0, angle / 2, angle)
+    ]
+    return DISTANCE * np.concatenate(rings)
+
+
+def farthest_seen(angle=CAP):
+    """Angle from the x axis down to which a sphere's surface faces a pose at the cap's edge."""
+    past = np.linspace(0, np.pi / 2, 100_001)  # angle between a normal and the edge's pose
+    ahead = DISTANCE * np.cos(past) - RADIUS
+    aside = DISTANCE * np.sin(past)
+    return angle + past[np.flatnonzero(ahead / np.hypot(ahead, aside) > FACING)[-1]]
+
+
+def plate(thickness, side=0.04):
+    return trimesh.creation.box((side, side, thickness)).subdivide_to_size(0.005)
+
+
+def cup(depth=0.04, inner=0.02, wall=0.008):
+    """A pot that is open upwards, and which of its triangles are inside of it."""
+    bottom = -wall
+    profile = [
+        (0.0, bottom), (inner + wall, bottom), (inner + wall, depth), (inner, depth), (inner, 0.0),
+        (0.0, 0.0),
+    ]  # fmt: skip
+    mesh = trimesh.creation.revolve(profile, sections=48).subdivide_to_size(0.005)
+    middles = mesh.triangles_center
+    out = np.linalg.norm(middles[:, :2], axis=1)
+    inside = (out < inner + 1e-6) & (middles[:, 2] > -1e-6) & (middles[:, 2] < depth - 1e-6)
+    assert mesh.is_watertight
+    assert mesh.volume > 0
+    return mesh, inside
+
+
+def test_a_body_that_was_heard_from_all_around_is_closed():
+    found = judge_openness(sphere(), all_around())
+    assert found.kind == "closed"
+    assert found.unseen.shape == (5120,)
+    assert not found.unseen.any()
+    assert (found.unseen_share, found.thin_share) == (0.0, 0.0)
+
+
+def test_of_a_body_heard_from_one_side_the_far_side_is_cut_off():
+    mesh = sphere()
+    found = judge_openness(mesh, cap())
+    edge = farthest_seen()
+    assert 105 < np.degrees(edge) < 115
+    # What lies behind has a share of (1 + cos) / 2. Its edge is rugged by half a triangle's
+    # height, a thirtieth of the radius.
+    rugged = 1 / 30
+    assert found.unseen_share == pytest.approx((1 + np.cos(edge)) / 2, abs=rugged / 4)
+    assert found.kind == "one-sided"
+    angle = np.arccos(mesh.triangles_center[:, 0] / np.linalg.norm(mesh.triangles_center, axis=1))
+    assert angle[found.unseen].min() > edge - rugged
+    assert angle[~found.unseen].max() < edge + rugged
+    cut = without_unseen(mesh, found)
+    assert len(cut.faces) == (~found.unseen).sum()
+    assert len(np.unique(cut.faces)) == len(cut.vertices) < len(mesh.vertices)
+    np.testing.assert_allclose(cut.triangles, mesh.triangles[~found.unseen])
+    assert not cut.is_watertight
+    assert cut.area == pytest.approx((1 - found.unseen_share) * mesh.area)
+    assert len(mesh.faces) == 5120  # the given one stays whole
+
+
+def test_what_hardly_anyone_missed_is_closed_by_guess():
+    """Poses over more than a half leave a share of 0.12: less than a quarter."""
+    found = judge_openness(sphere(), cap(np.radians(60)))
+    expected = (1 + np.cos(farthest_seen(np.radians(60)))) / 2
+    assert 0.1 < expected < 0.15
+    assert found.unseen_share == pytest.approx(expected, abs=1 / 120)
+    assert found.kind == "closed"
+
+
+def test_what_stands_in_the_way_hides_what_lies_behind():
+    """Of two balls in a row, heard from one end, the rear one is hidden by the front one."""
+    front, rear = (trimesh.creation.icosphere(subdivisions=3, radius=r) for r in (0.02, 0.01))
+    rear.apply_translation([-0.04, 0.0, 0.0])
+    alone = judge_openness(rear, np.array([[DISTANCE, 0.0, 0.0]]))
+    assert alone.unseen_share == pytest.approx(0.55, abs=0.02)  # faces the pose, by FACING
+    both = judge_openness(trimesh.util.concatenate([front, rear]), np.array([[DISTANCE, 0.0, 0.0]]))
+    count = len(front.faces)
+    np.testing.assert_array_equal(
+        both.unseen[:count], judge_openness(front, np.array([[DISTANCE, 0.0, 0.0]])).unseen
+    )
+    assert both.unseen[count:].all()
+
+
+@pytest.mark.parametrize("thickness", [0.0015, THIN - 2e-4])
+def test_a_thin_plate_is_a_sheet(thickness):
+    mesh = plate(thickness)
+    found = judge_openness(mesh, all_around(300))
+    assert found.kind == "sheet"
+    # Its narrow sides are not thin; their other sides are 40 mm away.
+    share = 0.04 / (0.04 + 2 * thickness)
+    assert found.thin_share == pytest.approx(share, rel=1e-6)
+    assert found.unseen_share == 0.0
+
+
+@pytest.mark.parametrize("thickness", [THIN + LIFT + 1e-4, 0.01])
+def test_a_thick_plate_is_closed(thickness):
+    found = judge_openness(plate(thickness), all_around(300))
+    assert found.kind == "closed"
+    assert found.thin_share == 0.0
+
+
+def test_a_plate_that_was_heard_from_one_side_is_one_sided():
+    sources = all_around(300)
+    mesh = plate(0.0015)
+    found = judge_openness(mesh, sources[sources[:, 2] > 0.1])
+    assert found.kind == "one-sided"
+    top = mesh.face_normals[:, 2] > 0.5
+    assert not found.unseen[top].any()
+    assert found.unseen[mesh.face_normals[:, 2] < -0.5].all()
+
+
+def test_a_pit_that_poses_look_into_was_heard():
+    mesh, inside = cup(depth=0.01)
+    found = judge_openness(mesh, all_around(300))
+    assert inside.sum() > 100
+    assert not found.unseen.any()
+    assert found.kind == "closed"
+
+
+def test_a_pit_that_no_pose_looks_into_was_not():
+    mesh, inside = cup(depth=0.04)
+    sources = all_around(300)
+    # From 15 degrees above the rim one sees a centimetre of the wall, and no bottom.
+    found = judge_openness(mesh, sources[sources[:, 2] < DISTANCE * np.sin(np.radians(15))])
+    depth = 0.04 - mesh.triangles_center[:, 2]
+    assert inside[depth > 0.02].any()
+    assert found.unseen[inside & (depth > 0.02)].all()
+    assert not found.unseen[~inside & (depth > 0.002)].any()
+
+
+def test_pieces_of_the_work_change_nothing(monkeypatch):
+    whole = judge_openness(sphere(), cap())
+    monkeypatch.setattr(openness, "CHUNK", 777)
+    pieces = judge_openness(sphere(), cap())
+    np.testing.assert_array_equal(pieces.unseen, whole.unseen)
+
+
+@pytest.mark.parametrize(
+    ("unseen", "thin", "kind"),
+    [
+        (0.0, 0.0, "closed"),
+        (0.25, 0.75, "closed"),
+        (0.26, 0.0, "one-sided"),
+        (0.25, 0.76, "sheet"),
+        (0.5, 0.9, "one-sided"),  # a sheet that was heard from one side alone
+    ],
+)
+def test_what_is_called_what(unseen, thin, kind):
+    assert Openness(np.zeros(3, dtype=bool), unseen, thin).kind == kind
+
+
+def hull_over(sources):
+    """First echoes off the sphere, for heads that call and hear at one place."""
+    return EchoHull(
+        emitters=sources,
+        receivers=sources[:, None],
+        first=np.linalg.norm(sources, axis=1, keepdims=True) - RADIUS,
+        axes=-sources / np.linalg.norm(sources, axis=1, keepdims=True),
+    )
+
+
+@pytest.fixture
+def read(monkeypatch):
+    """Read out a field whose surface is the sphere, whatever its glints are."""
+    region = torch.tensor([[-0.03] * 3, [0.03] * 3])
+    torch.manual_seed(0)
+    field = FourierField(region, torch.tensor([40e3, 60e3]), octaves=2, width=8)
+
+    def drawn(*given, **options):
+        return sphere(), None, 1.0
+
+    monkeypatch.setattr(read_out, "_glint_surface", drawn)
+    monkeypatch.setattr(read_out, "oriented_surface", drawn)
+    monkeypatch.setattr(read_out, "isosurface", lambda *given: sphere())
+    monkeypatch.setattr(read_out, "find_glints", lambda *given: None)
+
+    def make(hull, method="oriented"):
+        return read_out.reconstruct(field, hull=hull, spacing=0.02, method=method, directions=2)
+
+    return make
+
+
+def test_a_closed_surface_is_read_out_whole(read):
+    found = read(hull_over(all_around()))
+    assert found.openness.kind == "closed"
+    assert found.mesh.is_watertight
+    assert len(found.mesh.faces) == 5120
+
+
+def test_a_read_out_loses_what_no_pose_can_have_heard(read):
+    found = read(hull_over(cap()))
+    assert found.openness.kind == "one-sided"
+    assert len(found.openness.unseen) == 5120
+    assert len(found.mesh.faces) == (~found.openness.unseen).sum() < 5120
+    assert found.mesh.vertices[:, 0].min() > -0.6 * RADIUS
+
+
+def test_a_hole_of_a_closed_surface_stays_closed(read):
+    found = read(hull_over(cap(np.radians(60))))
+    assert found.openness.unseen.any()
+    assert found.openness.kind == "closed"
+    assert found.mesh.is_watertight
+
+
+def test_without_poses_or_without_glints_no_one_judges(read):
+    assert read(None).openness is None
+    found = read(hull_over(cap()), method="isosurface")
+    assert found.openness is None
+    assert found.mesh.is_watertight
