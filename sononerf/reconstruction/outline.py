@@ -189,6 +189,8 @@ def _heard_through(
 
 def _angle_between(sources: Array) -> float:
     """Return the usual angle between neighbouring poses, seen from their middle."""
+    if len(sources) < 2:
+        return np.pi
     around = sources - sources.mean(axis=0)
     next_one = cKDTree(around).query(around, k=min(2, len(around)))[0].reshape(len(around), -1)
     return float(np.median(next_one[:, -1]) / np.median(np.linalg.norm(around, axis=1)))

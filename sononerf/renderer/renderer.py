@@ -134,7 +134,7 @@ class Renderer(nn.Module):
         field : Field
             What is rendered.
         possible : callable or None
-            Which places the echoes leave possible; asked once, at the first step.
+            Which places the echoes leave possible; asked at the first step and at refinements.
         step : int
             Number of the training step.
 

@@ -384,7 +384,7 @@ def listening(field, monkeypatch):
 def front_and_back(acquisition, formula):
     """Make field and renderer of two places on the x axis, ``apart`` steps of 4 mm."""
 
-    def make(apart, *, back=0.1, occlusion=True, prune_every=1):
+    def make(apart, *, back=0.1, occlusion=True):
         corner = torch.tensor([0.032, 0.008, 0.008], dtype=torch.float64)
         region = torch.stack((-corner, corner))
 
@@ -395,14 +395,11 @@ def front_and_back(acquisition, formula):
             return value[..., None].expand(*directions.shape[:-1], 3)
 
         field = formula(region, acquisition.frequency, two, spacing=FINE)
-        renderer = quiet(
-            ProfileRenderer(region, acquisition, occlusion=occlusion, prune_every=prune_every)
-        )
+        renderer = quiet(ProfileRenderer(region, acquisition, occlusion=occlusion, prune_every=1))
         renderer.emitter.zero_()
         renderer.prepare(field, None, 0)
         renderer.prepare(field, None, 1)
-        if prune_every:
-            assert int(renderer.alive.sum()) == 2
+        assert int(renderer.alive.sum()) == 2
         return field, renderer
 
     return make
