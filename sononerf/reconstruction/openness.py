@@ -18,7 +18,7 @@ from sononerf.geometry.raycast import RayCaster
 
 Array = NDArray[np.float64]
 LOOKS = 12
-"""Of the poses that a triangle faces, so many that it faces best are asked whether they see it."""
+"""So many poses at a time are asked whether they see a triangle, those that it faces best first."""
 FACING = 0.1
 """Cosine from which on a triangle faces a pose."""
 UNSEEN_SHARE = 0.25
@@ -88,11 +88,17 @@ def _seen(caster: RayCaster, middles: Array, normals: Array, sources: Array) -> 
         ways = sources[None] - middles[some, None]
         ways /= np.linalg.norm(ways, axis=2, keepdims=True)
         facing = np.einsum("tpi,ti->tp", ways, normals[some])
-        best = np.argsort(-facing, axis=1)[:, :LOOKS]
-        row, column = np.nonzero(np.take_along_axis(facing, best, axis=1) > FACING)
-        which = start + row
-        free = caster.visible(middles[which], sources[best[row, column]], normals=normals[which])
-        seen[which[free]] = True
+        order = np.argsort(-facing, axis=1)
+        left = np.arange(len(facing))
+        for first in range(0, len(sources), LOOKS):
+            best = order[left, first : first + LOOKS]
+            row, column = np.nonzero(np.take_along_axis(facing[left], best, axis=1) > FACING)
+            if not len(row):
+                break
+            which = start + left[row]
+            asked = sources[best[row, column]]
+            seen[which[caster.visible(middles[which], asked, normals=normals[which])]] = True
+            left = left[~seen[start + left]]
     return seen
 
 

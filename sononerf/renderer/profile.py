@@ -244,8 +244,8 @@ class ProfileRenderer(Renderer):
         self.alive = self.alive & (self.energy > self.prune_below * most)
         self.opaque = self.alive & (self.energy > OPAQUE * most)
 
-    def _hidden(self, places: Tensor, towards: Tensor) -> Tensor:
-        """Return which of (M, 3) places have an opaque one on their way towards (M, 3)."""
+    def _hidden(self, places: Tensor, towards: Tensor, way: Tensor) -> Tensor:
+        """Return which of (M, 3) places have an opaque one within (M,) m towards (M, 3)."""
         if not bool(self.opaque.any()):
             return torch.zeros(len(places), dtype=torch.bool, device=places.device)
         size = ((self.region[1] - self.region[0]) / self.spacing).round().long() + 1
@@ -255,13 +255,14 @@ class ProfileRenderer(Renderer):
         shadow[(cell.clamp(min=0).minimum(size - 1) * stride).sum(-1)] = True
         length = float((self.region[1] - self.region[0]).norm())
         hidden = torch.zeros(len(places), dtype=torch.bool, device=places.device)
-        for far in torch.arange(FREE, length, float(self.spacing)).tolist():
+        free = FREE + float(self.spacing) * math.sqrt(3) / 2  # a place stands for its cell
+        for far in torch.arange(free, length, float(self.spacing)).tolist():
             cell = ((places + far * towards - self.region[0]) / self.spacing).round().long()
             inside = ((cell >= 0) & (cell < size)).all(dim=-1)
             if not bool(inside.any()):
                 break
             index = (cell.clamp(min=0).minimum(size - 1) * stride).sum(-1)
-            hidden |= inside & shadow[index]
+            hidden |= inside & (far < way) & shadow[index]
         return hidden
 
     def _draw(self) -> tuple[Tensor, Tensor | None]:
@@ -324,7 +325,8 @@ class ProfileRenderer(Renderer):
             pose, place = field.audible(places, ray / -out[..., None]).nonzero(as_tuple=True)
             # From here on a row for each pair of a pose and a place that answers it.
             if self.occlusion:
-                free = ~self._hidden(places[place], ray[pose, place] / -out[pose, place, None])
+                way = out[pose, place]
+                free = ~self._hidden(places[place], ray[pose, place] / -way[:, None], way)
                 pose, place = pose[free], place[free]
             unit, out = ray[pose, place] / out[pose, place, None], out[pose, place]
             beam = look_up(self.beam[bins], _in_head(rotation[pose], unit)).square()

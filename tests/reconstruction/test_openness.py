@@ -158,6 +158,16 @@ def test_a_pit_that_poses_look_into_was_heard():
     assert found.kind == "closed"
 
 
+@pytest.mark.parametrize("count", [100, 400])
+def test_a_deep_pit_was_heard_by_poses_that_its_walls_hardly_face(count):
+    """The wall faces best the poses that the wall across hides, and more of them the more are."""
+    mesh, inside = cup(depth=0.06)
+    found = judge_openness(mesh, all_around(count))
+    assert inside.mean() > 0.3
+    assert found.unseen_share < 0.001
+    assert found.kind == "closed"
+
+
 def test_a_pit_that_no_pose_looks_into_was_not():
     mesh, inside = cup(depth=0.04)
     sources = all_around(300)

@@ -459,6 +459,29 @@ def test_the_places_of_one_surface_do_not_shade_each_other(
     assert len(heard[-1]) == (1 if hidden else 2)
 
 
+def test_what_lies_behind_a_pose_hides_nothing_from_it(front_and_back, monkeypatch):
+    """A pose between the two, 12 mm from the weak place; the strong one is at its back."""
+    field, renderer = front_and_back(5)
+    heard = listening(field, monkeypatch)
+    renderer(field, *tensors([-2 * FINE, 0.0, 0.0], LEVEL_BACK), rows())
+    assert len(heard[-1]) == 2
+
+
+@pytest.mark.parametrize("spacing", [0.008, 0.016, 0.032])
+def test_on_a_coarse_lattice_too_no_place_shades_itself(acquisition, formula, monkeypatch, spacing):
+    region = torch.tensor([[-0.032] * 3, [0.032] * 3], dtype=torch.float64)
+    field = formula(region, acquisition.frequency, smooth, spacing=spacing)
+    renderer = quiet(ProfileRenderer(region, acquisition, occlusion=True, prune_every=0))
+    renderer.prepare(field, None, 0)
+    heard = listening(field, monkeypatch)
+    for direction in ([1.0, 0.0, 0.0], [0.6, 0.64, 0.48], [0.8, -0.6, 0.0]):
+        for place in (0, len(renderer.lattice) // 2):
+            renderer.opaque = torch.arange(len(renderer.lattice)) == place
+            renderer(field, *from_there(0.3 * np.asarray(direction)), rows())
+            there = torch.cdist(heard[-1], renderer.lattice[renderer.opaque]) < 1e-6
+            assert there.any()
+
+
 @pytest.mark.parametrize("at", [0.02, 0.028])
 def test_a_wall_hides_what_is_behind_it_and_no_more(acquisition, formula, monkeypatch, at):
     """Lines from places to an oblique pose, cut with a wall of one layer, tell what is hidden.
