@@ -29,7 +29,8 @@ from sononerf.weights import DESCRIPTION_NAME
 
 NAME = "retrace.safetensors"
 RAYS = 30_000
-"""Per pose; ten times as many move the error by less than a hundredth of a decibel."""
+"""Per pose. Off the true three spheres they give what 300,000 gave to 0.05 dB over all cells and
+0.23 dB over active ones."""
 GAIN_POSES = 12
 """Training poses that the gain is taken from."""
 

@@ -21,7 +21,8 @@ Array = NDArray[np.float64]
 COARSER = 4
 """The hull is first looked at so many times more coarsely."""
 BEAM = 0.006
-"""Sound on its way to an ear needs a free way so wide, m: half a wavelength in mid band."""
+"""Sound on its way to an ear needs a free way so wide to each side, m: a wavelength in mid
+band."""
 SPREAD = 0.8
 """And so much more per distance and angle between poses: there are no looks in between."""
 BEHIND = 0.004
