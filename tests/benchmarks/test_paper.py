@@ -112,10 +112,10 @@ def test_the_series_ends_with_the_first_run_that_is_as_good(monkeypatch, tmp_pat
     lines = go().splitlines()
     common = ["scene.name=ua", "poses.count=9"]
     assert asked == [
-        (name, tmp_path / "data", [*common, setting], config, "prediction")
-        for name, config, setting in (
+        (name, tmp_path / "data", [*common, *own], config, "prediction")
+        for name, config, *own in (
             ("pilot", PAPER, f"fit.max_steps={PILOT_STEPS}"),
-            ("paper-1800", PAPER, "fit.max_steps=1800"),
+            ("paper-1800", PAPER, "fit.max_steps=1800", "fit.epochs=1800"),
             ("default-1", CONFIG, "fit.epochs=1"),
             ("default-2", CONFIG, "fit.epochs=2"),
         )
@@ -130,7 +130,7 @@ def test_the_series_ends_with_the_first_run_that_is_as_good(monkeypatch, tmp_pat
         "fit_s": 3700.0,
         "mae_db": 1.0,
         "mae_db_active": 4.0,
-        "settings": [*common, "fit.max_steps=1800"],
+        "settings": [*common, "fit.max_steps=1800", "fit.epochs=1800"],
     }
     assert [row["epochs"] for row in kept["default"]] == [1, 2]
     assert lines[0].split()[:4] == ["epochs", "steps", "fit/s", "all"]
@@ -207,8 +207,13 @@ def test_fewer_steps_are_the_first_of_the_papers_hundred_epochs(steps):
 
     total, whole = rates()
     assert total == 100 * per_pass
-    assert rates(f"fit.max_steps={steps}") == (steps, whole)
+    assert rates(f"fit.max_steps={steps}", f"fit.epochs={steps}") == (steps, whole)
     assert whole[-1][0] == (1.0 if steps < 10 * per_pass else 0.97)
+
+
+def test_more_steps_than_a_hundred_epochs_have_are_taken():
+    settings = load_settings(PAPER, ["fit.max_steps=90000", "fit.epochs=90000"])
+    assert _length(settings, 683) == (683, 90_000)
 
 
 def test_the_command_line_leads_to_the_series(monkeypatch, capsys):
