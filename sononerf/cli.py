@@ -164,14 +164,9 @@ def fit(
 
     extra = [] if seed is None else [f"fit.seed={seed}"]
     settings = load_settings(config, [*(overrides or ()), *extra])
-    from sononerf.errors import NumericalError
+    from sononerf.experiment.finish import finish, is_finished
     from sononerf.experiment.fit import fit as run
     from sononerf.experiment.fit import follows
-    from sononerf.experiment.predict import predict as predict_run
-    from sononerf.experiment.reconstruct import evaluate as evaluate_run
-    from sononerf.experiment.reconstruct import reconstruct as reconstruct_run
-    from sononerf.experiment.retrace import NAME as RETRACE_NAME
-    from sononerf.experiment.retrace import learn_retrace
     from sononerf.progress import Progress
 
     folder = output or Path("runs") / config.stem
@@ -188,22 +183,11 @@ def fit(
     )
     if follows():
         return  # the first process does the rest
-    metrics = done.read_metrics()
-    traced = (folder / RETRACE_NAME).is_file()
-    if "baseline" in metrics and traced:  # what is written last
+    if is_finished(folder):
         _print(f"{folder}: is finished; --overwrite fits it anew")
+        metrics = done.read_metrics()
     else:
-        silent: NumericalError | None = None
-        try:
-            reconstruct_run(folder, progress=progress)
-            learn_retrace(folder, accelerator=accelerator.value, progress=progress)
-        except NumericalError as error:
-            silent = error  # a field without a surface predicts all the same
-        if settings.poses.heldout:
-            predict_run(folder, accelerator=accelerator.value, progress=progress)
-        if silent is not None:
-            raise silent
-        metrics = evaluate_run(folder, progress=progress)
+        metrics = finish(folder, accelerator=accelerator.value, progress=progress)
     _summary(folder, metrics)
 
 

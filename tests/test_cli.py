@@ -27,11 +27,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sononerf import cli, storage
 from sononerf.callbacks import preview, spectrogram_images
-from sononerf.experiment import fit as fit_module
-from sononerf.experiment import predict as predict_module
+from sononerf.experiment import finish as finish_module
 from sononerf.experiment import reconstruct as reconstruct_module
-from sononerf.experiment import retrace as retrace_module
-from sononerf.experiment.run_folder import RunFolder
 from sononerf.reconstruction import baseline
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
@@ -287,23 +284,13 @@ def test_reconstruct_with_spacing_and_level(at_home, tmp_path):
     assert tree(at_home.run) == before
 
 
-learn_retrace = retrace_module.learn_retrace
-
-
 @pytest.fixture
 def fit_alone(monkeypatch):
-    """Let `fit` leave out what follows the fit; return what it would have called."""
+    """Let `fit` leave out what follows the fit; return of what it would have followed."""
     called = []
-    for module, name in ((retrace_module, "learn_retrace"), (predict_module, "predict")):
-        monkeypatch.setattr(
-            module, name, lambda run, *, accelerator, progress, name=name: called.append(name)
-        )
-    for name in ("reconstruct", "evaluate"):
-        monkeypatch.setattr(
-            reconstruct_module,
-            name,
-            lambda run, *, progress, name=name: called.append(name) or {},
-        )
+    monkeypatch.setattr(
+        finish_module, "finish", lambda run, *, accelerator, progress: called.append(run) or {}
+    )
     monkeypatch.setattr(spectrogram_images.SpectrogramImages, "on_epoch", lambda *given: None)
     return called
 
@@ -323,28 +310,8 @@ def test_what_follows_the_fit_is_made_up_for(fit_alone, clean):
     done(*command)
     model = (clean / "run" / "model.json").stat()
     done(*command)  # as after a stop between the fit and its end
-    assert fit_alone == ["reconstruct", "learn_retrace", "predict", "evaluate"] * 2
+    assert fit_alone == [Path("run")] * 2
     assert (clean / "run" / "model.json").stat() == model
-
-
-def test_nothing_is_predicted_where_nothing_is_held_out(fit_alone, clean, monkeypatch):
-    monkeypatch.setattr(fit_module, "fit", lambda settings, path, **options: RunFolder(path))
-    done("fit", SMOKE, "poses.heldout=0", "--output", "run")
-    assert fit_alone == ["reconstruct", "learn_retrace", "evaluate"]
-
-
-def test_a_surface_that_cannot_be_traced_is_told_and_no_fault(fit_alone, clean, monkeypatch):
-    monkeypatch.setattr(retrace_module, "learn_retrace", learn_retrace)
-
-    def speck(run, *, progress):
-        mesh = trimesh.creation.icosphere(radius=1e-5)
-        (run / "reconstruction").mkdir()
-        (run / "reconstruction" / "mesh.ply").write_bytes(mesh.export(file_type="ply"))
-
-    monkeypatch.setattr(reconstruct_module, "reconstruct", speck)
-    result = done("fit", SMOKE, *SHORT, "--accelerator", "cpu", "--output", "run")
-    assert "no echoes are traced off the mesh: the mesh is " in result.err
-    assert fit_alone == ["predict", "evaluate"]
 
 
 def test_a_plugins_scene_goes_the_whole_way(plugin, quick, tmp_path, monkeypatch):

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import lightning
 import numpy as np
@@ -27,7 +27,6 @@ from sononerf.renderer.renderer import Renderer
 from sononerf.weights import DESCRIPTION_NAME, load_weights
 
 Split = Literal["train", "val", "test"]
-HULL = ("emitters", "receivers", "first", "axes", "within")
 
 
 @dataclass(frozen=True)
@@ -81,10 +80,10 @@ def load_fitted(path: Path) -> Fitted:
 
 
 def _hull(state: dict[str, torch.Tensor]) -> EchoHull:
-    read = {name: state[f"hull.{name}"].double().numpy() for name in HULL}
-    return EchoHull(
-        read["emitters"], read["receivers"], read["first"], read["axes"], float(read["within"])
-    )
+    read: dict[str, Any] = {
+        f.name: state[f"hull.{f.name}"].double().numpy() for f in fields(EchoHull)
+    }
+    return EchoHull(**{**read, "within": float(read["within"])})
 
 
 def store_of(fitted: Fitted) -> EnsembleStore:

@@ -153,7 +153,7 @@ def _outermost(sources: Array, middle: Array) -> NDArray[np.bool_]:
         np.arctan2((steps * second[:, None]).sum(-1), (steps * first[:, None]).sum(-1)), axis=1
     )
     gaps = np.diff(angles, axis=1, append=angles[:, :1] + 2 * np.pi)
-    return np.asarray(gaps.max(axis=1, initial=0.0) > ONE_SIDE)
+    return np.asarray(gaps.max(axis=1, initial=0.0) > ONE_SIDE) | (count == 1)
 
 
 def _enough(hull: EchoHull) -> float:
@@ -193,5 +193,5 @@ def _angle_between(sources: Array) -> float:
     if len(sources) < 2:
         return np.pi
     around = sources - sources.mean(axis=0)
-    next_one = cKDTree(around).query(around, k=min(2, len(around)))[0].reshape(len(around), -1)
-    return float(np.median(next_one[:, -1]) / np.median(np.linalg.norm(around, axis=1)))
+    next_one = cKDTree(around).query(around, k=2)[0][:, 1]
+    return float(np.median(next_one) / np.median(np.linalg.norm(around, axis=1)))

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import shutil
 
@@ -13,9 +14,10 @@ import torch
 from sononerf.config import validate_settings
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
+from sononerf.experiment.build import echo_hull
 from sononerf.experiment.fitted import load_fitted, poses_of, render_poses, store_of
 from sononerf.progress import Progress
-from sononerf.weights import load_weights
+from sononerf.weights import load_weights, save_weights
 
 QUIET = Progress(quiet=True)
 
@@ -64,6 +66,81 @@ def test_the_hull_is_of_the_training_poses_alone(run, echoes):
     assert hull.first.shape == (len(train), 2)
     assert type(hull.within) is float
     assert -1 <= hull.within <= 1
+
+
+HULL = ["hull.emitters", "hull.receivers", "hull.first", "hull.axes", "hull.within"]
+
+
+@pytest.mark.parametrize("name", [*HULL, "field.region"])
+def test_weights_without_what_is_needed_are_told(run, name):
+    state, description = load_weights(run)
+    del state[name]
+    save_weights(run, state, description)
+    with pytest.raises(InputError, match=rf"incomplete \('{name}'\); repeat the fit") as caught:
+        load_fitted(run)
+    assert "\n" not in str(caught.value)
+    assert "model.json" not in str(caught.value)  # which is whole
+
+
+def test_what_is_loaded_knows_what_first_echoes_leave(run, echoes, tiny):
+    """An ear that heard nothing goes with the weights like all others."""
+    hull = echo_hull(tiny(), EnsembleStore.open(echoes))
+    state, description = load_weights(run)
+    state["hull.first"][3, 1] = -torch.inf
+    save_weights(run, state, description)
+    loaded = load_fitted(run).hull
+    assert loaded.within == hull.within
+    assert isinstance(loaded.within, float)
+    for name in ("emitters", "receivers", "axes"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(hull, name))
+    assert loaded.first[3, 1] == -np.inf
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (50, 3))
+    heard = hull.first.copy()
+    heard[3, 1] = -np.inf
+    expected = dataclasses.replace(hull, first=heard).clearance(points)
+    np.testing.assert_array_equal(loaded.clearance(points), expected)
+
+
+def damage(path, change):
+    description = json.loads((path / "model.json").read_text())
+    change(description)
+    (path / "model.json").write_text(json.dumps(description))
+
+
+def other_field(description):
+    description["settings"]["field"] = {"kind": "fourier", "options": {}}
+
+
+def unknown_key(description):
+    description["settings"]["fit"]["speed"] = 3
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (lambda d: d.pop("reference"), InputError, "incomplete"),
+        (lambda d: d.pop("settings"), InputError, "incomplete"),
+        (lambda d: d.update(reference="loud"), InputError, "incomplete"),
+        (lambda d: d.update(schema_version=99), IncompatibleError, "newer sononerf"),
+        (other_field, IncompatibleError, "does not fit fourier and profile"),
+        (unknown_key, IncompatibleError, r"settings of another version: .*fit\.speed"),
+    ],
+)
+def test_a_wrong_description_is_told(run, change, error, message):
+    damage(run, change)
+    with pytest.raises(error, match=message) as caught:
+        load_fitted(run)
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_or_missing_weights_are_told(run, tmp_path):
+    data = bytearray((run / "model.safetensors").read_bytes())
+    data[-5] ^= 1
+    (run / "model.safetensors").write_bytes(data)
+    with pytest.raises(InputError, match="damaged"):
+        load_fitted(run)
+    with pytest.raises(InputError, match="no fitted run"):
+        load_fitted(tmp_path / "nowhere")
 
 
 def test_the_ensemble_is_found_where_the_settings_or_its_hash_say(run, echoes, tmp_path):

@@ -383,6 +383,34 @@ def test_a_damaged_file_is_told_in_one_line_with_a_way_out(run, learned, how):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("vertices", float("nan")),
+        ("gain_db", float("inf")),
+        ("share", -0.1),
+        ("share", 1.1),
+        ("share", float("nan")),
+        ("faces", -1),
+        ("faces", 1_000_000),
+    ],
+)
+def test_what_cannot_be_is_damage(run, learned, name, value):
+    tensors = safetensors.torch.load(learned)
+    tensors[name].view(-1)[:1] = value
+    digest = hashlib.sha256((run / "model.safetensors").read_bytes()).hexdigest()
+    (run / NAME).write_bytes(safetensors.torch.save(tensors, {"model": digest}))
+    with pytest.raises(InputError, match=r"retrace\.safetensors: damaged \(.*fit"):
+        load_retrace(run)
+
+
+def test_a_damaged_file_is_told_before_a_folder_is_made(run, learned, tmp_path):
+    (run / NAME).write_bytes(learned[:-5])
+    with pytest.raises(InputError, match="damaged"):
+        predict(run, accelerator="cpu", output=tmp_path / "elsewhere")
+    assert not (tmp_path / "elsewhere").exists()
+
+
 def test_nothing_is_predicted_with_a_damaged_file_until_it_is_made_anew(run, learned):
     (run / NAME).write_bytes(learned[:-5])
     with pytest.raises(InputError, match="damaged"):

@@ -230,3 +230,23 @@ def test_where_no_pose_speaks_the_clearance_is_far_and_finite():
     cell = outline_module.COARSER * SPACING
     np.testing.assert_allclose(values[y < -cell], 2 * np.linalg.norm(2 * CORNER))
     assert (values[y > cell] < -0.05).all()
+
+
+def test_what_a_single_pose_bounds_is_kept_beside_what_it_heard():
+    """It has no neighbours, so that it looks from one side, and its ways are as wide as can be."""
+    face = cuboid([0.0, -0.02, -0.02], [FACE, 0.02, 0.02])
+    hull = hull_around(face, count=1)
+    clearance = clearance_volume(hull, -CORNER, CORNER, SPACING)
+    head = hull.sources[0]
+    middle = head * (1 - hull.first[0, 0] / np.linalg.norm(head))
+    heard = glints_at(middle[None] + 0.0, head[None])
+    glints = Glints(heard.points, heard.normals, heard.power, np.zeros(1, int))
+    points, normals = outline(hull, clearance, glints, np.ones(1))
+    reach = np.linalg.norm(points - middle, axis=1)
+    assert len(points) == len(normals) > 10
+    assert reach.max() < outline_module.BESIDE
+    apart = clearance.points()[np.abs(clearance.values.ravel()) < SPACING / 2]
+    assert (
+        np.linalg.norm(apart - middle, axis=1).max() > outline_module.BESIDE
+    )  # it reached farther
+    assert not len(outline(hull, clearance, none(), np.zeros(0))[0])

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: MIT
+"""What follows a fit: surface, share of the traced echoes, prediction, numbers; in this order."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from sononerf.errors import NumericalError
+from sononerf.experiment.fitted import load_fitted
+from sononerf.experiment.predict import predict
+from sononerf.experiment.reconstruct import evaluate, reconstruct
+from sononerf.experiment.retrace import NAME as RETRACE_NAME
+from sononerf.experiment.retrace import learn_retrace
+from sononerf.experiment.run_folder import RunFolder
+from sononerf.progress import Progress
+
+
+def is_finished(path: Path) -> bool:
+    """Tell whether a run has all that follows its fit."""
+    # The baselines are what is written last; runs of before there were traced echoes lack them.
+    return "baseline" in RunFolder(path).read_metrics() and (path / RETRACE_NAME).is_file()
+
+
+def finish(
+    path: Path, *, accelerator: str = "auto", progress: Progress | None = None
+) -> dict[str, Any]:
+    """Reconstruct, learn how far traced echoes are believed, predict held-out poses, evaluate.
+
+    Parameters
+    ----------
+    path : Path
+        A fitted run.
+    accelerator : {"auto", "cpu", "gpu"}
+        What to render on.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    metrics : dict
+        ``RUN/metrics.json``.
+
+    Raises
+    ------
+    NumericalError
+        If the field has no surface; its predictions are written all the same.
+    """
+    progress = progress or Progress(quiet=True)
+    no_surface: NumericalError | None = None
+    try:
+        reconstruct(path, progress=progress)
+        learn_retrace(path, accelerator=accelerator, progress=progress)
+    except NumericalError as error:
+        no_surface = error
+    if load_fitted(path).settings.poses.heldout:
+        predict(path, accelerator=accelerator, progress=progress)
+    if no_surface is not None:
+        raise no_surface
+    return evaluate(path, progress=progress)
