@@ -92,18 +92,44 @@ def scenes(
     preview: Annotated[Path | None, typer.Option(help="Draw every scene into this folder.")] = None,
 ) -> None:
     """List the scenes that are installed, built-in and everyone's."""
-    from sononerf.experiment.scenes import describe_scenes, draw_scenes
+    from sononerf.experiment.scenes import describe_scenes, draw_scenes, scene_table
 
-    rows = describe_scenes()
     if preview is not None:
-        for path in draw_scenes(preview):
+        written, skipped = draw_scenes(preview)
+        for path in written:
             _print(f"wrote {path}")
+        for line in skipped:
+            _print(f"not drawn: {line}")
+    rows = describe_scenes()
     if as_json:
         _print_json({"scenes": rows})
         return
-    for row in rows:
-        origin = f"{row['distribution']} {row['version']}"
-        typer.echo(f"{row['name']:16} {origin:24} {row['summary']}")
+    for line in scene_table(rows):
+        typer.echo(line)
+
+
+@app.command()
+def new_scene(
+    name: Annotated[str, typer.Argument(help="Of the scene, such as my_bar.")],
+    output: Annotated[
+        Path | None, typer.Option(help="A new folder; NAME in the working directory by default.")
+    ] = None,
+) -> None:
+    """Write a scene of one's own to start from: a plugin of two files, and its test."""
+    import shlex
+
+    from sononerf.experiment.new_scene import new_scene as write
+
+    written = write(name, output)
+    for path in written:
+        _print(f"wrote {path}")
+    folder, scene = shlex.quote(str(written[0].parent)), written[1].stem
+    _print("next:")
+    _print(f"  python -m pip install -e {folder if '/' in folder else './' + folder}")
+    _print(f"  python -m pytest {folder}")
+    _print("  sononerf scenes")
+    _print(f"  echo 'scene: {{name: {scene}}}' > {scene}.yaml")
+    _print(f"  sononerf fit {scene}.yaml")
 
 
 @app.command()

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -308,6 +310,11 @@ class Settings(_Section):
             )
         return self
 
+    @cached_property
+    def source(self) -> str | None:
+        """The file they were read from, for messages; no part of the settings, nor compared."""
+        return None
+
     def plain(self) -> dict[str, Any]:
         """Return the settings as plain data, ready for YAML, JSON and checkpoints."""
         return self.model_dump(mode="json")
@@ -443,9 +450,10 @@ def _model_at(model: type[BaseModel], path: Iterable[str | int]) -> type[BaseMod
 
 
 def describe_faults(
-    error: ValidationError, model: type[BaseModel], source: str, prefix: str = ""
+    error: ValidationError, model: type[BaseModel], source: str | None, prefix: str = ""
 ) -> str:
     """Turn pydantic's faults into one line each: source, dotted key, what is wrong, a way out."""
+    head = "" if source is None else f"{source}: "
     lines: dict[str, None] = {}
     for fault in error.errors():
         location = [
@@ -462,17 +470,17 @@ def describe_faults(
             known = list(parent.model_fields) if parent else []
             near = difflib.get_close_matches(str(location[-1]), known, n=1)
             hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
-            lines[f"{source}: {key}: unknown key; {hint}"] = None
+            lines[f"{head}{key}: unknown key; {hint}"] = None
         elif fault["type"] == "missing":
-            lines[f"{source}: {key}: missing; set it, e.g. {key}=..."] = None
+            lines[f"{head}{key}: missing; set it, e.g. {key}=..."] = None
         elif fault["type"] == "value_error":
             message = fault["msg"].removeprefix("Value error, ")
-            lines[f"{source}: {key + ': ' if key else ''}{message}"] = None
+            lines[f"{head}{key + ': ' if key else ''}{message}"] = None
         else:
             message = fault["msg"][0].lower() + fault["msg"][1:]
             found = repr(fault["input"])
             found = found if len(found) < 80 else found[:77] + "..."
-            lines[f"{source}: {key}: found {found}; {message}"] = None
+            lines[f"{head}{key}: found {found}; {message}"] = None
     return "\n".join(lines)
 
 
@@ -485,9 +493,23 @@ def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
         One line per fault, naming ``source``, the dotted key and what is allowed.
     """
     try:
-        return Settings.model_validate(dict(data))
+        settings = Settings.model_validate(dict(data))
     except ValidationError as error:
         raise SettingsError(describe_faults(error, Settings, source)) from None
+    settings.__dict__["source"] = source
+    return settings
+
+
+@contextmanager
+def faults_of(source: str | None) -> Iterator[None]:
+    """Name the file, where it is known, in faults of settings that are checked later on."""
+    try:
+        yield
+    except SettingsError as error:
+        if source is None:
+            raise
+        lines = [f"{source}: {line}" for line in str(error).splitlines()]
+        raise SettingsError("\n".join(lines)) from None
 
 
 def load_settings(path: Path, overrides: Iterable[str] = ()) -> Settings:

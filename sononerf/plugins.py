@@ -131,5 +131,5 @@ def check_options(
     try:
         checked = model.model_validate(dict(options))
     except ValidationError as error:
-        raise SettingsError(describe_faults(error, model, where)) from None
+        raise SettingsError(describe_faults(error, model, None, where)) from None
     return {name: getattr(checked, name) for name in fields}

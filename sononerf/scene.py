@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +13,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from sononerf import plugins
+from sononerf.config import faults_of
 from sononerf.errors import InputError, SonoNerfError
 from sononerf.geometry.faults import surface_faults
 from sononerf.material import MATERIALS, RIGID, Material, MaterialName
@@ -138,7 +139,9 @@ def list_scenes() -> list[plugins.Plugin]:
     return plugins.registered(plugins.SCENES)
 
 
-def load_scene(name: str, options: Mapping[str, Any] | None = None) -> Scene:
+def load_scene(
+    name: str, options: Mapping[str, Any] | None = None, *, source: str | None = None
+) -> Scene:
     """Build a scene by its name.
 
     Parameters
@@ -147,6 +150,8 @@ def load_scene(name: str, options: Mapping[str, Any] | None = None) -> Scene:
         Of an entry point of the group ``sononerf.scenes``.
     options : mapping
         Keyword arguments of its factory.
+    source : str, optional
+        Where the settings were read from, for messages.
 
     Returns
     -------
@@ -160,15 +165,23 @@ def load_scene(name: str, options: Mapping[str, Any] | None = None) -> Scene:
     InputError
         If the plugin cannot be imported, fails, or returns no scene.
     """
-    factory = plugins.load(plugins.SCENES, name)
-    arguments = plugins.check_options(factory, options or {}, where="scene.options")
-    plugin = next(plugin for plugin in list_scenes() if plugin.name == name)
-    owner = f"scene {name!r} of {plugin.distribution} {plugin.version}"
+    with faults_of(source):
+        factory = plugins.load(plugins.SCENES, name)
+        plugin = next(plugin for plugin in list_scenes() if plugin.name == name)
+        owner = f"scene {name!r} of {plugin.distribution} {plugin.version}"
+        try:
+            arguments = plugins.check_options(factory, options or {}, where="scene.options")
+        except InputError as error:
+            raise InputError(f"{owner}: {error}") from None
+        return _built(owner, factory, arguments)
+
+
+def _built(owner: str, factory: Callable[..., Any], arguments: dict[str, Any]) -> Scene:
     try:
         scene = factory(**arguments)
     except SonoNerfError:
         raise  # says itself what is wrong, in one line
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         text = " ".join(str(error).split())
         raise InputError(f"{owner} failed: {type(error).__name__}: {text}") from error
     if not isinstance(scene, Scene):

@@ -17,7 +17,7 @@ import shutil
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -64,14 +64,19 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _make_folder(folder: Path) -> None:
+def _missing_folders(folder: Path) -> list[Path]:
+    """Return what has to be created for a folder to be there, innermost first."""
     missing = []
-    current = folder
-    while not current.is_dir():
-        missing.append(current)
-        if current.parent == current:
+    while not folder.is_dir():
+        missing.append(folder)
+        if folder.parent == folder:
             break
-        current = current.parent
+        folder = folder.parent
+    return missing
+
+
+def _make_folder(folder: Path) -> None:
+    missing = _missing_folders(folder)
     for new in reversed(missing):
         with suppress(FileExistsError):  # another process was faster
             os.mkdir(new)  # noqa: PTH102 - the fault tests replace the calls of `os`
@@ -159,6 +164,50 @@ def commit(
 def commit_bytes(path: Path, data: bytes | memoryview) -> None:
     """Commit bytes; see :func:`commit`."""
     commit(path, lambda file: file.write(data))
+
+
+def commit_folder(folder: Path, files: Mapping[str, str]) -> None:
+    """Write a new folder of text files so that all of them are there, whole, or none.
+
+    They are written into a temporary folder beside the target, which then takes its name.
+
+    Parameters
+    ----------
+    folder : Path
+        The target; not there yet, or empty.
+    files : mapping
+        Content by name.
+
+    Raises
+    ------
+    StorageError
+        If the folder cannot be written, or is not empty; nothing is left behind then.
+    """
+    folder = folder.absolute()
+    current = temporary_beside(folder)
+    try:
+        missing = _missing_folders(folder.parent)
+        try:
+            _make_folder(folder.parent)
+            shutil.rmtree(current, ignore_errors=True)  # of a process that had our number
+            os.mkdir(current)  # noqa: PTH102 - see `_make_folder`
+            for name, text in files.items():
+                with open(current / name, "wb") as file:  # noqa: PTH123
+                    file.write(text.encode())
+                    file.flush()
+                    os.fsync(file.fileno())
+            sync_folder(current)
+            os.replace(current, folder)  # noqa: PTH105
+            current = folder
+            sync_folder(folder.parent)
+        except BaseException:
+            shutil.rmtree(current, ignore_errors=True)
+            for new in missing:
+                with suppress(OSError):
+                    new.rmdir()
+            raise
+    except OSError as error:
+        raise storage_error("cannot be written", folder, error) from error
 
 
 def commit_text(path: Path, text: str) -> None:
@@ -311,11 +360,7 @@ def probe_writable(folder: Path) -> None:
     StorageError
         If it cannot be created or written; nothing is left behind then.
     """
-    created = []
-    current = folder
-    while not current.exists() and current.parent != current:
-        created.append(current)
-        current = current.parent
+    created = _missing_folders(folder)
     probe = folder / ".probe"
     try:
         commit_bytes(probe, b"sononerf\n" * 512)

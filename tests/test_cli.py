@@ -25,7 +25,7 @@ import yaml
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sononerf import cli, storage
+from sononerf import __version__, cli, storage
 from sononerf.callbacks import preview, spectrogram_images
 from sononerf.experiment import finish as finish_module
 from sononerf.experiment import reconstruct as reconstruct_module
@@ -33,7 +33,7 @@ from sononerf.reconstruction import baseline
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 SMOKE = str(CONFIGS / "smoke.yaml")
-COMMANDS = ["scenes", "simulate", "fit", "predict", "reconstruct", "evaluate"]
+COMMANDS = ["scenes", "new-scene", "simulate", "fit", "predict", "reconstruct", "evaluate"]
 SHORT = [  # of the smoke settings, so that a fit takes a second
     "poses.count=6",
     "poses.validation=1",
@@ -330,9 +330,36 @@ def test_a_plugins_scene_goes_the_whole_way(plugin, quick, tmp_path, monkeypatch
 def test_scenes_are_listed_for_people_and_for_programs():
     text = done("scenes")
     assert text.err == ""
-    assert any(line.startswith("three_spheres ") for line in text.out.splitlines())
+    assert text.out.splitlines()[0].split() == ["name", "from", "size", "(mm)", "triangles"]
+    (line,) = (line for line in text.out.splitlines() if line.startswith("box "))
+    assert line.split()[:9] == ["box", "sononerf", __version__, "80", "x", "60", "x", "50", "12"]
     rows = json.loads(done("scenes", "--json").out)["scenes"]
-    assert {"name", "distribution", "version", "broken", "options", "summary"} == rows[0].keys()
+    assert rows[0].keys() == {
+        *("name", "distribution", "version", "broken", "options", "needs", "size_m"),
+        *("triangles", "summary"),
+    }
+    assert not any(row["broken"] for row in rows)
+
+
+def test_a_new_scene_is_written_and_what_to_do_next_is_said(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    text = done("new-scene", "tin-drum")
+    assert text.err.splitlines() == [
+        *(f"wrote tin-drum/{name}" for name in ("pyproject.toml", "tin_drum.py")),
+        "wrote tin-drum/test_tin_drum.py",
+        "next:",
+        "  python -m pip install -e ./tin-drum",
+        "  python -m pytest tin-drum",
+        "  sononerf scenes",
+        "  echo 'scene: {name: tin_drum}' > tin_drum.yaml",
+        "  sononerf fit tin_drum.yaml",
+    ]
+    assert "--output" in refused(2, "new-scene", "tin-drum")
+    assert "sphere" in refused(2, "new-scene", "sphere", "--output", "other")
+    assert not Path("other").exists()
+    assert "a part of the path is a file" in refused(
+        4, "new-scene", "tin", "--output", "tin-drum/pyproject.toml/bar"
+    )
 
 
 # How it refuses.
@@ -401,6 +428,12 @@ def test_settings_files_that_are_none(clean, command, content, words):
     for word in words:
         assert word in message
     assert tree(clean) == before
+
+
+def test_faults_of_a_scenes_options_name_the_file(clean):
+    Path("mine.yaml").write_text("scene: {name: sphere, options: {radios: 1}}\n")
+    message = refused(2, "simulate", "mine.yaml", "--output", "out")
+    assert message.startswith("error: mine.yaml: scene.options.radios: unknown key; did you mean ")
 
 
 def test_several_faults_are_told_at_once(clean):
@@ -472,6 +505,11 @@ def test_folders_that_cannot_be_written(clean, command, output):
     message = refused(4, command, SMOKE, *SHORT, "--output", output)
     assert output.split("/x")[0] in message
     assert tree(clean) == before
+
+
+def test_pictures_of_scenes_need_a_folder(clean):
+    Path("file").write_text("x")
+    assert "file" in refused(4, "scenes", "--preview", "file")
 
 
 def test_a_folder_that_is_no_run(clean):

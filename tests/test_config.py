@@ -55,6 +55,24 @@ def test_what_is_dumped_reads_back(write):
     assert Settings.model_validate(settings.plain()) == settings
 
 
+def test_settings_know_their_file_and_are_the_same_from_another(write):
+    first, second = load_settings(write(SCENE, "a.yaml")), load_settings(write(SCENE, "b.yaml"))
+    assert first.source.endswith("a.yaml")
+    assert second.source.endswith("b.yaml")
+    assert first == second
+    assert first != load_settings(write(SCENE, "b.yaml"), ["fit.epochs=3"])
+    assert "source" not in first.plain()
+    assert Settings.model_validate(first.plain()).source is None
+
+
+def test_later_faults_name_the_file():
+    with pytest.raises(SettingsError) as caught, config.faults_of("mine.yaml"):
+        raise SettingsError("one\ntwo")
+    assert str(caught.value) == "mine.yaml: one\nmine.yaml: two"
+    with pytest.raises(SettingsError, match=r"^one$"), config.faults_of(None):
+        raise SettingsError("one")
+
+
 def test_off_is_a_word_and_no_truth_value(write):
     path = write(SCENE + "prediction: {traced: off}\n")
     settings = load_settings(path)

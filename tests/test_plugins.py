@@ -150,11 +150,11 @@ def test_options_are_filled_in_and_converted():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"poses": [], "sise": 1}, "field.options: sise: unknown key; did you mean size?"),
-        ({}, "field.options: poses: missing"),
-        ({"poses": [], "size": "big"}, "field.options: size: found 'big'"),
-        ({"poses": [], "size": float("nan")}, "field.options: size: found nan"),
-        ({"poses": [], "kind": "c"}, "field.options: kind: found 'c'"),
+        ({"poses": [], "sise": 1}, "field.options.sise: unknown key; did you mean size?"),
+        ({}, "field.options.poses: missing"),
+        ({"poses": [], "size": "big"}, "field.options.size: found 'big'"),
+        ({"poses": [], "size": float("nan")}, "field.options.size: found nan"),
+        ({"poses": [], "kind": "c"}, "field.options.kind: found 'c'"),
     ],
 )
 def test_wrong_options_are_told(options, message):
@@ -169,7 +169,7 @@ def test_a_choice_of_types_is_told_under_its_own_key():
     with pytest.raises(SettingsError) as caught:
         check({"level": "high"}, choosy)
     for line in str(caught.value).splitlines():
-        assert line.startswith("field.options: level: found 'high'")
+        assert line.startswith("field.options.level: found 'high'")
 
 
 def test_annotations_that_cannot_be_read():

@@ -12,12 +12,16 @@ import typer
 
 from sononerf.cli import app
 from sononerf.config import load_settings
-from sononerf.plugins import SCENES, registered
+from sononerf.experiment import new_scene as new_scene_module
+from sononerf.plugins import SCENES as GROUP
+from sononerf.plugins import check_options, load, registered
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
 GUIDES = "\n".join(path.read_text(encoding="utf-8") for path in sorted(ROOT.glob("docs/*.md")))
-OTHERS = {".", "tensorboard", "pip", "git", "cd", "dask", "diff"}  # not ours to test
+SIMULATOR = (ROOT / "docs" / "simulator.md").read_text(encoding="utf-8")
+SCENES = (ROOT / "docs" / "scenes.md").read_text(encoding="utf-8")
+OTHERS = {".", "tensorboard", "pip", "pytest", "git", "cd", "dask", "diff"}  # not ours to test
 
 
 def blocks(kind, text=TEXT + GUIDES):
@@ -28,6 +32,12 @@ def commands():
     lines = "\n".join(blocks("sh")).replace("\\\n", " ").splitlines()
     found = [shlex.split(line, comments=True) for line in lines]
     return [words for words in found if words]
+
+
+def shown():
+    """Return the settings files that the guides show, by the name in their first line."""
+    found = (text.partition("\n") for text in blocks("yaml", GUIDES))
+    return {first.removeprefix("# "): rest for first, _, rest in found}
 
 
 def targets():
@@ -49,7 +59,7 @@ def test_two_commands_come_first():
 
 
 @pytest.mark.parametrize("words", commands(), ids=" ".join)
-def test_a_command_exists(words):
+def test_a_command_exists(words, tmp_path):
     program, *arguments = words
     if program == "make":
         assert set(arguments) <= targets()
@@ -57,7 +67,15 @@ def test_a_command_exists(words):
         parameters = parse(arguments)
         config = parameters.get("config")
         if config is not None:
-            load_settings(ROOT / config, parameters["overrides"] or ())
+            path = ROOT / config
+            if path.name == str(config):
+                path = tmp_path / config
+                path.write_text(shown()[str(config)], encoding="utf-8")
+            load_settings(path, parameters["overrides"] or ())
+    elif program == "python" and arguments[0] == "-c":
+        compile(arguments[1], "command", "exec")
+    elif program == "python" and arguments[0] == "-m":
+        assert arguments[1] in OTHERS
     elif program == "python":
         assert (ROOT / arguments[0]).is_file()
     else:
@@ -75,7 +93,7 @@ def test_the_files_and_scenes_it_names_are_there():
         assert (ROOT / path).is_file(), path
 
 
-@pytest.mark.parametrize("code", blocks("python", GUIDES))
+@pytest.mark.parametrize("code", blocks("python", SIMULATOR))
 def test_the_code_of_the_guides_runs(code):
     names = {}
     exec(compile(code, "guide", "exec"), names)
@@ -83,8 +101,22 @@ def test_the_code_of_the_guides_runs(code):
     assert names["magnitude"].shape == (2, len(names["simulator"].range), 47)
 
 
+def test_the_guide_shows_the_scene_that_is_written(tmp_path, monkeypatch):
+    # Whoever follows the guide here has that scene installed, and tests all the same.
+    monkeypatch.setattr(new_scene_module, "_check_name", lambda *_: None)
+    project, module, _ = new_scene_module.new_scene("round-bar", tmp_path / "round-bar")
+    assert blocks("toml", SCENES) == [project.read_text(encoding="utf-8")]
+    assert blocks("python", SCENES) == [module.read_text(encoding="utf-8")]
+
+
+def test_the_guide_knows_the_options_of_a_mesh():
+    table = SCENES.partition("| option |")[2].partition("\n\n")[0]
+    made = check_options(load(GROUP, "mesh"), {"path": "x"}, where="scene.options")
+    assert re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE) == list(made)
+
+
 def test_the_scene_of_a_file_is_there():
-    assert {"mesh"} <= {plugin.name for plugin in registered(SCENES)}
+    assert {"mesh"} <= {plugin.name for plugin in registered(GROUP)}
 
 
 def test_it_stays_short():

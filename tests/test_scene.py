@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
 import logging
+import sys
 
 import numpy as np
 import pytest
@@ -127,7 +128,7 @@ def test_scenes_are_rigid_unless_told_otherwise():
 
 
 def test_wrong_options_and_names_are_refused():
-    with pytest.raises(SettingsError, match=r"scene\.options: radios: unknown key; .*radius"):
+    with pytest.raises(SettingsError, match=r"scene\.options\.radios: unknown key; .*radius"):
         load_scene("sphere", {"radios": 1.0})
     with pytest.raises(SettingsError, match="radius"):
         load_scene("sphere", {"radius": -1.0})
@@ -135,14 +136,31 @@ def test_wrong_options_and_names_are_refused():
         load_scene("spher")
 
 
+def test_faults_of_options_name_the_file_that_sets_them():
+    for name, options in [
+        ("sphere", {"radius": -1.0, "radios": 1.0}),  # found before the factory is called
+        ("torus", {"major_radius": 0.01, "minor_radius": 0.02}),  # found by the factory
+        ("spher", {}),
+    ]:
+        with pytest.raises(SettingsError) as caught:
+            load_scene(name, options, source="mine.yaml")
+        assert all(line.startswith("mine.yaml: ") for line in str(caught.value).splitlines())
+
+
+def unreadable(size: "NoSuchType" = 1):  # noqa: F821
+    """A factory whose annotation names nothing."""
+
+
 @pytest.mark.parametrize(
     ("factory", "match"),
     [
         (lambda: 5, "returned int, expected a Scene"),
         (lambda: 1 / 0, "failed: ZeroDivisionError: division by zero"),
+        (lambda: sys.exit(3), "failed: SystemExit: 3"),
+        (unreadable, ": scene.options: the factory's annotations cannot be read: .*NoSuchType.*"),
     ],
 )
 def test_a_faulty_factory_is_named_with_its_distribution(monkeypatch, factory, match):
     monkeypatch.setattr(plugins, "load", lambda group, name: factory)
-    with pytest.raises(InputError, match=rf"^scene 'sphere' of sononerf 0\.\S+ {match}$"):
+    with pytest.raises(InputError, match=rf"^scene 'sphere' of sononerf 0\.[\d.]+ ?{match}$"):
         load_scene("sphere")

@@ -161,6 +161,35 @@ def test_threads_that_commit_one_name_do_not_mix_their_bytes(tmp_path):
     assert path.read_bytes() in (b"a" * 100, b"b" * 100)
 
 
+def test_a_folder_is_committed_whole(tmp_path):
+    files = {"a": "1\n", "b": "é"}
+    storage.commit_folder(tmp_path / "new" / "folder", files)
+    (tmp_path / "empty").mkdir()
+    storage.commit_folder(tmp_path / "empty", files)
+    for folder in (tmp_path / "new" / "folder", tmp_path / "empty"):
+        assert {path.name: path.read_text("utf-8") for path in folder.iterdir()} == files
+    assert names(tmp_path) == ["empty", "new"]
+    assert names(tmp_path / "new") == ["folder"]
+
+
+def test_a_folder_that_fails_at_any_call_leaves_nothing(tmp_path, monkeypatch):
+    for number in range(1, 11):  # two folders, two files with their syncs, rename, two folders
+        with failing(monkeypatch, number, errno.ENOSPC, lasting=True):
+            with pytest.raises(StorageError, match="folder: cannot be written: the disk is full"):
+                storage.commit_folder(tmp_path / "new" / "folder", {"a": "1", "b": "2"})
+        assert names(tmp_path) == []
+    with failing(monkeypatch, 11, errno.ENOSPC, lasting=True):
+        storage.commit_folder(tmp_path / "new" / "folder", {"a": "1", "b": "2"})
+
+
+def test_a_folder_that_is_not_empty_stays_as_it_is(tmp_path):
+    (tmp_path / "mine").write_text("x")
+    with pytest.raises(StorageError):
+        storage.commit_folder(tmp_path, {"a": "1"})
+    assert names(tmp_path) == ["mine"]
+    assert not list(tmp_path.parent.glob(f".{tmp_path.name}.*"))
+
+
 def test_json_converts_numpy_and_refuses_nan(tmp_path):
     path = tmp_path / "data.json"
     data = {"f": np.float32(0.5), "i": np.int64(3), "b": np.bool_(True), "a": np.arange(2)}

@@ -15,7 +15,7 @@ from sononerf.acoustics.air import air_absorption, speed_of_sound
 from sononerf.acoustics.ears import analysed_ears, synthetic_ears
 from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
-from sononerf.config import Settings
+from sononerf.config import Settings, faults_of
 from sononerf.data.first_echo import first_echoes
 from sononerf.data.region import WITNESS_GAIN, EchoEvidence, echo_power, echo_reach
 from sononerf.data.store import EnsembleStore
@@ -150,17 +150,18 @@ def field_and_renderer(settings: Settings, region: Tensor) -> tuple[Field, Rende
         If a plugin returns something else.
     """
     known = acquisition(settings)
-    make_field = plugins.load(plugins.FIELDS, settings.field.kind)
-    options = plugins.check_options(
-        make_field, settings.field.options, where="field.options", given=2
-    )
+    with faults_of(settings.source):
+        make_field = plugins.load(plugins.FIELDS, settings.field.kind)
+        field_options = plugins.check_options(
+            make_field, settings.field.options, where="field.options", given=2
+        )
+        make_renderer = plugins.load(plugins.RENDERERS, settings.renderer.kind)
+        renderer_options = plugins.check_options(
+            make_renderer, settings.renderer.options, where="renderer.options", given=2
+        )
     torch.manual_seed(settings.fit.seed)
-    field = make_field(region, known.frequency, **options)
-    make_renderer = plugins.load(plugins.RENDERERS, settings.renderer.kind)
-    options = plugins.check_options(
-        make_renderer, settings.renderer.options, where="renderer.options", given=2
-    )
-    renderer = make_renderer(region, known, **options)
+    field = make_field(region, known.frequency, **field_options)
+    renderer = make_renderer(region, known, **renderer_options)
     for made, kind, name in (
         (field, Field, settings.field.kind),
         (renderer, Renderer, settings.renderer.kind),

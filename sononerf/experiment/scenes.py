@@ -4,6 +4,10 @@
 from __future__ import annotations
 
 import inspect
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +15,7 @@ from sononerf import plugins, storage
 from sononerf.acoustics.spectrogram import compress
 from sononerf.config import Settings
 from sononerf.data.store import EnsembleStore
-from sononerf.errors import SonoNerfError
+from sononerf.errors import InputError, SonoNerfError
 from sononerf.render.echo import echo_png
 from sononerf.render.mesh import mesh_png
 from sononerf.render.scene import scene_png
@@ -21,39 +25,123 @@ from sononerf.simulation.simulator import Simulator
 
 
 def describe_scenes() -> list[dict[str, Any]]:
-    """Return name, origin and one line of every scene; a broken one says why it is broken."""
+    """Return what there is to know of every scene, built as it is without options.
+
+    Returns
+    -------
+    rows : list of dict
+        Plain data. ``needs`` are the options without a default; where there are any, ``size_m``
+        and ``triangles`` are None. A broken scene says in its ``summary`` why, and hurts no other.
+    """
     rows = []
     for plugin in list_scenes():
-        row = {
+        row: dict[str, Any] = {
             "name": plugin.name,
             "distribution": plugin.distribution,
             "version": plugin.version,
             "broken": False,
             "options": [],
+            "needs": [],
+            "size_m": None,
+            "triangles": None,
         }
         try:
-            factory = plugins.load(plugins.SCENES, plugin.name)
-            row["summary"] = (inspect.getdoc(factory) or "").partition("\n")[0]
-            row["options"] = list(inspect.signature(factory).parameters)
+            with _quietly():
+                factory = plugins.load(plugins.SCENES, plugin.name)
+                row["summary"] = (inspect.getdoc(factory) or "").partition("\n")[0]
+                row["options"], row["needs"] = _options(factory)
+                if not row["needs"]:
+                    mesh = load_scene(plugin.name).mesh
+                    row["size_m"] = [float(length) for length in mesh.extents]
+                    row["triangles"] = len(mesh.faces)
         except SonoNerfError as error:
-            row["summary"] = f"broken: {error}"
+            row["summary"] = "broken: " + " ".join(str(error).split())
             row["broken"] = True
         rows.append(row)
     return rows
 
 
-def draw_scenes(folder: Path) -> list[Path]:
-    """Draw every scene that needs no options; return the files."""
-    written = []
+def scene_table(rows: list[dict[str, Any]]) -> list[str]:
+    """Return the rows as lines of an aligned table under a head; sizes in millimetres."""
+    table = [["name", "from", "size (mm)", "triangles", ""]]
+    for row in rows:
+        size = " x ".join(f"{1e3 * length:.4g}" for length in row["size_m"] or [])
+        needs = f"needs {', '.join(row['needs'])}" if row["needs"] else "-"
+        count = "-" if row["triangles"] is None else str(row["triangles"])
+        origin = f"{row['distribution']} {row['version']}"
+        table.append([row["name"], origin, size or needs, count, row["summary"]])
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    return [
+        f"{name:{widths[0]}}  {origin:{widths[1]}}  {size:{widths[2]}}  {count:>{widths[3]}}  "
+        f"{summary}".rstrip()
+        for name, origin, size, count, summary in table
+    ]
+
+
+def _options(factory: Callable[..., Any]) -> tuple[list[str], list[str]]:
+    """Return the names of a factory's options, and of those that have no default."""
+    try:
+        given = inspect.signature(factory).parameters.values()
+    except (TypeError, ValueError) as error:
+        raise InputError(f"its arguments cannot be read: {error}") from None
+    named = [p for p in given if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    return [p.name for p in named], [p.name for p in named if p.default is p.empty]
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Keep what factories print off our output, and warnings of meshes nobody asked for."""
+
+    def drop(record: logging.LogRecord) -> bool:
+        del record
+        return False
+
+    logger = logging.getLogger("sononerf")
+    logger.addFilter(drop)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        logger.removeFilter(drop)
+
+
+def draw_scenes(folder: Path) -> tuple[list[Path], list[str]]:
+    """Draw every scene that needs no options.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the pictures, ``NAME.png`` each.
+
+    Returns
+    -------
+    written : list of Path
+        The pictures.
+    skipped : list of str
+        Each other scene, and why it is not drawn.
+
+    Raises
+    ------
+    StorageError
+        If the folder cannot be written, before anything is drawn.
+    """
+    storage.probe_writable(folder)
+    written, skipped = [], []
     for plugin in list_scenes():
         try:
-            scene = load_scene(plugin.name)
-        except SonoNerfError:
-            continue  # listed as broken, or made from a file of the user's
+            with _quietly():
+                needs = _options(plugins.load(plugins.SCENES, plugin.name))[1]
+                picture = None if needs else mesh_png(load_scene(plugin.name).mesh)
+        except SonoNerfError as error:
+            skipped.append(f"{plugin.name}: " + " ".join(str(error).split()))
+            continue
+        if picture is None:
+            skipped.append(f"{plugin.name}: needs scene.options.{', '.join(needs)}")
+            continue
         path = folder / f"{plugin.name}.png"
-        storage.commit_bytes(path, mesh_png(scene.mesh))
+        storage.commit_bytes(path, picture)
         written.append(path)
-    return written
+    return written, skipped
 
 
 def draw_ensemble(settings: Settings, store: EnsembleStore, folder: Path) -> list[Path]:
@@ -80,7 +168,7 @@ def draw_ensemble(settings: Settings, store: EnsembleStore, folder: Path) -> lis
     StorageError
         If a picture cannot be written.
     """
-    scene = load_scene(settings.scene.name, settings.scene.options)
+    scene = load_scene(settings.scene.name, settings.scene.options, source=settings.source)
     written = [folder / "scene.png"]
     forward = store.rotations[:, :, 0]
     storage.commit_bytes(

@@ -111,7 +111,7 @@ def simulate(
         If the folder holds another ensemble.
     """
     progress = progress or Progress(quiet=True)
-    scene = load_scene(settings.scene.name, settings.scene.options)
+    scene = load_scene(settings.scene.name, settings.scene.options, source=settings.source)
     path = store_path(settings, scene, output)
     wanted = echo_hash(settings, scene)
     if (path / "zarr.json").is_file():

@@ -187,8 +187,8 @@ def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):
     [
         ({"field": {"kind": "gird", "options": {}}}, "unknown field 'gird'; did you mean grid"),
         ({"renderer": {"kind": "shel", "options": {}}}, "unknown renderer 'shel'"),
-        ({"field": {"options": {"level": 2}}}, r"field\.options: level: .*did you mean levels"),
-        ({"renderer": {"options": {"points": 0}}}, r"renderer\.options: points: found 0"),
+        ({"field": {"options": {"level": 2}}}, r"field\.options\.level: .*did you mean levels"),
+        ({"renderer": {"options": {"points": 0}}}, r"renderer\.options\.points: found 0"),
     ],
 )
 def test_wrong_kinds_and_options_are_refused(tiny, changes, message):

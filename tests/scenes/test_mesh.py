@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
 import os
+import re
 
 import numpy as np
 import pytest
 import trimesh
+from trimesh.exchange.gltf import export_gltf
 
 from sononerf.errors import InputError, SettingsError
 from sononerf.material import MATERIALS
@@ -12,17 +14,40 @@ from sononerf.scene import load_scene
 BOX = trimesh.creation.box((30.0, 20.0, 10.0))
 
 
+HEAD = trimesh.creation.icosphere(subdivisions=1, radius=5.0)
+BESIDE = trimesh.transformations.translation_matrix([40.0, 0.0, 0.0])
+
+
 def load(path, **options):
     return load_scene("mesh", {"path": str(path), **options}).mesh
 
 
-@pytest.mark.parametrize("name", ["a.stl", "a.ply", "a.obj", "a.glb", "UPPER.STL", "text.stl"])
+def whole_gltf(shape):
+    """Return a glTF that carries its numbers itself."""
+    return export_gltf(trimesh.Scene(shape), embed_buffers=True)["model.gltf"]
+
+
+@pytest.fixture
+def insect():
+    """A body and a head; the head stands where the scene graph moves it."""
+    scene = trimesh.Scene()
+    scene.add_geometry(BOX, geom_name="body", node_name="below")
+    scene.add_geometry(HEAD, geom_name="head", node_name="above", transform=BESIDE)
+    return scene
+
+
+@pytest.mark.parametrize(
+    "name", ["a.stl", "a.ply", "a.obj", "a.off", "a.glb", "a.gltf", "UPPER.STL", "text.stl"]
+)
 def test_formats_and_units(tmp_path, name):
     path = tmp_path / name
     kind = "stl_ascii" if name == "text.stl" else path.suffix[1:].lower()
     moved = BOX.copy()
     moved.apply_translation([5.0, 6.0, 7.0])
-    moved.export(path, file_type=kind)
+    if kind == "gltf":
+        path.write_bytes(whole_gltf(moved))
+    else:
+        moved.export(path, file_type=kind)
     mesh = load(path, unit="mm")
     np.testing.assert_allclose(
         mesh.bounds, [[-0.015, -0.01, -0.005], [0.015, 0.01, 0.005]], atol=1e-8
@@ -33,12 +58,62 @@ def test_formats_and_units(tmp_path, name):
     )
 
 
-def test_glb_is_in_metres(tmp_path):
+def test_glb_and_gltf_are_in_metres(tmp_path):
     BOX.export(tmp_path / "a.glb")
-    np.testing.assert_allclose(load(tmp_path / "a.glb").extents, [30, 20, 10])
+    (tmp_path / "a.gltf").write_bytes(whole_gltf(BOX))
+    for name in ("a.glb", "a.gltf"):
+        np.testing.assert_allclose(load(tmp_path / name).extents, [30, 20, 10])
 
 
-@pytest.mark.parametrize("name", ["a.stl", "a.ply", "a.obj"])
+def test_the_scale_multiplies_the_units(tmp_path):
+    BOX.export(tmp_path / "a.stl")
+    mesh = load(tmp_path / "a.stl", unit="mm", scale=2.5)
+    np.testing.assert_allclose(mesh.extents, [0.075, 0.05, 0.025])
+    for wrong in (0.0, -1.0, float("inf")):
+        with pytest.raises(SettingsError, match=r"scene\.options\.scale: found"):
+            load(tmp_path / "a.stl", unit="mm", scale=wrong)
+
+
+@pytest.mark.parametrize("name", ["a.glb", "a.gltf", "a.obj"])
+def test_parts_stand_in_their_places_with_their_materials(tmp_path, insect, name):
+    path = tmp_path / name
+    if name == "a.gltf":
+        path.write_bytes(whole_gltf(insect))
+    else:
+        insect.export(path)
+    options = {"path": str(path), "unit": "mm", "material": "rigid"}
+    scene = load_scene("mesh", {**options, "materials": {"head": "insect"}})
+    assert scene.mesh.extents == pytest.approx([0.06, 0.02, 0.01])
+    assert scene.mesh.is_watertight
+    middles = scene.mesh.triangles_center
+    of_head = np.array([material == MATERIALS["insect"] for material in scene.materials])
+    np.testing.assert_array_equal(of_head[scene.part], middles[:, 0] > 0.01)
+    assert set(scene.materials) == {MATERIALS["insect"], MATERIALS["rigid"]}
+    assert load_scene("mesh", options).material == MATERIALS["rigid"]
+
+
+def test_a_part_that_stands_twice_and_mirrored_is_one(tmp_path, insect):
+    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+    insect.graph.update("other", matrix=mirror @ BESIDE, geometry="head")
+    insect.export(tmp_path / "a.glb")
+    options = {"path": str(tmp_path / "a.glb"), "unit": "mm"}
+    scene = load_scene("mesh", {**options, "materials": {"head": "leaf"}})
+    assert scene.mesh.extents == pytest.approx([0.09, 0.02, 0.01])
+    assert scene.mesh.volume == pytest.approx(1e-9 * (BOX.volume + 2 * HEAD.volume))
+    assert np.count_nonzero(np.equal(scene.part, 1)) == 2 * len(HEAD.faces)
+
+
+def test_a_part_that_is_not_there_is_refused_with_those_that_are(tmp_path, insect):
+    insect.export(tmp_path / "a.glb")
+    for given, words in [
+        ({"heed": "leaf"}, "no part 'heed'; did you mean head.* there are: body, head"),
+        ({"head": "wood"}, r"scene\.options\.materials\.head: found 'wood'; .*'leaf'"),
+    ]:
+        with pytest.raises(SettingsError, match=words):
+            load(tmp_path / "a.glb", materials=given)
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.ply", "a.obj", "a.off"])
 def test_other_formats_must_be_told_the_unit(tmp_path, name):
     BOX.export(tmp_path / name)
     with pytest.raises(InputError, match=r"set scene\.options\.unit to m, cm or mm"):
@@ -55,6 +130,9 @@ def test_relative_paths_start_at_the_working_directory(tmp_path, monkeypatch):
 
 STL = BOX.export(file_type="stl")
 TEXT = BOX.export(file_type="stl_ascii")
+OFF = BOX.export(file_type="off")
+GLTF = whole_gltf(BOX)
+ELSEWHERE = export_gltf(trimesh.Scene(BOX))["model.gltf"]
 NAN = STL[:96] + np.float32(np.nan).tobytes() + STL[100:]
 
 
@@ -78,6 +156,17 @@ NAN = STL[:96] + np.float32(np.nan).tobytes() + STL[100:]
         ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "vertex 0"),
         ("index.obj", b"v 0 0 1\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "index.obj"),
         ("points.obj", b"v 0 0 1\nv 1 0 0\nv 0 1 0\n", "points.obj"),
+        ("cut.off", OFF[:-4].encode(), "promises 12 faces, 11 can be read"),
+        ("short.off", "".join(OFF.splitlines(True)[:9]).encode(), "damaged OFF|cannot be read"),
+        ("corner.off", OFF.replace("3 ", "2 ").encode(), "promises 12 faces, 0"),
+        ("none.off", b"OFF\n", "does not say how many"),
+        ("page.off", b"<html>OFF 1 2 3", "does not begin with OFF"),
+        ("far.off", f"{OFF.strip()[:-1]}99".encode(), "cannot be read as OFF"),
+        ("cut.gltf", GLTF[:-20], "cannot be read as GLTF"),
+        ("short.gltf", re.sub(rb"base64,.{40}", b"base64,", GLTF), "short.gltf"),
+        ("other.gltf", ELSEWHERE, "in another file, 'gltf_buffer_0.bin'; save it as GLB"),
+        ("etc.gltf", GLTF.replace(b"data:", b"file:///etc/passwd?"), "in another file"),
+        ("deep.gltf", b"[" * 100_000, "cannot be read as GLTF"),
         ("bomb.3mf", b"PK", "not a file that ends in"),
         ("a.zip", b"PK", "not a file that ends in"),
     ],
@@ -93,7 +182,7 @@ def test_damaged_files_are_refused_by_name(tmp_path, name, data, match):
 
 def test_what_is_no_regular_file_is_refused(tmp_path):
     with pytest.raises(InputError, match="No such file"):
-        load(tmp_path / "none.stl", unit="m")
+        load(tmp_path / "none.stl")  # before it is asked for a unit
     (tmp_path / "folder.stl").mkdir()
     with pytest.raises(InputError, match="not a regular file"):
         load(tmp_path / "folder.stl", unit="m")
