@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Measured, predicted and their difference in TensorBoard, each epoch."""
+"""Measured, predicted and their difference in TensorBoard, epoch by epoch."""
 
 from __future__ import annotations
+
+import time
 
 import lightning
 import torch
@@ -11,6 +13,9 @@ from sononerf.callbacks.epoch import EpochCallback
 from sononerf.data.range_slices import WholePoses
 from sononerf.module import EchoModule, decibels
 from sononerf.render.spectrogram import spectrogram_image
+
+SHARE = 0.05
+"""Part of the time that drawing may take; short epochs may go without a picture, but the last."""
 
 
 class SpectrogramImages(EpochCallback):
@@ -30,6 +35,7 @@ class SpectrogramImages(EpochCallback):
         self.poses = poses
         self.range_m = range_m.double().numpy()
         self.frequency_hz = frequency_hz.double().numpy()
+        self.next_at = 0.0  # of the monotonic clock, s
 
     def on_epoch(self, trainer: lightning.Trainer, module: EchoModule, epoch: int) -> None:
         """Render one pose and show it."""
@@ -37,6 +43,9 @@ class SpectrogramImages(EpochCallback):
         if not trainer.is_global_zero or not isinstance(trainer.logger, TensorBoardLogger):
             return
         if not len(self.poses):
+            return
+        started = time.monotonic()
+        if started < self.next_at and module.global_step < trainer.max_steps:
             return
         batch = trainer.strategy.batch_to_device(self.poses[0])
         was_training = module.training
@@ -53,3 +62,5 @@ class SpectrogramImages(EpochCallback):
         trainer.logger.experiment.add_image(
             "spectrogram", picture, module.global_step, dataformats="HWC"
         )
+        now = time.monotonic()
+        self.next_at = now + (now - started) / SHARE

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial.distance import cdist
 
 from sononerf.acoustics.call import covered
 from sononerf.acoustics.ears import Ears
@@ -198,17 +199,14 @@ class EchoEvidence:
 
     def _rows(self, points: Array) -> tuple[Array, NDArray[np.int64], Mask]:
         """Return each pose's distance to each place, and the range slice it falls in, (P, N)."""
-        squared = (
-            (self.sources**2).sum(1)[:, None] - 2 * self.sources @ points.T + (points**2).sum(1)
-        )
-        distance = np.sqrt(squared.clip(1e-12))
+        distance = cdist(self.sources, points).clip(1e-6)
         row = np.round((distance - self.range[0]) / self.step).astype(np.int64)
         within = (row >= 0) & (row < len(self.range))
         return distance, row.clip(0, len(self.range) - 1), within
 
     def _witnesses(self, points: Array, distance: Array) -> Mask:
         local = [
-            (self.rotations[:, :, axis] @ points.T)
+            np.einsum("pi,ni->pn", self.rotations[:, :, axis], points)
             - (self.rotations[:, :, axis] * self.sources).sum(1)[:, None]
             for axis in range(3)
         ]

@@ -41,7 +41,7 @@ def training(ensemble, tmp_path):
     """Make module, data and a trainer with callbacks; ``train`` runs them."""
     settings, path = ensemble
 
-    def make(*callbacks, validation=True, sanity=0, logger=False, start=0):
+    def make(*callbacks, validation=True, sanity=0, logger=False, start=0, steps=STEPS):
         quiet_lightning()
         store = EnsembleStore.open(path)
         region, possible = echo_region(settings, store)
@@ -50,7 +50,7 @@ def training(ensemble, tmp_path):
             *field_and_renderer(settings, region),
             reference=store.attributes["reference"],
             possible=possible,
-            total_steps=STEPS,
+            total_steps=steps,
             steps_per_epoch=PER_EPOCH,
         )
         data = EchoDataModule(store, whole_poses=True, batch=2, batch_frequencies=2, seed=0)
@@ -58,7 +58,7 @@ def training(ensemble, tmp_path):
         trainer = lightning.Trainer(
             accelerator="cpu",
             max_epochs=-1,
-            max_steps=STEPS,
+            max_steps=steps,
             val_check_interval=PER_EPOCH,
             check_val_every_n_epoch=None,
             limit_val_batches=1.0 if validation else 0,

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Measured, predicted and difference, once in every epoch, in TensorBoard alone."""
+"""Measured, predicted and difference, epoch by epoch as time allows, in TensorBoard alone."""
 
 from __future__ import annotations
 
 import io
+from types import SimpleNamespace
 
 import lightning
 import torch
@@ -42,6 +43,30 @@ def test_one_picture_per_epoch(training, tmp_path):
     assert [picture.step for picture in pictures] == [4, 8]
     with Image.open(io.BytesIO(pictures[0].encoded_image_string)) as image:
         assert min(image.size) > 100
+
+
+def test_drawing_takes_no_more_than_its_share_and_the_last_epoch_has_a_picture(
+    training, monkeypatch
+):
+    clock = [0.0]
+    shown = []
+    monkeypatch.setattr(images_module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+
+    def draw(*given):
+        shown.append(clock[0])
+        clock[0] += 1.0  # so long does a picture take, and an epoch three
+        return torch.zeros(2, 2, 3, dtype=torch.uint8).numpy()
+
+    class Epochs(lightning.Callback):
+        def on_train_batch_end(self, trainer, pl_module, *rest):
+            clock[0] += 3.0 if pl_module.global_step % 4 == 0 else 0.0
+
+    monkeypatch.setattr(images_module, "spectrogram_image", draw)
+    made = training(Epochs(), logger=True, validation=False, steps=48)
+    made.trainer.callbacks.append(callback(made))
+    made.train()
+    # The second comes 20 s after the first was drawn; the twelfth epoch is the last.
+    assert shown == [3.0, 25.0, 38.0]
 
 
 def test_what_is_shown_is_the_first_validation_pose(training, monkeypatch):
