@@ -137,23 +137,22 @@ class Field(nn.Module):
         return response if bins is None else response[..., bins]
 
     @torch.no_grad()
-    def audible(self, positions: Tensor, directions: Tensor) -> Tensor:
-        """Return which places answer at all towards which directions.
+    def audible(self, positions: Tensor, sources: Tensor) -> Tensor:
+        """Return which places answer which emitters at all.
 
         Parameters
         ----------
         positions : (N, 3) float, m
             Places, world frame.
-        directions : (P, N, 3) float
-            Unit vectors to the emitter, for several poses.
+        sources : (P, 3) float, m
+            Emitters of several poses.
 
         Returns
         -------
         audible : (P, N) bool
             False only where the answer may be left out.
         """
-        del positions
-        return torch.ones_like(directions[..., 0], dtype=torch.bool)
+        return positions.new_ones(len(sources), len(positions), dtype=torch.bool)
 
     def echo(
         self,

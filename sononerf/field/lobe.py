@@ -130,10 +130,12 @@ class LobeField(Field):
         return response * self.inside(positions)[:, None]
 
     @torch.no_grad()
-    def audible(self, positions: Tensor, directions: Tensor) -> Tensor:
-        """Return which places answer towards which directions, (P, N) bool; by the lobe alone."""
+    def audible(self, positions: Tensor, sources: Tensor) -> Tensor:
+        """Return which places answer which emitters, (P, N) bool; by the lobe alone."""
         lobe = self.code(positions)[:, 1:4]
-        tilt = (directions * lobe).sum(-1) - lobe.norm(dim=-1)
+        distance = torch.cdist(sources, positions, compute_mode="donot_use_mm_for_euclid_dist")
+        along = sources @ lobe.T - (positions * lobe).sum(-1)
+        tilt = along / distance.clamp_min(1e-6) - lobe.norm(dim=-1)
         return tilt * self.sharpness.min().exp() > QUIETEST
 
     def echo(

@@ -100,7 +100,7 @@ def find_glints(
         ray = source - places
         distance = ray.norm(dim=-1)
         unit = ray / distance[:, None]
-        index = field.audible(places, unit[None])[0].nonzero()[:, 0]
+        index = field.audible(places, source[None])[0].nonzero()[:, 0]
         response, lead = field.echo(places[index], unit[index], bands)
         power = response.abs().square().mean(-1) / distance[index] ** 4
         loud = power > FAINTEST_PLACE * power.max() if len(power) else power > 0

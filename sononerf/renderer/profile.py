@@ -316,20 +316,19 @@ class ProfileRenderer(Renderer):
         bins: Tensor,
     ) -> Tensor:
         """Return what fine range bins hold: power (1, P, E, B, K) or pressure (2, P, E, B, K)."""
-        sources = position[:, None] + torch.einsum(
-            "pij,ej->pei", rotation, torch.cat((self.emitter[None], self.ear_positions))
-        )  # (P, 1 + E, 3): emitter, then ears
+        emitters = position + rotation @ self.emitter  # (P, 3)
         with torch.no_grad():
-            ray = places - sources[:, :1]  # (P, N, 3)
-            out = ray.square().sum(-1).clamp_min(1e-12).sqrt()
-            pose, place = field.audible(places, ray / -out[..., None]).nonzero(as_tuple=True)
+            pose, place = field.audible(places, emitters).nonzero(as_tuple=True)
             # From here on a row for each pair of a pose and a place that answers it.
+            ray = places[place] - emitters[pose]
+            out = ray.square().sum(-1).clamp_min(1e-12).sqrt()
             if self.occlusion:
-                way = out[pose, place]
-                free = ~self._hidden(places[place], ray[pose, place] / -way[:, None], way)
-                pose, place = pose[free], place[free]
-            unit, out = ray[pose, place] / out[pose, place, None], out[pose, place]
-            beam = look_up(self.beam[bins], _in_head(rotation[pose], unit)).square()
+                free = ~self._hidden(places[place], ray / -out[:, None], out)
+                pose, place, ray, out = pose[free], place[free], ray[free], out[free]
+            unit = ray / out[:, None]
+            # All places in all heads are turned at once: sooner done than pair by pair.
+            in_head = ((places - position[:, None]) @ rotation)[pose, place]
+            beam = look_up(self.beam[bins], (in_head - self.emitter) / out[:, None]).square()
         there = places[place]
         response, lead = field.echo(places, -unit, bins, place)  # (M, B), (M,)
         phased = bool(self.phased)
@@ -340,9 +339,9 @@ class ProfileRenderer(Renderer):
         profiles = places.new_zeros((2 if phased else 1) * size)
         for ear in range(ears):
             with torch.no_grad():
-                ray = there - sources[pose, 1 + ear]
+                ray = in_head - self.ear_positions[ear]
                 back = ray.square().sum(-1).clamp_min(1e-12).sqrt()
-                head = _in_head(rotation[pose], ray / back[:, None])
+                head = ray / back[:, None]
                 loss = torch.exp(-2 * self.absorption[bins] * (out + back)[:, None])
                 known = look_up(self.ears[ear, bins], head).square() * beam * loss
                 known /= (out * back).square()[:, None]
@@ -367,11 +366,6 @@ class ProfileRenderer(Renderer):
                 profiles = profiles + _Deposit.apply(near, at_part, len(profiles))
                 profiles = profiles + _Deposit.apply(echo - near, at_part + 1, len(profiles))
         return profiles.reshape(-1, count, ears, width, self.bins)
-
-
-def _in_head(rotation: Tensor, directions: Tensor) -> Tensor:
-    """Turn world directions (M, 3) into head frames (M, 3, 3)."""
-    return (rotation * directions[:, :, None]).sum(1)
 
 
 def lattice_over(region: Tensor, spacing: float) -> Tensor:

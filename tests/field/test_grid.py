@@ -100,7 +100,7 @@ def test_what_is_corrected_is_what_is_heard(bins):
     several = directions.roll(1, 0).expand(2, 20, 3)
     ratio = field.select(places, several, bins) / plain.select(places, several, bins)
     torch.testing.assert_close(ratio.log(), field.correction(places, several, bins))
-    assert torch.equal(field.audible(places, several), plain.audible(places, several))
+    assert torch.equal(field.audible(places, directions), plain.audible(places, directions))
     for one, two in zip(field.oriented(places, 8), plain.oriented(places, 8), strict=True):
         assert torch.equal(one, two)
 
@@ -113,7 +113,7 @@ def test_only_what_is_asked_for_is_corrected():
     places, directions, bins = places_in(50), sphere_directions(6, REGION), torch.tensor([1])
     found = field.echo(places, directions, bins, place)[0]
     torch.testing.assert_close(found, field.select(places[place], directions, bins))
-    field.audible(places, directions[:, None])
+    field.audible(places, directions)
     field.oriented(places, 8)
     assert seen == [(6, 1), (6, 1)]
 

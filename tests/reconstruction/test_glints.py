@@ -27,8 +27,9 @@ class Lobes(Field):
         axis = rays[torch.arange(len(rays)), nearest]
         return (axis / axis.norm(dim=-1, keepdim=True) * directions).sum(-1)
 
-    def audible(self, positions, directions):
-        cosine = self.cosine(positions, directions)
+    def audible(self, positions, sources):
+        rays = sources - positions  # of one emitter
+        cosine = self.cosine(positions, rays / rays.norm(dim=-1, keepdim=True))[None]
         return (self.concentration * (cosine - 1) > -5) & self.heard
 
     def echo(self, positions, directions, bins, place=None):

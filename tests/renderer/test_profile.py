@@ -504,8 +504,8 @@ def test_gradients(acquisition, gradients_are_right, kind):
 class Everywhere(GridField):
     """All places are rendered for all poses."""
 
-    def audible(self, positions, directions):
-        return torch.ones_like(directions[..., 0], dtype=torch.bool)
+    def audible(self, positions, sources):
+        return torch.ones(len(sources), len(positions), dtype=torch.bool)
 
 
 def test_leaving_out_who_does_not_answer_changes_nothing_to_be_heard(acquisition):
@@ -531,8 +531,8 @@ def test_leaving_out_who_does_not_answer_changes_nothing_to_be_heard(acquisition
 
 def test_where_no_one_answers_there_is_noise(acquisition):
     class Deaf(GridField):
-        def audible(self, positions, directions):
-            return torch.zeros_like(directions[..., 0], dtype=torch.bool)
+        def audible(self, positions, sources):
+            return torch.zeros(len(sources), len(positions), dtype=torch.bool)
 
     field = Deaf(REGION, acquisition.frequency, spacing=0.01, levels=1).double()
     renderer = ProfileRenderer(REGION, acquisition).double()

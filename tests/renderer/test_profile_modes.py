@@ -364,7 +364,7 @@ def test_the_options_are_checked():
     plain = check_options(ProfileRenderer, {}, where="renderer.options", given=2)
     assert {name: plain[name] for name in good} == {"mode": "power", "occlusion": False}
     for wrong in ({"mode": "phase"}, {"occlusion": "perhaps"}):
-        with pytest.raises(SettingsError, match=rf"renderer\.options: {next(iter(wrong))}: "):
+        with pytest.raises(SettingsError, match=rf"renderer\.options\.{next(iter(wrong))}: "):
             check_options(ProfileRenderer, wrong, where="renderer.options", given=2)
 
 
