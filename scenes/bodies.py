@@ -78,7 +78,7 @@ def tube(path: ArrayLike, radius: float) -> trimesh.Trimesh:
     rings[..., 1:] = middle[:, None]
     rings[..., 1:] += (width[:, None] * np.sin(around))[..., None] * aside[:, None]
     vertices = rings.reshape(-1, 3)
-    faces = _walls(len(middle), count, closed)
+    faces = walls(len(middle), count, closed)
     if not closed:
         ring, size = np.arange(count), len(vertices)
         beside, last = np.roll(ring, -1), size - count
@@ -107,8 +107,11 @@ def _even(
     return even, along / np.linalg.norm(along, axis=1, keepdims=True)
 
 
-def _walls(rows: int, columns: int, closed: bool) -> NDArray[np.int64]:
-    """Return the triangles between neighbouring rings, (T, 3)."""
+def walls(rows: int, columns: int, closed: bool) -> NDArray[np.int64]:
+    """Return the triangles between neighbouring rings of points, numbered row by row, (T, 3).
+
+    They face outward where the rings run counter-clockwise about the direction of the rows.
+    """
     number = np.arange(rows * columns).reshape(rows, columns)
     ahead = np.roll(number, -1, axis=0) if closed else number[1:]
     here = number if closed else number[:-1]
@@ -134,8 +137,23 @@ def placed(
     mesh : Trimesh
         At the origin, at which poses look.
     """
-    rotation = rotation_from_euler(*np.radians((yaw, pitch, roll)))
-    vertices = np.asarray(mesh.vertices) @ rotation.T
+    vertices = np.asarray(mesh.vertices) @ _rotation(yaw, pitch, roll).T
     vertices -= (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    return rounded(vertices, mesh.faces)
+
+
+def turned(
+    mesh: trimesh.Trimesh, yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0
+) -> trimesh.Trimesh:
+    """Turn a mesh as :func:`placed` does, but about the origin, which stays where it is."""
+    return rounded(np.asarray(mesh.vertices) @ _rotation(yaw, pitch, roll).T, mesh.faces)
+
+
+def _rotation(yaw: float, pitch: float, roll: float) -> NDArray[np.float64]:
+    return rotation_from_euler(*np.radians((yaw, pitch, roll)))
+
+
+def rounded(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
+    """Build a mesh of vertices (V, 3) m, to a nanometre, and triangles (T, 3)."""
     # The last bits of a sine are the processor's own; the same scene has the same echoes' hash.
-    return trimesh.Trimesh(vertices.round(9) + 0.0, mesh.faces, process=False)
+    return trimesh.Trimesh(vertices.round(9) + 0.0, faces, process=False)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import difflib
 import re
+import typing
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
@@ -440,12 +441,15 @@ def _drop_options_of_another(data: dict[str, Any], assignment: str) -> None:
 
 def _model_at(model: type[BaseModel], path: Iterable[str | int]) -> type[BaseModel] | None:
     for part in path:
-        info = model.model_fields.get(str(part))
-        if info is None or not (
-            isinstance(info.annotation, type) and issubclass(info.annotation, BaseModel)
-        ):
+        if isinstance(part, int):  # in a list of models, each of them
+            continue
+        info = model.model_fields.get(part)
+        found = info.annotation if info else None
+        if typing.get_origin(found) is list:
+            found = typing.get_args(found)[0]
+        if not (isinstance(found, type) and issubclass(found, BaseModel)):
             return None
-        model = info.annotation
+        model = found
     return model
 
 

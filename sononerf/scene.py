@@ -47,11 +47,13 @@ class Scene:
         One for all of it, or one for each of its parts.
     part : (T,) int, optional
         Which of the materials each triangle is of, where there are several.
+    background : (T,) bool, optional
+        True where a triangle is surroundings and not the target. It sounds all the same.
 
     Raises
     ------
     ValueError
-        If materials and parts do not fit.
+        If materials, parts or background do not fit, or if nothing is left to be the target.
     InputError
         If the mesh has no triangles, a vertex that is no finite number, an index to no vertex,
         or a size that says its unit was mistaken.
@@ -60,6 +62,7 @@ class Scene:
     mesh: trimesh.Trimesh
     material: Material | tuple[Material, ...] = RIGID
     part: NDArray[np.int64] | None = None
+    background: NDArray[np.bool_] | None = None
 
     def __post_init__(self) -> None:
         several = isinstance(self.material, tuple)
@@ -75,8 +78,21 @@ class Scene:
             if part.dtype.kind not in "iu" or part.min() < 0 or part.max() >= len(self.materials):
                 raise ValueError(f"part names no material, expected 0 to {len(self.materials) - 1}")
             object.__setattr__(self, "part", part.astype(np.int64))
+        if self.background is not None:
+            object.__setattr__(self, "background", self._checked(self.background))
         check_surface(self.mesh)
         _warn_of_faults(self.mesh)
+
+    def _checked(self, background: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        background = np.asarray(background)
+        if background.shape != (len(self.mesh.faces),) or background.dtype != np.bool_:
+            raise ValueError(
+                f"background is {background.dtype} of shape {background.shape}, expected one bool "
+                f"for each of the {len(self.mesh.faces)} triangles"
+            )
+        if len(background) and background.all():
+            raise ValueError("all triangles are background; leave the target out of it")
+        return background
 
     @property
     def materials(self) -> tuple[Material, ...]:

@@ -20,7 +20,8 @@ PACKAGE = ROOT / "sononerf"
 # In the order in which data flows: each may import what stands before it, and itself.
 LAYERS = (
     "errors config plugins progress storage checkpoint_io weights geometry material scene "
-    "acoustics simulation data field renderer module reconstruction render callbacks experiment cli"
+    "composition acoustics simulation data field renderer module reconstruction render callbacks "
+    "experiment cli"
 ).split()
 # Below the place that turns settings into objects, nobody chooses a device.
 DEVICELESS = LAYERS[: LAYERS.index("experiment")]
@@ -279,7 +280,7 @@ def test_each_rule_sees_a_source_that_breaks_it(rule, arguments, bad, good):
 
 
 def test_scenes_use_the_public_door():
-    allowed = {"scene", "geometry", "errors"}
+    allowed = {"scene", "composition", "geometry", "errors"}
     for path in sources(ROOT / "scenes"):
         for module, line in imports(parse(path)):
             first, _, rest = module.partition(".")

@@ -102,6 +102,27 @@ def test_each_triangle_may_have_its_material():
     np.testing.assert_array_equal(scene.part, np.repeat([0, 1], 6))
 
 
+@pytest.mark.parametrize(
+    ("background", "match"),
+    [
+        (np.zeros(11, bool), r"bool of shape \(11,\), expected one bool for each of the 12"),
+        (np.zeros((12, 1), bool), r"shape \(12, 1\)"),
+        (np.zeros(12, int), "background is int64"),
+        (np.ones(12, bool), "all triangles are background"),
+    ],
+)
+def test_a_background_that_does_not_fit_or_is_all_is_refused(background, match):
+    with pytest.raises(ValueError, match=match) as error:
+        Scene(box(), background=background)
+    assert "\n" not in str(error.value)
+
+
+def test_some_triangles_may_be_background():
+    assert Scene(box()).background is None
+    background = np.arange(12) > 0
+    np.testing.assert_array_equal(Scene(box(), background=background).background, background)
+
+
 def test_built_in_scenes_are_listed():
     names = {plugin.name for plugin in list_scenes() if plugin.distribution == "sononerf"}
     assert {"sphere", "three_spheres", "ua", "mesh"} <= names

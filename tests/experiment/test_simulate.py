@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+from dataclasses import replace
 
 import distributed
 import numpy as np
@@ -42,6 +43,13 @@ def test_the_hash_covers_all_that_echoes_depend_on_and_nothing_else(tiny):
         {"reconstruction": {"spacing": 0.01}},
     ):
         assert hashed(tiny(**changed)) == base, changed
+
+
+def test_what_is_background_sounds_as_it_would_otherwise(tiny):
+    settings = tiny()
+    scene = load_scene(settings.scene.name, settings.scene.options)
+    background = np.arange(len(scene.mesh.faces)) > 0
+    assert echo_hash(settings, replace(scene, background=background)) == hashed(settings)
 
 
 def test_another_simulator_makes_another_ensemble(tiny, monkeypatch):

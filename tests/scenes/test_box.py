@@ -22,5 +22,5 @@ def test_a_box_is_turned():
 
 @pytest.mark.parametrize("size", [[0.1, 0.1], [0.1, 0.1, 0.0], [0.1, 0.1, 9.0], 0.1])
 def test_other_sizes_are_refused(size):
-    with pytest.raises(SettingsError, match=r"scene\.options: size"):
+    with pytest.raises(SettingsError, match=r"scene\.options\.size"):
         load_scene("box", {"size": size})

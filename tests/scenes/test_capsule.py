@@ -26,5 +26,5 @@ def test_a_capsule_is_turned():
 
 @pytest.mark.parametrize("options", [{"length": 0.0}, {"radius": -1.0}, {"yaw": 1000.0}])
 def test_sizes_and_angles_have_bounds(options):
-    with pytest.raises(SettingsError, match=rf"scene\.options: {next(iter(options))}"):
+    with pytest.raises(SettingsError, match=rf"scene\.options\.{next(iter(options))}"):
         load_scene("capsule", options)

@@ -100,5 +100,5 @@ def test_an_unknown_letter_is_refused_with_the_known_ones(text, found):
 
 @pytest.mark.parametrize("options", [{"text": ""}, {"text": "A" * 13}, {"stroke": 0.2}])
 def test_options_have_bounds(options):
-    with pytest.raises(SettingsError, match=rf"scene\.options: {next(iter(options))}"):
+    with pytest.raises(SettingsError, match=rf"scene\.options\.{next(iter(options))}"):
         load_scene("letters", options)

@@ -61,5 +61,5 @@ def test_the_material_is_an_option_of_every_kind(seed):
 
 @pytest.mark.parametrize("seed", [-1, 1.5, 2**32])
 def test_other_seeds_are_refused(seed):
-    with pytest.raises(SettingsError, match=r"scene\.options: seed"):
+    with pytest.raises(SettingsError, match=r"scene\.options\.seed"):
         load_scene("procedural", {"seed": seed})
