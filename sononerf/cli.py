@@ -318,6 +318,28 @@ def evaluate(run: Run, as_json: Json = False) -> None:
         _summary(run, metrics)
 
 
+@app.command()
+def compare(
+    run_a: Annotated[Path, typer.Argument(help="Folder of a run.")],
+    run_b: Annotated[Path, typer.Argument(help="Folder of the run without it.")],
+    output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
+    accelerator: OnWhat = Accelerator.auto,
+) -> None:
+    """Show what is heard in RUN_A and not in RUN_B, and where: a prey on a leaf."""
+    from sononerf import storage
+    from sononerf.experiment.compare import compare_runs
+    from sononerf.progress import Progress
+
+    folder = compare_runs(
+        run_a, run_b, output=output, accelerator=accelerator.value, progress=Progress()
+    )
+    found = storage.read_json(folder / "comparison.json")
+    place = ", ".join(f"{1e3 * x:.1f}" for x in found["strongest_m"])
+    away = _optional(found, "distance_m", "; {:.4f} m from the middle of what was added")
+    _print(f"strongest difference at ({place}) mm, {found['score']:.2f} of the maximum{away}")
+    _print(f"wrote {folder}")
+
+
 class _SignalledError(BaseException):
     """A signal came; nothing on the way may take it for a fault and go on."""
 

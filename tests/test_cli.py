@@ -33,7 +33,7 @@ from sononerf.reconstruction import baseline
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 SMOKE = str(CONFIGS / "smoke.yaml")
-COMMANDS = ["scenes", "new-scene", "simulate", "fit", "predict", "reconstruct", "evaluate"]
+COMMANDS = "scenes new-scene simulate fit predict reconstruct evaluate compare".split()
 SHORT = [  # of the smoke settings, so that a fit takes a second
     "poses.count=6",
     "poses.validation=1",
@@ -281,6 +281,15 @@ def test_reconstruct_with_spacing_and_level(at_home, tmp_path):
     assert f"wrote {tmp_path / 'coarse'}" in done("reconstruct", "runs/smoke", *options).err
     said = json.loads((tmp_path / "coarse" / "read_out.json").read_text())
     assert (said["spacing_m"], said["level"]) == (pytest.approx(0.012), pytest.approx(0.4))
+    assert tree(at_home.run) == before
+
+
+def test_two_runs_are_compared(at_home, tmp_path):
+    before = tree(at_home.run)
+    said = done("compare", "runs/smoke", "runs/smoke", "--output", tmp_path / "c").err
+    assert f"wrote {tmp_path / 'c'}" in said
+    assert "strongest difference at (" in said
+    assert json.loads((tmp_path / "c" / "comparison.json").read_text())["score"] == 0
     assert tree(at_home.run) == before
 
 

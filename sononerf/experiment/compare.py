@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: MIT
+"""Two runs side by side: what is heard in one and not in the other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+from sononerf import storage
+from sononerf.acoustics.spectrogram import compress
+from sononerf.data.range_slices import WholePoses
+from sononerf.errors import IncompatibleError
+from sononerf.experiment.build import acquisition
+from sononerf.experiment.fitted import Fitted, load_fitted, render_poses
+from sononerf.experiment.reconstruct import true_mesh
+from sononerf.experiment.run_folder import differing_keys
+from sononerf.geometry.poses import Poses
+from sononerf.progress import Progress
+from sononerf.reconstruction.baseline import backprojection
+from sononerf.reconstruction.compare import added_part, compare
+from sononerf.reconstruction.volume import Volume, vti_bytes
+from sononerf.render.difference import difference_pngs, overlay_png
+from sononerf.simulation.ensemble import TRAIN, ensemble_poses
+
+HEARING = ("air", "ears", "call", "spectrogram")
+"""Sections in which two runs must not differ: else what differs is who listens."""
+VOXELS = 80
+"""Along the longest side."""
+MOST_POSES = 400
+
+
+def compare_runs(
+    first: Path,
+    second: Path,
+    *,
+    output: Path | None = None,
+    accelerator: str = "auto",
+    progress: Progress | None = None,
+) -> Path:
+    """Compare what two fitted fields are heard to send back, place by place.
+
+    Both are rendered for the same poses, those that either was trained on, and their levels (dB,
+    0 is silence) are projected back to where they can have come from. In decibels a few loud
+    flashes of a smooth face do not drown what answers more faintly in all directions. The places
+    of the two fields themselves are not compared: two fits of one scene place the same sound some
+    millimetres apart.
+
+    Parameters
+    ----------
+    first, second : Path
+        Fitted runs; the difference is the first without the second.
+    output : Path or None
+        Folder of the results; ``FIRST/compare-<name of SECOND>`` where None.
+    accelerator : {"auto", "cpu", "gpu"}
+        What to render on.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    folder : Path
+        With ``comparison.json``; both volumes over their common maximum and their difference as
+        VTI; projections of all three; and the difference on the first's true surface, where that
+        is known.
+
+    Raises
+    ------
+    InputError
+        If one is no fitted run.
+    IncompatibleError
+        If the two hear differently.
+    NumericalError
+        If both are silent.
+    """
+    progress = progress or Progress(quiet=True)
+    runs = [load_fitted(path) for path in (first, second)]
+    differing = [
+        key
+        for key in differing_keys(*(run.settings for run in runs))
+        if key.split(".")[0] in HEARING
+    ]
+    if differing:
+        raise IncompatibleError(
+            f"{first} and {second} hear differently ({', '.join(differing)}); fit both alike"
+        )
+    folder = output or first / f"compare-{second.resolve().name}"
+    storage.probe_writable(folder)
+    corners = np.array([run.module.field.region.double().cpu().numpy() for run in runs])
+    box = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+    reference = max(run.module.reference for run in runs)
+    poses = _common_poses(runs)
+    one, other = (_heard(run, poses, reference, *box, accelerator, progress) for run in runs)
+    found = compare(one, other)
+    surfaces = [true_mesh(run) for run in runs]
+    truth = _added(*surfaces)
+    names = first.resolve().name, second.resolve().name
+    for name in ("first", "second", "difference"):
+        storage.commit_bytes(folder / f"{name}.vti", vti_bytes(getattr(found, name), "level"))
+    for axis, picture in difference_pngs(found, names, truth=truth).items():
+        storage.commit_bytes(folder / f"mip_{axis}.png", picture)
+    if surfaces[0] is not None:
+        storage.commit_bytes(folder / "overlay.png", overlay_png(surfaces[0], found))
+    distance = None if truth is None else float(np.linalg.norm(found.strongest - truth))
+    storage.commit_json(
+        folder / "comparison.json",
+        {
+            "first": names[0],
+            "second": names[1],
+            "poses": len(poses.positions),
+            "score": found.score,
+            "strongest_m": found.strongest.tolist(),
+            "added_m": None if truth is None else truth.tolist(),
+            "distance_m": distance,
+        },
+    )
+    return folder
+
+
+def _common_poses(runs: list[Fitted]) -> Poses:
+    """Return the poses that either run was trained on, each once, evenly thinned out."""
+    table = []
+    for run in runs:
+        poses, split = ensemble_poses(run.settings)
+        rows = np.concatenate([poses.positions, poses.rotations.reshape(-1, 9)], axis=1)
+        table.append(rows[split == TRAIN])
+    _, index = np.unique(np.concatenate(table).round(9), axis=0, return_index=True)
+    rows = np.concatenate(table)[np.sort(index)]
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_POSES)).astype(int)]
+    return Poses(rows[:, :3], rows[:, 3:].reshape(-1, 3, 3))
+
+
+def _heard(
+    run: Fitted,
+    poses: Poses,
+    reference: float,
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    accelerator: str,
+    progress: Progress,
+) -> Volume:
+    """Return the mean level that is heard from each place's range."""
+    renderer = run.module.renderer
+    whole = WholePoses(
+        torch.as_tensor(poses.positions),
+        torch.as_tensor(poses.rotations),
+        len(renderer.range),
+        len(renderer.frequency),
+    )
+    rendered = render_poses(run, whole, accelerator=accelerator, progress=progress)
+    known = acquisition(run.settings)
+    # Delay-and-sum adds squares; the square of this is the level.
+    roots = (np.sqrt(compress(spectrogram, reference)) for spectrogram in rendered)
+    return backprojection(
+        roots,
+        poses.positions,
+        poses.rotations,
+        renderer.range.double().cpu().numpy(),
+        lower,
+        upper,
+        float((upper - lower).max()) / VOXELS,
+        emitter_offset=known.emitter.double().numpy(),
+        ear_offsets=known.ear_positions.double().numpy(),
+    )
+
+
+def _added(
+    first: trimesh.Trimesh | None, second: trimesh.Trimesh | None
+) -> NDArray[np.float64] | None:
+    """Return the middle of what the first true surface has and the second has not, (3,) m."""
+    if first is None or second is None:
+        return None
+    added = added_part(first, second)
+    if added is None:
+        return None
+    weights = added.area_faces
+    return np.asarray(weights @ added.triangles_center / weights.sum(), dtype=np.float64)
