@@ -136,8 +136,25 @@ class Field(nn.Module):
         response: Tensor = self(positions.expand(directions.shape), directions)
         return response if bins is None else response[..., bins]
 
+    def code(self, positions: Tensor) -> Tensor | None:
+        """Return what places are, as the field itself puts it, or None where it has no such thing.
+
+        :meth:`audible` and :meth:`echo` take it, so that it need be found out once for both.
+
+        Parameters
+        ----------
+        positions : (N, 3) float, m
+            Places, world frame.
+
+        Returns
+        -------
+        code : (N, C) float or None
+        """
+        del positions
+        return None
+
     @torch.no_grad()
-    def audible(self, positions: Tensor, sources: Tensor) -> Tensor:
+    def audible(self, positions: Tensor, sources: Tensor, code: Tensor | None = None) -> Tensor:
         """Return which places answer which emitters at all.
 
         Parameters
@@ -146,12 +163,15 @@ class Field(nn.Module):
             Places, world frame.
         sources : (P, 3) float, m
             Emitters of several poses.
+        code : (N, C) float or None
+            Of :meth:`code`; found out where None.
 
         Returns
         -------
         audible : (P, N) bool
             False only where the answer may be left out.
         """
+        del code
         return positions.new_ones(len(sources), len(positions), dtype=torch.bool)
 
     def echo(
@@ -160,6 +180,7 @@ class Field(nn.Module):
         directions: Tensor,
         bins: Tensor | None,
         place: Tensor | None = None,
+        code: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Return what places answer, and from how much nearer than they lie.
 
@@ -174,6 +195,8 @@ class Field(nn.Module):
         place : (M,) int or None
             Which place each direction is for, so that what a place is need be found out once
             for all directions; each its own where None.
+        code : (N, C) float or None
+            Of :meth:`code`; found out where None.
 
         Returns
         -------
@@ -183,6 +206,7 @@ class Field(nn.Module):
             A place that stands for a piece of curved surface answers off its axis from another
             point of it, which lies this much nearer.
         """
+        del code
         there = positions if place is None else positions[place]
         return self.select(there, directions, bins), torch.zeros_like(directions[:, 0])
 

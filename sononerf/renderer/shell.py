@@ -93,9 +93,9 @@ class ShellRenderer(Renderer):
             sums.append(total.index_add(0, slice_index, echo))
         total = torch.stack(sums)  # (E, P R, B)
         # The magnitude's gradient at exactly zero is not defined; a field that is zero there
-        # has none.
+        # has none. That much less than the root of a little more, and exactly zero of zero.
         power = total.real.square() + total.imag.square() if total.is_complex() else total.square()
-        magnitude = (power + 1e-20).sqrt() - 1e-10
+        magnitude = power / ((power + 1e-20).sqrt() + 1e-10)
         scale = (self.log_gain + spectrum).exp() / len(self.directions)
         shape = (len(transfer), inside.shape[0], inside.shape[1], -1)
         return (magnitude * scale).reshape(shape).transpose(0, 1)

@@ -12,6 +12,7 @@ from sononerf.experiment.build import acquisition as acquisition_of
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.geometry.poses import look_at, rotation_from_euler
+from sononerf.renderer import profile
 from sononerf.renderer.profile import ProfileRenderer, lattice_over
 from sononerf.scene import Scene
 from sononerf.simulation.simulator import Simulator
@@ -504,7 +505,7 @@ def test_gradients(acquisition, gradients_are_right, kind):
 class Everywhere(GridField):
     """All places are rendered for all poses."""
 
-    def audible(self, positions, sources):
+    def audible(self, positions, sources, code=None):
         return torch.ones(len(sources), len(positions), dtype=torch.bool)
 
 
@@ -531,7 +532,7 @@ def test_leaving_out_who_does_not_answer_changes_nothing_to_be_heard(acquisition
 
 def test_where_no_one_answers_there_is_noise(acquisition):
     class Deaf(GridField):
-        def audible(self, positions, sources):
+        def audible(self, positions, sources, code=None):
             return torch.zeros(len(sources), len(positions), dtype=torch.bool)
 
     field = Deaf(REGION, acquisition.frequency, spacing=0.01, levels=1).double()
@@ -551,8 +552,8 @@ def test_a_lead_brings_the_echo_nearer_by_as_much(head, acquisition, one_place, 
     before = renderer(field, *poses, rows(poses=2)).detach()
     plain = field.echo
 
-    def echo(positions, directions, bins, place):
-        response, lead = plain(positions, directions, bins, place)
+    def echo(positions, directions, bins, place, code):
+        response, lead = plain(positions, directions, bins, place, code)
         return response, lead + 5 * head.step * (directions[:, 0] > 0.5)
 
     monkeypatch.setattr(field, "echo", echo)
@@ -573,7 +574,7 @@ def test_gradients_of_a_lead(acquisition, formula, gradients_are_right):
             lengths = 0.004 * torch.rand(27, dtype=torch.float64, generator=generator)
             self.lengths = torch.nn.Parameter(lengths)
 
-        def echo(self, positions, directions, bins, place):
+        def echo(self, positions, directions, bins, place, code):
             there = positions[place]
             index = ((there - REGION[0]) / 0.02).round().long() @ torch.tensor([9, 3, 1])
             return self.select(there, directions, bins), self.lengths[index]
@@ -629,3 +630,41 @@ def test_a_tiny_sphere_sounds_where_and_as_long_as_the_simulator_hears_it(kind):
         # Without the lag, sweeps are 0.9 and 1.5 mm off.
         assert np.abs(late[0] - late[1]).mean() < 0.0006
         assert 0.95 < (long[0] / long[1]).min() < (long[0] / long[1]).max() < 1.4
+
+
+def test_gradients_of_the_deposit_where_some_places_lie_outside_the_bins():
+    generator = torch.Generator().manual_seed(0)
+    values = torch.rand(2, 7, dtype=torch.float64, generator=generator, requires_grad=True)
+    at = torch.tensor([-0.7, 0.2, 1.6, 3.9, 4.4, 2.5, 9.0], dtype=torch.float64)
+    row = torch.tensor([0, 0, 0, 1, 1, 2, 2])
+    expected = torch.zeros(2, 3, 5, dtype=torch.float64)
+    for place, (where, line) in enumerate(zip(at.tolist(), row.tolist(), strict=True)):
+        left = math.floor(where)
+        if 0 <= left < 4:
+            expected[:, line, left] += values[:, place].detach() * (left + 1 - where)
+            expected[:, line, left + 1] += values[:, place].detach() * (where - left)
+    torch.testing.assert_close(profile._Deposit.apply(values, at, row, 3, 5).detach(), expected)
+    for places in (at, torch.stack((at, at + 0.05))):
+        places.requires_grad_()
+        assert torch.autograd.gradcheck(
+            lambda v, a: profile._Deposit.apply(v, a, row, 3, 5), (values, places)
+        )
+
+
+@pytest.mark.parametrize("step", [1, 2, 3])
+def test_the_windows_gradients_are_those_of_a_plain_convolution(step):
+    generator = torch.Generator().manual_seed(0)
+    kernel = torch.rand(3, 5, dtype=torch.float64, generator=generator, requires_grad=True)
+    length = 6 * step + 5
+    seen = torch.rand(4, 3, length, dtype=torch.float64, generator=generator, requires_grad=True)
+    found = profile._Window.apply(seen, kernel, step)
+    expected = torch.nn.functional.conv1d(seen, kernel[:, None], stride=step, groups=3)
+    torch.testing.assert_close(found, expected)
+    assert found.shape == (4, 3, 7)
+    weight = torch.rand(found.shape, dtype=torch.float64, generator=generator)
+    for mine, theirs in zip(
+        torch.autograd.grad(found, (seen, kernel), weight),
+        torch.autograd.grad(expected, (seen, kernel), weight),
+        strict=True,
+    ):
+        torch.testing.assert_close(mine, theirs)

@@ -116,8 +116,8 @@ def test_a_lead_turns_the_phase_as_well(head, two_places, monkeypatch):
     field, renderer = two_places(apart, mode="coherent")
     plain = field.echo
 
-    def echo(positions, directions, bins, place):
-        response, leads = plain(positions, directions, bins, place)
+    def echo(positions, directions, bins, place, code):
+        response, leads = plain(positions, directions, bins, place, code)
         return response, leads + lead * (positions[place][:, 0] > apart / 2).double()
 
     monkeypatch.setattr(field, "echo", echo)
@@ -337,10 +337,10 @@ class Leading(torch.nn.Module):
         generator = torch.Generator().manual_seed(0)
         lengths = 0.002 * torch.rand(count, dtype=torch.float64, generator=generator)
         self.lengths = torch.nn.Parameter(lengths)
-        self.audible = field.audible
+        self.audible, self.code = field.audible, field.code
 
-    def echo(self, positions, directions, bins, place):
-        response, _ = self.field.echo(positions, directions, bins, place)
+    def echo(self, positions, directions, bins, place, code):
+        response, _ = self.field.echo(positions, directions, bins, place, code)
         return response, self.lengths[place]
 
 
@@ -372,9 +372,9 @@ def listening(field, monkeypatch):
     """Note which places are asked for their echoes, render after render."""
     heard, plain = [], field.echo
 
-    def echo(positions, directions, bins, place):
+    def echo(positions, directions, bins, place, code):
         heard.append(positions[place])
-        return plain(positions, directions, bins, place)
+        return plain(positions, directions, bins, place, code)
 
     monkeypatch.setattr(field, "echo", echo)
     return heard
