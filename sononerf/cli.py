@@ -233,6 +233,13 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
             f"{scores['0.002']:.2f} at 2 mm and {scores['0.005']:.2f} at 5 mm, "
             f"{geometry['components']} parts (true: {geometry['components_true']})"
         )
+        target = geometry.get("target")
+        if target:
+            near = target["fscore"]
+            _print(
+                f"the target alone: F-score {near['0.002']:.2f} at 2 mm and "
+                f"{near['0.005']:.2f} at 5 mm"
+            )
         other = (metrics.get("baseline") or {}).get("backprojection")
         if other:
             _print(

@@ -99,6 +99,17 @@ class Scene:
         """All of them; ``part`` counts through them."""
         return self.material if isinstance(self.material, tuple) else (self.material,)
 
+    def surface(self, *, background: bool) -> trimesh.Trimesh | None:
+        """Return the surroundings alone, or the target alone; None where there is none of it."""
+        faces = np.asarray(self.mesh.faces)
+        marked = np.zeros(len(faces), bool) if self.background is None else self.background
+        faces = faces[marked == background]
+        if not len(faces):
+            return None
+        alone = trimesh.Trimesh(self.mesh.vertices, faces, process=False)
+        alone.remove_unreferenced_vertices()
+        return alone
+
 
 def check_surface(mesh: trimesh.Trimesh) -> None:
     """Refuse a mesh that is no surface of a sensible size in metres.

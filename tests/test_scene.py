@@ -123,6 +123,20 @@ def test_some_triangles_may_be_background():
     np.testing.assert_array_equal(Scene(box(), background=background).background, background)
 
 
+def test_target_and_surroundings_are_taken_apart():
+    whole = Scene(box())
+    assert whole.surface(background=True) is None
+    assert len(whole.surface(background=False).faces) == 12
+    marked = np.asarray(box().face_normals)[:, 2] < -0.5  # the two triangles below
+    scene = Scene(box(), background=marked)
+    below, rest = scene.surface(background=True), scene.surface(background=False)
+    assert len(below.faces) == 2
+    np.testing.assert_allclose(below.face_normals, [[0, 0, -1]] * 2)
+    assert len(below.vertices) == 4
+    assert len(rest.faces) == 10
+    assert len(scene.mesh.faces) == 12
+
+
 def test_built_in_scenes_are_listed():
     names = {plugin.name for plugin in list_scenes() if plugin.distribution == "sononerf"}
     assert {"sphere", "three_spheres", "ua", "mesh"} <= names

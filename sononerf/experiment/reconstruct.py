@@ -23,14 +23,14 @@ from sononerf.progress import Progress
 from sononerf.reconstruction.baseline import backprojection, best_level_surface
 from sononerf.reconstruction.confidence import poses_that_saw
 from sononerf.reconstruction.mesh import MeshFormat, mesh_bytes
-from sononerf.reconstruction.metrics import geometry_metrics
+from sononerf.reconstruction.metrics import geometry_metrics, target_metrics
 from sononerf.reconstruction.read_out import reconstruct as read_out
 from sononerf.reconstruction.truth import TrueSurface
 from sononerf.reconstruction.volume import Volume, vti_bytes
 from sononerf.reconstruction.voxels import voxel_fit
 from sononerf.render.mesh import confidence_png, mesh_png, side_by_side_png
 from sononerf.render.projection import mip_pngs
-from sononerf.scene import load_scene
+from sononerf.scene import Scene, load_scene
 
 OPEN = {
     "sheet": "the surface is a sheet: {0.thin_share:.0%} of it has its other side right behind it",
@@ -116,12 +116,18 @@ def reconstruct(
     return folder
 
 
-def true_mesh(fitted: Fitted) -> trimesh.Trimesh | None:
-    """Return the scene's own surface; None where the scene is not installed here."""
+def true_scene(fitted: Fitted) -> Scene | None:
+    """Return the scene that a run is of; None where it is not installed here."""
     try:
-        return load_scene(fitted.settings.scene.name, fitted.settings.scene.options).mesh
+        return load_scene(fitted.settings.scene.name, fitted.settings.scene.options)
     except SonoNerfError:
         return None
+
+
+def true_mesh(fitted: Fitted) -> trimesh.Trimesh | None:
+    """Return the scene's own surface; None where the scene is not installed here."""
+    scene = true_scene(fitted)
+    return None if scene is None else scene.mesh
 
 
 def evaluate(path: Path, *, progress: Progress | None = None) -> dict[str, Any]:
@@ -145,15 +151,19 @@ def evaluate(path: Path, *, progress: Progress | None = None) -> dict[str, Any]:
     folder = path / "reconstruction"
     if not (folder / "mesh.ply").is_file():
         reconstruct(path, progress=progress)
-    truth = true_mesh(fitted)
+    scene = true_scene(fitted)
     geometry: dict[str, Any] | None = None
     baseline: dict[str, Any] = {"backprojection": None, "voxels": None}
-    if truth is not None:
+    if scene is not None:
         with progress.task("evaluating", 3) as task:
             mesh = read_mesh(folder / "mesh.ply")
             level = storage.read_json(folder / "read_out.json")["level"]
-            true = TrueSurface(truth)
+            true = TrueSurface(scene.mesh)
             geometry = {**geometry_metrics(mesh, true), "level": level}
+            surroundings = scene.surface(background=True)
+            target = scene.surface(background=False)
+            if surroundings is not None and target is not None:
+                geometry["target"] = target_metrics(mesh, target, surroundings)
             task.advance()
             for name, volume in _baselines(fitted):
                 baseline[name] = _at_best_level(volume, true)

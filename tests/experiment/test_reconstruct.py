@@ -60,6 +60,8 @@ def few_samples(monkeypatch):
     """A hundred thousand samples of each surface are for the reports, and so are pictures."""
     metrics = functools.partial(reconstruct_module.geometry_metrics, samples=2000)
     monkeypatch.setattr(reconstruct_module, "geometry_metrics", metrics)
+    of_target = functools.partial(reconstruct_module.target_metrics, samples=2000)
+    monkeypatch.setattr(reconstruct_module, "target_metrics", of_target)
     monkeypatch.setattr(reconstruct_module, "BASELINE_VOXELS", 24)
     monkeypatch.setattr(baseline, "LEVEL_SAMPLES", 300)
 
@@ -202,6 +204,22 @@ def test_what_needs_a_closed_surface_is_null_for_an_open_one(
     for key in ("volume_ratio", "iou", "thickness_bias_m"):
         assert geometry[key] is None, key
     assert geometry["chamfer_m"] > 0
+
+
+def test_amid_surroundings_the_target_is_judged_alone_too(
+    run, few_samples, no_projections, monkeypatch
+):
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
+    slab = trimesh.creation.box((0.1, 0.1, 0.01))
+    slab.apply_translation((0, 0, -0.09))
+    both = trimesh.util.concatenate([slab, sphere])
+    scene = Scene(both, background=np.arange(len(both.faces)) < len(slab.faces))
+    monkeypatch.setattr(reconstruct_module, "load_scene", lambda *given: scene)
+    geometry = evaluate(run)["geometry"]
+    assert geometry.keys() == GEOMETRY | {"target"}
+    assert geometry["target"]["share"] == 1.0  # nothing was reconstructed near the slab
+    assert geometry["target"]["fscore"]["0.005"] > geometry["fscore"]["0.005"]
+    assert geometry["target"]["chamfer_m"] < geometry["chamfer_m"]
 
 
 @pytest.mark.parametrize("content", [b"", b"ply\nnonsense", b"\x00" * 100])

@@ -4,7 +4,7 @@ import pytest
 import trimesh
 
 from sononerf.errors import NumericalError
-from sononerf.reconstruction.metrics import geometry_metrics
+from sononerf.reconstruction.metrics import geometry_metrics, target_metrics
 
 RADIUS = 0.015
 
@@ -109,3 +109,64 @@ def test_wrong_input_is_refused():
         geometry_metrics(trimesh.Trimesh(), sphere(RADIUS, subdivisions=1))
     with pytest.raises(ValueError, match="samples"):
         geometry_metrics(sphere(1, subdivisions=1), sphere(1, subdivisions=1), samples=0)
+
+
+def ground(size=0.2):
+    """A slab whose upper side lies 50 mm below the origin."""
+    slab = trimesh.creation.box((size, size, 0.01))
+    slab.apply_translation((0, 0, -0.055))
+    return slab
+
+
+def test_surroundings_cost_the_target_nothing():
+    """A perfect target beside ground that is 3 mm off: its half of the gap belongs to neither."""
+    low = ground()
+    low.apply_translation((0, 0, -0.003))
+    found = trimesh.util.concatenate([sphere(RADIUS), low])
+    of_target = target_metrics(found, sphere(RADIUS), ground(), samples=20_000)
+    assert of_target["chamfer_m"] < 1e-5
+    assert of_target["fscore"] == {"0.001": 1.0, "0.002": 1.0, "0.005": 1.0}
+    assert of_target["share"] == pytest.approx(sphere(RADIUS).area / found.area, rel=0.1)
+    assert geometry_metrics(found, sphere(RADIUS), samples=5000)["chamfer_m"] > 0.01
+
+
+def test_what_grew_off_the_target_towards_the_ground_counts_against_it():
+    # Two thirds of the way from the sphere (bottom at -15 mm) to the ground (top at -50 mm).
+    lump = sphere(0.002, (0, 0, -0.025))
+    plain = target_metrics(sphere(RADIUS), sphere(RADIUS), ground(), samples=20_000)
+    grown = trimesh.util.concatenate([sphere(RADIUS), lump])
+    with_lump = target_metrics(grown, sphere(RADIUS), ground(), samples=20_000)
+    share = lump.area / grown.area
+    # 10 mm off, give or take the lump's own size; the mean of both ways halves it.
+    assert with_lump["chamfer_m"] - plain["chamfer_m"] == pytest.approx(share * 0.01 / 2, rel=0.1)
+    below = trimesh.util.concatenate([sphere(RADIUS), sphere(0.002, (0, 0, -0.045))])
+    assert target_metrics(below, sphere(RADIUS), ground(), samples=20_000)["chamfer_m"] < 1e-5
+
+
+def test_a_target_that_is_missing_scores_nothing():
+    found = target_metrics(ground(), sphere(RADIUS), ground(), samples=2000)
+    assert found == {
+        "share": 0.0,
+        "chamfer_m": None,
+        "fscore": {"0.001": 0.0, "0.002": 0.0, "0.005": 0.0},
+    }
+    half = trimesh.util.concatenate([ground(), sphere(RADIUS, (0.03, 0, 0))])
+    beside = target_metrics(half, sphere(RADIUS), ground(), samples=2000)
+    assert beside["chamfer_m"] > 0.005
+    with pytest.raises(ValueError, match="samples: 0, expected 1 or more"):
+        target_metrics(ground(), ground(), ground(), samples=0)
+
+
+def test_ground_that_lies_near_does_not_stand_in_for_what_is_missing():
+    """The upper half of a sphere that lies 1 mm above the ground: with or without the ground."""
+    low = sphere(RADIUS, (0, 0, -0.05 + 0.001 + RADIUS))
+    upper = low.copy()
+    upper.update_faces(upper.triangles_center[:, 2] > -0.05 + 0.001 + RADIUS)
+    alone = target_metrics(upper, low, ground(), samples=20_000)
+    above = target_metrics(
+        trimesh.util.concatenate([upper, ground()]), low, ground(), samples=50_000
+    )
+    assert alone["share"] == 1
+    assert above["chamfer_m"] == pytest.approx(alone["chamfer_m"], rel=0.05)
+    # Of the lower half all but a ring of 5 mm (a third of the half) is farther than 5 mm.
+    assert alone["fscore"]["0.005"] == pytest.approx(2 / (1 + 1 / 0.67), abs=0.05)
