@@ -8,7 +8,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from sononerf.field.lobe import CalmLayer, hidden_layers
+from sononerf.field.lobe import CALM, CalmLayer, hidden_layers
 
 LARGEST = 3.0
 """No correction is larger, as a natural logarithm: 26 dB."""
@@ -44,7 +44,8 @@ def harmonics(directions: Tensor) -> Tensor:
         (35 / 8, x * (x * x - 3 * y * y)),
         (35 / 8, y * (3 * x * x - y * y)),
     )
-    return torch.stack([math.sqrt(square) * value for square, value in polynomials], dim=-1)
+    # Side by side in memory, as all that is done to many pairs; see LobeField.
+    return torch.stack([math.sqrt(square) * value for square, value in polynomials]).movedim(0, -1)
 
 
 class Correction(nn.Module):
@@ -82,7 +83,13 @@ class Correction(nn.Module):
         self.out = CalmLayer(width, count)
         nn.init.zeros_(self.out.weight)
 
-    def forward(self, positions: Tensor, directions: Tensor, bins: Tensor | None) -> Tensor:
+    def forward(
+        self,
+        positions: Tensor,
+        directions: Tensor,
+        bins: Tensor | None,
+        place: Tensor | None = None,
+    ) -> Tensor:
         """Return what to add to the log strength.
 
         Differentiable in the parameters.
@@ -91,17 +98,38 @@ class Correction(nn.Module):
         ----------
         positions : (N, 3) float, m
             Places, world frame.
-        directions : (..., N, 3) float
-            Unit vectors to the emitter.
+        directions : (..., N, 3) or (M, 3) float
+            Unit vectors to the emitter; the latter with ``place``.
         bins : (B,) int or None
             Which frequencies; all where None.
+        place : (M,) int or None
+            Which place each direction is for.
 
         Returns
         -------
-        correction : (..., N, B) float
+        correction : (..., N, B) or (M, B) float
         """
-        phase = ((positions - self.origin)[..., None] * self.waves).flatten(-2)
-        place = torch.cat((phase.sin(), phase.cos()), dim=-1).expand(*directions.shape[:-1], -1)
-        hidden = self.hidden(torch.cat((place, harmonics(directions)), dim=-1))
-        wanted = self.out(hidden, slice(None) if bins is None else bins)
+        # What the first layer makes of a place is found out once for all its directions. Weights
+        # are calmed, not what they make of many pairs: it is the same, and they are few.
+        phase = (self.waves[:, None] * (positions - self.origin).T[:, None]).flatten(0, 1)
+        of_place = torch.cat((phase.sin(), phase.cos()))
+        (first, bias), second = _calm(self.hidden[0]), _calm(self.hidden[2])
+        known = torch.addmm(bias, first[:, : len(of_place)], of_place)  # (width, N)
+        if place is not None:
+            known = known.index_select(1, place)
+        told = harmonics(directions).movedim(-1, 0)  # (16, ..., N)
+        shape = told.shape[1:]
+        known = known.reshape(len(known), *[1] * (len(shape) - 1), shape[-1]).expand(-1, *shape)
+        hidden = torch.addmm(known.flatten(1), first[:, len(of_place) :], told.flatten(1)).relu()
+        hidden = torch.addmm(second[1], second[0], hidden).relu()
+        weight, bias = _calm(self.out)
+        which = slice(None) if bins is None else bins
+        wanted = torch.addmm(bias[which], weight[which], hidden)
+        wanted = wanted.reshape(len(wanted), *shape).movedim(0, -1)
         return LARGEST * torch.tanh(wanted / LARGEST)
+
+
+def _calm(layer: nn.Module) -> tuple[Tensor, Tensor]:
+    """Return a layer's weight and bias, a column, as they act."""
+    assert isinstance(layer, CalmLayer)
+    return layer.weight * CALM, layer.bias[:, None] * CALM

@@ -92,9 +92,14 @@ class GridField(LobeField):
         return total
 
     def _log_response(
-        self, code: Tensor, positions: Tensor, directions: Tensor, bins: Tensor | None
+        self,
+        code: Tensor,
+        positions: Tensor,
+        directions: Tensor,
+        bins: Tensor | None,
+        place: Tensor | None = None,
     ) -> Tensor:
-        response = super()._log_response(code, positions, directions, bins)
+        response = super()._log_response(code, positions, directions, bins, place)
         if self.correction is None:
             return response
-        return response + self.correction(positions, directions, bins)
+        return response + self.correction(positions, directions, bins, place)

@@ -122,10 +122,18 @@ class LobeField(Field):
         return spectrum + self.basis[:, bins].T @ code.T[CODE:]
 
     def _log_response(
-        self, code: Tensor, positions: Tensor, directions: Tensor, bins: Tensor | None
+        self,
+        code: Tensor,
+        positions: Tensor,
+        directions: Tensor,
+        bins: Tensor | None,
+        place: Tensor | None = None,
     ) -> Tensor:
-        """Return the log reflectivity of (N, 3) places towards (..., N, 3), (..., N, B)."""
-        del positions
+        """Return the log reflectivity of (N, 3) places towards (..., N, 3), (..., N, B).
+
+        Where (M,) ``place`` is given, codes and directions are those of M pairs.
+        """
+        del positions, place
         which = slice(None) if bins is None else bins
         lobe = code.T[1:4]
         # The small number keeps the gradient finite where there is no lobe yet.
@@ -164,8 +172,7 @@ class LobeField(Field):
         inside = self.inside(positions)
         if place is not None:
             code, inside = code.index_select(1, place), inside.index_select(0, place)
-            positions = positions.index_select(0, place)
-        response = self._log_response(code.T, positions, directions, bins).exp()
+        response = self._log_response(code.T, positions, directions, bins, place).exp()
         lobe = code[1:4].detach()  # the range must not turn the lobes
         length = along(lobe.T, lobe).sqrt()
         cosine = along(directions, lobe) / length.clamp_min(1e-6)

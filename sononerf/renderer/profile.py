@@ -264,7 +264,11 @@ class ProfileRenderer(Renderer):
         around = torch.cartesian_prod(steps, steps, steps)
         size = ((self.region[1] - self.region[0]) / half + 1e-3).floor().long() + 1
         cells = (cell[:, None] + around).reshape(-1, 3)
-        cells = cells[((cells >= 0) & (cells < size)).all(dim=1)].unique(dim=0)
+        cells = cells[((cells >= 0) & (cells < size)).all(dim=1)]
+        # As one number each: rows are sorted a hundred times slower.
+        flat = ((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]).unique()
+        line, plane = flat % (size[1] * size[2]), flat // (size[1] * size[2])
+        cells = torch.stack((plane, line // size[2], line % size[2]), dim=1)
         places = self.region[0] + cells * half
         if possible is not None:
             places = places[possible(places, half * math.sqrt(3) / 2)]

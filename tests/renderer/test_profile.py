@@ -401,6 +401,19 @@ def test_the_lattice_is_refined_where_there_is_energy(acquisition, formula):
     assert heard.max() > 1
 
 
+def test_a_box_of_unequal_sides_is_refined_where_there_is_energy_too(acquisition, formula):
+    corners = [[-0.008, -0.016, -0.024], [0.04, 0.024, 0.016]]
+    region = torch.tensor(corners, dtype=torch.float64)
+    field = formula(region, acquisition.frequency, ball, spacing=0.002)
+    renderer = quiet(ProfileRenderer(region, acquisition, start=400, prune_every=10))
+    for step in (0, 10, 20, 30):
+        renderer.prepare(field, None, step)
+    found, fine = renderer.lattice[renderer.alive], lattice_over(region, 0.002)
+    expected = fine[fine.norm(dim=1) < 0.0062]
+    assert len(found) == len(expected) > 50
+    assert torch.cdist(found, expected).amin(1).max() < 1e-6
+
+
 def test_a_lattice_that_is_refined_stays_within_what_is_possible(acquisition, formula):
     """The neighbours of what is alive are asked about, each as finely as it is laid."""
     region = torch.tensor([[-0.024] * 3, [0.024] * 3], dtype=torch.float64)
