@@ -192,6 +192,7 @@ class DataSettings(_Section):
     """Where the ensemble lies and how it is streamed."""
 
     store: Path | None = None
+    background: Literal["scene"] | Path | None = None  # taken off as power; scene: what it marks
     workers: Annotated[int, Field(ge=0, le=64)] = 0
     memory_bytes: Count = 2_000_000_000
 

@@ -110,6 +110,14 @@ class Scene:
         alone.remove_unreferenced_vertices()
         return alone
 
+    def surroundings(self) -> Scene | None:
+        """Return what is background as a scene of its own; None where nothing is."""
+        mesh = self.surface(background=True)
+        if mesh is None or self.background is None:
+            return None
+        part = None if self.part is None else self.part[self.background]
+        return Scene(mesh, self.material, part)
+
 
 def check_surface(mesh: trimesh.Trimesh) -> None:
     """Refuse a mesh that is no surface of a sensible size in metres.

@@ -28,6 +28,7 @@ from sononerf.checkpoint_io import DurableCheckpointIO
 from sononerf.config import Settings
 from sononerf.data.datamodule import EchoDataModule
 from sononerf.data.store import EnsembleStore
+from sononerf.data.subtracted import SubtractedStore
 from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.experiment.build import (
     check_plugins,
@@ -37,7 +38,7 @@ from sononerf.experiment.build import (
     module_for,
 )
 from sononerf.experiment.run_folder import RunFolder
-from sononerf.experiment.simulate import simulate, store_path
+from sononerf.experiment.simulate import background_path, ensemble, store_path
 from sononerf.geometry.hull import EchoHull
 from sononerf.module import EchoModule
 from sononerf.progress import Progress
@@ -88,12 +89,17 @@ def follows() -> bool:
 def _wait_for_store(settings: Settings) -> EnsembleStore:
     """Open the ensemble once the first process has sealed it."""
     path = store_path(settings, load_scene(settings.scene.name, settings.scene.options), None)
-    while True:
-        if (path / "zarr.json").is_file():
-            store = EnsembleStore.open(path)
-            if "reference" in store.attributes and not store.missing():
-                return store
+    background = background_path(settings)
+    while not all(_is_sealed(part) for part in (path, background) if part is not None):
         time.sleep(WAIT_SECONDS)
+    return EnsembleStore.open(path) if background is None else SubtractedStore(path, background)
+
+
+def _is_sealed(path: Path) -> bool:
+    if not (path / "zarr.json").is_file():
+        return False
+    store = EnsembleStore.open(path)
+    return "reference" in store.attributes and not store.missing()
 
 
 def fit(
@@ -161,7 +167,7 @@ def fit(
             if run.is_fitted:
                 return run
             started = time.monotonic()
-            store = simulate(settings, workers=workers, progress=progress)
+            store = ensemble(settings, workers=workers, progress=progress)
             simulated = time.monotonic() - started
             run.begin(settings)
             run.write_provenance(

@@ -15,7 +15,7 @@ from sononerf.config import Settings, dump_yaml, read_yaml, validate_settings
 from sononerf.errors import IncompatibleError, InputError
 
 METRICS_SCHEMA = 1
-FREE_KEYS = ("data", "fit.checkpoint_seconds")
+FREE_KEYS = ("data.store", "data.workers", "data.memory_bytes", "fit.checkpoint_seconds")
 """What may change between two calls of one run: it moves no number."""
 RECORDED = ("torch", "lightning", "numpy", "scipy", "trimesh", "embreex", "zarr")
 

@@ -16,7 +16,8 @@ from sononerf.acoustics.reception import warn_of_call
 from sononerf.acoustics.spectrogram import compress
 from sononerf.config import Settings
 from sononerf.data.store import EnsembleStore
-from sononerf.errors import IncompatibleError, NumericalError
+from sononerf.data.subtracted import SubtractedStore
+from sononerf.errors import IncompatibleError, NumericalError, SettingsError
 from sononerf.geometry.poses import Poses
 from sononerf.progress import Progress
 from sononerf.reconstruction.prediction import mae_db
@@ -71,9 +72,54 @@ def default_store(settings: Settings, echoes: str) -> Path:
     return Path("data") / f"{settings.scene.name}-{echoes[:12]}"
 
 
+def background_path(settings: Settings) -> Path | None:
+    """Return where the ensemble of the surroundings alone lies; None where none is taken off.
+
+    Raises
+    ------
+    SettingsError
+        If the scene's own are asked for, and it marks none.
+    """
+    chosen = settings.data.background
+    return _own_background(settings)[0] if chosen == "scene" else chosen
+
+
+def _own_background(settings: Settings) -> tuple[Path, Scene]:
+    scene = load_scene(settings.scene.name, settings.scene.options, source=settings.source)
+    alone = scene.surroundings()
+    if alone is None:
+        raise SettingsError(
+            f"data.background: the scene {settings.scene.name!r} marks no background; give the "
+            "ensemble of the surroundings alone, or leave it out"
+        )
+    path = default_store(settings, echo_hash(settings, alone))
+    return path.with_name(f"{path.name}-background"), alone
+
+
+def ensemble(
+    settings: Settings, *, workers: int | None = None, progress: Progress | None = None
+) -> EnsembleStore:
+    """Simulate what is missing, and take the surroundings off where that is asked for.
+
+    As :func:`simulate`, whose errors it raises.
+    """
+    # What is wrong with the background is told before minutes of simulation.
+    background = background_path(settings)
+    if background is not None and settings.data.background != "scene":
+        EnsembleStore.open(background)
+    store = simulate(settings, workers=workers, progress=progress)
+    if background is None:
+        return store
+    if settings.data.background == "scene":
+        alone = _own_background(settings)[1]
+        simulate(settings, scene=alone, output=background, workers=workers, progress=progress)
+    return SubtractedStore(store.path, background)
+
+
 def simulate(
     settings: Settings,
     *,
+    scene: Scene | None = None,
     output: Path | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
@@ -85,6 +131,8 @@ def simulate(
     ----------
     settings : Settings
         The experiment.
+    scene : Scene or None
+        Another one than the settings'.
     output : Path or None
         The store; ``data/<scene>-<hash>`` where None.
     workers : int or None
@@ -111,7 +159,8 @@ def simulate(
         If the folder holds another ensemble.
     """
     progress = progress or Progress(quiet=True)
-    scene = load_scene(settings.scene.name, settings.scene.options, source=settings.source)
+    if scene is None:
+        scene = load_scene(settings.scene.name, settings.scene.options, source=settings.source)
     path = store_path(settings, scene, output)
     wanted = echo_hash(settings, scene)
     if (path / "zarr.json").is_file():

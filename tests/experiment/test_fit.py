@@ -341,18 +341,18 @@ def test_what_a_fit_cost_is_counted_over_its_parts(tiny, tmp_path, interrupt, mo
     with pytest.raises(StoppedError):
         run(tiny(), path)
     first = cost()["simulate_s"]
-    simulate, load = fit_module.simulate, DurableCheckpointIO.load_checkpoint
+    ensemble, load = fit_module.ensemble, DurableCheckpointIO.load_checkpoint
 
     def slow(*arguments, **options):
         time.sleep(first + 0.1)
-        return simulate(*arguments, **options)
+        return ensemble(*arguments, **options)
 
     def long_ago(self, *arguments, **options):
         content = load(self, *arguments, **options)
         content["callbacks"]["CheckpointCallback"]["elapsed"] += 1000.0
         return content
 
-    monkeypatch.setattr(fit_module, "simulate", slow)
+    monkeypatch.setattr(fit_module, "ensemble", slow)
     monkeypatch.setattr(DurableCheckpointIO, "load_checkpoint", long_ago)
     run(tiny(), path)
     assert 1000.0 < cost()["fit_s"] < 1100.0

@@ -15,6 +15,7 @@ from sononerf.config import validate_settings
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
 from sononerf.experiment.build import echo_hull
+from sononerf.experiment.fit import fit
 from sononerf.experiment.fitted import load_fitted, poses_of, render_poses, store_of
 from sononerf.progress import Progress
 from sononerf.weights import load_weights, save_weights
@@ -217,3 +218,33 @@ def test_a_gpu_that_is_not_there(run, monkeypatch):
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     with pytest.raises(ResourceError):
         render_poses(fitted, poses, accelerator="gpu", progress=QUIET)
+
+
+def test_what_was_fitted_without_its_background_is_measured_without_it(run, tiny, echoes, tmp_path):
+    """The surroundings are the tiny echoes themselves, at half their magnitude."""
+    heard = EnsembleStore.open(echoes)
+    alone = EnsembleStore.create(
+        tmp_path / "alone",
+        poses_positions=heard.positions,
+        poses_rotations=heard.rotations,
+        split=heard.split,
+        range=heard.range,
+        frequency=heard.frequency,
+        attributes=heard.attributes,
+    )
+    for index in range(len(heard)):
+        alone.write_pose(index, 0.5 * heard.read_pose(index))
+    alone.seal()
+    fitted = load_fitted(run)
+    settings = tiny(data={"background": str(tmp_path / "alone")})
+    store = store_of(dataclasses.replace(fitted, settings=settings))
+    np.testing.assert_allclose(
+        store.read_pose(1), np.sqrt(0.75) * heard.read_pose(1), rtol=1e-5, atol=1e-9
+    )
+    assert type(store_of(fitted)) is EnsembleStore
+    path = tmp_path / "fitted"
+    fit(settings, path)
+    reference = load_fitted(path).module.reference
+    assert reference == pytest.approx(np.sqrt(0.75) * heard.attributes["reference"], rel=1e-5)
+    with pytest.raises(IncompatibleError, match=r"data\.background"):
+        fit(tiny(), path)

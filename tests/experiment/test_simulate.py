@@ -11,12 +11,27 @@ from dataclasses import replace
 import distributed
 import numpy as np
 import pytest
+import trimesh
 
 from sononerf.data.store import EnsembleStore
-from sononerf.errors import IncompatibleError, LockedError, NumericalError
+from sononerf.data.subtracted import SubtractedStore
+from sononerf.errors import (
+    IncompatibleError,
+    InputError,
+    LockedError,
+    NumericalError,
+    SettingsError,
+)
 from sononerf.experiment import simulate as simulate_module
-from sononerf.experiment.simulate import echo_hash, simulate, store_path
-from sononerf.scene import load_scene
+from sononerf.experiment.simulate import (
+    background_path,
+    echo_hash,
+    ensemble,
+    simulate,
+    store_path,
+)
+from sononerf.material import LEAF, RIGID
+from sononerf.scene import Scene, load_scene
 from sononerf.storage import lock
 
 
@@ -223,3 +238,59 @@ def test_range_limits_that_no_echo_reaches(tiny, tmp_path, limits):
 def test_a_store_in_use_is_left_alone(tiny, tmp_path):
     with lock(tmp_path / "store"), pytest.raises(LockedError):
         simulate(tiny(), output=tmp_path / "store")
+
+
+def before_a_wall(settings):
+    """The tiny sphere, and a plate behind it that is background."""
+    sphere = load_scene("sphere", settings.scene.options).mesh
+    plate = trimesh.creation.box((0.002, 0.1, 0.1))
+    plate.apply_translation((-0.03, 0, 0))
+    both = trimesh.util.concatenate([sphere, plate])
+    marked = np.arange(len(both.faces)) >= len(sphere.faces)
+    return Scene(both, (RIGID, LEAF), marked.astype(int), background=marked)
+
+
+def test_the_scenes_own_background_is_simulated_alone_and_taken_off(tiny, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = tiny(data={"store": None, "background": "scene"})
+    scene = before_a_wall(settings)
+    monkeypatch.setattr(simulate_module, "load_scene", lambda *given, **named: scene)
+    left = ensemble(settings, workers=1)
+    whole = simulate(tiny(data={"store": None}), workers=1)
+    alone = EnsembleStore.open(background_path(settings))
+    assert left.path == whole.path
+    assert alone.path.name.endswith("-background")
+    for index in range(len(whole)):
+        power = whole.read_pose(index) ** 2 - alone.read_pose(index) ** 2
+        np.testing.assert_allclose(left.read_pose(index) ** 2, power.clip(min=0), atol=1e-6)
+    assert max(alone.read_pose(index).max() for index in range(len(alone))) > 0
+    assert max(left.read_pose(index).max() for index in range(len(left))) > 0
+    # The plate alone is heard as it is, and as what it is made of.
+    plate = scene.surroundings()
+    assert len(plate.mesh.faces) == 12
+    assert (plate.part == 1).all()
+    assert plate.materials == (RIGID, LEAF)
+    # What is there is not simulated again.
+    monkeypatch.setattr(simulate_module, "Simulator", None)
+    np.testing.assert_array_equal(ensemble(settings).read_pose(0), left.read_pose(0))
+
+
+def test_a_background_of_ones_own_is_taken_off(tiny, echoes, tmp_path):
+    settings = tiny(data={"background": str(echoes)})
+    assert background_path(settings) == echoes
+    assert isinstance(ensemble(settings), SubtractedStore)
+    assert background_path(tiny()) is None
+    assert not isinstance(ensemble(tiny()), SubtractedStore)
+
+
+def test_a_background_that_is_not_there_is_told_before_anything_is_simulated(tiny, monkeypatch):
+    monkeypatch.setattr(simulate_module, "simulate", None)
+    with pytest.raises(InputError, match="nowhere: no ensemble store"):
+        ensemble(tiny(data={"background": "nowhere"}))
+
+
+def test_a_scene_without_background_has_none_to_take_off(tiny, monkeypatch):
+    monkeypatch.setattr(simulate_module, "simulate", None)
+    with pytest.raises(SettingsError, match="the scene 'sphere' marks no background") as error:
+        ensemble(tiny(data={"background": "scene"}))
+    assert "\n" not in str(error.value)
