@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from sononerf import storage
+from sononerf.errors import NumericalError
 from tools.benchmarks import prey as module
 from tools.benchmarks.prey import CONDITIONS, OCCUPIED, plot_png, summary, table
 
@@ -158,6 +159,29 @@ def test_what_was_compared_is_not_compared_again(asked, tmp_path):
     before = len(compared)
     module.prey(arguments(tmp_path, conditions=["clutter"], placements=1))
     assert len(compared) == before == 3
+
+
+def test_what_broke_off_or_cannot_be_compared_fails_alone(asked, monkeypatch, tmp_path):
+    """The fit of the first placement has costs of its echoes alone; the other is not comparable."""
+    plain = module.run_experiment
+
+    def broken(folder, data, settings, *, enough):
+        found = plain(folder, data, settings, enough=enough)
+        return {"cost": {"simulate_s": 1.0}} if folder.name == "prey-0" else found
+
+    def silent(first, second, *, output):
+        raise NumericalError("nothing to compare: both are silent")
+
+    monkeypatch.setattr(module, "run_experiment", broken)
+    monkeypatch.setattr(module, "compare_runs", silent)
+    module.prey(arguments(tmp_path, conditions=["clutter"], placements=1))
+    rows = json.loads((tmp_path / "prey.json").read_text())["rows"]
+    assert [row.get("failed") for row in rows] == [
+        None,
+        "the fit came to no end",
+        "nothing to compare: both are silent",
+        "nothing to compare: both are silent",
+    ]
 
 
 def test_the_conditions_change_one_thing_at_a_time_and_their_settings_are_known():

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from sononerf import storage
+from sononerf.errors import SonoNerfError
 from sononerf.experiment.compare import compare_runs
 from sononerf.render.figure import figure, pixels_from_figure, png_from_pixels
 from tools.benchmarks.experiment import Row, aligned, ending, origin, run_experiment
@@ -139,7 +140,10 @@ class _Cases:
             except RuntimeError as error:
                 yield {**head, "failed": str(error), "settings": settings}
                 return
-            seconds = metrics["cost"]["fit_s"]
+            seconds = metrics["cost"].get("fit_s")
+            if seconds is None:  # a fit that broke off has costs too, those of its echoes
+                yield {**head, "failed": "the fit came to no end", "settings": settings}
+                return
             scores = (metrics.get("geometry") or {}).get("fscore", {})
             row = {
                 **head,
@@ -151,7 +155,10 @@ class _Cases:
             if empty is None:
                 yield row
                 return
-            yield {**row, **_compared(run, empty)}
+            try:
+                yield {**row, **_compared(run, empty)}
+            except SonoNerfError as error:  # of this pair alone: the settings are known to be right
+                yield {**row, "failed": str(error)}
 
 
 def _compared(run: Path, empty: Path) -> dict[str, Any]:
