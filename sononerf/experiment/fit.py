@@ -28,7 +28,6 @@ from sononerf.checkpoint_io import DurableCheckpointIO
 from sononerf.config import Settings
 from sononerf.data.datamodule import EchoDataModule
 from sononerf.data.store import EnsembleStore
-from sononerf.data.subtracted import SubtractedStore
 from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.experiment.build import (
     check_plugins,
@@ -38,7 +37,12 @@ from sononerf.experiment.build import (
     module_for,
 )
 from sononerf.experiment.run_folder import RunFolder
-from sononerf.experiment.simulate import background_path, ensemble, store_path
+from sononerf.experiment.simulate import (
+    background_path,
+    ensemble,
+    open_ensemble,
+    store_path,
+)
 from sononerf.geometry.hull import EchoHull
 from sononerf.module import EchoModule
 from sononerf.progress import Progress
@@ -92,7 +96,7 @@ def _wait_for_store(settings: Settings) -> EnsembleStore:
     background = background_path(settings)
     while not all(_is_sealed(part) for part in (path, background) if part is not None):
         time.sleep(WAIT_SECONDS)
-    return EnsembleStore.open(path) if background is None else SubtractedStore(path, background)
+    return open_ensemble(settings, path)
 
 
 def _is_sealed(path: Path) -> bool:

@@ -16,11 +16,10 @@ from torch.utils.data import DataLoader
 from sononerf.config import Settings, validate_settings
 from sononerf.data.range_slices import PoseReader, WholePoses
 from sononerf.data.store import EnsembleStore
-from sononerf.data.subtracted import SubtractedStore
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.experiment.build import field_and_renderer, module_for
 from sononerf.experiment.fit import quiet_lightning, require_accelerator
-from sononerf.experiment.simulate import background_path, default_store
+from sononerf.experiment.simulate import default_store, open_ensemble
 from sononerf.geometry.hull import EchoHull
 from sononerf.module import EchoModule
 from sononerf.progress import Progress
@@ -104,11 +103,10 @@ def store_of(fitted: Fitted) -> EnsembleStore:
             f"{path}: the ensemble of this run is not there; make it again with "
             "`sononerf simulate RUN/config.yaml`, or predict poses of your own with --poses"
         )
-    store = EnsembleStore.open(path)
+    store = open_ensemble(settings, path)
     if store.attributes.get("echo_hash") != fitted.echo_hash:
         raise IncompatibleError(f"{path}: holds other echoes than those of this run")
-    background = background_path(settings)
-    return store if background is None else SubtractedStore(path, background)
+    return store
 
 
 def poses_of(store: EnsembleStore, split: Split, renderer: Renderer) -> WholePoses:

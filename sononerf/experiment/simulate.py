@@ -96,6 +96,12 @@ def _own_background(settings: Settings) -> tuple[Path, Scene]:
     return path.with_name(f"{path.name}-background"), alone
 
 
+def open_ensemble(settings: Settings, path: Path) -> EnsembleStore:
+    """Open a simulated ensemble, less its surroundings where that is asked for."""
+    background = background_path(settings)
+    return EnsembleStore.open(path) if background is None else SubtractedStore(path, background)
+
+
 def ensemble(
     settings: Settings, *, workers: int | None = None, progress: Progress | None = None
 ) -> EnsembleStore:
@@ -108,12 +114,10 @@ def ensemble(
     if background is not None and settings.data.background != "scene":
         EnsembleStore.open(background)
     store = simulate(settings, workers=workers, progress=progress)
-    if background is None:
-        return store
     if settings.data.background == "scene":
         alone = _own_background(settings)[1]
         simulate(settings, scene=alone, output=background, workers=workers, progress=progress)
-    return SubtractedStore(store.path, background)
+    return store if background is None else SubtractedStore(store.path, background)
 
 
 def simulate(
