@@ -153,6 +153,22 @@ class Field(nn.Module):
         del positions
         return None
 
+    def code_of_lattice(self, lattice: Tensor, which: Tensor | None) -> Tensor | None:
+        """Return what :meth:`code` does, for places that will be asked for again and again.
+
+        Parameters
+        ----------
+        lattice : (L, 3) float, m
+            The same tensor as long as the places are the same: how it is read may be kept.
+        which : (N,) int or None
+            Which of the places; all where None.
+
+        Returns
+        -------
+        code : (N, C) float or None
+        """
+        return self.code(lattice if which is None else lattice[which])
+
     @torch.no_grad()
     def audible(self, positions: Tensor, sources: Tensor, code: Tensor | None = None) -> Tensor:
         """Return which places answer which emitters at all.

@@ -203,6 +203,7 @@ class ProfileRenderer(Renderer):
         self.register_buffer("energy", torch.zeros(0))
         self.register_buffer("opaque", torch.zeros(0, dtype=torch.bool))
         self.register_buffer("spacing", torch.zeros(()))
+        self._living = (self.alive, -1, self.lattice)  # which, as of when, and where they are
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         # The lattice's size is found by the fit, so a loaded one replaces ours whole.
@@ -316,15 +317,24 @@ class ProfileRenderer(Renderer):
             hidden |= inside & (far < way) & shadow[index]
         return hidden
 
-    def _draw(self) -> tuple[Tensor, Tensor | None]:
-        """Return the places of this step and, where they are a sample, their weights."""
-        index = self.alive.nonzero()[:, 0]
-        if not self.training or len(index) <= self.points:
-            return index, None
-        energy = self.energy[index]
-        share = (1 - self.uniform) * energy / energy.sum() + self.uniform / len(index)
+    def _there(self) -> Tensor:
+        """Return the places that are alive, (L, 3): the same tensor until others are."""
+        alive, version, places = self._living
+        if alive is not self.alive or version != alive._version:
+            # Validation may come first, and what it makes is of no use to a gradient.
+            with torch.inference_mode(False):
+                places = self.lattice[self.alive]
+            self._living = (self.alive, self.alive._version, places)
+        return places
+
+    def _draw(self) -> tuple[Tensor | None, Tensor | None]:
+        """Return which of the places alive are this step's, and their weights; None for all."""
+        if not self.training or len(self._there()) <= self.points:
+            return None, None
+        energy = self.energy[self.alive]
+        share = (1 - self.uniform) * energy / energy.sum() + self.uniform / len(energy)
         drawn = torch.multinomial(share, self.points, replacement=True)
-        return index[drawn], 1.0 / (share[drawn] * self.points)
+        return drawn, 1.0 / (share[drawn] * self.points)
 
     def forward(
         self,
@@ -335,10 +345,10 @@ class ProfileRenderer(Renderer):
         bins: Tensor | None = None,
     ) -> Tensor:
         """Render; see the base class. Differentiable in the field, gain, spectrum and noise."""
-        index, weight = self._draw()
+        which, weight = self._draw()
         if bins is None:
             bins = torch.arange(len(self.frequency), device=self.frequency.device)
-        profile = self._profile(field, self.lattice[index], weight, position, rotation, bins)
+        profile = self._profile(field, which, weight, position, rotation, bins)
         phased = bool(self.phased)
         half = (self.log_kernel[bins] / (2 if phased else 1)).exp()
         kernel = torch.cat((half.flip(1), torch.ones_like(half[:, :1]), half), dim=1)
@@ -359,7 +369,7 @@ class ProfileRenderer(Renderer):
     def _profile(
         self,
         field: Field,
-        places: Tensor,
+        which: Tensor | None,
         weight: Tensor | None,
         position: Tensor,
         rotation: Tensor,
@@ -367,7 +377,9 @@ class ProfileRenderer(Renderer):
     ) -> Tensor:
         """Return what fine range bins hold: power (1, P, E, B, K) or pressure (2, P, E, B, K)."""
         emitters = position + rotation @ self.emitter  # (P, 3)
-        code = field.code(places)
+        there = self._there()
+        code = field.code_of_lattice(there, which)
+        places = there if which is None else there[which]
         count, ears = len(position), len(self.ears)
         with torch.no_grad():
             # Vectors and frequencies come first in memory, pairs run along it: see LobeField.

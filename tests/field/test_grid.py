@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from sononerf.field.field import sphere_directions
+from sononerf.renderer.profile import lattice_over
 from tests.field.lobes import REGION, fill, grid, places_in
 
 WITH_OPTIONS = pytest.mark.parametrize("options", [{}, {"rank": 2}, {"rank": 1, "correction": 4}])
@@ -68,6 +69,45 @@ def test_linear_functions_are_read_exactly(rank):
     places = torch.cat((places_in(50), REGION, REGION[:1] + 0.01))
     expected = places @ slopes.sum(0).T + offsets.sum(0)
     torch.testing.assert_close(field.code(places), expected, rtol=0, atol=1e-12)
+
+
+def lattice_in(field):
+    """Vertices of the lattice that fits are made of, every other one; and some beyond."""
+    places = lattice_over(REGION, field.resolution)[::2]
+    return torch.cat((places, REGION + torch.tensor([[-0.004], [0.004]])))
+
+
+@pytest.mark.parametrize("which", [None, torch.tensor([2, 0, 2])])
+@pytest.mark.parametrize("options", [{"rank": 2}, {"spacing": 0.2}])  # 0.2: one interval a side
+def test_a_lattice_is_read_as_any_places_are(options, which):
+    field = fill(grid(levels=3, **options))
+    # Vertices of less weight than 1e-5 are left out: up to a few of them, of numbers about one.
+    # Vertices of the finest grid to a rounding, midpoints and quarters of others, and any place.
+    for places in (lattice_in(field), lattice_in(field) + 1e-10, places_in(30)):
+        found = field.code_of_lattice(places, which)
+        wanted = field.code(places if which is None else places[which])
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-4)
+        weight = torch.randn(found.shape, dtype=found.dtype)
+        for one, two in zip(
+            torch.autograd.grad((found * weight).sum(), list(field.grids)),
+            torch.autograd.grad((wanted * weight).sum(), list(field.grids)),
+            strict=True,
+        ):
+            torch.testing.assert_close(one, two, rtol=0, atol=1e-4)
+
+
+def test_how_a_lattice_is_read_is_found_once():
+    field = fill(grid())
+    places, others = lattice_in(field), places_in(5)
+    with torch.inference_mode():  # validation may come first
+        field.code_of_lattice(places, None)
+    known = field._reading
+    field.code_of_lattice(places, torch.tensor([1])).sum().backward()
+    assert field._reading is known
+    assert len(field.code_of_lattice(others, None)) == 5
+    assert field._reading is not known
+    field.float()
+    assert field.code_of_lattice(others, None).dtype == torch.float32
 
 
 def test_the_grids_cover_the_region():

@@ -11,11 +11,13 @@ from sononerf.config import validate_settings
 from sononerf.experiment.build import acquisition as acquisition_of
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
+from sononerf.field.hash import HashField
 from sononerf.geometry.poses import look_at, rotation_from_euler
 from sononerf.renderer import profile
 from sononerf.renderer.profile import ProfileRenderer, lattice_over
 from sononerf.scene import Scene
 from sononerf.simulation.simulator import Simulator
+from tests.field.lobes import fill, grid, hashed
 
 REGION = torch.tensor([[-0.02, -0.03, -0.01], [0.02, 0.01, 0.03]], dtype=torch.float64)
 POSITION = np.array([[0.29, 0.02, 0.01], [0.0, -0.28, 0.05]])
@@ -217,6 +219,84 @@ def test_many_places_against_a_slow_loop(head, acquisition, formula, kind, monke
         expected = np.sqrt(power + np.exp([-2.0, 0.0, 1.0]))
         np.testing.assert_allclose(found[pose], expected, rtol=1e-6)
         assert expected.max() > 5 * expected.min()
+
+
+LOBES = pytest.mark.parametrize("make", [grid, hashed])
+
+
+def heard_by_lobes(make, acquisition, **options):
+    """A field with a code for each place, and its renderer, with what it makes of two poses."""
+    field = fill(make(REGION, acquisition.frequency), size=0.3)
+    renderer = quiet(ProfileRenderer(REGION, acquisition, **options))
+    renderer.prepare(field, None, 0)
+    return field, renderer, lambda: renderer(field, *tensors(POSITION, ROTATION), rows(poses=2))
+
+
+@LOBES
+def test_what_is_heard_follows_the_places_that_are_alive(make, acquisition):
+    _, renderer, hear = heard_by_lobes(make, acquisition)
+    silent = torch.zeros_like(renderer.alive)
+    few = silent.clone()
+    few[:3] = True
+    heard = [hear()]
+    renderer.alive[3:] = False  # in place
+    heard.append(hear())
+    renderer.alive = ~few  # another tensor, as often changed as the first when it was new
+    heard.append(hear())
+    torch.testing.assert_close(heard[1] ** 2 + heard[2] ** 2, heard[0] ** 2)
+    assert not torch.equal(heard[1], heard[2])
+    renderer.alive = silent
+    assert hear().max() < 1e-10
+
+
+class Direct(HashField):
+    """Multiplies the places themselves with what is learned, so that its gradient needs them."""
+
+    def code(self, positions):
+        return torch.cat((positions * self.spectrum, positions[:, :2]), dim=1)
+
+
+def direct(region, frequency):
+    return Direct(region, frequency, finest=0.01, levels=2, rank=0).double()
+
+
+@pytest.mark.parametrize("make", [grid, hashed, direct])
+def test_a_fit_may_begin_with_a_validation(make, acquisition):
+    field, _, hear = heard_by_lobes(make, acquisition)
+    with torch.inference_mode():
+        first = hear()
+    again = hear()
+    again.sum().backward()
+    assert torch.equal(first, again)
+    assert field.spectrum.grad.abs().min() > 0
+
+
+@LOBES
+def test_a_sample_has_the_right_power_on_average(make, acquisition):
+    """Some of the places that are loudest in the books being dead."""
+    _, renderer, hear = heard_by_lobes(make, acquisition, points=25)
+    renderer.energy = torch.linspace(1, 2, 125, dtype=torch.float64) ** 4
+    renderer.alive[60:80] = renderer.alive[120:] = False
+    renderer.eval()
+    whole = hear().detach() ** 2
+    renderer.train()
+    torch.manual_seed(0)
+    draws = torch.stack([hear().detach() ** 2 for _ in range(200)])
+    loud = whole > 0.2 * whole.amax()
+    deviation = draws.std(0) / math.sqrt(len(draws))
+    assert ((draws.mean(0) - whole).abs() <= 5 * deviation)[loud].all()
+    assert (deviation / whole)[loud].median() < 0.05  # so that the test can tell
+
+
+def test_loud_places_are_drawn_more_often(acquisition):
+    _, renderer, _ = heard_by_lobes(grid, acquisition, points=70, uniform=0.4)
+    renderer.alive[:50] = False
+    renderer.energy = (torch.arange(125) >= 115).double()
+    torch.manual_seed(0)
+    drawn, _ = renderer.train()._draw()
+    assert drawn.max() < 75
+    # 6 in 10 by their energy, and 2 in 15 of the others: 65 %, by chance 6 % more or less.
+    assert (drawn >= 65).double().mean() == pytest.approx(0.65, abs=0.18)
 
 
 def test_doubling_the_range_divides_by_four(acquisition, one_place):

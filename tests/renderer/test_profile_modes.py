@@ -232,12 +232,10 @@ def test_a_sample_of_the_places_has_the_right_pressure_on_average(cloud):
     renderer.points = 30
 
     def pressure():
-        places, weight = renderer._draw()
+        which, weight = renderer._draw()
         pose = tensors(POSITION[0], ROTATION[0])
         with torch.no_grad():
-            return renderer._profile(
-                field, renderer.lattice[places], weight, *pose, torch.arange(3)
-            )
+            return renderer._profile(field, which, weight, *pose, torch.arange(3))
 
     renderer.eval()
     whole = pressure()
@@ -337,7 +335,7 @@ class Leading(torch.nn.Module):
         generator = torch.Generator().manual_seed(0)
         lengths = 0.002 * torch.rand(count, dtype=torch.float64, generator=generator)
         self.lengths = torch.nn.Parameter(lengths)
-        self.audible, self.code = field.audible, field.code
+        self.audible, self.code_of_lattice = field.audible, field.code_of_lattice
 
     def echo(self, positions, directions, bins, place, code):
         response, _ = self.field.echo(positions, directions, bins, place, code)
