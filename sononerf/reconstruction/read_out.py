@@ -202,30 +202,38 @@ def _glint_surface(
     silent = np.full(len(points), OUTLINE * total / max(len(points), 1))
     where = np.concatenate((glints.points, points))
     normals = np.concatenate((glints.normals, normals))
+
+    def draw(inflated: float) -> tuple[trimesh.Trimesh, Volume, float]:
+        seen = np.ones(len(weights), dtype=bool)
+        for look in range(LOOKS + 1):
+            mesh, indicator, used = oriented_surface(
+                where + inflated * normals,
+                np.concatenate((weights * np.where(seen, 1.0, HIDDEN), silent)),
+                normals,
+                *(lower, upper, step),
+                smoothing=SMOOTHING,
+                level=level,
+                bound=np.asarray(clearance.values + inflated, dtype=np.float64),
+            )
+            if inflated:
+                mesh.vertices = mesh.vertices - inflated * mesh.vertex_normals
+            if look == LOOKS:
+                break
+            before = seen
+            seen = RayCaster(mesh).visible(
+                glints.points + CLEARANCE * glints.normals, hull.sources[glints.pose]
+            )
+            if (seen == before).all():
+                break
+        return mesh, indicator, used
+
     # The two sides of a sheet would cancel: drawn on a thicker one, which is then thinned again.
-    inflated = INFLATED * step if _is_sheet(where, normals) else 0.0
-    seen = np.ones(len(weights), dtype=bool)
-    for look in range(LOOKS + 1):
-        mesh, indicator, used = oriented_surface(
-            where + inflated * normals,
-            np.concatenate((weights * np.where(seen, 1.0, HIDDEN), silent)),
-            normals,
-            *(lower, upper, step),
-            smoothing=SMOOTHING,
-            level=level,
-            bound=np.asarray(clearance.values + inflated, dtype=np.float64),
-        )
-        if inflated:
-            mesh.vertices = mesh.vertices - inflated * mesh.vertex_normals
-        if look == LOOKS:
-            break
-        before = seen
-        seen = RayCaster(mesh).visible(
-            glints.points + CLEARANCE * glints.normals, hull.sources[glints.pose]
-        )
-        if (seen == before).all():
-            break
-    return mesh, indicator, used
+    if not _is_sheet(where, normals):
+        try:
+            return draw(0.0)
+        except NumericalError:
+            pass  # they have cancelled: a sheet, though too little was heard of it to be sure
+    return draw(INFLATED * step)
 
 
 def _is_sheet(points: Array, normals: Array) -> bool:

@@ -190,6 +190,26 @@ def test_without_glints_to_trust_the_surface_runs_along_the_hull(glints):
     assert np.abs(radii(mesh) - RADIUS).max() < 0.0004
 
 
+def test_sides_that_cancel_are_drawn_as_a_sheet(monkeypatch):
+    """A leaf of 0.4 mm whose sides were heard 1 mm wrong, each beyond the other."""
+    monkeypatch.setattr(read_out, "BACKED", 1.0)  # too few points have others behind them
+    x, y = (axis.ravel() for axis in np.meshgrid(*[np.arange(-0.015, 0.016, 0.0015)] * 2))
+    top = np.stack((x, y, np.full(len(x), -0.0008)), axis=1)
+    up = np.tile([0.0, 0.0, 1.0], (len(x), 1))
+    sides = np.concatenate((top, -top)), np.concatenate((up, -up))
+    glints = Glints(*sides, np.ones(2 * len(x)), np.arange(2 * len(x)))
+    sources = sides[0] + 0.4 * sides[1]
+    corner = np.full(3, 0.0303)
+    given = (glints, deaf(sources), -corner, corner, 0.0015)
+    mesh, _, _ = read_out._glint_surface(*given, "auto")
+    size = np.ptp(mesh.vertices, axis=0)
+    # Its edges are rounded off by three voxels.
+    assert (0.03 - 6 * 0.0015 < size[:2]).all()
+    assert (size[:2] < 0.03).all()
+    assert size[2] < 0.004
+    assert mesh.is_watertight
+
+
 @pytest.mark.parametrize("ahead", [0.004, 1.0])
 def test_what_lies_before_a_first_echo_is_no_glint(monkeypatch, ahead):
     """The ghosts lie 6 mm before the first echoes of the poses behind the sphere."""
