@@ -352,8 +352,13 @@ def clean_leftovers(folder: Path) -> None:
                 path.unlink()
 
 
-def probe_writable(folder: Path) -> None:
+def probe_writable(folder: Path) -> list[Path]:
     """Create a folder and prove that files can be written there, before anything expensive.
+
+    Returns
+    -------
+    created : list of Path
+        The folders that were not there, innermost first; see :func:`remove_if_empty`.
 
     Raises
     ------
@@ -368,10 +373,16 @@ def probe_writable(folder: Path) -> None:
     except BaseException:
         with suppress(OSError):
             probe.unlink(missing_ok=True)
-        for new in created:
-            with suppress(OSError):
-                new.rmdir()
+        remove_if_empty(created)
         raise
+    return created
+
+
+def remove_if_empty(folders: list[Path]) -> None:
+    """Remove folders that nothing came into, in the order given."""
+    for folder in folders:
+        with suppress(OSError):  # something did
+            folder.rmdir()
 
 
 def _take(path: Path) -> int | None:

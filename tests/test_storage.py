@@ -255,8 +255,13 @@ def test_remove_file_twice(tmp_path):
 
 
 def test_probe_creates_the_folder_and_leaves_it_empty(tmp_path):
-    storage.probe_writable(tmp_path / "a" / "b")
+    created = storage.probe_writable(tmp_path / "a" / "b")
+    assert created == [tmp_path / "a" / "b", tmp_path / "a"]
     assert names(tmp_path / "a" / "b") == []
+    assert storage.probe_writable(tmp_path / "a") == []
+    (tmp_path / "a" / "kept").touch()
+    storage.remove_if_empty(created)
+    assert names(tmp_path / "a") == ["kept"]
 
 
 @pytest.mark.parametrize("number", range(1, 8))

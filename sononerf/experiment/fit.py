@@ -8,7 +8,6 @@ import resource
 import sys
 import time
 import warnings
-from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 
@@ -163,8 +162,7 @@ def fit(
         aside = run.move_aside()
         if aside:
             progress.say(f"moved the old run to {aside}")
-    was_there = path.exists()
-    storage.probe_writable(path)
+    created = storage.probe_writable(path)
     try:
         with storage.lock(path):
             run.check(settings)
@@ -181,9 +179,7 @@ def fit(
                 run.write_metrics("cost", {"simulate_s": simulated}, merge=True)
             _fit(settings, run, store, accelerator, devices, num_nodes, progress)
     finally:
-        if not was_there:
-            with suppress(OSError):
-                path.rmdir()  # goes only if nothing came of the run
+        storage.remove_if_empty(created)  # those stay that something came of
     return run
 
 

@@ -311,8 +311,13 @@ def test_what_fails_before_the_fit_leaves_no_run(tiny, tmp_path):
         spectrogram={"range_min": 1.0, "range_max": 1.1}, data={"store": str(tmp_path / "store")}
     )
     with pytest.raises(NumericalError, match="no pose received an echo"):
-        run(deaf, tmp_path / "run")
-    assert not (tmp_path / "run").exists()
+        run(deaf, tmp_path / "kept" / "runs" / "run")
+    assert not (tmp_path / "kept").exists()
+    (tmp_path / "kept").mkdir()
+    with pytest.raises(NumericalError, match="no pose received an echo"):
+        run(deaf, tmp_path / "kept" / "runs" / "run")
+    assert (tmp_path / "kept").exists()
+    assert not (tmp_path / "kept" / "runs").exists()
 
 
 def test_a_gradient_that_is_no_number_leaves_a_sound_checkpoint(tiny, tmp_path, monkeypatch):
