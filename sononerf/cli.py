@@ -260,7 +260,9 @@ def _optional(values: dict[str, Any], key: str, template: str) -> str:
 @app.command()
 def predict(
     run: Run,
-    split: Annotated[Split, typer.Option(help="Which poses of the ensemble.")] = Split.test,
+    split: Annotated[
+        Split | None, typer.Option(help="Which poses of the ensemble; test by default.")
+    ] = None,
     poses: Annotated[
         Path | None, typer.Option(help="CSV of your own poses: x,y,z,yaw,pitch,roll (m, degrees).")
     ] = None,
@@ -268,12 +270,14 @@ def predict(
     accelerator: OnWhat = Accelerator.auto,
 ) -> None:
     """Predict the spectrograms of poses that were never heard."""
+    if split is not None and poses is not None:
+        raise SettingsError("--split and --poses exclude each other; give one")
     from sononerf.experiment.predict import predict as predict_run
     from sononerf.progress import Progress
 
     folder = predict_run(
         run,
-        split=split.value,
+        split="test" if split is None else split.value,
         poses_csv=poses,
         output=output,
         accelerator=accelerator.value,
@@ -301,8 +305,8 @@ def reconstruct(
             number = float(level)
         except ValueError:
             raise SettingsError(f"--level: found {level!r}; give auto or a number") from None
-        if not math.isfinite(number):
-            raise SettingsError(f"--level: found {level!r}; give auto or a finite number")
+        if not (math.isfinite(number) and number >= 0):
+            raise SettingsError(f"--level: found {level!r}; give auto or a number from 0 on")
     if spacing is not None and not (math.isfinite(spacing) and spacing > 0):
         raise SettingsError(f"--spacing: found {spacing}; give metres above zero")
     from sononerf.experiment.reconstruct import reconstruct as reconstruct_run

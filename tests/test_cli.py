@@ -601,6 +601,7 @@ def test_tables_of_poses_that_are_none(smoke, clean, content, words):
     [
         ("--level", "high"),
         ("--level", "nan"),
+        ("--level", "-1"),
         ("--spacing", "0"),
         ("--spacing", "nan"),
         ("--spacing", "wide"),
@@ -612,8 +613,21 @@ def test_wrong_numbers_for_the_read_out(smoke, clean, options):
 
 
 def test_a_surface_that_is_not_there(smoke, clean):
-    refused(5, "reconstruct", smoke.run, "--level", "1e9", "--output", "out")
-    assert [name for name in tree(clean) if name != "out"] == []
+    refused(5, "reconstruct", smoke.run, "--level", "1e9", "--output", "there/out")
+    assert tree(clean) == {}
+
+
+@pytest.mark.parametrize("command", ["predict", "reconstruct"])
+def test_results_do_not_go_into_a_runs_own_folder(at_home, command):
+    before = tree(at_home.run)
+    message = refused(3, command, "runs/smoke", "--output", "runs/smoke")
+    assert "runs/smoke: is the folder of a run; give --output" in message
+    assert tree(at_home.run) == before
+
+
+def test_split_and_poses_exclude_each_other(smoke, clean):
+    message = refused(2, "predict", smoke.run, "--split", "test", "--poses", "mine.csv")
+    assert "exclude each other" in message
 
 
 def test_workers_and_scheduler_exclude_each_other(clean):

@@ -16,9 +16,17 @@ from sononerf.acoustics.spectrogram import compress
 from sononerf.data.range_slices import WholePoses
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError
-from sononerf.experiment.fitted import Split, load_fitted, poses_of, render_poses, store_of
+from sononerf.experiment.fitted import (
+    Fitted,
+    Split,
+    load_fitted,
+    poses_of,
+    render_poses,
+    store_of,
+)
+from sononerf.experiment.retrace import NAME as RETRACE_NAME
 from sononerf.experiment.retrace import load_retrace, trace_poses
-from sononerf.experiment.run_folder import RunFolder
+from sononerf.experiment.run_folder import RunFolder, results_folder
 from sononerf.geometry.poses import Poses, read_pose_csv
 from sononerf.progress import Progress
 from sononerf.reconstruction.prediction import mae_db, prediction_metrics
@@ -57,6 +65,12 @@ def predict(
     -------
     folder : Path
         With ``spectrograms.npz`` and a picture per pose.
+
+    Raises
+    ------
+    InputError
+        If the run or the poses are none, a pose can hear nothing of what was fitted, or the folder
+        is a run's.
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder(path)
@@ -68,32 +82,38 @@ def predict(
         if own is None and split == "test"
         else f"prediction-{'poses' if own is not None else split}"
     )
+    if own is not None:
+        _check_poses(own, poses_csv, fitted, progress)
     store = None if own is not None else store_of(fitted)
     retrace = load_retrace(path)
+    told = run.read_metrics().get("prediction", {}).get("traced_share", 0)
+    if retrace is None and told > 0:
+        progress.say(
+            f"{path / RETRACE_NAME} is missing: what follows is rendered from the field alone, "
+            f"not the run's own prediction, {told:.0%} of which is traced off its mesh"
+        )
     poses = _poses_to_render(store, own, split, renderer)
-    storage.probe_writable(folder)
-    rendered = render_poses(fitted, poses, accelerator=accelerator, progress=progress)
-    reference = fitted.module.reference
-    magnitude = rendered
-    if retrace is not None and retrace.share > 0:
-        traced = trace_poses(fitted.settings, retrace, poses, progress=progress)
-        magnitude = blend(rendered, traced, retrace.share, reference).astype(np.float32)
-    predicted = compress(magnitude, reference)
-    measured = None
-    if store is not None:
-        measured = compress(np.stack([store.read_pose(int(i)) for i in poses.numbers]), reference)
-    axes = {
-        "range_m": renderer.range.double().numpy(),
-        "frequency_hz": renderer.frequency.double().numpy(),
-    }
-    arrays = {"predicted": magnitude, "pose": poses.numbers.numpy(), **axes}
-    if measured is not None and store is not None:
-        arrays["measured"] = np.stack([store.read_pose(int(i)) for i in poses.numbers])
-    arrays["position"] = poses.positions.numpy()
-    arrays["rotation"] = poses.rotations.numpy()
-    arrays["reference"] = np.asarray(reference)
-    storage.commit(folder / "spectrograms.npz", lambda file: _save_npz(file, arrays))
-    _pictures(folder, poses, measured, predicted, axes, progress)
+    with results_folder(folder):
+        rendered = render_poses(fitted, poses, accelerator=accelerator, progress=progress)
+        magnitude, reference = rendered, fitted.module.reference
+        if retrace is not None and retrace.share > 0:
+            traced = trace_poses(fitted.settings, retrace, poses, progress=progress)
+            magnitude = blend(rendered, traced, retrace.share, reference).astype(np.float32)
+        axes = {
+            "range_m": renderer.range.double().numpy(),
+            "frequency_hz": renderer.frequency.double().numpy(),
+        }
+        arrays = {"predicted": magnitude, "pose": poses.numbers.numpy(), **axes}
+        measured = None
+        if store is not None:
+            arrays["measured"] = np.stack([store.read_pose(int(i)) for i in poses.numbers])
+            measured = compress(arrays["measured"], reference)
+        arrays["position"] = poses.positions.numpy()
+        arrays["rotation"] = poses.rotations.numpy()
+        arrays["reference"] = np.asarray(reference)
+        storage.commit(folder / "spectrograms.npz", lambda file: _save_npz(file, arrays))
+        predicted = compress(magnitude, reference)
+        _pictures(folder, poses, measured, predicted, axes, progress)
     if store is not None and measured is not None and output is None and split == "test":
         figures = _numbers(store, split, measured, predicted, reference)
         alone = compress(rendered, reference)
@@ -107,6 +127,30 @@ def predict(
             },
         )
     return folder
+
+
+def _check_poses(poses: Poses, csv: Path | None, fitted: Fitted, progress: Progress) -> None:
+    """Refuse poses that can hear nothing of the region; say which lie within it."""
+    lower, upper = (c.double().cpu().numpy() for c in fitted.module.field.region)
+    ranges = fitted.module.renderer.range.double().cpu().numpy()
+    below, above = lower - poses.positions, poses.positions - upper
+    with np.errstate(over="ignore"):  # what is too far for a number is too far
+        nearest = np.linalg.norm(np.maximum(np.maximum(below, above), 0), axis=1)
+        farthest = np.linalg.norm(np.maximum(-below, -above), axis=1)
+    deaf = np.flatnonzero((nearest > ranges[-1]) | (farthest < ranges[0]))
+    if len(deaf):
+        worst = deaf[0]
+        where = f"{nearest[worst]:.3g} to {farthest[worst]:.3g} m"
+        raise InputError(
+            f"{csv}: from pose {worst} (the first is 0) the fitted region lies {where} away, and "
+            f"what is heard is {ranges[0]:.3g} to {ranges[-1]:.3g} m; positions are in metres"
+        )
+    within = np.flatnonzero(nearest == 0)
+    if len(within):
+        numbers = ", ".join(map(str, within[:10])) + (" ..." if len(within) > 10 else "")
+        progress.say(
+            f"{csv}: within the fitted region, where no pose was trained, lie poses {numbers}"
+        )
 
 
 def _save_npz(file: BinaryIO, arrays: dict[str, NDArray[np.generic]]) -> None:
@@ -144,7 +188,7 @@ def _pictures(
     with progress.task("drawing", len(poses)) as task:
         for row, number in enumerate(poses.numbers.tolist()):
             picture = spectrogram_png(
-                predicted[row] if measured is None else measured[row],
+                None if measured is None else measured[row],
                 predicted[row],
                 axes["range_m"],
                 axes["frequency_hz"],

@@ -18,12 +18,13 @@ from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, NumericalError, SonoNerfError
 from sononerf.experiment.build import acquisition
 from sononerf.experiment.fitted import Fitted, load_fitted, store_of
-from sononerf.experiment.run_folder import RunFolder
+from sononerf.experiment.run_folder import RunFolder, results_folder
 from sononerf.progress import Progress
 from sononerf.reconstruction.baseline import backprojection, best_level_surface
 from sononerf.reconstruction.confidence import poses_that_saw
 from sononerf.reconstruction.mesh import MeshFormat, mesh_bytes
 from sononerf.reconstruction.metrics import geometry_metrics, target_metrics
+from sononerf.reconstruction.read_out import Reconstruction
 from sononerf.reconstruction.read_out import reconstruct as read_out
 from sononerf.reconstruction.truth import TrueSurface
 from sononerf.reconstruction.volume import Volume, vti_bytes
@@ -74,18 +75,29 @@ def reconstruct(
     started = time.monotonic()
     fitted = load_fitted(path)
     folder = output or path / "reconstruction"
-    storage.probe_writable(folder)
     options = fitted.settings.reconstruction
-    with progress.task("reconstructing", 1000) as task, torch.inference_mode():
-        found = read_out(
-            fitted.module.field,
-            hull=fitted.hull,
-            spacing=spacing or options.spacing,
-            level=options.level if level is None else level,
-            method=options.method,
-            directions=options.directions,
-            progress=lambda done, total: task.advance(1000 * done // total - task.done),
+    with results_folder(folder):
+        with progress.task("reconstructing", 1000) as task, torch.inference_mode():
+            found = read_out(
+                fitted.module.field,
+                hull=fitted.hull,
+                spacing=spacing or options.spacing,
+                level=options.level if level is None else level,
+                method=options.method,
+                directions=options.directions,
+                progress=lambda done, total: task.advance(1000 * done // total - task.done),
+            )
+        _write(folder, found, true_mesh(fitted))
+    if found.openness is not None and found.openness.kind in OPEN:
+        progress.say(OPEN[found.openness.kind].format(found.openness))
+    if output is None:
+        RunFolder(path).write_metrics(
+            "cost", {"reconstruct_s": time.monotonic() - started}, merge=True
         )
+    return folder
+
+
+def _write(folder: Path, found: Reconstruction, truth: trimesh.Trimesh | None) -> None:
     seen = None if found.glints is None else poses_that_saw(found.mesh, found.glints)
     for kind in FORMATS:
         data = mesh_bytes(found.mesh, kind, confidence=seen)
@@ -95,7 +107,6 @@ def reconstruct(
     storage.commit_bytes(folder / "volume.vti", vti_bytes(found.volume))
     for axis, picture in mip_pngs(found.volume).items():
         storage.commit_bytes(folder / f"mip_{axis}.png", picture)
-    truth = true_mesh(fitted)
     view = mesh_png(found.mesh) if truth is None else side_by_side_png(truth, found.mesh)
     storage.commit_bytes(folder / "view.png", view)
     storage.commit_json(
@@ -107,13 +118,6 @@ def reconstruct(
             "surface": None if found.openness is None else found.openness.kind,
         },
     )
-    if found.openness is not None and found.openness.kind in OPEN:
-        progress.say(OPEN[found.openness.kind].format(found.openness))
-    if output is None:
-        RunFolder(path).write_metrics(
-            "cost", {"reconstruct_s": time.monotonic() - started}, merge=True
-        )
-    return folder
 
 
 def true_scene(fitted: Fitted) -> Scene | None:

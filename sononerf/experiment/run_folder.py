@@ -7,12 +7,15 @@ import importlib.metadata
 import os
 import platform
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from sononerf import __version__, storage
 from sononerf.config import Settings, dump_yaml, read_yaml, validate_settings
 from sononerf.errors import IncompatibleError, InputError
+from sononerf.weights import DESCRIPTION_NAME
 
 METRICS_SCHEMA = 1
 FREE_KEYS = ("data.store", "data.workers", "data.memory_bytes", "fit.checkpoint_seconds")
@@ -29,6 +32,26 @@ def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
         else:
             flat[name] = value
     return flat
+
+
+@contextmanager
+def results_folder(folder: Path) -> Iterator[None]:
+    """Make a folder for results; if nothing comes into it, it is gone afterwards.
+
+    Raises
+    ------
+    InputError
+        If it is a run's own, in which results would lie among its files.
+    StorageError
+        If it cannot be created or written.
+    """
+    if any((folder / name).exists() for name in ("config.yaml", DESCRIPTION_NAME)):
+        raise InputError(f"{folder}: is the folder of a run; give --output a folder of its own")
+    created = storage.probe_writable(folder)
+    try:
+        yield
+    finally:
+        storage.remove_if_empty(created)
 
 
 def differing_keys(old: Settings, new: Settings) -> list[str]:

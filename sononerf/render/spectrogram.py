@@ -18,7 +18,7 @@ LEVEL_MAP, DIFFERENCE_MAP = "magma", "RdBu_r"
 
 
 def spectrogram_png(
-    measured_db: ArrayLike,
+    measured_db: ArrayLike | None,
     predicted_db: ArrayLike,
     range_m: ArrayLike,
     frequency_hz: ArrayLike,
@@ -28,8 +28,10 @@ def spectrogram_png(
 
     Parameters
     ----------
-    measured_db, predicted_db : (E, R, F) float, dB
-        0 dB is silence.
+    measured_db : (E, R, F) float or None, dB
+        0 dB is silence; the prediction alone is drawn where None.
+    predicted_db : (E, R, F) float, dB
+        The same.
     range_m : (R,) float, m
         Range axis, ascending; drawn only around what sounds.
     frequency_hz : (F,) float, Hz
@@ -79,22 +81,27 @@ def sounding_slice(spectrograms: NDArray[np.floating], range_m: NDArray[np.float
 
 
 def _checked(
-    measured_db: ArrayLike, predicted_db: ArrayLike, range_m: ArrayLike, frequency_hz: ArrayLike
-) -> tuple[NDArray[np.float64], ...]:
-    measured, predicted, ranges, frequencies = (
-        np.asarray(values, dtype=np.float64)
-        for values in (measured_db, predicted_db, range_m, frequency_hz)
-    )
-    expected = (len(measured), len(ranges), len(frequencies))
-    if measured.shape != expected or predicted.shape != expected or not measured.size:
+    measured_db: ArrayLike | None,
+    predicted_db: ArrayLike,
+    range_m: ArrayLike,
+    frequency_hz: ArrayLike,
+) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64], NDArray[np.float64]]:
+    ranges, frequencies = (np.asarray(a, dtype=np.float64) for a in (range_m, frequency_hz))
+    given = {} if measured_db is None else {"measured": measured_db}
+    levels = {
+        name: np.asarray(values, dtype=np.float64)
+        for name, values in {**given, "predicted": predicted_db}.items()
+    }
+    expected = (len(levels["predicted"]), len(ranges), len(frequencies))
+    if any(values.shape != expected or not values.size for values in levels.values()):
+        found = " and ".join(f"{name} {values.shape}" for name, values in levels.items())
         raise ValueError(
-            f"measured {measured.shape} and predicted {predicted.shape}: expected (E, R, F) with "
-            f"R = {len(ranges)} and F = {len(frequencies)}"
+            f"{found}: expected (E, R, F) with R = {len(ranges)} and F = {len(frequencies)}"
         )
-    for name, values in (("measured", measured), ("predicted", predicted)):
+    for name, values in levels.items():
         if not np.isfinite(values).all():
             raise NumericalError(f"the {name} spectrogram holds values that are not finite")
-    return measured, predicted, ranges, frequencies
+    return levels, ranges, frequencies
 
 
 def axis_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
@@ -108,59 +115,43 @@ def _round_up(value: float, step: float) -> float:
 
 
 def _pixels(
-    measured_db: ArrayLike,
+    measured_db: ArrayLike | None,
     predicted_db: ArrayLike,
     range_m: ArrayLike,
     frequency_hz: ArrayLike,
     title: str,
     dpi: int,
 ) -> NDArray[np.uint8]:
-    measured, predicted, ranges, frequencies = _checked(
-        measured_db, predicted_db, range_m, frequency_hz
-    )
-    shown = sounding_slice(np.stack([measured, predicted]), ranges)
-    measured, predicted, ranges = measured[:, shown], predicted[:, shown], ranges[shown]
-    difference = predicted - measured
-    top = _round_up(max(measured.max(), predicted.max()), 5)
-    # A single odd cell must not bleach all the others.
-    worst = _round_up(float(np.quantile(np.abs(difference), 0.998)), 3)
-    ears = len(measured)
+    panels, ranges, frequencies = _checked(measured_db, predicted_db, range_m, frequency_hz)
+    shown = sounding_slice(np.stack([*panels.values()]), ranges)
+    panels, ranges = {name: values[:, shown] for name, values in panels.items()}, ranges[shown]
+    top = _round_up(max(values.max() for values in panels.values()), 5)
+    columns, ears = len(panels), len(panels["predicted"])
+    if columns == 2:
+        panels["predicted − measured"] = panels["predicted"] - panels["measured"]
     names = ["left ear", "right ear"] if ears == 2 else [f"ear {ear}" for ear in range(ears)]
     extent = (*axis_edges(ranges), *axis_edges(frequencies / 1e3))
-    with figure(10.5, 0.9 + 2.3 * ears, dpi) as drawn:
-        axes = drawn.subplots(ears, 3, sharex=True, sharey=True, squeeze=False)
-        for ear in range(ears):
-            panels = measured[ear], predicted[ear], difference[ear]
-            levels = _row(axes[ear], panels, extent, top, worst)
-            axes[ear, 0].set_ylabel(f"{names[ear]}\nfrequency (kHz)")
-        for axis, name in zip(
-            axes[0], ("measured", "predicted", "predicted − measured"), strict=True
-        ):
-            axis.set_title(name)
-        for axis in axes[-1]:
-            axis.set_xlabel("range (m)")
-        drawn.colorbar(levels[0], ax=axes[:, :2], label="level (dB)", pad=0.01, aspect=12 * ears)
-        drawn.colorbar(
-            levels[1], ax=axes[:, 2:], label="difference (dB)", pad=0.02, aspect=12 * ears
-        )
+    with figure(10.5 * len(panels) / 3 + (len(panels) == 1), 0.9 + 2.3 * ears, dpi) as drawn:
+        axes = drawn.subplots(ears, len(panels), sharex=True, sharey=True, squeeze=False)
+        for column, (name, values) in enumerate(panels.items()):
+            options: dict[str, Any] = {"cmap": LEVEL_MAP, "vmin": 0, "vmax": top}
+            if column == 2:
+                # A single odd cell must not bleach all the others.
+                worst = _round_up(float(np.quantile(np.abs(values), 0.998)), 3)
+                options = {"cmap": DIFFERENCE_MAP, "vmin": -worst, "vmax": worst}
+            axes[0, column].set_title(name)
+            axes[-1, column].set_xlabel("range (m)")
+            for panel, level in zip(axes[:, column], values, strict=True):
+                picture = panel.imshow(level.T, extent=extent, aspect="auto", **options)
+                panel.locator_params(axis="x", nbins=5)  # more labels would touch one another
+            if column == columns - 1:
+                bar = axes[:, :columns]
+                drawn.colorbar(picture, ax=bar, label="level (dB)", pad=0.01, aspect=12 * ears)
+            elif column == 2:
+                bar = axes[:, 2:]
+                drawn.colorbar(picture, ax=bar, label="difference (dB)", pad=0.02, aspect=12 * ears)
+        for panel, name in zip(axes[:, 0], names, strict=True):
+            panel.set_ylabel(f"{name}\nfrequency (kHz)")
         if title:
             drawn.suptitle(title, fontsize=10)
         return pixels_from_figure(drawn)
-
-
-def _row(
-    axes: Any,
-    panels: tuple[NDArray[np.float64], ...],
-    extent: tuple[float, ...],
-    top: float,
-    worst: float,
-) -> tuple[Any, Any]:
-    """Draw one ear; returns what the two colour bars are made from."""
-    options = {"extent": extent, "aspect": "auto"}
-    measured, predicted, difference = (panel.T for panel in panels)
-    level = axes[0].imshow(measured, cmap=LEVEL_MAP, vmin=0, vmax=top, **options)
-    axes[1].imshow(predicted, cmap=LEVEL_MAP, vmin=0, vmax=top, **options)
-    deviation = axes[2].imshow(difference, cmap=DIFFERENCE_MAP, vmin=-worst, vmax=worst, **options)
-    for panel in axes:
-        panel.locator_params(axis="x", nbins=5)  # more labels would touch one another
-    return level, deviation

@@ -16,7 +16,10 @@ from sononerf.data.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
 from sononerf.experiment import predict as predict_module
 from sononerf.experiment.fit import fit
+from sononerf.experiment.fitted import load_fitted
 from sononerf.experiment.predict import predict
+from sononerf.experiment.run_folder import RunFolder
+from sononerf.progress import Progress
 
 CSV = "x,y,z,yaw,pitch,roll\n-0.4,0,0,0,0,0\n0,0,0.4,0,90,0\n"
 AXES = {"range_m", "frequency_hz", "reference", "pose", "position", "rotation"}
@@ -117,6 +120,69 @@ def test_poses_of_ones_own_need_neither_store_nor_scene(run, tmp_path, monkeypat
     np.testing.assert_allclose(arrays["rotation"][1][:, 0], [0, 0, -1], atol=1e-6)  # looks down
     assert len(list(folder.glob("pose_*.png"))) == 2
     assert not (run / "metrics.json").exists()
+
+
+def test_what_was_not_measured_is_not_drawn(run, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        predict_module, "spectrogram_png", lambda measured, *_: drawn.append(measured) or b""
+    )
+    (tmp_path / "poses.csv").write_text(CSV)
+    predict(run, poses_csv=tmp_path / "poses.csv", accelerator="cpu")
+    assert drawn == [None, None]
+
+
+@pytest.mark.parametrize("pose", ["9,0,0,180,0,0", "0.4,0,-300,0,0,0", "1e200,0,0,180,0,0"])
+def test_poses_that_can_hear_nothing_of_the_region_are_refused(run, tmp_path, pose):
+    csv = tmp_path / "poses.csv"
+    csv.write_text(f"{CSV}{pose}\n")
+    with pytest.raises(InputError, match=r"poses\.csv: from pose 2 .* positions are in metres"):
+        predict(run, poses_csv=csv, output=tmp_path / "out", accelerator="cpu")
+    assert not (tmp_path / "out").exists()
+
+
+def test_nor_are_those_that_are_too_near_to_hear_any(run, tmp_path):
+    csv = tmp_path / "poses.csv"
+    csv.write_text(f"{CSV}0,0,0,0,0,0\n")
+    module = load_fitted(run).module
+    assert module.field.region.norm(dim=1).max() < module.renderer.range[0]
+    with pytest.raises(InputError, match="from pose 2"):
+        predict(run, poses_csv=csv, accelerator="cpu")
+
+
+def test_poses_within_the_region_are_told(run, tmp_path, no_pictures, monkeypatch):
+    csv, told = tmp_path / "poses.csv", []
+    lower, upper = load_fitted(run).module.field.region.double().numpy()
+    x, y, z = lower + 0.01 * (upper - lower)
+    csv.write_text(f"{CSV}{x},{y},{z},0,0,0\n")
+    fitted = load_fitted(run)
+    fitted.module.renderer.range[0] = 0.0
+    monkeypatch.setattr(predict_module, "load_fitted", lambda path: fitted)
+    monkeypatch.setattr(Progress, "say", lambda self, text: told.append(text))
+    predict(run, poses_csv=csv, accelerator="cpu")
+    assert len(told) == 1
+    assert told[0].endswith("within the fitted region, where no pose was trained, lie poses 2")
+
+
+def test_a_pose_that_hears_the_regions_far_side_alone_will_do(run, tmp_path, no_pictures):
+    csv, module = tmp_path / "poses.csv", load_fitted(run).module
+    lower, upper = module.field.region.double().numpy()
+    first = float(module.renderer.range[0])
+    csv.write_text(f"{CSV}{upper[0] + first - (upper[0] - lower[0]) / 2},0,0,180,0,0\n")
+    assert len(arrays_of(predict(run, poses_csv=csv, accelerator="cpu"))["pose"]) == 3
+
+
+def test_that_tracing_is_missing_is_told(run, no_pictures, monkeypatch):
+    told = []
+    monkeypatch.setattr(Progress, "say", lambda self, text: told.append(text))
+    predict(run, accelerator="cpu")
+    predict(run, accelerator="cpu")  # nothing was traced
+    assert told == []
+    RunFolder(run).write_metrics("prediction", {"traced_share": 0.3})
+    predict(run, accelerator="cpu")
+    assert len(told) == 1
+    assert f"{run / 'retrace.safetensors'} is missing" in told[0]
+    assert "30%" in told[0]
 
 
 def test_the_same_field_predicts_the_same_bits_wherever_it_lies(run, fitted, tmp_path, no_pictures):

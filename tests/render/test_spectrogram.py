@@ -49,6 +49,16 @@ def test_one_range_and_one_frequency():
     np.testing.assert_allclose(panels, [[252, 253, 191], [0, 0, 4], [34, 102, 172]], atol=24)
 
 
+def test_a_prediction_alone_has_one_panel():
+    pixels = spectrogram_image(None, [[[5.0]]], [0.4], [40e3])
+    both = spectrogram_image([[[5.0]]], [[[5.0]]], [0.4], [40e3])
+    assert pixels.shape[0] == both.shape[0]
+    assert 0.3 < pixels.shape[1] / both.shape[1] < 0.5
+    middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2].astype(int)
+    np.testing.assert_allclose(middle, [252, 253, 191], atol=24)  # the top of the scale
+    assert spectrogram_png(None, echo(), RANGE, FREQUENCY)
+
+
 def test_a_difference_shows():
     same = spectrogram_image(echo(), echo(), RANGE, FREQUENCY)
     other = spectrogram_image(echo(), 0.5 * echo(), RANGE, FREQUENCY)
