@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import logging
 import math
+import signal
 import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import partial
+from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -381,19 +383,35 @@ def _workers(workers: int, scheduler: str | None) -> Iterator[Client]:
         stack.enter_context(_quiet("distributed"))
         try:
             if scheduler is None:
-                cluster = LocalCluster(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    processes=True,
-                    dashboard_address="127.0.0.1:0",  # none would still take port 8787
-                    silence_logs=logging.CRITICAL,
-                )
+                with _deaf_to_interrupts():
+                    cluster = LocalCluster(
+                        n_workers=workers,
+                        threads_per_worker=1,
+                        processes=True,
+                        dashboard_address="127.0.0.1:0",  # none would still take port 8787
+                        silence_logs=logging.CRITICAL,
+                    )
                 scheduler = stack.enter_context(cluster)
             client = stack.enter_context(Client(scheduler, timeout=CONNECT_SECONDS))
         except (OSError, ValueError, RuntimeError) as error:
             where = scheduler if isinstance(scheduler, str) else f"{workers} local workers"
             raise ResourceError(f"{where} cannot be reached: {error}") from error
         yield client
+
+
+@contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """Keep Ctrl-C from threads and processes that are started in the block, and those of theirs.
+
+    A terminal sends it to all of them; we alone end them, and without a traceback of each.
+    """
+    # Where it is not running yet, its start would let the signal through again.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

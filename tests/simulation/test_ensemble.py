@@ -3,6 +3,7 @@ import hashlib
 import os
 import signal
 import time
+from multiprocessing import resource_tracker
 
 import numpy as np
 import pytest
@@ -246,6 +247,23 @@ def test_a_pose_is_not_blamed_for_its_workers(tmp_path, caplog, times):
         simulate_ensemble(*task, seed=0, workers=2)
         assert {index: values.item() for index, values in found.items()} == {0: 1, 1: -2, 2: 3}
     assert not caplog.records
+
+
+class Deaf:
+    """A simulator that returns whether Ctrl-C goes unheard where it runs."""
+
+    def spectrogram(self, position, rotation, *, seed):
+        blocked = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+        return np.full((1, 1, 1), blocked, dtype=np.float32)
+
+
+def test_ctrl_c_is_for_us_and_not_for_our_workers():
+    resource_tracker._resource_tracker._stop()  # as in a process that has started no other yet
+    found, poses = {}, poses_at([1.0, 0.0, 0.0], [-2.0, 0.0, 0.0])
+    simulate_ensemble(Deaf(), poses, range(2), found.__setitem__, seed=0, workers=2)
+    assert [found[index].item() for index in range(2)] == [1, 1]
+    with pytest.raises(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
 
 
 def poses_at(*positions):
