@@ -328,11 +328,12 @@ def read_pose_csv(path: Path) -> Poses:
         rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except csv.Error as error:
         raise InputError(f"{path}: no CSV table ({error})") from None
-    header = [cell.strip() for cell in rows[0][1]] if rows else []
+    if not rows:
+        raise InputError(f"{path}: is empty; expected the header {','.join(CSV_COLUMNS)} and poses")
+    header = [cell.strip() for cell in rows[0][1]]
     if sorted(header) != sorted(CSV_COLUMNS):
         raise InputError(
-            f"{path}:1: the header is {','.join(header) or 'missing'!r}, "
-            f"expected {','.join(CSV_COLUMNS)}"
+            f"{path}:1: the header is {','.join(header)!r}, expected {','.join(CSV_COLUMNS)}"
         )
     if len(rows) < 2:
         raise InputError(f"{path}: no poses below the header")
