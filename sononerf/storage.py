@@ -370,10 +370,13 @@ def probe_writable(folder: Path) -> list[Path]:
     try:
         commit_bytes(probe, b"sononerf\n" * 512)
         remove_file(probe)
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             probe.unlink(missing_ok=True)
         remove_if_empty(created)
+        # The user asked for the folder, and never heard of the probe.
+        if isinstance(error, StorageError) and isinstance(error.__cause__, OSError):
+            raise storage_error("cannot be written", folder, error.__cause__) from error.__cause__
         raise
     return created
 

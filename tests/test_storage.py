@@ -267,15 +267,19 @@ def test_probe_creates_the_folder_and_leaves_it_empty(tmp_path):
 @pytest.mark.parametrize("number", range(1, 8))
 def test_probe_that_fails_leaves_nothing_behind(tmp_path, monkeypatch, number):
     with failing(monkeypatch, number, errno.EROFS, lasting=True):
-        with pytest.raises(StorageError, match="read-only"):
+        with pytest.raises(StorageError, match=r"^\S*/a/b: cannot be written: .* read-only"):
             storage.probe_writable(tmp_path / "a" / "b")
     assert names(tmp_path) == []
 
 
 def test_probe_below_a_file_is_a_storage_error(tmp_path):
     (tmp_path / "file").write_bytes(b"")
-    with pytest.raises(StorageError, match="part of the path is a file"):
-        storage.probe_writable(tmp_path / "file" / "folder")
+    for folder in (tmp_path / "file" / "folder", tmp_path / "file"):
+        with pytest.raises(StorageError) as caught:
+            storage.probe_writable(folder)
+        assert str(caught.value) == (
+            f"{folder}: cannot be written: a part of the path is a file; choose another folder"
+        )
     assert names(tmp_path) == ["file"]
 
 
