@@ -183,7 +183,8 @@ class EchoModule(lightning.LightningModule):
             name = bad[int((~finite).nonzero()[0])]
             raise NumericalError(
                 f"the gradient of {name} is not finite at step {self.global_step}; "
-                "the last checkpoint is sound; lower fit.learning_rate and start anew"
+                "the last checkpoint is sound; lower fit.learning_rate and start anew with "
+                "--overwrite"
             )
 
     def validation_step(self, batch: RangeSlices, batch_index: int) -> None:
