@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -64,6 +65,11 @@ def load_fitted(path: Path) -> Fitted:
         raise InputError(f"{path}: incomplete ({error}); repeat the fit") from None
     except SettingsError as error:
         raise IncompatibleError(f"settings of another version: {error}") from None
+    if not 0.0 < reference < math.inf:  # JSON as Python reads it knows NaN
+        raise InputError(
+            f"{path / DESCRIPTION_NAME}: reference is {reference}, expected a finite number above "
+            "0; fetch the run again, or repeat the fit with --overwrite"
+        )
     field, renderer = field_and_renderer(settings, region)
     module = module_for(settings, field, renderer, reference=reference)
     for part, prefix in ((field, "field."), (renderer, "renderer.")):
