@@ -345,9 +345,12 @@ def compare(
         run_a, run_b, output=output, accelerator=accelerator.value, progress=Progress()
     )
     found = storage.read_json(folder / "comparison.json")
-    place = ", ".join(f"{1e3 * x:.1f}" for x in found["strongest_m"])
-    away = _optional(found, "distance_m", "; {:.4f} m from the middle of what was added")
-    _print(f"strongest difference at ({place}) mm, {found['score']:.2f} of the maximum{away}")
+    if found["strongest_m"] is None:
+        _print(f"nothing is stronger in {run_a} than in {run_b}")
+    else:
+        place = ", ".join(f"{1e3 * x:.1f}" for x in found["strongest_m"])
+        away = _optional(found, "distance_m", "; {:.4f} m from the middle of what was added")
+        _print(f"strongest difference at ({place}) mm, {found['score']:.2f} of the maximum{away}")
     _print(f"wrote {folder}")
 
 

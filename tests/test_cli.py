@@ -30,6 +30,7 @@ from sononerf.callbacks import preview, spectrogram_images
 from sononerf.experiment import finish as finish_module
 from sononerf.experiment import reconstruct as reconstruct_module
 from sononerf.reconstruction import baseline
+from sononerf.weights import load_weights, save_weights
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 SMOKE = str(CONFIGS / "smoke.yaml")
@@ -285,11 +286,19 @@ def test_reconstruct_with_spacing_and_level(at_home, tmp_path):
 
 
 def test_two_runs_are_compared(at_home, tmp_path):
+    state, description = load_weights(at_home.run)
+    state["renderer.log_gain"] -= 0.5
+    (tmp_path / "quiet").mkdir()
+    save_weights(tmp_path / "quiet", state, description)
     before = tree(at_home.run)
-    said = done("compare", "runs/smoke", "runs/smoke", "--output", tmp_path / "c").err
+    output = ("--output", tmp_path / "c", "--accelerator", "cpu")
+    said = done("compare", "runs/smoke", tmp_path / "quiet", *output).err
     assert f"wrote {tmp_path / 'c'}" in said
     assert "strongest difference at (" in said
-    assert json.loads((tmp_path / "c" / "comparison.json").read_text())["score"] == 0
+    said = done("compare", tmp_path / "quiet", "runs/smoke", *output).err
+    assert f"nothing is stronger in {tmp_path / 'quiet'} than in runs/smoke" in said
+    assert "strongest" not in said
+    assert "are the same run" in refused(2, "compare", "runs/smoke", "runs/smoke", *output)
     assert tree(at_home.run) == before
 
 

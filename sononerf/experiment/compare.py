@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sononerf import storage
 from sononerf.acoustics.spectrogram import compress
 from sononerf.data.range_slices import WholePoses
-from sononerf.errors import IncompatibleError
+from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.experiment.build import acquisition
 from sononerf.experiment.fitted import Fitted, load_fitted, render_poses
 from sononerf.experiment.reconstruct import true_mesh
@@ -71,6 +71,8 @@ def compare_runs(
     ------
     InputError
         If one is no fitted run.
+    SettingsError
+        If both are the same folder.
     IncompatibleError
         If the two hear differently.
     NumericalError
@@ -78,6 +80,11 @@ def compare_runs(
     """
     progress = progress or Progress(quiet=True)
     runs = [load_fitted(path) for path in (first, second)]
+    if first.resolve() == second.resolve():
+        raise SettingsError(
+            f"{first} and {second} are the same run; give as the second a run without what is "
+            "looked for"
+        )
     differing = [
         key
         for key in differing_keys(*(run.settings for run in runs))
@@ -104,7 +111,10 @@ def compare_runs(
         storage.commit_bytes(folder / f"mip_{axis}.png", picture)
     if surfaces[0] is not None:
         storage.commit_bytes(folder / "overlay.png", overlay_png(surfaces[0], found))
-    distance = None if truth is None else float(np.linalg.norm(found.strongest - truth))
+    place = found.strongest
+    distance: float | None = None
+    if place is not None and truth is not None:
+        distance = float(np.linalg.norm(place - truth))
     storage.commit_json(
         folder / "comparison.json",
         {
@@ -112,7 +122,7 @@ def compare_runs(
             "second": names[1],
             "poses": len(poses.positions),
             "score": found.score,
-            "strongest_m": found.strongest.tolist(),
+            "strongest_m": None if place is None else place.tolist(),
             "added_m": None if truth is None else truth.tolist(),
             "distance_m": distance,
         },

@@ -28,16 +28,16 @@ class Comparison:
         0 to 1, on one grid.
     difference : Volume
         First without second.
-    strongest : (3,) float, m
-        Where the difference is greatest.
+    strongest : (3,) float or None, m
+        Where the difference is greatest; None where it is nowhere above zero.
     score : float
-        How great it is there: part of the common maximum.
+        How great it is at most: part of the common maximum.
     """
 
     first: Volume
     second: Volume
     difference: Volume
-    strongest: Array
+    strongest: Array | None
     score: float
 
 
@@ -69,8 +69,10 @@ def compare(first: Volume, second: Volume) -> Comparison:
     one, other = (volume.with_values(volume.values / most) for volume in (first, second))
     difference = first.with_values(one.values - other.values)
     index = np.unravel_index(int(difference.values.argmax()), difference.shape)
-    strongest = difference.origin + difference.spacing * np.array(index)
-    return Comparison(one, other, difference, strongest, float(difference.values[index]))
+    score = float(difference.values[index])
+    # Where nothing is stronger the greatest value lies anywhere, often in a corner.
+    strongest = difference.origin + difference.spacing * np.array(index) if score > 0 else None
+    return Comparison(one, other, difference, strongest, score)
 
 
 def added_part(mesh: trimesh.Trimesh, without: trimesh.Trimesh) -> trimesh.Trimesh | None:

@@ -27,7 +27,7 @@ def difference_pngs(
     Parameters
     ----------
     comparison : Comparison
-        What to draw; a ring marks the strongest difference.
+        What to draw; a ring marks the strongest difference, where there is one.
     titles : (str, str)
         Names of the two.
     truth : (3,) float, m, optional
@@ -68,14 +68,16 @@ def difference_pngs(
                     label = "level over the common maximum" if number == 1 else "first − second"
                     drawn.colorbar(picture, ax=panel, label=label, pad=0.02)
             panels[0].set_ylabel(f"{'xyz'[up]} (mm)")
-            place = 1e3 * comparison.strongest
-            panels[2].plot(
-                place[across], place[up], "o", mfc="none", mec="black", ms=14, label="strongest"
-            )
+            if comparison.strongest is not None:
+                place = 1e3 * comparison.strongest
+                panels[2].plot(
+                    place[across], place[up], "o", mfc="none", mec="black", ms=14, label="strongest"
+                )
             if truth is not None:
                 real = 1e3 * np.asarray(truth)
                 panels[2].plot(real[across], real[up], "k+", ms=10, label="true")
-            panels[2].legend(loc="best", fontsize=7)
+            if panels[2].get_legend_handles_labels()[1]:
+                panels[2].legend(loc="best", fontsize=7)
             pictures[name] = png_from_pixels(pixels_from_figure(drawn))
     return pictures
 

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from sononerf.config import validate_settings
-from sononerf.errors import IncompatibleError, InputError
+from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.experiment.compare import compare_runs
 from sononerf.weights import load_weights, save_weights
 
@@ -46,13 +46,15 @@ def numbers(folder):
     return json.loads((folder / "comparison.json").read_text())
 
 
-def test_a_run_does_not_differ_from_itself(run):
+def test_a_run_does_not_differ_from_its_copy(run):
     one = run("one")
-    folder = compare_runs(one, run("same"), accelerator="cpu")
+    # What is true of their scenes makes no difference to what is heard.
+    folder = compare_runs(one, run("same", scene={"options": {"radius": 0.01}}), accelerator="cpu")
     assert folder == one / "compare-same"
     found = numbers(folder)
     assert found["score"] == 0
-    assert found["added_m"] is found["distance_m"] is None
+    assert found["strongest_m"] is found["distance_m"] is None
+    assert found["added_m"] is not None
     assert (found["first"], found["second"]) == ("one", "same")
     assert found["poses"] == 8  # that both were trained on, once
 
@@ -78,13 +80,24 @@ def test_what_only_the_first_hears_is_found(run, tmp_path):
 
 def test_poses_of_both_runs_are_listened_from(run):
     other = run("other", poses={"seed": 5})
-    assert numbers(compare_runs(run("one"), other, accelerator="cpu"))["poses"] == 16
+    found = numbers(compare_runs(run("one"), other, accelerator="cpu"))
+    assert found["poses"] == 16
+    assert found["added_m"] is found["distance_m"] is None  # the scenes are alike
 
 
 def test_runs_that_hear_differently_are_refused(run, tmp_path):
     other = run("other", air={"relative_humidity": 0.2})
     with pytest.raises(IncompatibleError, match=r"hear differently \(air\.relative_h") as caught:
         compare_runs(run("one"), other, output=tmp_path / "out", accelerator="cpu")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_same_run_twice_is_refused(run, tmp_path):
+    one = run("one")
+    (tmp_path / "link").symlink_to(one)
+    with pytest.raises(SettingsError, match=r"one and \S*link are the same run; give as") as caught:
+        compare_runs(one, tmp_path / "link", output=tmp_path / "out", accelerator="cpu")
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
 

@@ -41,7 +41,14 @@ def test_equal_fields_do_not_differ():
     one = GRID.with_values(bump([0, 0, 0]))
     found = compare(one, one)
     assert found.score == 0
+    assert found.strongest is None
     assert (found.difference.values == 0).all()
+
+
+def test_what_is_weaker_everywhere_is_strongest_nowhere():
+    found = compare(GRID.with_values(bump([0, 0, 0])), GRID.with_values(bump([0, 0, 0]) + 1.0))
+    assert found.score < 0
+    assert found.strongest is None
 
 
 def test_what_cannot_be_compared():

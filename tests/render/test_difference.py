@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: MIT
+import dataclasses
 import io
 
 import numpy as np
@@ -55,6 +56,16 @@ def test_where_something_was_truly_added_is_marked(comparison):
     without = difference_pngs(comparison, ("with", "without"))
     marked = difference_pngs(comparison, ("with", "without"), truth=LESS)
     assert all(marked[name] != without[name] for name in "xyz")
+
+
+def test_where_nothing_is_stronger_there_is_no_ring(comparison, recwarn):
+    none = dataclasses.replace(comparison, strongest=None)
+    ringed = difference_pngs(comparison, ("with", "without"))
+    plain = difference_pngs(none, ("with", "without"))
+    assert all(plain[name] != ringed[name] for name in "xyz")
+    marked = difference_pngs(none, ("with", "without"), truth=LESS)
+    assert all(marked[name] != plain[name] for name in "xyz")
+    assert not recwarn  # of a legend of nothing
 
 
 def test_a_surface_is_red_where_the_first_has_more_and_grey_where_neither(comparison, monkeypatch):
