@@ -29,6 +29,7 @@ PLUGIN_NAMES = (("scene", "name"), ("field", "kind"), ("renderer", "kind"))
 Vector = tuple[float, float, float]
 Name = Annotated[str, Field(min_length=1)]
 Positive = Annotated[float, Field(gt=0)]
+Spacing = Annotated[float, Field(gt=0, le=0.1)]  # m; more were millimetres taken for metres
 Level = Annotated[float, Field(ge=0)]
 Decibels = Annotated[float, Field(ge=-100, le=200)]
 Count = Annotated[int, Field(ge=1)]
@@ -266,7 +267,7 @@ class PredictionSettings(_Section):
 class ReconstructionSettings(_Section):
     """The read-out of the finished field."""
 
-    spacing: Positive | None = None  # from the field's own resolution where it is not set
+    spacing: Spacing | None = None  # from the field's own resolution where it is not set
     level: Annotated[float, Field(ge=0)] | Literal["auto"] = "auto"
     method: Literal["auto", "oriented", "isosurface"] = "auto"
     directions: Annotated[int, Field(ge=6)] = 100

@@ -99,6 +99,10 @@ def test_settings_do_not_change(write):
         ("poses.radius=-1", ["poses.radius: found -1"]),
         ("scene.name=", ["scene.name: found None"]),
         ("reconstruction.level=high", ["reconstruction.level: found 'high'"]),
+        (
+            "reconstruction.spacing=2",
+            ["reconstruction.spacing: found 2", "less than or equal to 0.1"],
+        ),
         ("fit.batch_frequencies=some", ["fit.batch_frequencies: found 'some'"]),
         ("spectrogram.range_min=2", ["spectrogram: range_min must lie below range_max"]),
         ("spectrogram.fft=32", ["spectrogram: fft must be at least window"]),

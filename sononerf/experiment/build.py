@@ -145,7 +145,7 @@ def field_and_renderer(settings: Settings, region: Tensor) -> tuple[Field, Rende
     Raises
     ------
     SettingsError
-        If a kind or an option is not known.
+        If a kind or an option is not known, or options do not go together.
     InputError
         If a plugin returns something else.
     """
@@ -159,9 +159,9 @@ def field_and_renderer(settings: Settings, region: Tensor) -> tuple[Field, Rende
         renderer_options = plugins.check_options(
             make_renderer, settings.renderer.options, where="renderer.options", given=2
         )
-    torch.manual_seed(settings.fit.seed)
-    field = make_field(region, known.frequency, **field_options)
-    renderer = make_renderer(region, known, **renderer_options)
+        torch.manual_seed(settings.fit.seed)
+        field = make_field(region, known.frequency, **field_options)
+        renderer = make_renderer(region, known, **renderer_options)
     for made, kind, name in (
         (field, Field, settings.field.kind),
         (renderer, Renderer, settings.renderer.kind),

@@ -12,6 +12,7 @@ import torch.nn.functional as F
 from pydantic import Field as Option
 from torch import Tensor, nn
 
+from sononerf.errors import SettingsError
 from sononerf.field.correction import Correction
 from sononerf.field.lobe import CODE, LobeField
 
@@ -132,6 +133,11 @@ class GridField(LobeField):
         Width of the hidden layers of a network that corrects what places answer; 0 for none.
         Only :meth:`select` and :meth:`echo` hear it: which places are audible, and their energy
         and axis, go by the lobe alone.
+
+    Raises
+    ------
+    SettingsError
+        If ``finest`` lies above ``coarsest`` where they are needed.
     """
 
     origin: Tensor
@@ -141,10 +147,10 @@ class GridField(LobeField):
         region: Tensor,
         frequency: Tensor,
         *,
-        spacing: Annotated[float, Option(gt=0)] | None = None,
+        spacing: Annotated[float, Option(gt=0, le=0.1)] | None = None,
         vertices: Annotated[int, Option(ge=8)] = 1_000_000,
-        finest: Annotated[float, Option(gt=0)] = 0.004,
-        coarsest: Annotated[float, Option(gt=0)] = 0.02,
+        finest: Annotated[float, Option(gt=0, le=0.1)] = 0.004,
+        coarsest: Annotated[float, Option(gt=0, le=0.1)] = 0.02,
         levels: Annotated[int, Option(ge=1, le=8)] = 3,
         rank: Annotated[int, Option(ge=0, le=64)] = 0,
         correction: Annotated[int, Option(ge=0, le=256)] = 0,
@@ -152,6 +158,11 @@ class GridField(LobeField):
         super().__init__(region, frequency, rank)
         extent = (region[1] - region[0]).double()
         if spacing is None:
+            if finest > coarsest:
+                raise SettingsError(
+                    f"field.options.finest: found {finest:g}; must not lie above coarsest, "
+                    f"{coarsest:g}"
+                )
             spacing = float((extent.prod() / vertices) ** (1 / 3))
             spacing = min(max(spacing, finest), coarsest)
         self.spacing = spacing

@@ -86,7 +86,7 @@ class HashField(LobeField):
         region: Tensor,
         frequency: Tensor,
         *,
-        finest: Annotated[float, Option(gt=0)] = 0.002,
+        finest: Annotated[float, Option(gt=0, le=0.1)] = 0.002,
         growth: Annotated[float, Option(ge=1.1, le=4)] = 2.0,
         levels: Annotated[int, Option(ge=1, le=24)] = 5,
         features: Annotated[int, Option(ge=1, le=16)] = 4,

@@ -189,10 +189,22 @@ def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):
         ({"renderer": {"kind": "shel", "options": {}}}, "unknown renderer 'shel'"),
         ({"field": {"options": {"level": 2}}}, r"field\.options\.level: .*did you mean levels"),
         ({"renderer": {"options": {"points": 0}}}, r"renderer\.options\.points: found 0"),
+        # As of one who thinks in millimetres.
+        ({"field": {"options": {"spacing": 4}}}, r"field\.options\.spacing: found 4; .*0\.1"),
+        ({"field": {"options": {"finest": 4}}}, r"field\.options\.finest: found 4; .*0\.1"),
+        ({"field": {"options": {"coarsest": 20}}}, r"field\.options\.coarsest: found 20; .*0\.1"),
+        (
+            {"field": {"kind": "hash", "options": {"finest": 2}}},
+            r"field\.options\.finest: found 2; .*0\.1",
+        ),
+        (
+            {"field": {"options": {"finest": 0.03}}},
+            r"field\.options\.finest: found 0\.03; must not lie above coarsest, 0\.02$",
+        ),
     ],
 )
 def test_wrong_kinds_and_options_are_refused(tiny, changes, message):
-    with pytest.raises(SettingsError, match=message):
+    with pytest.raises(SettingsError, match=f"^tiny: {message}"):
         check_plugins(tiny(**changes))
 
 

@@ -2,6 +2,7 @@
 import pytest
 import torch
 
+from sononerf.errors import SettingsError
 from sononerf.field.field import sphere_directions
 from sononerf.renderer.profile import lattice_over
 from tests.field.lobes import REGION, fill, grid, places_in
@@ -125,6 +126,11 @@ def test_the_spacing_is_found_from_the_number_of_vertices():
     assert grid(region, vertices=8000, **options).resolution == pytest.approx(0.02)
     assert grid(region, vertices=8000, **options | {"finest": 0.03}).resolution == 0.03
     assert grid(region, vertices=8000, **options | {"coarsest": 0.01}).resolution == 0.01
+    assert grid(region, **options | {"finest": 0.03, "coarsest": 0.03}).resolution == 0.03
+    crossed = {"finest": 0.03, "coarsest": 0.02}
+    with pytest.raises(SettingsError, match="coarsest"):
+        grid(region, **options | crossed)
+    assert grid(region, **crossed | {"spacing": 0.1}).resolution == 0.1  # which needs no bounds
 
 
 @pytest.mark.parametrize("bins", [None, torch.tensor([2, 0])])
