@@ -18,8 +18,11 @@ from sononerf.progress import Progress
 
 def is_finished(path: Path) -> bool:
     """Tell whether a run has all that follows its fit."""
-    # The baselines are what is written last; runs of before there were traced echoes lack them.
-    return "baseline" in RunFolder(path).read_metrics() and (path / RETRACE_NAME).is_file()
+    # The baselines are what is written last, but another mesh takes the numbers of its geometry
+    # away; runs of before there were traced echoes lack these.
+    has_numbers = {"geometry", "baseline"} <= RunFolder(path).read_metrics().keys()
+    files = path / RETRACE_NAME, path / "reconstruction" / "mesh.ply"
+    return has_numbers and all(file.is_file() for file in files)
 
 
 def finish(

@@ -87,6 +87,8 @@ def reconstruct(
                 directions=options.directions,
                 progress=lambda done, total: task.advance(1000 * done // total - task.done),
             )
+        if folder.resolve() == (path / "reconstruction").resolve():
+            RunFolder(path).drop_metrics("geometry")  # of the mesh that is replaced
         _write(folder, found, true_mesh(fitted))
     if found.openness is not None and found.openness.kind in OPEN:
         progress.say(OPEN[found.openness.kind].format(found.openness))

@@ -184,6 +184,13 @@ class RunFolder:
             values = {**(metrics.get(section) or {}), **(values or {})}
         storage.commit_json(self.metrics, {**metrics, "schema": METRICS_SCHEMA, section: values})
 
+    def drop_metrics(self, section: str) -> None:
+        """Take one section out of ``metrics.json``, where it is there."""
+        metrics = self.read_metrics()
+        if section in metrics:
+            del metrics[section]
+            storage.commit_json(self.metrics, metrics)
+
     def write_provenance(self, **facts: Any) -> None:
         """Record what the run was made with; no names of people, machines or folders."""
         storage.commit_json(

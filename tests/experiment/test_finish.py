@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 
 import pytest
@@ -93,12 +92,24 @@ def test_a_surface_that_cannot_be_traced_is_told_and_no_fault(run, steps, monkey
     assert steps == [("predict", "cpu"), "evaluate"]
 
 
-def test_a_run_is_finished_when_both_that_come_last_are_there(run):
+def test_a_run_is_finished_when_its_mesh_and_all_that_comes_of_it_are_there(run):
     assert not is_finished(run)
-    RunFolder(run).write_metrics("baseline", {})
-    assert "baseline" in json.loads((run / "metrics.json").read_text())
+    numbers = RunFolder(run)
+    mesh = run / "reconstruction" / "mesh.ply"
+    mesh.parent.mkdir()
+    mesh.touch()
+    numbers.write_metrics("geometry", None)  # of a scene that is not installed here
+    numbers.write_metrics("baseline", {})
     assert not is_finished(run)  # as a run of before echoes were traced
     (run / NAME).touch()
     assert is_finished(run)
+    mesh.unlink()
+    assert not is_finished(run)
+    mesh.touch()
+    for section in ("geometry", "baseline"):
+        numbers.drop_metrics(section)
+        assert not is_finished(run)
+        numbers.write_metrics(section, {})
+        assert is_finished(run)
     (run / "metrics.json").unlink()
     assert not is_finished(run)

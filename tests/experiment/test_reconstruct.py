@@ -182,6 +182,24 @@ def test_what_is_evaluated(run, few_samples):
         assert metrics["baseline"][name].keys() == GEOMETRY, name
 
 
+def test_another_mesh_takes_the_numbers_of_the_last_one_away(
+    run, tmp_path, few_samples, no_projections
+):
+    first = evaluate(run)
+    reconstruct(run, spacing=0.02, output=tmp_path / "aside")
+    with pytest.raises(NumericalError):
+        reconstruct(run, level=1e9)
+    assert json.loads((run / "metrics.json").read_text()) == first
+    for output in (None, run / "reconstruction"):
+        reconstruct(run, spacing=0.02, output=output)
+        left = json.loads((run / "metrics.json").read_text())
+        assert left.keys() == first.keys() - {"geometry"}
+        assert left["baseline"] == first["baseline"]  # which know no mesh
+        again = evaluate(run)
+        assert again.keys() == first.keys()
+        assert again["geometry"]["chamfer_m"] != first["geometry"]["chamfer_m"]
+
+
 def test_a_scene_that_is_not_installed_has_no_truth(run, few_samples):
     description = json.loads((run / "model.json").read_text())
     description["settings"]["scene"] = {"name": "theirs", "options": {}}
