@@ -10,7 +10,7 @@ import trimesh
 from pydantic import Field
 
 from sononerf.errors import InputError, SettingsError
-from sononerf.scene import MATERIALS, MaterialName, Scene, check_surface
+from sononerf.scene import MATERIALS, MaterialName, Scene, SurfaceSizeError, check_surface
 
 from .mesh_file import IN_METRES, kind_of, read_parts, stacked
 
@@ -78,6 +78,13 @@ def mesh(
     try:
         # Before vertices are merged: that would drop those that are no numbers without a word.
         check_surface(trimesh.Trimesh(vertices, faces, process=False, validate=False))
+    except SurfaceSizeError as error:
+        hint = (
+            "millimetres taken for metres? set the unit to mm"
+            if error.is_too_large
+            else "metres taken for millimetres? set the unit to m"
+        )
+        raise InputError(f"{path}: {error}; {hint}") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     if centre:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sononerf import plugins
 from sononerf.config import faults_of
-from sononerf.errors import InputError, SonoNerfError
+from sononerf.errors import InputError, SettingsError, SonoNerfError
 from sononerf.geometry.faults import surface_faults
 from sononerf.material import MATERIALS, RIGID, Material, MaterialName
 
@@ -23,6 +23,7 @@ __all__ = [
     "Material",
     "MaterialName",
     "Scene",
+    "SurfaceSizeError",
     "check_surface",
     "list_scenes",
     "load_scene",
@@ -33,6 +34,20 @@ logger = logging.getLogger("sononerf")
 LARGEST = 100.0  # m
 SMALLEST = 1e-3  # m
 LARGE, SMALL = 5.0, 5e-3  # m, beyond which a mistaken unit is likelier than such a scene
+
+
+class SurfaceSizeError(InputError):
+    """A surface far larger or smaller than any scene.
+
+    Parameters
+    ----------
+    size : float, m
+        Along its longest side.
+    """
+
+    def __init__(self, size: float) -> None:
+        super().__init__(f"the mesh is {size:.3g} m large, expected {SMALLEST:g} to {LARGEST:g} m")
+        self.is_too_large = size > LARGEST
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +70,9 @@ class Scene:
     ValueError
         If materials, parts or background do not fit, or if nothing is left to be the target.
     InputError
-        If the mesh has no triangles, a vertex that is no finite number, an index to no vertex,
-        or a size that says its unit was mistaken.
+        If the mesh has no triangles, a vertex that is no finite number, or an index to no vertex.
+    SurfaceSizeError
+        If it is far too large or too small.
     """
 
     mesh: trimesh.Trimesh
@@ -124,7 +140,7 @@ def check_surface(mesh: trimesh.Trimesh) -> None:
 
     Raises
     ------
-    InputError
+    InputError, SurfaceSizeError
         As :class:`Scene` says.
     """
     faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices)
@@ -137,14 +153,7 @@ def check_surface(mesh: trimesh.Trimesh) -> None:
         raise InputError(f"vertex {bad[0]} of the mesh is {vertices[bad[0]]}; mend the mesh")
     size = _size(mesh)
     if not SMALLEST <= size <= LARGEST:
-        hint = (
-            "millimetres taken for metres? set the unit to mm"
-            if size > LARGEST
-            else "metres taken for millimetres? set the unit to m"
-        )
-        raise InputError(
-            f"the mesh is {size:.3g} m large, expected {SMALLEST:g} to {LARGEST:g} m; {hint}"
-        )
+        raise SurfaceSizeError(size)
 
 
 def _size(mesh: trimesh.Trimesh) -> float:
@@ -196,7 +205,8 @@ def load_scene(
     Raises
     ------
     SettingsError
-        If the name is unknown or claimed twice, or an option is not allowed.
+        If the name is unknown or claimed twice, an option is not allowed, or options make a
+        surface that is far too large or too small.
     InputError
         If the plugin cannot be imported, fails, or returns no scene.
     """
@@ -208,7 +218,12 @@ def load_scene(
             arguments = plugins.check_options(factory, options or {}, where="scene.options")
         except InputError as error:
             raise InputError(f"{owner}: {error}") from None
-        return _built(owner, factory, arguments)
+        try:
+            return _built(owner, factory, arguments)
+        except SurfaceSizeError as error:
+            if options:
+                raise SettingsError(f"scene.options: {error}") from None
+            raise InputError(f"{owner}: {error}") from None
 
 
 def _built(owner: str, factory: Callable[..., Any], arguments: dict[str, Any]) -> Scene:

@@ -9,7 +9,7 @@ import trimesh
 from sononerf import plugins
 from sononerf.errors import InputError, SettingsError
 from sononerf.material import LEAF, MATERIALS, RIGID, Material
-from sononerf.scene import Scene, list_scenes, load_scene
+from sononerf.scene import Scene, SurfaceSizeError, list_scenes, load_scene
 
 
 def box(size=0.1):
@@ -40,10 +40,13 @@ def test_a_triangle_that_names_no_vertex_is_refused():
         Scene(mesh)
 
 
-@pytest.mark.parametrize(("size", "unit"), [(101.0, "mm"), (0.9e-3, "m")])
-def test_sizes_that_speak_of_another_unit_are_refused(size, unit):
-    with pytest.raises(InputError, match=f"set the unit to {unit}$"):
+@pytest.mark.parametrize(("size", "said"), [(101.0, "101"), (0.9e-3, "0.0009")])
+def test_sizes_beyond_any_scene_are_refused(size, said):
+    # What is to be done about it only those know who made the mesh.
+    message = f"^the mesh is {said} m large, expected 0.001 to 100 m$"
+    with pytest.raises(SurfaceSizeError, match=message) as caught:
         Scene(box(size))
+    assert caught.value.is_too_large == (size > 1)
 
 
 @pytest.mark.parametrize("size", [99.0, 1.1e-3])
@@ -176,10 +179,26 @@ def test_faults_of_options_name_the_file_that_sets_them():
         ("sphere", {"radius": -1.0, "radios": 1.0}),  # found before the factory is called
         ("torus", {"major_radius": 0.01, "minor_radius": 0.02}),  # found by the factory
         ("spher", {}),
+        ("sphere", {"radius": 100}),  # found by what checks every scene
     ]:
         with pytest.raises(SettingsError) as caught:
             load_scene(name, options, source="mine.yaml")
         assert all(line.startswith("mine.yaml: ") for line in str(caught.value).splitlines())
+
+
+def test_a_size_is_blamed_on_options_where_there_are_some(monkeypatch):
+    with pytest.raises(SettingsError, match=r"^scene\.options: the mesh is 200 m large, expected"):
+        load_scene("sphere", {"radius": 100})
+    ball = {"scene": "sphere", "options": {"radius": 100}}
+    nested = r"^mine: scene\.options\.parts\.0\.options: the mesh is 200 m large"
+    with pytest.raises(SettingsError, match=nested):
+        load_scene("composed", {"parts": [ball]}, source="mine")
+    apart = [{"scene": "sphere", "position": [place, 0, 0]} for place in (-90, 90)]
+    with pytest.raises(SettingsError, match=r"^mine: scene\.options: the mesh is 180 m large"):
+        load_scene("composed", {"parts": apart}, source="mine")
+    monkeypatch.setattr(plugins, "load", lambda group, name: lambda: Scene(box(200)))
+    with pytest.raises(InputError, match=r"^scene 'sphere' of sononerf [\d.]+: the mesh is 200 m"):
+        load_scene("sphere")
 
 
 def unreadable(size: "NoSuchType" = 1):  # noqa: F821

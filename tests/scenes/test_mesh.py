@@ -199,6 +199,8 @@ def test_a_sphere_in_millimetres_taken_for_metres_is_refused(tmp_path):
     trimesh.creation.icosphere(radius=120.0).export(tmp_path / "a.stl")
     with pytest.raises(InputError, match=r"a\.stl: the mesh is 240 m large.*set the unit to mm"):
         load(tmp_path / "a.stl", unit="m")
+    with pytest.raises(InputError, match=r"a\.stl: the mesh is 0\.00024 m .*set the unit to m$"):
+        load(tmp_path / "a.stl", unit="mm", scale=1e-3)
 
 
 def test_seams_between_patches_are_closed(tmp_path, caplog):
