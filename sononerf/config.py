@@ -269,7 +269,7 @@ class ReconstructionSettings(_Section):
 
     spacing: Spacing | None = None  # from the field's own resolution where it is not set
     level: Annotated[float, Field(ge=0)] | Literal["auto"] = "auto"
-    method: Literal["auto", "oriented", "isosurface"] = "auto"
+    method: Literal["auto", "oriented", "hull", "isosurface"] = "auto"
     directions: Annotated[int, Field(ge=6)] = 100
 
 

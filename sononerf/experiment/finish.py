@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from sononerf.errors import NumericalError
+from sononerf.experiment.borne_out import NAME as RETRACE_NAME
 from sononerf.experiment.fitted import load_fitted
 from sononerf.experiment.predict import predict
 from sononerf.experiment.reconstruct import evaluate, reconstruct
-from sononerf.experiment.retrace import NAME as RETRACE_NAME
 from sononerf.experiment.retrace import learn_retrace
 from sononerf.experiment.run_folder import RunFolder
 from sononerf.progress import Progress
@@ -51,12 +51,14 @@ def finish(
     """
     progress = progress or Progress(quiet=True)
     no_surface: NumericalError | None = None
+    options = load_fitted(path).settings
     try:
-        reconstruct(path, progress=progress)
+        # By the field alone; what its poses bear out is found next.
+        reconstruct(path, method=options.reconstruction.method, progress=progress)
         learn_retrace(path, accelerator=accelerator, progress=progress)
     except NumericalError as error:
         no_surface = error
-    if load_fitted(path).settings.poses.heldout:
+    if options.poses.heldout:
         predict(path, accelerator=accelerator, progress=progress)
     if no_surface is not None:
         raise no_surface

@@ -16,6 +16,7 @@ from sononerf.acoustics.spectrogram import compress
 from sononerf.data.range_slices import WholePoses
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError
+from sononerf.experiment.borne_out import NAME as RETRACE_NAME
 from sononerf.experiment.fitted import (
     Fitted,
     Split,
@@ -24,7 +25,6 @@ from sononerf.experiment.fitted import (
     render_poses,
     store_of,
 )
-from sononerf.experiment.retrace import NAME as RETRACE_NAME
 from sononerf.experiment.retrace import load_retrace, trace_poses
 from sononerf.experiment.run_folder import RunFolder, results_folder
 from sononerf.geometry.poses import Poses, read_pose_csv

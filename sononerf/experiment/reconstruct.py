@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from sononerf import storage
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, NumericalError, SonoNerfError
+from sononerf.experiment.borne_out import borne_out
 from sononerf.experiment.build import acquisition
 from sononerf.experiment.fitted import Fitted, load_fitted, store_of
 from sononerf.experiment.run_folder import RunFolder, results_folder
@@ -39,6 +40,7 @@ OPEN = {
     "is left out",
 }
 """What is said of surfaces that are no body's skin."""
+Method = Literal["auto", "oriented", "hull", "isosurface"]
 FORMATS: tuple[MeshFormat, ...] = ("ply", "stl", "glb")
 BASELINE_VOXELS = 64
 """Along the region's longest side; finer than the window's length in any scene of ours."""
@@ -49,6 +51,7 @@ def reconstruct(
     *,
     spacing: float | None = None,
     level: float | Literal["auto"] | None = None,
+    method: Method | None = None,
     output: Path | None = None,
     progress: Progress | None = None,
 ) -> Path:
@@ -62,6 +65,9 @@ def reconstruct(
         Voxel size; the settings' where None.
     level : float, "auto" or None
         Level of the surface; the settings' where None.
+    method : {"auto", "oriented", "hull", "isosurface"} or None
+        How the surface is found; where None the settings', and where these say ``auto`` what bore
+        out the run's validation poses, see :func:`sononerf.experiment.retrace.learn_retrace`.
     output : Path or None
         Folder of the results; ``RUN/reconstruction`` where None.
     progress : Progress or None
@@ -76,6 +82,8 @@ def reconstruct(
     fitted = load_fitted(path)
     folder = output or path / "reconstruction"
     options = fitted.settings.reconstruction
+    if method is None:
+        method = options.method if options.method != "auto" else borne_out(path)
     with results_folder(folder):
         with progress.task("reconstructing", 1000) as task, torch.inference_mode():
             found = read_out(
@@ -83,7 +91,7 @@ def reconstruct(
                 hull=fitted.hull,
                 spacing=spacing or options.spacing,
                 level=options.level if level is None else level,
-                method=options.method,
+                method=method,
                 directions=options.directions,
                 progress=lambda done, total: task.advance(1000 * done // total - task.done),
             )

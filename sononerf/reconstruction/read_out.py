@@ -61,7 +61,7 @@ class Reconstruction:
     mesh: trimesh.Trimesh
     volume: Volume
     level: float
-    method: Literal["oriented", "isosurface"]
+    method: Literal["oriented", "hull", "isosurface"]
     glints: Glints | None = None
     openness: Openness | None = None
 
@@ -72,7 +72,7 @@ def reconstruct(
     hull: EchoHull | None = None,
     spacing: float | None = None,
     level: float | Literal["auto"] = "auto",
-    method: Literal["auto", "oriented", "isosurface"] = "auto",
+    method: Literal["auto", "oriented", "hull", "isosurface"] = "auto",
     directions: int = 100,
     progress: Callable[[int, int], None] | None = None,
 ) -> Reconstruction:
@@ -90,8 +90,9 @@ def reconstruct(
         Voxel size; half of the field's own resolution where None.
     level : float or "auto"
         Value of the volume, or of the oriented indicator, on the surface.
-    method : {"auto", "oriented", "isosurface"}
-        ``auto`` is the oriented surface where the field knows directions.
+    method : {"auto", "oriented", "hull", "isosurface"}
+        ``auto`` is the oriented surface where the field knows directions. ``hull`` is what the
+        first echoes leave, whatever the field says: exact for a body without hollows.
     directions : int
         Size of the spherical lattice that is summed over where the field has no lobes.
     progress : callable, optional
@@ -104,7 +105,7 @@ def reconstruct(
     Raises
     ------
     SettingsError
-        If the spacing is larger than the region.
+        If the spacing is larger than the region, or ``hull`` is asked for without one.
     NumericalError
         If the field is silent everywhere, or there is no surface at the level.
     ResourceError
@@ -119,17 +120,23 @@ def reconstruct(
         )
     if method == "auto":
         method = "oriented" if field.knows_directions else "isosurface"
+    if method == "hull" and hull is None:
+        raise SettingsError("method hull: it is not known where the field was heard from")
     volume = volume_from_function(
         _loudness(field, directions, method), lower, upper, step, chunk=CHUNK, progress=progress
     )
     if not float(volume.values.max()) > 0:
         raise NumericalError("no surface: the field is silent everywhere")
-    if method == "oriented":
+    if method != "isosurface":
         places, energy, axis = _places(field, lower, upper, directions)
         if hull is not None:
             sources = torch.as_tensor(hull.sources, dtype=places.dtype, device=places.device)
             glints = find_glints(field, places, sources)
-            mesh, _, found = _glint_surface(glints, hull, lower, upper, step, level)
+            if method == "hull":
+                found = 0.0 if level == "auto" else level
+                mesh = isosurface(clearance_volume(hull, lower, upper, step), found)
+            else:
+                mesh, _, found = _glint_surface(glints, hull, lower, upper, step, level)
             openness = judge_openness(mesh, hull.sources)
             if openness.kind == "one-sided":
                 mesh = without_unseen(mesh, openness)
@@ -149,14 +156,14 @@ def _numbers(values: Tensor) -> Array:
 
 
 def _loudness(
-    field: Field, directions: int, method: Literal["oriented", "isosurface"]
+    field: Field, directions: int, method: Literal["oriented", "hull", "isosurface"]
 ) -> Callable[[Array], Array]:
     def loudness(points: Array) -> Array:
         places = torch.as_tensor(points, dtype=field.region.dtype, device=field.region.device)
         inside = field.inside(places)
         values = places.new_zeros(len(places))
         if bool(inside.any()):
-            if method == "oriented":
+            if method != "isosurface":
                 values[inside] = field.oriented(places[inside], directions)[0]
             else:
                 values[inside] = field.loudness(places[inside], directions)

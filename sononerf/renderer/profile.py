@@ -161,7 +161,7 @@ class ProfileRenderer(Renderer):
         oversampling: Annotated[int, Option(ge=1, le=16)] = 2,
         points: Annotated[int, Option(ge=1)] = 25_000,
         uniform: Annotated[float, Option(gt=0, le=1)] = 0.4,
-        start: Annotated[int, Option(ge=1)] = 40_000,
+        start: Annotated[int, Option(ge=1)] = 12_000,
         prune_every: Annotated[int, Option(ge=0)] = 100,
         prune_below: Annotated[float, Option(ge=0, lt=1)] = 1e-6,
         surroundings: Annotated[float, Option(gt=0)] = 0.03,

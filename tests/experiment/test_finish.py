@@ -10,8 +10,9 @@ import trimesh
 
 from sononerf.errors import NumericalError
 from sononerf.experiment import finish as finish_module
+from sononerf.experiment.borne_out import NAME
 from sononerf.experiment.finish import finish, is_finished
-from sononerf.experiment.retrace import NAME, learn_retrace
+from sononerf.experiment.retrace import learn_retrace
 from sononerf.experiment.run_folder import RunFolder
 from sononerf.progress import Progress
 from sononerf.weights import load_weights, save_weights
@@ -49,7 +50,9 @@ def steps(monkeypatch):
         )
     for name in ("reconstruct", "evaluate"):
         monkeypatch.setattr(
-            finish_module, name, lambda path, *, progress, name=name: called.append(name) or {}
+            finish_module,
+            name,
+            lambda path, *, progress, name=name, **given: called.append(name) or given,
         )
     return called
 
@@ -57,6 +60,18 @@ def steps(monkeypatch):
 def test_traces_are_learned_off_the_mesh_before_anything_is_predicted(run, steps):
     finish(run, accelerator="cpu")
     assert steps == ["reconstruct", ("learn_retrace", "cpu"), ("predict", "cpu"), "evaluate"]
+
+
+@pytest.mark.parametrize("method", ["auto", "hull", "isosurface"])
+def test_what_poses_bore_out_before_is_found_out_anew(run, steps, monkeypatch, method):
+    """The surface is first drawn as the settings say, not as an earlier end of the run did."""
+    state, description = load_weights(run)
+    description["settings"]["reconstruction"]["method"] = method
+    save_weights(run, state, description)
+    asked = []
+    monkeypatch.setattr(finish_module, "reconstruct", lambda path, **given: asked.append(given))
+    finish(run)
+    assert [given["method"] for given in asked] == [method]
 
 
 def test_nothing_is_predicted_where_nothing_is_held_out(run, steps):
@@ -79,7 +94,7 @@ def test_a_field_without_a_surface_predicts_before_it_is_told(run, steps, monkey
 
 
 def test_a_surface_that_cannot_be_traced_is_told_and_no_fault(run, steps, monkeypatch):
-    def speck(path, *, progress):
+    def speck(path, **given):
         mesh = trimesh.creation.icosphere(radius=1e-5)
         (path / "reconstruction").mkdir()
         (path / "reconstruction" / "mesh.ply").write_bytes(mesh.export(file_type="ply"))

@@ -15,13 +15,14 @@ import trimesh
 
 from sononerf.acoustics.spectrogram import compress
 from sononerf.data.store import EnsembleStore
-from sononerf.errors import InputError
+from sononerf.errors import InputError, NumericalError
 from sononerf.experiment import predict as predict_module
 from sononerf.experiment import retrace as retrace_module
+from sononerf.experiment.borne_out import NAME, borne_out
 from sononerf.experiment.fitted import load_fitted, poses_of, render_poses, store_of
 from sononerf.experiment.predict import predict
-from sononerf.experiment.reconstruct import read_mesh
-from sononerf.experiment.retrace import NAME, Retrace, learn_retrace, load_retrace, trace_poses
+from sononerf.experiment.reconstruct import read_mesh, reconstruct
+from sononerf.experiment.retrace import Retrace, learn_retrace, load_retrace, trace_poses
 from sononerf.progress import Progress
 from sononerf.reconstruction.retrace import blend, calmed
 from sononerf.scene import Scene
@@ -46,6 +47,10 @@ class Heard(Progress):
         self.said.append(text)
 
 
+def no_hull(fitted):
+    raise NumericalError("first echoes leave nothing")
+
+
 def reconstruct_as(path, mesh):
     (path / "reconstruction").mkdir(exist_ok=True)
     (path / "reconstruction" / "mesh.ply").write_bytes(mesh.export(file_type="ply"))
@@ -55,6 +60,7 @@ def reconstruct_as(path, mesh):
 def run(fitted_run, tmp_path, monkeypatch):
     """A run that was hardly fitted, yet whose reconstruction is the true surface."""
     monkeypatch.setattr(retrace_module, "RAYS", 500)
+    monkeypatch.setattr(retrace_module, "_hull_surface", no_hull)
     monkeypatch.setattr(predict_module, "spectrogram_png", lambda *given: b"")
     path = tmp_path / "run"
     path.mkdir()
@@ -76,6 +82,7 @@ def learned(fitted_run, without_pictures, tmp_path_factory):
     reconstruct_as(path, SPHERE)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(retrace_module, "RAYS", 500)
+        patch.setattr(retrace_module, "_hull_surface", no_hull)
         learn(path)
     return (path / NAME).read_bytes()
 
@@ -270,6 +277,83 @@ def test_a_mesh_that_is_gone_or_damaged_is_an_error(run):
     with pytest.raises(InputError, match=r"mesh\.ply"):
         learn(run)
     assert not (run / NAME).exists()
+
+
+# The hull of first echoes in place of the mesh.
+
+DENTED = SPHERE.copy()
+DENTED.vertices[DENTED.vertices[:, 0] > 0.005, 0] = 0.005
+
+
+@pytest.fixture
+def hull(run, monkeypatch):
+    """Say what the first echoes leave; keep how the run is reconstructed for it."""
+    asked = []
+
+    def redrawn(path, *, method, progress):
+        asked.append(method)
+
+    def put(mesh):
+        monkeypatch.setattr(retrace_module, "_hull_surface", lambda fitted: mesh)
+        return asked
+
+    monkeypatch.setattr(retrace_module, "reconstruct", redrawn)
+    return put
+
+
+def test_the_hull_is_the_surface_where_unseen_poses_bear_it_out(run, hull):
+    reconstruct_as(run, DENTED)
+    asked, heard = hull(SPHERE), Heard()
+    assert learn(run, progress=heard) == 1
+    assert asked == ["hull"]
+    assert borne_out(run) == "hull"
+    np.testing.assert_array_equal(load_retrace(run).mesh.vertices, calmed(SPHERE).vertices)
+    np.testing.assert_allclose(load_retrace(run).gain_db, 0, atol=0.5)
+    assert [text for text in heard.said if "hull of first echoes" in text] == heard.said[-1:]
+
+
+def test_the_mesh_stays_where_the_hull_is_no_better(run, hull):
+    asked = hull(DENTED)
+    assert learn(run) == 1
+    assert asked == []
+    assert borne_out(run) == "auto"
+    np.testing.assert_array_equal(
+        load_retrace(run).mesh.vertices,
+        calmed(read_mesh(run / "reconstruction" / "mesh.ply")).vertices,
+    )
+
+
+def test_a_hull_may_be_traced_where_the_mesh_cannot(run, hull):
+    reconstruct_as(run, SPHERE.copy().apply_scale(1e-3))
+    asked = hull(SPHERE)
+    assert learn(run) == 1
+    assert asked == ["hull"]
+
+
+def settings_of(path, **changed):
+    description = json.loads((path / "model.json").read_text())
+    description["settings"]["reconstruction"].update(changed)
+    (path / "model.json").write_text(json.dumps(description))
+
+
+@pytest.mark.parametrize("changed", [{"method": "oriented"}, {"level": 0.4}])
+def test_who_says_how_the_surface_is_found_is_obeyed(run, monkeypatch, changed):
+    settings_of(run, **changed)
+    reconstruct_as(run, DENTED)
+    monkeypatch.setattr(retrace_module, "_hull_surface", never)
+    learn(run)
+    assert borne_out(run) == "auto"
+
+
+@pytest.mark.parametrize("spacing", [None, 0.003])
+def test_the_hull_is_that_of_the_reconstruction(run, monkeypatch, spacing):
+    settings_of(run, spacing=spacing)
+    monkeypatch.undo()
+    found = retrace_module._hull_surface(load_fitted(run))
+    folder = reconstruct(run, method="hull", output=run / "hull")
+    np.testing.assert_allclose(
+        read_mesh(folder / "mesh.ply").bounds, found.bounds, rtol=0, atol=1e-6
+    )
 
 
 # Tracing.

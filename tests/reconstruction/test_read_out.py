@@ -121,6 +121,24 @@ def test_where_the_field_is_silent_the_surface_runs_along_the_hull():
     assert glints.mesh.volume < 0.8 * found.mesh.volume
 
 
+def test_the_hull_is_what_first_echoes_leave_whatever_the_field_says():
+    field = sounding(RADIUS)
+    with torch.no_grad():
+        field.grids[0][0, 0, :, :, :13] = -20.0
+    hull = hull_of_the_sphere()
+    found = reconstruct(field, hull=hull, method="hull")
+    assert (found.method, found.level) == ("hull", 0.0)
+    assert found.mesh.is_watertight
+    # Between 300 heads hull and sphere part by 0.2 mm; straight lines add to it.
+    assert np.abs(radii(found.mesh) - RADIUS).max() < 0.0004
+    assert len(found.glints.points)  # for the confidence
+    assert found.openness.kind == "closed"
+    deeper = reconstruct(field, hull=hull, method="hull", level=0.002)
+    assert np.abs(radii(deeper.mesh) - RADIUS + 0.002).max() < 0.0004
+    with pytest.raises(SettingsError, match="method hull"):
+        reconstruct(field, method="hull")
+
+
 def test_a_surface_never_lies_before_a_first_echo():
     """A field that sounds from 1.5 mm too near: the hull has the last word."""
     field = sounding(RADIUS)
