@@ -626,10 +626,13 @@ def test_a_surface_that_is_not_there(smoke, clean):
     assert tree(clean) == {}
 
 
-@pytest.mark.parametrize("command", ["predict", "reconstruct"])
-def test_results_do_not_go_into_a_runs_own_folder(at_home, command):
-    before = tree(at_home.run)
-    message = refused(3, command, "runs/smoke", "--output", "runs/smoke")
+@pytest.mark.parametrize("command", ["predict", "reconstruct", "compare"])
+def test_results_do_not_go_into_a_runs_own_folder(at_home, tmp_path, command):
+    before, given = tree(at_home.run), ["runs/smoke"]
+    if command == "compare":
+        shutil.copytree(at_home.run, tmp_path / "other")
+        given.append(tmp_path / "other")
+    message = refused(3, command, *given, "--output", "runs/smoke")
     assert "runs/smoke: is the folder of a run; give --output" in message
     assert tree(at_home.run) == before
 

@@ -17,7 +17,7 @@ from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.experiment.build import acquisition
 from sononerf.experiment.fitted import Fitted, load_fitted, render_poses
 from sononerf.experiment.reconstruct import true_mesh
-from sononerf.experiment.run_folder import differing_keys
+from sononerf.experiment.run_folder import differing_keys, results_folder
 from sononerf.geometry.poses import Poses
 from sononerf.progress import Progress
 from sononerf.reconstruction.baseline import backprojection
@@ -95,38 +95,38 @@ def compare_runs(
             f"{first} and {second} hear differently ({', '.join(differing)}); fit both alike"
         )
     folder = output or first / f"compare-{second.resolve().name}"
-    storage.probe_writable(folder)
-    corners = np.array([run.module.field.region.double().cpu().numpy() for run in runs])
-    box = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
-    reference = max(run.module.reference for run in runs)
-    poses = _common_poses(runs)
-    one, other = (_heard(run, poses, reference, *box, accelerator, progress) for run in runs)
-    found = compare(one, other)
-    surfaces = [true_mesh(run) for run in runs]
-    truth = _added(*surfaces)
-    names = first.resolve().name, second.resolve().name
-    for name in ("first", "second", "difference"):
-        storage.commit_bytes(folder / f"{name}.vti", vti_bytes(getattr(found, name), "level"))
-    for axis, picture in difference_pngs(found, names, truth=truth).items():
-        storage.commit_bytes(folder / f"mip_{axis}.png", picture)
-    if surfaces[0] is not None:
-        storage.commit_bytes(folder / "overlay.png", overlay_png(surfaces[0], found))
-    place = found.strongest
-    distance: float | None = None
-    if place is not None and truth is not None:
-        distance = float(np.linalg.norm(place - truth))
-    storage.commit_json(
-        folder / "comparison.json",
-        {
-            "first": names[0],
-            "second": names[1],
-            "poses": len(poses.positions),
-            "score": found.score,
-            "strongest_m": None if place is None else place.tolist(),
-            "added_m": None if truth is None else truth.tolist(),
-            "distance_m": distance,
-        },
-    )
+    with results_folder(folder):
+        corners = np.array([run.module.field.region.double().cpu().numpy() for run in runs])
+        box = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+        reference = max(run.module.reference for run in runs)
+        poses = _common_poses(runs)
+        one, other = (_heard(run, poses, reference, *box, accelerator, progress) for run in runs)
+        found = compare(one, other)
+        surfaces = [true_mesh(run) for run in runs]
+        truth = _added(*surfaces)
+        names = first.resolve().name, second.resolve().name
+        for name in ("first", "second", "difference"):
+            storage.commit_bytes(folder / f"{name}.vti", vti_bytes(getattr(found, name), "level"))
+        for axis, picture in difference_pngs(found, names, truth=truth).items():
+            storage.commit_bytes(folder / f"mip_{axis}.png", picture)
+        if surfaces[0] is not None:
+            storage.commit_bytes(folder / "overlay.png", overlay_png(surfaces[0], found))
+        place = found.strongest
+        distance: float | None = None
+        if place is not None and truth is not None:
+            distance = float(np.linalg.norm(place - truth))
+        storage.commit_json(
+            folder / "comparison.json",
+            {
+                "first": names[0],
+                "second": names[1],
+                "poses": len(poses.positions),
+                "score": found.score,
+                "strongest_m": None if place is None else place.tolist(),
+                "added_m": None if truth is None else truth.tolist(),
+                "distance_m": distance,
+            },
+        )
     return folder
 
 

@@ -86,7 +86,7 @@ def predict(
         _check_poses(own, poses_csv, fitted, progress)
     store = None if own is not None else store_of(fitted)
     retrace = load_retrace(path)
-    told = run.read_metrics().get("prediction", {}).get("traced_share", 0)
+    told = (run.read_metrics().get("prediction") or {}).get("traced_share", 0)
     if retrace is None and told > 0:
         progress.say(
             f"{path / RETRACE_NAME} is missing: what follows is rendered from the field alone, "

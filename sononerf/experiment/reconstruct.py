@@ -82,15 +82,19 @@ def reconstruct(
     fitted = load_fitted(path)
     folder = output or path / "reconstruction"
     options = fitted.settings.reconstruction
+    if level is None:
+        level = options.level
     if method is None:
-        method = options.method if options.method != "auto" else borne_out(path)
+        # A level of one's own is one of the indicator; the hull knows depths alone.
+        free = (options.method, level) == ("auto", "auto")
+        method = borne_out(path) if free else options.method
     with results_folder(folder):
         with progress.task("reconstructing", 1000) as task, torch.inference_mode():
             found = read_out(
                 fitted.module.field,
                 hull=fitted.hull,
                 spacing=spacing or options.spacing,
-                level=options.level if level is None else level,
+                level=level,
                 method=method,
                 directions=options.directions,
                 progress=lambda done, total: task.advance(1000 * done // total - task.done),

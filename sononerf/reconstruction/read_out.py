@@ -89,7 +89,7 @@ def reconstruct(
     spacing : float or None, m
         Voxel size; half of the field's own resolution where None.
     level : float or "auto"
-        Value of the volume, or of the oriented indicator, on the surface.
+        Value of the volume, or of the oriented indicator, on the surface; of the hull the depth, m.
     method : {"auto", "oriented", "hull", "isosurface"}
         ``auto`` is the oriented surface where the field knows directions. ``hull`` is what the
         first echoes leave, whatever the field says: exact for a body without hollows.

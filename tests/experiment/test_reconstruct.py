@@ -176,6 +176,8 @@ def test_what_poses_bore_out_is_drawn_unless_the_settings_say_how(
     monkeypatch.setattr(reconstruct_module, "borne_out", lambda path: "hull")
     assert read_out(reconstruct(run))["method"] == found
     assert read_out(reconstruct(run, method="isosurface"))["method"] == "isosurface"
+    # A level is one of the indicator; 0.4 m deep in a hull there is nothing.
+    assert read_out(reconstruct(run, level=0.4))["method"] == "oriented"
 
 
 def test_a_level_above_everything_has_no_surface(run):
