@@ -32,12 +32,20 @@ def occupied(condition, placement, score, millimetres):
 
 
 ROWS = [
-    row("a", fit_s=40.0),
-    occupied("a", 0, 0.6, 4.0),
+    row("a", fit_s=40.0, fscore_5mm=0.9),
+    {**occupied("a", 0, 0.6, 4.0), "fscore_5mm": 0.7},
     occupied("a", 1, 0.2, 30.0),
     occupied("a", 2, 0.5, 9.0),
     row("a", 3, failed="no echo"),
-    row("a", other="calls", score=0.1, told_occupied=False, distance_m=None, found=None),
+    row(
+        "a",
+        other="calls",
+        score=0.1,
+        told_occupied=False,
+        distance_m=None,
+        found=None,
+        fscore_5mm=0.8,
+    ),
     row("a", other="fit", score=0.3, told_occupied=True, distance_m=None, found=None),
     occupied("b", 0, 0.9, 1.0),
 ]
@@ -54,6 +62,8 @@ def test_a_summary_counts_what_was_told_and_found_and_what_was_told_in_vain():
         "empty_pairs": 2,
         "false_alarms": 1,
         "most_empty_score": 0.3,
+        "empty_fscore_5mm": pytest.approx(0.85),
+        "occupied_fscore_5mm": 0.7,
         "fit_s": 40.0,
         "failed": 1,
     }
@@ -63,8 +73,8 @@ def test_a_summary_counts_what_was_told_and_found_and_what_was_told_in_vain():
 def test_the_table_has_a_line_for_each_condition():
     head, first, second = table(ROWS).splitlines()
     assert head.split()[:3] == ["condition", "told", "found"]
-    assert first.split() == "a 2 of 4 2 of 4 9.0 0.20 1 of 2 0.30 40 1".split()
-    assert second.split() == "b 1 of 1 1 of 1 1.0 0.90 0 of 0 - 30 0".split()
+    assert first.split() == "a 2 of 4 2 of 4 9.0 0.20 1 of 2 0.30 0.85 0.70 40 1".split()
+    assert second.split() == "b 1 of 1 1 of 1 1.0 0.90 0 of 0 - - - 30 0".split()
 
 
 def test_the_plot_shows_on_which_side_of_the_bound_the_dots_are():
@@ -95,7 +105,10 @@ def asked(monkeypatch):
             raise RuntimeError("exit code 5: no echo")
         runs[folder] = list(settings)
         storage.make_folder(folder)
-        return {"cost": {"fit_s": 70.0}, "geometry": {"fscore": {"0.005": 0.7}}}
+        geometry = {"fscore": {"0.005": 0.7}}
+        if folder.parent.name == "clutter":
+            geometry["target"] = {"fscore": {"0.005": 0.4}}
+        return {"cost": {"fit_s": 70.0}, "geometry": geometry}
 
     def compare_runs(first, second, *, output):
         compared.append((first.name, second.name))
@@ -151,6 +164,7 @@ def test_each_case_is_a_run_compared_with_the_empty_leaf(asked, tmp_path):
     alike = written["rows"][3]
     assert (alike["told_occupied"], alike["found"]) == (False, None)
     assert written["summary"][0]["found"] == 1
+    assert [of["occupied_fscore_5mm"] for of in written["summary"]] == [0.4, 0.7]
 
 
 def test_what_was_compared_is_not_compared_again(asked, tmp_path):

@@ -144,7 +144,9 @@ class _Cases:
             if seconds is None:  # a fit that broke off has costs too, those of its echoes
                 yield {**head, "failed": "the fit came to no end", "settings": settings}
                 return
-            scores = (metrics.get("geometry") or {}).get("fscore", {})
+            geometry = metrics.get("geometry") or {}
+            # Amid stones and twigs what counts is the leaf.
+            scores = (geometry.get("target") or geometry).get("fscore", {})
             row = {
                 **head,
                 "fit_s": seconds,
@@ -194,27 +196,39 @@ TITLES = (
     "least score",
     "false alarms",
     "most empty",
+    "leaf F 5mm",
+    "with prey",
     "longest fit/s",
     "failed",
 )
 
 
 def summary(rows: Sequence[Row], condition: str) -> dict[str, Any]:
-    """Return how often prey was told and found under a condition, and how often in vain."""
+    """Return how often prey was told and found under a condition, and how often in vain.
+
+    F-scores are medians over the runs; that of the empty leaf is over all its fits.
+    """
     here = [row for row in rows if row["condition"] == condition]
     occupied = [row for row in here if row["placement"] is not None]
     alike = [row for row in here if "other" in row]
-    far = [row["distance_m"] for row in occupied if row.get("distance_m") is not None]
+    bare = [row for row in here if row["placement"] is None]
+
+    def median(key: str, among: Sequence[Row]) -> float | None:
+        known = [row[key] for row in among if row.get(key) is not None]
+        return statistics.median(known) if known else None
+
     return {
         "condition": condition,
         "placements": len(occupied),
         "told": sum(bool(row.get("told_occupied")) for row in occupied),
         "found": sum(bool(row.get("found")) for row in occupied),
-        "distance_m": statistics.median(far) if far else None,
+        "distance_m": median("distance_m", occupied),
         "least_score": min((row["score"] for row in occupied if "score" in row), default=None),
         "empty_pairs": len(alike),
         "false_alarms": sum(bool(row.get("told_occupied")) for row in alike),
         "most_empty_score": max((row["score"] for row in alike if "score" in row), default=None),
+        "empty_fscore_5mm": median("fscore_5mm", bare),
+        "occupied_fscore_5mm": median("fscore_5mm", occupied),
         "fit_s": max((row["fit_s"] for row in here if "fit_s" in row), default=None),
         "failed": sum("failed" in row for row in here),
     }
@@ -238,6 +252,8 @@ def table(rows: Sequence[Row]) -> str:
                 shown(of["least_score"], ".2f"),
                 f"{of['false_alarms']} of {of['empty_pairs']}",
                 shown(of["most_empty_score"], ".2f"),
+                shown(of["empty_fscore_5mm"], ".2f"),
+                shown(of["occupied_fscore_5mm"], ".2f"),
                 shown(of["fit_s"], ".0f"),
                 str(of["failed"]),
             ]
