@@ -9,6 +9,7 @@
     python tools/benchmark.py shapes [--count 20] [--first 0] [--seconds 60]
     python tools/benchmark.py poses [--scene three_spheres] [--counts 12 25 50 100 200 400]
     python tools/benchmark.py paper [--scene three_spheres] [--minutes 60] [--steps N]
+    python tools/benchmark.py step [--accelerator cpu] [--compare OLD.json]
     python tools/benchmark.py prey [--placements 20] [--others 5] [--conditions NAME ...]
 
 ``simulate``: seconds per pose, against those that embreex alone needs for the same rays, those for
@@ -16,6 +17,11 @@ visibility included, and the greatest memory. ``noise``: by how much two simulat
 have other rays, 16 times as many, or twice as many; with the reported decibels, on active cells.
 ``physics``: both engines against exact solutions. ``dechirp``: where and how long a point echo is
 in the rows of a dechirped sweep.
+
+``step``: what a step of a fit costs for each field through each renderer, medians of at least
+five, beside equation 17 of the paper written down as it stands (which takes 9 GB of memory), the
+machine's matrix product and its copying; the file is named by version, machine and device, and
+``--compare`` prints what has changed.
 
 ``shapes``: the whole default experiment for shapes that nobody chose, each from its seed.
 ``poses``: the same for one scene and ever more calls. ``paper``: how much sooner the default gets
@@ -43,6 +49,7 @@ from tools.benchmarks.poses import COUNTS, poses  # noqa: E402
 from tools.benchmarks.prey import CONDITIONS, prey  # noqa: E402
 from tools.benchmarks.shapes import shapes  # noqa: E402
 from tools.benchmarks.simulator import noise, simulate  # noqa: E402
+from tools.benchmarks.step import step  # noqa: E402
 
 
 def main() -> None:
@@ -58,7 +65,7 @@ def main() -> None:
             command.add_argument("--bounces", type=int, default=3)
         if run is simulate:
             command.add_argument("--rays", type=int, default=300_000)
-    for series in (shapes, poses, paper, prey):
+    for series in (shapes, poses, paper, prey, step):
         command = commands.add_parser(series.__name__, help=(series.__doc__ or "").split("\n")[0])
         command.set_defaults(run=series)
         if series is shapes:
@@ -69,14 +76,17 @@ def main() -> None:
             command.add_argument("--others", type=int, default=5, help="of all other conditions")
             names = [condition.name for condition in CONDITIONS]
             command.add_argument("--conditions", nargs="+", choices=names, help="all where none")
-        if series in (poses, paper):
+        if series is step:
+            command.add_argument("--accelerator", choices=("auto", "cpu", "gpu"), default="auto")
+            command.add_argument("--compare", type=Path, metavar="OLD.json", help="print ratios")
+        if series in (poses, paper, step):
             command.add_argument("--scene", default="three_spheres")
         if series is poses:
             command.add_argument("--counts", type=int, nargs="+", default=COUNTS)
         if series is paper:
             command.add_argument("--minutes", type=float, default=60.0, help="of the paper's fit")
             command.add_argument("--steps", type=int, help="of the paper's fit; none are timed")
-        else:
+        elif series is not step:
             command.add_argument("--seconds", type=float, default=60.0, help="longer are marked")
         command.add_argument("--output", type=Path, help="folder of runs and table")
         command.add_argument("--data", type=Path, help="folder of the ensembles; DIR/data")

@@ -1,0 +1,381 @@
+# SPDX-License-Identifier: MIT
+"""What one step of a fit costs: each field through each renderer, and equation 17 as it stands.
+
+Every pair takes its steps in Lightning's own loop, as ``sononerf fit`` does, from a batch of the
+ensemble to the optimiser's update; what is reported is the median over the timed ones. Beside it:
+
+*Floating-point operations* are those of the matrix products that were executed, forward and
+backward, as torch counts them, in one more step; the rate is given over that of a plain product
+of two matrices of the same type on the same machine. *Bytes* are what the operations of that step
+read and write, each tensor once for each operation that touches it; the time that they would take
+at the rate at which the machine copies is what its memory allows.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import lightning
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+from torch.utils.flop_counter import FlopCounterMode
+
+from sononerf.callbacks.threads import ThreadsCallback
+from sononerf.config import Settings, load_settings
+from sononerf.data.datamodule import EchoDataModule
+from sononerf.experiment.build import (
+    acquisition,
+    echo_region,
+    field_and_renderer,
+    module_for,
+)
+from sononerf.experiment.fit import quiet_lightning, require_accelerator
+from sononerf.experiment.simulate import default_store, echo_hash, ensemble
+from sononerf.field.field import Field
+from sononerf.field.fourier import FourierField
+from sononerf.module import EchoModule
+from sononerf.progress import Progress
+from sononerf.renderer.shell import ShellRenderer
+from sononerf.scene import load_scene
+from tools.benchmarks.experiment import CONFIG, Row, aligned
+from tools.benchmarks.record import device_name, keep, ratios
+
+PAPER = CONFIG.parent / "paper" / "three_spheres.yaml"
+
+
+class Pair(NamedTuple):
+    """A field and a renderer, and at which steps of their fit they are timed."""
+
+    name: str
+    config: Path
+    settings: tuple[str, ...]
+    warm: int
+    timed: int
+
+
+PAIRS = (
+    Pair("equation 17", PAPER, (), 1, 5),
+    Pair("fourier, shell", PAPER, (), 5, 20),
+    Pair("grid, shell", PAPER, ("field.kind=grid",), 5, 20),
+    Pair("grid, profile", CONFIG, (), 200, 50),
+    Pair("fourier, profile", CONFIG, ("field.kind=fourier",), 3, 5),
+)
+NAIVE, SHELL, DEFAULT = PAIRS[0].name, PAIRS[1].name, PAIRS[3].name
+
+
+class EquationSeventeen(ShellRenderer):
+    """The paper's equation written down: every direction of every slice, zero outside the region.
+
+    The field is evaluated once for both ears, in float32. The yardstick, and nothing else; its
+    parameters and what it looks up are those of renderer ``shell``.
+    """
+
+    def forward(
+        self,
+        field: Field,
+        position: Tensor,
+        rotation: Tensor,
+        rows: Tensor,
+        bins: Tensor | None = None,
+    ) -> Tensor:
+        """Render; all frequencies."""
+        del bins
+        if not isinstance(field, FourierField):
+            raise TypeError(f"a {type(field).__name__}, expected the paper's network")
+        self.points_evaluated += rows.numel() * len(self.directions)
+        world = torch.einsum("pij,dj->pdi", rotation, self.directions)
+        places = position[:, None, None] + self.range[rows][..., None, None] * world[:, None]
+        toward = (-world)[:, None].expand(places.shape)
+        response = _network(field, places, toward)  # (P, R, D, F)
+        lower, upper = field.region
+        inside = ((places >= lower) & (places <= upper)).all(dim=-1, keepdim=True)
+        response = response * inside
+        phase = torch.exp(2j * torch.pi * self.frequency * self.range[rows][..., None] / 343.0)
+        heard = []
+        for ear in self.transfer:  # (D, F)
+            total = (response * ear).sum(dim=2) * phase
+            heard.append(total.abs())
+        scale = (self.log_gain + self.log_spectrum).exp() / len(self.directions)
+        return torch.stack(heard, dim=1) * scale
+
+
+def _network(field: FourierField, places: Tensor, toward: Tensor) -> Tensor:
+    x = torch.cat((places * field.scale, toward), dim=-1)
+    embedded = torch.sin(x[..., None] * field._first).flatten(-2)
+    hidden = field.trunk(embedded)
+    hidden = field.branch(torch.cat((hidden, embedded), dim=-1))
+    real, imaginary = field.out(field.head(torch.cat((hidden, embedded), dim=-1))).chunk(2, dim=-1)
+    return torch.complex(real, imaginary)
+
+
+class Traffic(TorchDispatchMode):  # type: ignore[no-untyped-call]
+    """Adds up the bytes that operations read and write."""
+
+    def __init__(self) -> None:
+        super().__init__()  # type: ignore[no-untyped-call]
+        self.bytes = 0
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        result = func(*args, **(kwargs or {}))
+        if not _only_looks(func):
+            touched = [*tree_leaves((args, kwargs)), *tree_leaves(result)]
+            self.bytes += sum(_bytes(t) for t in touched if isinstance(t, Tensor))
+        return result
+
+
+def _only_looks(func: Any) -> bool:
+    """Whether an operation hands out what it was given, under another shape."""
+    outputs = func._schema.returns
+    return bool(outputs) and all(
+        o.alias_info is not None and not o.alias_info.is_write for o in outputs
+    )
+
+
+def _bytes(tensor: Tensor) -> int:
+    if tensor.layout is torch.sparse_csr:
+        parts = (tensor.crow_indices(), tensor.col_indices(), tensor.values())
+        return sum(_bytes(part) for part in parts)
+    if tensor.layout is not torch.strided:
+        raise TypeError(f"bytes of a tensor of layout {tensor.layout} are not known")
+    whole = tensor.numel() * tensor.element_size()
+    return min(whole, tensor.untyped_storage().nbytes())  # what is expanded lies there once
+
+
+class Stopwatch(lightning.Callback):
+    """Times the steps after the first ones, and counts in one more."""
+
+    def __init__(self, warm: int, timed: int, counted: bool) -> None:
+        self.warm, self.timed, self.counted = warm, timed, counted
+        self.seconds: list[float] = []
+        self.points: list[int] = []
+        self.flop = self.bytes = 0
+        self._modes: list[Any] = []
+        self._began = 0.0
+
+    def on_train_batch_start(
+        self, trainer: Any, pl_module: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Start the clock, or the counting."""
+        del batch, batch_idx
+        if trainer.global_step == self.warm + self.timed and self.counted:
+            self._modes = [FlopCounterMode(display=False), Traffic()]
+            for mode in self._modes:
+                mode.__enter__()
+        self._points = int(pl_module.renderer.points_evaluated)
+        self._settle()
+        self._began = time.perf_counter()
+
+    def on_train_batch_end(
+        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Stop it."""
+        del outputs, batch, batch_idx
+        self._settle()
+        if self._modes:
+            flop, traffic = self._modes
+            for mode in reversed(self._modes):
+                mode.__exit__(None, None, None)
+            self._modes = []
+            self.flop, self.bytes = flop.get_total_flops(), traffic.bytes
+        elif trainer.global_step > self.warm:
+            self.seconds.append(time.perf_counter() - self._began)
+            self.points.append(int(pl_module.renderer.points_evaluated) - self._points)
+
+    @staticmethod
+    def _settle() -> None:
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+
+
+def step(arguments: argparse.Namespace) -> str:
+    """Time a step of each field through each renderer, beside equation 17 as it stands."""
+    require_accelerator(arguments.accelerator)
+    quiet_lightning()
+    output = arguments.output or Path("runs") / "step"
+    device = device_name(arguments.accelerator)
+    product, copy = matrix_rate(device), copy_rate(device)
+    rows: list[Row] = []
+    for pair in PAIRS:
+        settings = _settings(pair, arguments, output)
+        rows.append(_measured(pair, settings, arguments.accelerator, product, copy))
+        print(f"{pair.name}: {1e3 * rows[-1]['step_s']:.1f} ms", file=sys.stderr, flush=True)
+    by_name = {row["name"]: row for row in rows}
+    found = {
+        "scene": arguments.scene,
+        "matrix_flop_per_s": product,
+        "copy_bytes_per_s": copy,
+        "shell_over_equation_17": by_name[NAIVE]["step_s"] / by_name[SHELL]["step_s"],
+        "loss_of_equation_17_differs_by": by_name[NAIVE]["loss_differs"],
+        "default_over_what_memory_allows": by_name[DEFAULT]["over_memory"],
+        "rows": rows,
+    }
+    path = keep(output, "step", device, found)
+    text = f"{table(rows)}\n{sentences(found)}\nwrote {path}"
+    return text if arguments.compare is None else f"{text}\n{ratios(arguments.compare, found)}"
+
+
+def _settings(pair: Pair, arguments: argparse.Namespace, output: Path) -> Settings:
+    chosen = [f"scene.name={arguments.scene}", *pair.settings, *arguments.set]
+    settings = load_settings(pair.config, chosen)
+    scene = load_scene(settings.scene.name, settings.scene.options)
+    store = default_store(settings, echo_hash(settings, scene)).name
+    folder = arguments.data or output / "data"
+    return load_settings(pair.config, [*chosen, f"data.store={folder / store}"])
+
+
+def _measured(pair: Pair, settings: Settings, accelerator: str, product: float, copy: float) -> Row:
+    store = ensemble(settings, progress=Progress())
+    region, possible = echo_region(settings, store)
+    field, renderer = field_and_renderer(settings, region)
+    naive = pair.name == NAIVE
+    if naive:
+        own = renderer.state_dict()
+        torch.manual_seed(settings.fit.seed)
+        renderer = EquationSeventeen(region, acquisition(settings), **settings.renderer.options)
+        renderer.load_state_dict(own)
+    options = settings.fit
+    data = EchoDataModule(
+        store,
+        whole_poses=renderer.whole_poses,
+        batch=options.batch_poses if renderer.whole_poses else options.batch_slices,
+        batch_frequencies=(
+            None if options.batch_frequencies == "all" else options.batch_frequencies
+        ),
+        seed=options.seed,
+        workers=settings.data.workers,
+        memory_bytes=settings.data.memory_bytes,
+    )
+    per_epoch = data.stream().batches_per_pass
+    module = module_for(
+        settings,
+        field,
+        renderer,
+        reference=float(store.attributes["reference"]),
+        possible=possible,
+        total_steps=per_epoch * options.epochs,
+        steps_per_epoch=per_epoch,
+    )
+    watch = Stopwatch(pair.warm, pair.timed, counted=not naive)
+    trainer = lightning.Trainer(
+        accelerator=accelerator,
+        devices=1,
+        max_epochs=-1,
+        max_steps=pair.warm + pair.timed + watch.counted,
+        limit_val_batches=0,
+        num_sanity_val_steps=0,
+        gradient_clip_val=options.gradient_clip,
+        logger=False,
+        callbacks=[ThreadsCallback(), watch],
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+    )
+    trainer.fit(module, data)
+    seconds, points = statistics.median(watch.seconds), statistics.median(watch.points)
+    row: Row = {
+        "name": pair.name,
+        "steps": [pair.warm + 1, pair.warm + pair.timed],
+        "step_s": seconds,
+        "points": points,
+        "points_per_s": points / seconds,
+    }
+    if naive:
+        row["loss_differs"] = _loss_differs(module, data, settings, region)
+        return row
+    allowed = watch.bytes / copy
+    return {
+        **row,
+        "flop": watch.flop,
+        "flop_per_s": watch.flop / seconds,
+        "over_matrix_rate": watch.flop / seconds / product,
+        "bytes": watch.bytes,
+        "memory_s": allowed,
+        "over_memory": seconds / allowed,
+    }
+
+
+def _loss_differs(
+    module: EchoModule, data: EchoDataModule, settings: Settings, region: Tensor
+) -> float:
+    """Return by how much, of itself, the loss through ``shell`` differs from equation 17's."""
+    shell = ShellRenderer(region, acquisition(settings), **settings.renderer.options)
+    shell.load_state_dict(module.renderer.state_dict())
+    batch = next(iter(data.train_dataloader()))
+    plain = module.cpu().renderer
+    losses = []
+    with torch.no_grad():
+        for renderer in (plain, shell):
+            module.renderer = renderer
+            losses.append(float(module._loss(module(batch), batch.spectrum)))
+    return abs(losses[1] / losses[0] - 1)
+
+
+def matrix_rate(device: str, size: int | None = None) -> float:
+    """Return the floating-point operations a second of a product of two square float32 matrices."""
+    size = size or (8192 if device == "cuda" else 2048)
+    one = torch.rand(size, size, device=device)
+    return 2 * size**3 / _median_seconds(lambda: one @ one, device)
+
+
+def copy_rate(device: str, size: int | None = None) -> float:
+    """Return the bytes a second that a copy of a large tensor reads and writes."""
+    size = size or (1 << 30 if device == "cuda" else 1 << 26)
+    one = torch.rand(size, device=device)
+    other = torch.empty_like(one)
+    return 2 * 4 * size / _median_seconds(lambda: other.copy_(one), device)
+
+
+def _median_seconds(run: Callable[[], object], device: str) -> float:
+    seconds = []
+    for _ in range(8):
+        began = time.perf_counter()
+        run()
+        if device == "cuda":
+            torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - began)
+    return statistics.median(seconds[1:])
+
+
+TITLES = ("pair", "steps", "ms", "points/s", "GFLOP", "of peak", "MB", "over memory")
+
+
+def table(rows: list[Row]) -> str:
+    """Return one line for each pair."""
+
+    def shown(value: float | None, form: str, scale: float = 1.0) -> str:
+        return "-" if value is None else f"{scale * value:{form}}"
+
+    lines = [list(TITLES)]
+    lines += [
+        [
+            row["name"],
+            "{} to {}".format(*row["steps"]),
+            shown(row["step_s"], ".1f", 1e3),
+            shown(row["points_per_s"], ",.0f"),
+            shown(row.get("flop"), ".2f", 1e-9),
+            shown(row.get("over_matrix_rate"), ".0%"),
+            shown(row.get("bytes"), ".0f", 1e-6),
+            shown(row.get("over_memory"), ".1f"),
+        ]
+        for row in rows
+    ]
+    return "\n".join(aligned(lines))
+
+
+def sentences(found: dict[str, Any]) -> str:
+    """Return what the table comes to."""
+    return (
+        f"matrix product {found['matrix_flop_per_s'] / 1e9:.0f} GFLOP/s, "
+        f"copy {found['copy_bytes_per_s'] / 1e9:.1f} GB/s\n"
+        f"fourier, shell: {found['shell_over_equation_17']:.1f} times as fast as equation 17, "
+        f"loss {found['loss_of_equation_17_differs_by']:.0e} apart\n"
+        f"grid, profile: {found['default_over_what_memory_allows']:.1f} times what memory allows"
+    )
