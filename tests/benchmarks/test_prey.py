@@ -154,6 +154,7 @@ def test_each_case_is_a_run_compared_with_the_empty_leaf(asked, tmp_path):
         "scene.options.target=leaf_dragonfly",
         "scene.options.target_options.placement_seed=0",
         "poses.count=100",
+        "poses.heldout=0",
         "a=b",
     ]
     quiet = runs[tmp_path / "snr-20-db" / "empty-other-calls"]
