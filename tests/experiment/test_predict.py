@@ -177,6 +177,8 @@ def test_that_tracing_is_missing_is_told(run, no_pictures, monkeypatch):
     monkeypatch.setattr(Progress, "say", lambda self, text: told.append(text))
     predict(run, accelerator="cpu")
     predict(run, accelerator="cpu")  # nothing was traced
+    RunFolder(run).write_metrics("prediction", None)
+    predict(run, accelerator="cpu")
     assert told == []
     RunFolder(run).write_metrics("prediction", {"traced_share": 0.3})
     predict(run, accelerator="cpu")
