@@ -99,7 +99,7 @@ class Seat:
         """
         points, up, tip = self.blade.frames(*self.places(ahead, np.zeros_like(ahead)))
         right = np.cross(tip, up)
-        forward = np.cos(self.heading) * tip + np.sin(self.heading) * right
+        forward = np.cos(self.heading) * tip - np.sin(self.heading) * right
         return points + (STAND + above)[:, None] * up, forward, np.cross(up, forward), up
 
 

@@ -118,6 +118,16 @@ def test_heading_turns_it_about_the_normal():
     assert abdomen.bounds[:, 2].mean() == pytest.approx(0.01, abs=1e-6)
 
 
+@pytest.mark.parametrize("heading", [45.0, 90.0, -130.0])
+def test_all_of_it_turns_together(on_flat, heading):
+    """Wings, eyes and legs too; the feet alone find a vein here and there, 0.6 mm high."""
+    cos, sin = np.cos(np.radians(heading)), np.sin(np.radians(heading))
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, cos, -sin], [0.0, sin, cos]])  # +z to -y about +x
+    found = dragonfly_on(seat(blade(), heading=heading))
+    middles = [[part.centroid for part in mesh.split()] for mesh in (on_flat, found)]
+    np.testing.assert_allclose(middles[1], np.array(middles[0]) @ turn.T, atol=6e-4)
+
+
 def test_wings_stay_clear_of_a_hollow_leaf():
     leaf = blade(curl=100.0)
     mesh = dragonfly_on(seat(leaf, length=0.06))
