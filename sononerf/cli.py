@@ -333,7 +333,9 @@ def evaluate(run: Run, as_json: Json = False) -> None:
 def compare(
     run_a: Annotated[Path, typer.Argument(help="Folder of a run.")],
     run_b: Annotated[Path, typer.Argument(help="Folder of the run without it.")],
-    output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder of the results; RUN_A/compare-B where none.")
+    ] = None,
     accelerator: OnWhat = Accelerator.auto,
 ) -> None:
     """Show what is heard in RUN_A and not in RUN_B, and where: a prey on a leaf."""
@@ -349,7 +351,8 @@ def compare(
         _print(f"nothing is stronger in {run_a} than in {run_b}")
     else:
         place = ", ".join(f"{1e3 * x:.1f}" for x in found["strongest_m"])
-        away = _optional(found, "distance_m", "; {:.4f} m from the middle of what was added")
+        found["distance_mm"] = None if found["distance_m"] is None else 1e3 * found["distance_m"]
+        away = _optional(found, "distance_mm", "; {:.1f} mm from the middle of what was added")
         _print(f"strongest difference at ({place}) mm, {found['score']:.2f} of the maximum{away}")
     _print(f"wrote {folder}")
 

@@ -475,8 +475,15 @@ def describe_faults(
             parent = _model_at(model, location[:-1])
             known = list(parent.model_fields) if parent else []
             near = difflib.get_close_matches(str(location[-1]), known, n=1)
-            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+            listed = f"known here: {', '.join(known)}" if known else "there is none to set here"
+            hint = f"did you mean {near[0]}?" if near else listed
             lines[f"{head}{key}: unknown key; {hint}"] = None
+        elif fault["type"] == "missing" and isinstance(location[-1], int):
+            # One fault for each value that a list is short of; the last one tells the length.
+            short = ".".join([*([prefix] if prefix else []), *map(str, location[:-1])])
+            end = f"found {fault['input']!r}; give {location[-1] + 1} values"
+            lines = {line: None for line in lines if not line.startswith(f"{head}{short}: found")}
+            lines[f"{head}{short}: {end}"] = None
         elif fault["type"] == "missing":
             lines[f"{head}{key}: missing; set it, e.g. {key}=..."] = None
         elif fault["type"] == "value_error":
@@ -502,8 +509,48 @@ def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
         settings = Settings.model_validate(dict(data))
     except ValidationError as error:
         raise SettingsError(describe_faults(error, Settings, source)) from None
+    refuse_truths(data, settings, source=source)
     settings.__dict__["source"] = source
     return settings
+
+
+def refuse_truths(
+    given: Mapping[str, Any], taken: BaseModel, *, source: str | None = None, prefix: str = ""
+) -> None:
+    """Refuse yes and no where a number is meant; pydantic takes them for 1 and 0.
+
+    Parameters
+    ----------
+    given : mapping
+        What the settings say.
+    taken : BaseModel
+        What pydantic made of it.
+    source, prefix : str
+        Where it was read from, and the dotted key of all of it, for messages.
+
+    Raises
+    ------
+    SettingsError
+        One line for each.
+    """
+    head = "" if source is None else f"{source}: "
+    keys = [".".join([*([prefix] if prefix else []), *key]) for key in _truths(given, taken)]
+    if keys:
+        raise SettingsError("\n".join(f"{head}{key}: give a number, not yes or no" for key in keys))
+
+
+def _truths(given: Any, taken: Any) -> Iterator[tuple[str, ...]]:
+    if isinstance(given, bool):
+        if isinstance(taken, int | float) and not isinstance(taken, bool):
+            yield ()
+        return
+    pairs: Iterable[tuple[str, Any, Any]] = ()
+    if isinstance(given, Mapping) and isinstance(taken, BaseModel):
+        pairs = ((str(k), v, getattr(taken, k, None)) for k, v in given.items())
+    elif isinstance(given, list | tuple) and isinstance(taken, list | tuple):
+        pairs = ((str(n), *both) for n, both in enumerate(zip(given, taken, strict=False)))
+    for key, one, other in pairs:
+        yield from ((key, *rest) for rest in _truths(one, other))
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-from sononerf.config import describe_faults
+from sononerf.config import describe_faults, refuse_truths
 from sononerf.errors import InputError, SettingsError
 
 SCENES = "sononerf.scenes"
@@ -132,4 +132,5 @@ def check_options(
         checked = model.model_validate(dict(options))
     except ValidationError as error:
         raise SettingsError(describe_faults(error, model, None, where)) from None
+    refuse_truths(options, checked, prefix=where)
     return {name: getattr(checked, name) for name in fields}

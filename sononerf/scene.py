@@ -154,6 +154,8 @@ def check_surface(mesh: trimesh.Trimesh) -> None:
     size = _size(mesh)
     if not SMALLEST <= size <= LARGEST:
         raise SurfaceSizeError(size)
+    if not (mesh.area_faces > 0).any():
+        raise InputError("no triangle of the mesh has an area; give a surface")
 
 
 def _size(mesh: trimesh.Trimesh) -> float:
@@ -223,6 +225,11 @@ def load_scene(
         except SurfaceSizeError as error:
             if options:
                 raise SettingsError(f"scene.options: {error}") from None
+            raise InputError(f"{owner}: {error}") from None
+        except InputError as error:
+            # Ours name the file that they read; of what others make only they can say more.
+            if plugin.distribution == "sononerf" or str(error).startswith(owner):
+                raise
             raise InputError(f"{owner}: {error}") from None
 
 

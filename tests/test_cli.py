@@ -285,6 +285,14 @@ def test_reconstruct_with_spacing_and_level(at_home, tmp_path):
     assert tree(at_home.run) == before
 
 
+def test_a_comparison_is_told_in_millimetres(tmp_path, monkeypatch):
+    found = {"strongest_m": [0.0071, 0.013, -0.06], "score": 0.52, "distance_m": 0.00484}
+    (tmp_path / "comparison.json").write_text(json.dumps(found))
+    monkeypatch.setattr("sononerf.experiment.compare.compare_runs", lambda *a, **k: tmp_path)
+    said = done("compare", "runs/a", "runs/b").err
+    assert "at (7.1, 13.0, -60.0) mm, 0.52 of the maximum; 4.8 mm from the middle of what" in said
+
+
 def test_two_runs_are_compared(at_home, tmp_path):
     state, description = load_weights(at_home.run)
     state["renderer.log_gain"] -= 0.5

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 
@@ -155,11 +155,36 @@ def test_options_are_filled_in_and_converted():
         ({"poses": [], "size": "big"}, "field.options.size: found 'big'"),
         ({"poses": [], "size": float("nan")}, "field.options.size: found nan"),
         ({"poses": [], "kind": "c"}, "field.options.kind: found 'c'"),
+        ({"poses": [], "size": True}, "field.options.size: give a number, not yes or no"),
     ],
 )
 def test_wrong_options_are_told(options, message):
     with pytest.raises(SettingsError, match=message.replace("?", r"\?")):
         check(options)
+
+
+def test_yes_and_no_are_no_numbers_wherever_they_stand():
+    def truthful(pair: tuple[float, float] = (0, 1), flat: bool = False, name: Any = None):
+        """A factory that takes numbers and truths."""
+
+    assert check({"flat": True, "name": True}, truthful)["flat"] is True
+    said = r"^field\.options\.pair\.1: give a number, not yes or no$"
+    with pytest.raises(SettingsError, match=said):
+        check({"pair": [0.0, False]}, truthful)
+
+
+def test_a_list_that_is_too_short_is_told_in_one_line():
+    def needy(size: tuple[float, float, float] = (1, 1, 1)):
+        """A factory that takes three numbers."""
+
+    with pytest.raises(SettingsError) as caught:
+        check({"size": [4]}, needy)
+    assert str(caught.value) == "field.options.size: found [4]; give 3 values"
+
+
+def test_where_there_are_no_options_none_are_listed():
+    with pytest.raises(SettingsError, match=r"size: unknown key; there is none to set here$"):
+        check({"size": 1}, lambda: None)
 
 
 def test_a_choice_of_types_is_told_under_its_own_key():

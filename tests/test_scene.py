@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 import logging
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -199,6 +200,27 @@ def test_a_size_is_blamed_on_options_where_there_are_some(monkeypatch):
     monkeypatch.setattr(plugins, "load", lambda group, name: lambda: Scene(box(200)))
     with pytest.raises(InputError, match=r"^scene 'sphere' of sononerf [\d.]+: the mesh is 200 m"):
         load_scene("sphere")
+
+
+def test_faults_of_anothers_mesh_name_who_made_it(monkeypatch):
+    monkeypatch.setattr(plugins, "load", lambda group, name: lambda: Scene(trimesh.Trimesh()))
+    with pytest.raises(InputError, match=r"^the mesh has no triangles"):
+        load_scene("sphere")  # ours say themselves what they read
+    other = [replace(plugin, distribution="bats") for plugin in list_scenes()]
+    monkeypatch.setattr("sononerf.scene.list_scenes", lambda: other)
+    with pytest.raises(
+        InputError, match=r"^scene 'sphere' of bats 0\S+: the mesh has no triangles"
+    ):
+        load_scene("sphere")
+    monkeypatch.setattr(plugins, "load", lambda group, name: lambda: 5)
+    with pytest.raises(InputError, match=r"^scene 'sphere' of bats 0\S+ returned int"):
+        load_scene("sphere")
+
+
+def test_a_mesh_without_any_area_is_refused():
+    line = trimesh.Trimesh([[0, 0, 0], [0.1, 0, 0], [0.2, 0, 0]], [[0, 1, 2]], process=False)
+    with pytest.raises(InputError, match="no triangle of the mesh has an area"):
+        Scene(line)
 
 
 def unreadable(size: "NoSuchType" = 1):  # noqa: F821

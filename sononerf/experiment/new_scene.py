@@ -10,6 +10,8 @@ import re
 import sys
 from pathlib import Path
 
+import yaml
+
 from sononerf import plugins, storage
 from sononerf.errors import SettingsError
 
@@ -107,6 +109,11 @@ def _check_name(name: str, module: str) -> None:
         )
     if keyword.iskeyword(module) or module == "setup":  # setup.py is run by who installs it
         raise SettingsError(f"NAME: {name!r} is a word of Python; choose another, e.g. my_{module}")
+    if yaml.safe_load(module) != module:
+        raise SettingsError(
+            f"NAME: {name!r} means something else in a settings file; choose another, "
+            f"e.g. my_{module}"
+        )
     for plugin in plugins.registered(plugins.SCENES):
         if plugin.name == module:
             raise SettingsError(

@@ -181,7 +181,8 @@ def _levelled(
     mean = float(np.average(at_points, weights=weights))
     if not mean > 0:
         raise NumericalError(
-            "no surface: the points' normals enclose nothing; they may point inward"
+            "no surface: what was heard encloses nothing, or its normals point inward; more calls "
+            "or epochs may help"
         )
     density = cloud.blurred(weights, LEVEL_RADIUS)
     near = np.float32(0.01 * np.median(cloud.read(density)))

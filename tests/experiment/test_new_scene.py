@@ -74,6 +74,8 @@ def test_what_is_written_installs_and_passes_its_own_test(tmp_path):
         ("bär", "found 'bär'"),
         ("bar\n", "found"),
         ("lambda", "'lambda' is a word of Python"),
+        ("null", "'null' means something else in a settings file"),
+        ("yes", "'yes' means something else in a settings file"),
         ("sphere", "scene 'sphere' is there already, of sononerf "),
         ("three-spheres", "scene 'three_spheres' is there already"),
         ("scikit-image", "installed already, as scikit-image "),
