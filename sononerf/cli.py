@@ -88,12 +88,31 @@ def _root(
 
 @app.command()
 def scenes(
+    name: Annotated[
+        str | None, typer.Argument(help="One of them, to be told of its options.")
+    ] = None,
     as_json: Json = False,
     preview: Annotated[Path | None, typer.Option(help="Draw every scene into this folder.")] = None,
 ) -> None:
-    """List the scenes that are installed, built-in and everyone's."""
-    from sononerf.experiment.scenes import describe_scenes, draw_scenes, scene_table
+    """List the scenes that are installed, built-in and everyone's, or the options of one."""
+    from sononerf.experiment.scenes import (
+        describe_scene,
+        describe_scenes,
+        draw_scenes,
+        option_table,
+        scene_table,
+    )
 
+    if name is not None:
+        if preview is not None:
+            raise SettingsError("--preview draws all scenes; leave NAME out, or simulate --preview")
+        scene = describe_scene(name)
+        if as_json:
+            _print_json(scene)
+            return
+        for line in option_table(scene):
+            typer.echo(line)
+        return
     if preview is not None:
         written, skipped = draw_scenes(preview)
         for path in written:

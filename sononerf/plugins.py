@@ -12,9 +12,11 @@ import typing
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError, create_model
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
+from pydantic.errors import PydanticUserError
+from pydantic_core import to_jsonable_python
 
 from sononerf.config import describe_faults, refuse_truths
 from sononerf.errors import InputError, SettingsError
@@ -111,6 +113,80 @@ def check_options(
     InputError
         If the factory's annotations cannot be read.
     """
+    model = _options_model(factory, where, given)
+    try:
+        checked = model.model_validate(dict(options))
+    except ValidationError as error:
+        raise SettingsError(describe_faults(error, model, None, where)) from None
+    refuse_truths(options, checked, prefix=where)
+    return {name: getattr(checked, name) for name in model.model_fields}
+
+
+def describe_options(factory: Callable[..., Any], *, given: int = 0) -> list[dict[str, Any]]:
+    """Return what may be set of a factory's keyword arguments.
+
+    Parameters
+    ----------
+    factory : callable
+        Its annotated keyword arguments are what may be set.
+    given : int
+        How many leading arguments the caller passes itself.
+
+    Returns
+    -------
+    rows : list of dict
+        ``name``; ``default``, plain data, or None where there is none; ``needed``, where it has
+        to be set; ``allowed``, in words.
+
+    Raises
+    ------
+    InputError
+        If the factory's annotations cannot be read.
+    """
+    rows = []
+    for name, field in _options_model(factory, "options", given).model_fields.items():
+        needed = field.is_required()
+        default = None if needed else to_jsonable_python(field.default, fallback=str)
+        kind: Any = (
+            Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+        )
+        try:
+            schema = TypeAdapter(kind).json_schema()
+        except PydanticUserError:  # a type of the plugin's own, which has no schema
+            schema = {}
+        rows.append(
+            {"name": name, "default": default, "needed": needed, "allowed": _allowed(schema)}
+        )
+    return rows
+
+
+NUMBERS = {"number": "a number", "integer": "a whole number"}
+KINDS = {
+    **NUMBERS, "string": "text", "boolean": "true or false", "null": "none", "object": "a section",
+}  # fmt: skip
+
+
+def _allowed(schema: Mapping[str, Any]) -> str:
+    """Put a JSON schema into words."""
+    if "anyOf" in schema:
+        return " or ".join(dict.fromkeys(_allowed(part) for part in schema["anyOf"]))
+    if "enum" in schema or "const" in schema:
+        return ", ".join(str(value) for value in schema.get("enum", [schema.get("const")]))
+    if schema.get("type") == "array":
+        count = schema.get("minItems")
+        fixed = count is not None and count == schema.get("maxItems")
+        each = _allowed((schema.get("prefixItems") or [schema.get("items") or {}])[0])
+        return f"{count} of: {each}" if fixed else f"a list of: {each}"
+    kind = "a section" if "$ref" in schema else KINDS.get(str(schema.get("type")), "see the source")
+    if schema.get("type") not in NUMBERS:
+        return kind
+    least, most = schema.get("minimum"), schema.get("maximum")
+    above, below = schema.get("exclusiveMinimum"), schema.get("exclusiveMaximum")
+    bounds = (("from", least), ("above", above), ("to", most), ("below", below))
+    return " ".join([kind, *(f"{word} {bound}" for word, bound in bounds if bound is not None)])
+
+
+def _options_model(factory: Callable[..., Any], where: str, given: int) -> type[BaseModel]:
     try:
         signature = inspect.signature(factory)
         target = factory.__init__ if inspect.isclass(factory) else factory
@@ -128,9 +204,4 @@ def check_options(
         extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False, protected_namespaces=()
     )
     model: type[BaseModel] = create_model("Options", __config__=config, **fields)
-    try:
-        checked = model.model_validate(dict(options))
-    except ValidationError as error:
-        raise SettingsError(describe_faults(error, model, None, where)) from None
-    refuse_truths(options, checked, prefix=where)
-    return {name: getattr(checked, name) for name in fields}
+    return model

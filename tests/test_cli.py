@@ -285,6 +285,14 @@ def test_reconstruct_with_spacing_and_level(at_home, tmp_path):
     assert tree(at_home.run) == before
 
 
+def test_the_options_of_one_scene_are_told():
+    assert "curl" in done("scenes", "leaf").out
+    found = json.loads(done("scenes", "leaf", "--json").out)
+    assert {"name": "curl", "default": 60.0}.items() <= found["options"][3].items()
+    assert "did you mean leaf?" in refused(2, "scenes", "lef")
+    assert "leave NAME out" in refused(2, "scenes", "leaf", "--preview", "there")
+
+
 def test_a_comparison_is_told_in_millimetres(tmp_path, monkeypatch):
     found = {"strongest_m": [0.0071, 0.013, -0.06], "score": 0.52, "distance_m": 0.00484}
     (tmp_path / "comparison.json").write_text(json.dumps(found))

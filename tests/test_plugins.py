@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import sys
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pytest
+from pydantic import Field
 
 from sononerf import plugins
 from sononerf.errors import InputError, SettingsError
@@ -180,6 +181,28 @@ def test_a_list_that_is_too_short_is_told_in_one_line():
     with pytest.raises(SettingsError) as caught:
         check({"size": [4]}, needy)
     assert str(caught.value) == "field.options.size: found [4]; give 3 values"
+
+
+def test_options_are_told_with_default_and_bounds():
+    def many(
+        size: Annotated[float, Field(gt=0, le=2)],
+        place: tuple[float, float, float] = (0, 1, 2),
+        *,
+        kind: Literal["a", "b"] = "a",
+        count: Annotated[int, Field(ge=1)] | None = None,
+        names: list[str] | None = None,
+        own: Factory | None = None,
+    ):
+        """A factory of all sorts."""
+
+    assert [tuple(row.values()) for row in plugins.describe_options(many)] == [
+        ("size", None, True, "a number above 0 to 2"),
+        ("place", [0, 1, 2], False, "3 of: a number"),
+        ("kind", "a", False, "a, b"),
+        ("count", None, False, "a whole number from 1 or none"),
+        ("names", None, False, "a list of: text or none"),
+        ("own", None, False, "see the source"),  # what has no schema keeps no other from it
+    ]
 
 
 def test_where_there_are_no_options_none_are_listed():

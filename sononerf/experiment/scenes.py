@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import logging
 import sys
 from collections.abc import Callable, Iterator
@@ -76,6 +77,46 @@ def scene_table(rows: list[dict[str, Any]]) -> list[str]:
         f"{summary}".rstrip()
         for name, origin, size, count, summary in table
     ]
+
+
+def describe_scene(name: str) -> dict[str, Any]:
+    """Return what one scene is, and what may be set of it.
+
+    Returns
+    -------
+    scene : dict
+        ``name``, ``description``, all of it but what is returned and raised, and ``options``, as
+        :func:`sononerf.plugins.describe_options` has them.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such scene.
+    InputError
+        If it is broken.
+    """
+    with _quietly():
+        factory = plugins.load(plugins.SCENES, name)
+        return {
+            "name": name,
+            "description": (inspect.getdoc(factory) or "").partition("\n\nReturns\n")[0],
+            "options": plugins.describe_options(factory),
+        }
+
+
+def option_table(scene: dict[str, Any]) -> list[str]:
+    """Return a scene's description and its options as lines."""
+    table = [("scene.options.", "default", "allowed")]
+    for row in scene["options"]:
+        default = "needed" if row["needed"] else _plain(row["default"])
+        table.append((row["name"], default, row["allowed"]))
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = [f"{a:{widths[0]}}  {b:{widths[1]}}  {c}".rstrip() for a, b, c in table]
+    return [*scene["description"].splitlines(), "", *lines]
+
+
+def _plain(value: object) -> str:
+    return json.dumps(value) if isinstance(value, bool) else "none" if value is None else str(value)
 
 
 def _options(factory: Callable[..., Any]) -> tuple[list[str], list[str]]:

@@ -14,9 +14,11 @@ from sononerf.data.store import EnsembleStore
 from sononerf.errors import StorageError
 from sononerf.experiment import scenes as scenes_module
 from sononerf.experiment.scenes import (
+    describe_scene,
     describe_scenes,
     draw_ensemble,
     draw_scenes,
+    option_table,
     scene_table,
 )
 
@@ -31,6 +33,19 @@ def few(monkeypatch):
         return [plugin for plugin in real() if plugin.name in wanted]
 
     monkeypatch.setattr(scenes_module, "list_scenes", listed)
+
+
+def test_one_scene_tells_its_options():
+    lines = option_table(describe_scene("mesh"))
+    assert lines[0] == "Load a surface from a file."
+    assert not any("Returns" in line or "Raises" in line for line in lines)
+    rows = {
+        line.split()[0]: line.split(maxsplit=2)[1:] for line in lines[lines.index("") :] if line
+    }
+    assert rows["path"] == ["needed", "text"]
+    assert rows["scale"] == ["1.0", "a number above 0"]
+    assert rows["centre"] == ["true", "true or false"]
+    assert rows["unit"] == ["none", "m, cm, mm or none"]
 
 
 def test_every_scene_says_where_it_is_from_and_what_it_takes(plugin, few):
