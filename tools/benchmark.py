@@ -51,6 +51,12 @@ from tools.benchmarks.shapes import shapes  # noqa: E402
 from tools.benchmarks.simulator import noise, simulate  # noqa: E402
 from tools.benchmarks.step import step  # noqa: E402
 
+MAIN_HELP = "places of prey under the conditions 100-calls and clutter (20)"
+OTHER_HELP = "places of prey under every other condition (5)"
+CONDITIONS_HELP = "fewer or more calls, no ears, noise (signal to noise in dB), clutter; all"
+SECONDS_HELP = "fits that take longer are marked in the table (60)"
+SET_HELP = "laid over the settings of every run"
+
 
 def main() -> None:
     """Measure what the command line asks for."""
@@ -72,10 +78,10 @@ def main() -> None:
             command.add_argument("--count", type=int, default=20, help="how many")
             command.add_argument("--first", type=int, default=0, help="the first seed")
         if series is prey:
-            command.add_argument("--placements", type=int, default=20, help="of the first two")
-            command.add_argument("--others", type=int, default=5, help="of all other conditions")
+            command.add_argument("--placements", type=int, default=20, help=MAIN_HELP)
+            command.add_argument("--others", type=int, default=5, help=OTHER_HELP)
             names = [condition.name for condition in CONDITIONS]
-            command.add_argument("--conditions", nargs="+", choices=names, help="all where none")
+            command.add_argument("--conditions", nargs="+", choices=names, help=CONDITIONS_HELP)
         if series is step:
             command.add_argument("--accelerator", choices=("auto", "cpu", "gpu"), default="auto")
             command.add_argument("--compare", type=Path, metavar="OLD.json", help="print ratios")
@@ -87,10 +93,10 @@ def main() -> None:
             command.add_argument("--minutes", type=float, default=60.0, help="of the paper's fit")
             command.add_argument("--steps", type=int, help="of the paper's fit; none are timed")
         elif series is not step:
-            command.add_argument("--seconds", type=float, default=60.0, help="longer are marked")
+            command.add_argument("--seconds", type=float, default=60.0, help=SECONDS_HELP)
         command.add_argument("--output", type=Path, help="folder of runs and table")
         command.add_argument("--data", type=Path, help="folder of the ensembles; DIR/data")
-        command.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help="settings")
+        command.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help=SET_HELP)
     arguments = parser.parse_args()
     found = arguments.run(arguments)
     print(found if isinstance(found, str) else json.dumps(found, indent=2))
