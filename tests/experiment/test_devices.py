@@ -22,6 +22,7 @@ def test_two_devices_fit_what_one_fits(tmp_path):
         assert done.returncode == 0, done.stderr
         found.append(json.loads((tmp_path / folder / "metrics.json").read_text())["prediction"])
     one, two = found
-    # Sums over half batches round differently; 120 steps of Adam let that grow.
-    assert two["mae_db"] == pytest.approx(one["mae_db"], abs=0.1)
+    # Sums over half batches round differently; 120 steps of Adam let that grow, here to 0.02 dB.
+    # What is traced off the mesh of so short a fit hangs on where its surface is torn.
+    assert two["rendered_mae_db"] == pytest.approx(one["rendered_mae_db"], abs=0.1)
     assert two["mae_db"] < 0.7 * two["mean_predictor_mae_db"]
