@@ -44,6 +44,7 @@ TRAIN, VALIDATION, TEST = 0, 1, 2
 CONNECT_SECONDS = 30  # a scheduler across a network answers in one
 QUEUED_PER_WORKER = 4  # results wait in memory; more than this would only fill it
 PATIENCE_SECONDS = 10  # without a result, before workers are looked for
+GIVEN_UP_AFTER = 6  # such times on end without any worker of our own: none will come again
 SENT_AGAIN = 3  # times, and each time Dask itself tries four workers
 
 
@@ -262,7 +263,8 @@ def simulate_ensemble(
         _hand_over(results, len(wanted), write, progress)
     elif wanted:
         with _workers(workers, scheduler) as client:
-            results = _simulate_there(client, simulator, poses, wanted, seed)
+            ours = scheduler is None
+            results = _simulate_there(client, simulator, poses, wanted, seed, ours=ours)
             _hand_over(results, len(wanted), write, progress)
 
 
@@ -307,7 +309,13 @@ def _one(
 
 
 def _simulate_there(
-    client: Client, simulator: Simulator, poses: Poses, indices: list[int], seed: int
+    client: Client,
+    simulator: Simulator,
+    poses: Poses,
+    indices: list[int],
+    seed: int,
+    *,
+    ours: bool,
 ) -> Iterator[tuple[int, NDArray[np.float32]]]:
     from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 
@@ -315,7 +323,7 @@ def _simulate_there(
 
     executor, sent = client.get_executor(pure=False), _send(client, simulator)
     left, running, lost = deque(indices), dict[Future[Any], int](), Counter[int]()
-    idle = False
+    idle = 0
     while left or running:
         # Workers come and go.
         threads = _threads(client)
@@ -324,9 +332,14 @@ def _simulate_there(
             pose = poses.positions[index], poses.rotations[index]
             running[executor.submit(_one, sent, *pose, pose_seed(seed, index))] = index
         done = wait(running, PATIENCE_SECONDS, return_when=FIRST_COMPLETED).done
-        if not done and not threads and not idle:
+        idle = idle + 1 if not done and not threads else 0
+        if idle == 1:
             logger.warning("the Dask scheduler has no workers; waiting for some")
-        idle = not done and not threads
+        if ours and idle >= GIVEN_UP_AFTER:  # on a cluster others may start some tomorrow
+            raise ResourceError(
+                "all workers on this machine were killed, and none came back; give them more "
+                "memory, or start fewer; the same command goes on with what is missing"
+            )
         for future in done:
             index = running.pop(future)
             try:
