@@ -11,6 +11,10 @@ from sononerf.data.store import EnsembleStore
 Array = NDArray[np.float64]
 FAINTEST_DB = 40.0
 """Below the pose's loudest. What is fainter may be the skirt of the window, no echo."""
+FAINT_DB = 20.0
+"""Below the zero of the reported decibels: so faint is a thin sheet's edge beside its flash."""
+NOISE_DB, QUIET_SHARE = 10.0, 0.1
+"""Above the quietest tenth of what a pose heard: so high do the tops of noise reach."""
 ONSET_DB = 10.0
 """Below an echo's top: where it has risen to this its place is read, for there the next one, which
 may follow closely, has not begun."""
@@ -53,6 +57,8 @@ def _rise(window: Array) -> float:
 def _first(power: Array, axis: Array, floor: float) -> float:
     """Return the range at which the first echo has risen to the onset."""
     inner = power[1:-1]
+    noise = float(np.quantile(power, QUIET_SHARE)) * 10 ** (NOISE_DB / 10)
+    floor = min(floor, max(noise, floor * 10 ** (-FAINT_DB / 10)))
     least = max(floor, power.max() * 10 ** (-FAINTEST_DB / 10))
     tops = (inner >= power[:-2]) & (inner > power[2:]) & (inner > least)
     if not tops.any() or (power[0] > least and power[0] >= power[1]):

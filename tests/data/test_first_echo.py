@@ -81,17 +81,24 @@ def test_an_echo_behind_the_first_one_does_not_move_it(behind, level_db):
 
 
 def test_what_is_fainter_than_a_skirt_is_no_echo():
-    """40 dB below the pose's loudest, and 60 dB below that of all poses."""
+    """40 dB below the pose's loudest, and 80 dB below that of all poses."""
     loud = 0.4
     both = [echo(0.3, level) + echo(loud) for level in (-38.0, -42.0)]
-    faint = [echo(0.3, level - 61.0) + echo(loud, -22.0) for level in (0.0, 3.0)]
+    faint = [echo(0.3, level - 81.0) + echo(loud, -42.0) for level in (0.0, 3.0)]
     found = found_in([both, faint])
     np.testing.assert_allclose(found, [[0.3, loud], [loud, 0.3]], rtol=0, atol=FOUND)
 
 
+def test_noise_is_no_echo():
+    """Of seventy decibels below the loudest pose, as the mean of a few independent frequencies."""
+    noise = 1e-7 * np.random.default_rng(0).gamma(5.0, 0.2, size=(20, 2, len(RANGE)))
+    found = found_in([each + echo(0.4, -40.0) for each in noise])
+    np.testing.assert_allclose(found, 0.4, rtol=0, atol=1e-3)
+
+
 def test_an_ear_that_hears_nothing_tells_nothing():
     silence = np.zeros(len(RANGE))
-    murmur = echo(0.3, -61.0)
+    murmur = echo(0.3, -81.0)
     found = found_in([[silence, echo(0.3)], [murmur, silence]])
     assert found[0, 0] == found[1, 0] == found[1, 1] == -np.inf
     assert found[0, 1] == pytest.approx(0.3, abs=FOUND)
