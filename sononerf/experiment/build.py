@@ -16,6 +16,7 @@ from sononerf.acoustics.ears import analysed_ears, synthetic_ears
 from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import Settings, faults_of
+from sononerf.data.datamodule import EchoDataModule
 from sononerf.data.first_echo import first_echoes
 from sononerf.data.region import WITNESS_GAIN, EchoEvidence, echo_power, echo_reach
 from sononerf.data.store import EnsembleStore
@@ -177,6 +178,20 @@ def check_plugins(settings: Settings) -> None:
     """Refuse unknown kinds and options before anything expensive."""
     region = torch.tensor([[-0.05] * 3, [0.05] * 3])
     field_and_renderer(settings, region)
+
+
+def data_for(settings: Settings, store: EnsembleStore, renderer: Renderer) -> EchoDataModule:
+    """Return the LightningDataModule that streams an ensemble as a renderer wants it."""
+    fit = settings.fit
+    return EchoDataModule(
+        store,
+        whole_poses=renderer.whole_poses,
+        batch=fit.batch_poses if renderer.whole_poses else fit.batch_slices,
+        batch_frequencies=None if fit.batch_frequencies == "all" else fit.batch_frequencies,
+        seed=fit.seed,
+        workers=settings.data.workers,
+        memory_bytes=settings.data.memory_bytes,
+    )
 
 
 def module_for(

@@ -30,6 +30,7 @@ from sononerf.data.store import EnsembleStore
 from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.experiment.build import (
     check_plugins,
+    data_for,
     echo_hull,
     echo_region,
     field_and_renderer,
@@ -210,17 +211,7 @@ def _fit(
     progress.say(f"region {corners[0]} to {corners[1]} mm")
     field, renderer = field_and_renderer(settings, region)
     options = settings.fit
-    data = EchoDataModule(
-        store,
-        whole_poses=renderer.whole_poses,
-        batch=options.batch_poses if renderer.whole_poses else options.batch_slices,
-        batch_frequencies=(
-            None if options.batch_frequencies == "all" else options.batch_frequencies
-        ),
-        seed=options.seed,
-        workers=settings.data.workers,
-        memory_bytes=settings.data.memory_bytes,
-    )
+    data = data_for(settings, store, renderer)
     per_epoch, total = _length(settings, data.stream().batches_per_pass)
     module = module_for(
         settings,

@@ -33,6 +33,7 @@ from sononerf.config import Settings, load_settings
 from sononerf.data.datamodule import EchoDataModule
 from sononerf.experiment.build import (
     acquisition,
+    data_for,
     echo_region,
     field_and_renderer,
     module_for,
@@ -242,17 +243,7 @@ def _measured(pair: Pair, settings: Settings, accelerator: str, product: float, 
         renderer = EquationSeventeen(region, acquisition(settings), **settings.renderer.options)
         renderer.load_state_dict(own)
     options = settings.fit
-    data = EchoDataModule(
-        store,
-        whole_poses=renderer.whole_poses,
-        batch=options.batch_poses if renderer.whole_poses else options.batch_slices,
-        batch_frequencies=(
-            None if options.batch_frequencies == "all" else options.batch_frequencies
-        ),
-        seed=options.seed,
-        workers=settings.data.workers,
-        memory_bytes=settings.data.memory_bytes,
-    )
+    data = data_for(settings, store, renderer)
     per_epoch = data.stream().batches_per_pass
     module = module_for(
         settings,
