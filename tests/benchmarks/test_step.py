@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import json
 from argparse import Namespace
+from pathlib import Path
 
 import pytest
 import torch
@@ -75,6 +76,20 @@ def test_the_table_says_how_many_times_as_fast(measured):
         "fourier, shell",
         "grid, profile",
     ]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"scene": "nosuch"}, "error: unknown scene 'nosuch'"),
+        ({"compare": Path("nofile.json")}, "error: nofile.json"),
+    ],
+)
+def test_what_is_wrong_is_told_in_one_line_before_any_step_is_timed(tmp_path, wrong, said):
+    plain = {"output": tmp_path, "data": None, "scene": "sphere", "set": [], "compare": None}
+    with pytest.raises(SystemExit, match=f"^{said}"):
+        module.step(Namespace(**{**plain, "accelerator": "cpu", **wrong}))
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_traffic_counts_what_is_read_and_written_and_not_what_is_only_looked_at():

@@ -28,6 +28,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
+from sononerf import storage
 from sononerf.callbacks.threads import ThreadsCallback
 from sononerf.config import Settings, load_settings
 from sononerf.data.datamodule import EchoDataModule
@@ -46,7 +47,7 @@ from sononerf.module import EchoModule
 from sononerf.progress import Progress
 from sononerf.renderer.shell import ShellRenderer
 from sononerf.scene import load_scene
-from tools.benchmarks.experiment import CONFIG, Row, aligned
+from tools.benchmarks.experiment import CONFIG, Row, aligned, ending
 from tools.benchmarks.record import device_name, keep, ratios
 
 PAPER = CONFIG.parent / "paper" / "three_spheres.yaml"
@@ -198,9 +199,16 @@ class Stopwatch(lightning.Callback):
 
 def step(arguments: argparse.Namespace) -> str:
     """Time a step of each field through each renderer, beside equation 17 as it stands."""
+    output = arguments.output or Path("runs") / "step"
+    with ending(output):
+        return _step(arguments, output)
+
+
+def _step(arguments: argparse.Namespace, output: Path) -> str:
     require_accelerator(arguments.accelerator)
     quiet_lightning()
-    output = arguments.output or Path("runs") / "step"
+    if arguments.compare is not None:
+        storage.read_json(arguments.compare)  # that it cannot be read is told before minutes pass
     device = device_name(arguments.accelerator)
     product, copy = matrix_rate(device), copy_rate(device)
     rows: list[Row] = []
