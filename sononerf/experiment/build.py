@@ -20,12 +20,17 @@ from sononerf.data.datamodule import EchoDataModule
 from sononerf.data.first_echo import first_echoes
 from sononerf.data.region import WITNESS_GAIN, EchoEvidence, echo_power, echo_reach
 from sononerf.data.store import EnsembleStore
-from sononerf.errors import InputError
+from sononerf.errors import InputError, NumericalError
 from sononerf.field.field import Field
 from sononerf.geometry.hull import EchoHull
+from sononerf.geometry.late_echo import without_late
 from sononerf.module import EchoModule
 from sononerf.renderer.renderer import Acquisition, Possible, Renderer
 from sononerf.simulation.simulator import DEFAULT_SPEED, DEFAULT_TEMPERATURE
+
+MARGIN_OF_SOUND = 0.15
+"""Of its size: so far around the region of the sound, on each side, the origins of first echoes are
+sought."""
 
 
 def _tensor(values: NDArray[np.floating]) -> Tensor:
@@ -66,7 +71,7 @@ def acquisition(settings: Settings) -> Acquisition:
 
 
 def echo_hull(settings: Settings, store: EnsembleStore) -> EchoHull:
-    """Return the space that the first echoes of the training poses leave."""
+    """Return the space that the first echoes of the training poses leave, without late ones."""
     known = acquisition(settings)
     first = first_echoes(
         store,
@@ -79,13 +84,26 @@ def echo_hull(settings: Settings, store: EnsembleStore) -> EchoHull:
     positions = np.asarray(store.positions, dtype=np.float64)[train]
     rotations = np.asarray(store.rotations, dtype=np.float64)[train]
     ears = known.ear_positions.double().numpy()
-    return EchoHull(
+    hull = EchoHull(
         emitters=positions + rotations @ known.emitter.double().numpy(),
         receivers=positions[:, None] + np.einsum("pij,ej->pei", rotations, ears),
         first=first,
         axes=rotations[:, :, 0],
         within=_beam_cosine(known),
     )
+    try:
+        # Without the hull: late echoes would make it too small.
+        lower, upper = _evidence(settings, store, None).box()
+    except NumericalError:
+        return hull  # whoever needs a region will say why there is none
+    margin = MARGIN_OF_SOUND * (upper - lower)
+    return without_late(hull, lower - margin, upper + margin)
+
+
+def _evidence(settings: Settings, store: EnsembleStore, hull: EchoHull | None) -> EchoEvidence:
+    ears = synthetic_ears(settings.ears, frequency_axis(settings.spectrogram))
+    reach = echo_reach(settings.call, settings.spectrogram, _speed(settings))
+    return EchoEvidence(store, ears, reach=reach, hull=hull, most=200)
 
 
 def _beam_cosine(known: Acquisition) -> float:
@@ -122,9 +140,7 @@ def echo_region(
         Which places the echoes leave possible, given how far a place speaks for its surroundings.
     """
     hull = hull or echo_hull(settings, store)
-    ears = synthetic_ears(settings.ears, frequency_axis(settings.spectrogram))
-    reach = echo_reach(settings.call, settings.spectrogram, _speed(settings))
-    evidence = EchoEvidence(store, ears, reach=reach, hull=hull, most=200)
+    evidence = _evidence(settings, store, hull)
     set_region = settings.region
     if set_region.lower is not None and set_region.upper is not None:
         box = np.asarray((set_region.lower, set_region.upper))

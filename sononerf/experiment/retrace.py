@@ -65,9 +65,9 @@ def learn_retrace(
     held-out ones are not looked at. Writes ``RUN/retrace.safetensors``.
 
     Where the settings leave open how the surface is found, it is also asked whether what the first
-    echoes leave, the hull, bears out the validation poses better than the run's mesh does; then
-    the run is reconstructed anew. Faces that answer to few poses look dented to a field; where
-    there are hollows the hull is wrong.
+    echoes leave, the hull, bears out the validation poses better than the run's mesh does, and
+    well enough to be believed at all; then the run is reconstructed anew. Faces that answer to few
+    poses look dented to a field; where there are hollows the hull is wrong.
 
     Parameters
     ----------
@@ -106,9 +106,15 @@ def learn_retrace(
         error = np.abs(compress(traced, reference) - wanted).mean()
         return tuned, traced, float(error)
 
-    best = None
+    rendered = render_poses(fitted, validation, accelerator=accelerator, progress=progress)
+
+    def believed(traced: NDArray[np.float64]) -> float:
+        return best_share(_measured(validation), rendered, traced, reference)
+
+    best, share = None, 0.0
     try:
         best = trace(mesh)
+        share = believed(best[1])
     except SonoNerfError as error:  # a mesh may be sound for the eye and unfit for the simulator
         progress.say(f"no echoes are traced off the mesh: {error}")
     surface: Surface = "auto"
@@ -116,15 +122,14 @@ def learn_retrace(
     if fitted.module.field.knows_directions and (read_out.method, read_out.level) == ("auto",) * 2:
         with suppress(SonoNerfError):  # nor need there be a hull, or be one that can be traced
             other = trace(calmed(_hull_surface(fitted)))
-            if best is None or other[2] < best[2]:
-                best, surface = other, "hull"
+            # Of two that nobody believes the better one proves nothing.
+            if (best is None or other[2] < best[2]) and (heeded := believed(other[1])) > 0.0:
+                best, share, surface = other, heeded, "hull"
     if best is None:
         return _keep(path, Retrace(mesh, untold, 0.0), "auto")
     if surface == "hull":
         progress.say("the surface is the hull of first echoes, which bears out unseen poses better")
         reconstruct(path, method="hull", progress=progress)
-    rendered = render_poses(fitted, validation, accelerator=accelerator, progress=progress)
-    share = best_share(_measured(validation), rendered, best[1], reference)
     return _keep(path, replace(best[0], share=share), surface)
 
 

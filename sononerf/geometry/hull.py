@@ -76,17 +76,28 @@ class EchoHull:
             return np.zeros(0), np.zeros(0, dtype=np.intp)
         return np.concatenate([c for c, _ in parts]), np.concatenate([p for _, p in parts])
 
-    def _clearance(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
+    def behind(self, points: Array) -> Array:
+        """Return how far points lie behind each first echo, (N, P, E) m.
+
+        Plus infinity where it tells nothing of them.
+        """
         # No products of matrices: BLAS's threads wait for one another where a core is busy.
         out = cdist(points, self.emitters)
-        # Both ears bound the place: the nearer bound counts.
-        left = np.full(out.shape, np.inf)
-        for ear in range(self.receivers.shape[1]):
-            back = cdist(points, self.receivers[:, ear])
-            np.minimum(left, (out + back) / 2 - self.first[:, ear], out=left)
+        behind = np.stack(
+            [
+                (out + cdist(points, self.receivers[:, ear])) / 2 - self.first[:, ear]
+                for ear in range(self.receivers.shape[1])
+            ],
+            axis=2,
+        )
         if self.within > -1.0:
             ahead = np.einsum("ni,pi->np", points, self.axes)
             ahead -= (self.emitters * self.axes).sum(axis=1)
-            left[ahead < self.within * out] = np.inf
+            behind[ahead < self.within * out] = np.inf
+        return behind
+
+    def _clearance(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
+        # Both ears bound the place: the nearer bound counts.
+        left = self.behind(points).min(axis=2)
         pose = left.argmin(axis=1)
         return left[np.arange(len(points)), pose], pose

@@ -11,10 +11,12 @@ import pytest
 import torch
 
 from sononerf import plugins
+from sononerf.acoustics.ears import synthetic_ears
 from sononerf.acoustics.reception import effective_window
-from sononerf.data.region import OUTSIDE
+from sononerf.acoustics.spectrogram import frequency_axis
+from sononerf.data.region import OUTSIDE, EchoEvidence, echo_reach
 from sononerf.data.store import EnsembleStore
-from sononerf.errors import InputError, SettingsError
+from sononerf.errors import InputError, NumericalError, SettingsError
 from sononerf.experiment import build
 from sononerf.experiment.build import (
     acquisition,
@@ -91,6 +93,10 @@ def test_the_module_is_told_what_is_heard_at_first(tiny):
     assert [module.range_db(step) for step in (0, 3, 4)] == [25.0, 25.0, whole]
 
 
+def nothing_left(*given, **options):
+    raise NumericalError("no pose received an echo")
+
+
 def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeypatch):
     known = dataclasses.replace(
         acquisition(tiny()),
@@ -107,6 +113,7 @@ def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeyp
     heard = np.array([[0.4, 0.41], [-np.inf, 0.39]])
     asked = []
     monkeypatch.setattr(build, "first_echoes", lambda *given: asked.append(given) or heard)
+    monkeypatch.setattr(build, "EchoEvidence", nothing_left)
     hull = echo_hull(tiny(), store)
     expected = [[1.0, 2.002, 2.99], [0.002, 0.0, -0.01]]
     np.testing.assert_allclose(hull.emitters, expected, rtol=0, atol=1e-7)
@@ -129,6 +136,23 @@ def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeyp
     late[1, 3, 40, 100] = 0.004
     known = dataclasses.replace(known, lag=late)
     np.testing.assert_allclose(echo_hull(tiny(), store).first, heard - 0.004, rtol=0, atol=1e-9)
+
+
+def test_the_hull_leaves_late_first_echoes_out(tiny, echoes, monkeypatch):
+    """Their origins are sought around all sound, whatever the first echoes themselves leave."""
+    asked = []
+    monkeypatch.setattr(build, "without_late", lambda *given: asked.append(given) or "the others")
+    store = EnsembleStore.open(echoes)
+    settings = tiny(region={"lower": (-0.001,) * 3, "upper": (0.001,) * 3})
+    assert echo_hull(settings, store) == "the others"
+    ((hull, lower, upper),) = asked
+    assert hull.first.shape == (8, 2)
+    ears = synthetic_ears(settings.ears, frequency_axis(settings.spectrogram))
+    reach = echo_reach(settings.call, settings.spectrogram, 343.0)
+    box = EchoEvidence(store, ears, reach=reach).box()
+    size = box[1] - box[0]
+    np.testing.assert_allclose(lower, box[0] - 0.15 * size, rtol=1e-9)
+    np.testing.assert_allclose(upper, box[1] + 0.15 * size, rtol=1e-9)
 
 
 def test_the_hull_of_a_sphere_holds_it_and_little_more(tiny, echoes):
@@ -249,8 +273,9 @@ def test_the_region_is_told_how_long_an_echo_is(tiny, echoes, monkeypatch):
     store = EnsembleStore.open(echoes)
     for settings in (tiny(), tiny(call={"kind": "linear", "duration": 1e-3})):
         echo_region(settings, store)
-    assert told[0] == pytest.approx(31.5e-6 * 343 / 2)
-    assert told[1] > 3 * told[0]
+    impulse, other, sweep, *_ = told  # the late first echoes are sought first
+    assert impulse == other == pytest.approx(31.5e-6 * 343 / 2)
+    assert sweep > 3 * impulse
 
 
 def test_what_is_possible_is_what_the_hull_leaves(tiny, echoes):

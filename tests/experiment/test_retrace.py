@@ -323,6 +323,15 @@ def test_the_mesh_stays_where_the_hull_is_no_better(run, hull):
     )
 
 
+def test_of_two_that_nobody_believes_the_mesh_stays(run, hull, monkeypatch):
+    reconstruct_as(run, DENTED)
+    asked = hull(SPHERE)
+    monkeypatch.setattr(retrace_module, "best_share", lambda *given: 0.0)
+    assert learn(run) == 0
+    assert asked == []
+    assert borne_out(run) == "auto"
+
+
 def test_a_hull_may_be_traced_where_the_mesh_cannot(run, hull):
     reconstruct_as(run, SPHERE.copy().apply_scale(1e-3))
     asked = hull(SPHERE)
