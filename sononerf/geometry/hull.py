@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.distance import cdist
 
 Array = NDArray[np.float64]
-CHUNK = 8192
+AT_ONCE = 6_400_000
+"""Points times first echoes, so that memory does not grow with the poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +55,11 @@ class EchoHull:
         middle: Array = (self.emitters + self.receivers.mean(axis=1)) / 2
         return middle
 
+    @property
+    def chunk(self) -> int:
+        """How many points are looked at in one go."""
+        return max(AT_ONCE // max(self.first.size, 1), 1)
+
     def clearance(self, points: ArrayLike) -> tuple[Array, NDArray[np.intp]]:
         """Return how far points lie behind the first echoes, and which pose leaves them least.
 
@@ -71,7 +77,8 @@ class EchoHull:
             The pose that says so.
         """
         where = np.asarray(points, dtype=np.float64)
-        parts = [self._clearance(where[i : i + CHUNK]) for i in range(0, len(where), CHUNK)]
+        chunk = self.chunk
+        parts = [self._clearance(where[i : i + chunk]) for i in range(0, len(where), chunk)]
         if not parts:
             return np.zeros(0), np.zeros(0, dtype=np.intp)
         return np.concatenate([c for c, _ in parts]), np.concatenate([p for _, p in parts])

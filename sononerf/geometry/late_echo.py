@@ -35,7 +35,6 @@ AGAINST = 2.0
 others counts for 1/n: it may be itself that is wrong."""
 COARSE = 24
 """Cells along the longest side, at first."""
-CHUNK = 2048
 OCTANTS = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -104,8 +103,8 @@ def _cells(hull: EchoHull, box: Array, wanted: NDArray[np.intp], few: int) -> tu
     while True:
         reach = side * np.sqrt(3) / 2 + READING
         kept = []
-        for start in range(0, len(cells), CHUNK):
-            part = cells[start : start + CHUNK]
+        for start in range(0, len(cells), hull.chunk):
+            part = cells[start : start + hull.chunk]
             behind = hull.behind(part).reshape(len(part), -1)
             against, meets = behind < -reach, np.abs(behind[:, wanted]) <= reach
             keep = (against.sum(axis=1) <= few) & meets.any(axis=1)

@@ -177,9 +177,12 @@ def test_parts_of_the_points_make_no_difference(monkeypatch):
     hull = by_chance(within=0.9)
     points = points_around(100, 0.5)
     whole = hull.clearance(points)
-    monkeypatch.setattr(hull_module, "CHUNK", 7)
+    monkeypatch.setattr(hull_module, "AT_ONCE", 7 * 12 * 2)
+    assert hull.chunk == 7
     for one, two in zip(hull.clearance(points), whole, strict=True):
         np.testing.assert_allclose(one, two, rtol=0, atol=1e-13)
+    monkeypatch.setattr(hull_module, "AT_ONCE", 3)
+    assert hull.chunk == 1
     clearance, pose = hull.clearance(np.zeros((0, 3)))
     assert clearance.shape == pose.shape == (0,)
     assert pose.dtype == np.intp
