@@ -37,6 +37,8 @@ AGREEMENT = 0.6
 """A place is taken where the sound from its range is this part of the best place's, or more."""
 UNEXPLAINED_SHARE = 0.02
 """The search for more places ends when only this share of the sound is not explained."""
+ORIGIN_POSES = 3
+"""So many poses must agree on a place for it to be where their first echoes came from."""
 ROUNDS = 4
 ECHO_END = 0.05
 """An echo ends where its magnitude is this part of its middle's; a Hamming window ends earlier."""
@@ -119,7 +121,8 @@ class EchoEvidence:
         self.reach = reach
         self.hull = hull
         indices = np.asarray(store.indices("train"))
-        indices = indices[np.linspace(0, len(indices) - 1, min(most, len(indices))).astype(int)]
+        chosen = np.linspace(0, len(indices) - 1, min(most, len(indices))).astype(int)
+        indices = indices[chosen]
         self.range = np.asarray(store.range, dtype=np.float64)
         self.step = float(self.range[1] - self.range[0])
         threshold = float(store.attributes["reference"]) * (10 ** (HEARD_DB / 20) - 1)
@@ -137,6 +140,11 @@ class EchoEvidence:
         # Who hears nothing at all tells nothing about what lies in front.
         self.first = np.where(silent, -np.inf, self.range[self.heard.argmax(axis=1)])
         self.last = self.range[self.heard.shape[1] - 1 - self.heard[:, ::-1].argmax(axis=1)]
+        # As the hull knows them, without those that tell nothing.
+        self.nearest = np.full(len(indices), np.inf)
+        if hull is not None:
+            known = np.isfinite(hull.first[chosen])
+            self.nearest = np.where(known, hull.first[chosen], np.inf).min(axis=1)
         self.rotations = np.asarray(store.rotations)[indices]
         # Emitter and ears lie about a centimetre apart: half way between them, the mean of the
         # ranges to both ears is met within a fraction of a millimetre.
@@ -273,10 +281,12 @@ class EchoEvidence:
         Places out in the open lie at the range of *some* echo of many poses, but the echoes
         do not agree there. So the places where they agree best are taken, what they explain is
         taken out of the sound, and the rest is looked at anew, until little is left: a weak or
-        hidden part is found in the sound that the loud ones cannot explain.
+        hidden part is found in the sound that the loud ones cannot explain. Where first echoes are
+        left without a place that they can come from, it is found last.
         """
         unexplained = self.power.copy()
         keep = np.zeros(len(points), dtype=bool)
+        covered = np.zeros_like(self.heard)
         inside = self._in_hull(points, tolerance)
         for silent_share in SILENT_SHARES:
             for _ in range(ROUNDS):
@@ -287,10 +297,44 @@ class EchoEvidence:
                     keep |= energy >= AGREEMENT * energy.max()
                 if int(keep.sum()) == before:
                     break
-                unexplained = np.where(self._covered(points[keep], tolerance), 0.0, self.power)
+                covered = self._covered(points[keep], tolerance)
+                unexplained = np.where(covered, 0.0, self.power)
                 if unexplained.sum() <= UNEXPLAINED_SHARE * self.power.sum():
-                    return keep
-        return keep
+                    return self._with_origins(points, tolerance, keep, covered)
+        return self._with_origins(points, tolerance, keep, covered)
+
+    def _with_origins(self, points: Array, tolerance: float, keep: Mask, covered: Mask) -> Mask:
+        """Add places that first echoes without an origin agree on, to those that are kept.
+
+        Beside a ground a leaf is a small part of the sound, yet what stands nearest to a pose is
+        heard first, however faint it is.
+        """
+        known = np.isfinite(self.nearest)
+        row = np.round((np.where(known, self.nearest, 0.0) - self.range[0]) / self.step)
+        row = row.astype(int).clip(0, len(self.range) - 1)
+        pose = np.arange(len(row))
+        possible: Mask | None = None
+        while True:
+            asks = np.flatnonzero(known & ~covered[pose, row])
+            if len(asks) < max(ORIGIN_POSES, UNEXPLAINED_SHARE * known.sum()):
+                return keep
+            if possible is None:
+                possible = self.about(points, tolerance).possible & self._in_hull(points, tolerance)
+            agree = np.where(possible & ~keep, self._origins(points, tolerance, asks), 0)
+            if agree.max() < ORIGIN_POSES:
+                return keep
+            keep = keep | (agree >= AGREEMENT * agree.max())
+            covered = self._covered(points[keep], tolerance)
+
+    def _origins(self, points: Array, tolerance: float, asks: NDArray[np.intp]) -> Array:
+        """Return how many of some first echoes can have come from each place, (N,)."""
+        parts = []
+        for start in range(0, len(points), CHUNK):
+            distance = cdist(self.sources, points[start : start + CHUNK]).clip(1e-6)
+            witness = self._witnesses(points[start : start + CHUNK], distance)[asks]
+            near = np.abs(distance[asks] - self.nearest[asks, None]) <= tolerance + self.step
+            parts.append((witness & near).sum(axis=0))
+        return np.concatenate(parts)
 
     def _covered(self, points: Array, tolerance: float) -> Mask:
         """Return which range slices of each pose the places explain, (P, R)."""

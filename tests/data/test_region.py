@@ -302,3 +302,72 @@ def test_a_flight_in_a_line(tmp_path, looks):
     box = evidence(tmp_path / "s", positions, rotations, place).box()
     assert (box[0] <= place[0]).all()
     assert (box[1] >= place[0]).all()
+
+
+GROUND = np.array([[x, y, -0.08] for x in (-0.09, 0.0, 0.09) for y in (-0.09, 0.0, 0.09)])
+FAINT = np.array([[0.0, 0.0, 0.05]])
+
+
+def over_loud_ground(position, rotation):
+    """The ground answers 30 dB louder than what stands above it."""
+    return echoes(position, rotation, GROUND) + 10**-1.5 * echoes(position, rotation, FAINT)
+
+
+def test_what_is_heard_first_is_in_the_box_however_faint_it_is(tmp_path):
+    """Of all sound it is less than the part that may stay unexplained."""
+    positions, rotations = around(100)
+    hull = hull_of(np.concatenate((GROUND, FAINT)), positions, rotations)
+    found = evidence(tmp_path / "s", positions, rotations, over_loud_ground, hull=hull)
+    plain = EchoEvidence(EnsembleStore.open(tmp_path / "s"), EARS, reach=HALF_WINDOW)
+    assert plain.box(margin=0.0)[1][2] < FAINT[0, 2] - 0.08
+    lower, upper = found.box(margin=0.0)
+    assert (lower <= GROUND.min(axis=0)).all()
+    assert (upper[:2] >= GROUND.max(axis=0)[:2]).all()
+    # A place speaks for its surroundings, 6 mm at last, and for half of a window around its range.
+    assert upper[2] == pytest.approx(FAINT[0, 2], abs=0.02)
+
+
+def test_where_few_poses_are_asked_each_has_its_own_first_echo(tmp_path):
+    positions, rotations = around(100)
+    hull = hull_of(PLACES, positions, rotations)
+    found = evidence(tmp_path / "s", positions, rotations, PLACES, hull=hull, most=50)
+    asked = [int(np.linalg.norm(positions - at, axis=1).argmin()) for at in found.sources]
+    assert len(set(asked)) == 50
+    np.testing.assert_array_equal(found.nearest, hull.first[asked].min(axis=1))
+
+
+def test_a_first_echo_that_few_share_adds_no_place(tmp_path):
+    """Two poses that heard a click in front of everything, each in a place of its own."""
+    positions, rotations = around(100)
+    clicks = {10: 0.3 * positions[10], 60: 0.3 * positions[60]}
+
+    def heard(position, rotation):
+        index = int(np.linalg.norm(positions - position, axis=1).argmin())
+        click = clicks.get(index)
+        loud = echoes(position, rotation, PLACES)
+        return loud if click is None else loud + 10**-1.5 * echoes(position, rotation, [click])
+
+    hull = hull_of(PLACES, positions, rotations)
+    plain = evidence(tmp_path / "s", positions, rotations, heard, hull=hull)
+    clicked = hull.first.copy()
+    for index, click in clicks.items():
+        alone = hull_of(click[None], positions, rotations)
+        clicked[index] = alone.first[index]
+    wrong = EchoHull(hull.emitters, hull.receivers, clicked, hull.axes)
+    found = EchoEvidence(EnsembleStore.open(tmp_path / "s"), EARS, reach=HALF_WINDOW, hull=wrong)
+    np.testing.assert_array_equal(found.box(), plain.box())
+
+
+def test_ears_that_tell_nothing_are_not_asked(tmp_path):
+    positions, rotations = around(100)
+    hull = hull_of(np.concatenate((GROUND, FAINT)), positions, rotations)
+    one, none = hull.first.copy(), np.full_like(hull.first, -np.inf)
+    one[:, 0] = -np.inf
+    evidence(tmp_path / "s", positions, rotations, over_loud_ground, hull=hull)
+    tops = []
+    for first in (one, none):
+        deaf = EchoHull(hull.emitters, hull.receivers, first, hull.axes)
+        store = EnsembleStore.open(tmp_path / "s")
+        tops.append(EchoEvidence(store, EARS, reach=HALF_WINDOW, hull=deaf).box(margin=0.0)[1][2])
+    assert tops[0] > FAINT[0, 2] - 0.02
+    assert tops[1] < FAINT[0, 2] - 0.08
