@@ -246,6 +246,7 @@ class FitSettings(_Section):
     early_range_db: Annotated[float, Field(gt=0, le=200)] = 30.0  # second bounces lie below it
     early_share: Annotated[float, Field(ge=0, le=1)] = 0.75
     silent_weight: Annotated[float, Field(ge=0)] = 1.0
+    silent_share: Annotated[float, Field(ge=0, le=1)] = 1.0  # of the slices in which nothing sounds
     gradient_clip: Positive | None = None
     seed: Seed = 0
     checkpoint_seconds: Positive = 60.0

@@ -46,6 +46,8 @@ class EchoDataModule(lightning.LightningDataModule):
         Processes that prepare batches; the batches do not depend on it.
     memory_bytes : int
         How much of the ensemble may be kept in memory.
+    silent_share, silent_below : float
+        Which part of the silent slices is met, and what magnitude no cell of these reaches.
     """
 
     def __init__(
@@ -58,6 +60,8 @@ class EchoDataModule(lightning.LightningDataModule):
         seed: int,
         workers: int = 0,
         memory_bytes: int = 2_000_000_000,
+        silent_share: float = 1.0,
+        silent_below: float = 0.0,
     ) -> None:
         super().__init__()
         self.store = store
@@ -67,6 +71,8 @@ class EchoDataModule(lightning.LightningDataModule):
         self.seed = seed
         self.workers = workers
         self.memory_bytes = memory_bytes
+        self.silent_share = silent_share
+        self.silent_below = silent_below
         self.sampler = StepSampler()
 
     def stream(self) -> SliceStream:
@@ -82,6 +88,8 @@ class EchoDataModule(lightning.LightningDataModule):
             seed=self.seed,
             memory_bytes=self.memory_bytes,
             share=share,
+            silent_share=self.silent_share,
+            silent_below=self.silent_below,
         )
 
     def whole(self, split: Literal["train", "val", "test"]) -> WholePoses:

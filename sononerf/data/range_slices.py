@@ -34,6 +34,11 @@ class RangeSlices(NamedTuple):
     spectrum: Tensor  # (P, E, R, B) linear magnitude; no ears where nothing was measured
 
 
+def _silent(spectrogram: Tensor, below: float) -> Tensor:
+    """Tell which slices of one pose (E, R, F) no ear hears anything in, (R,) bool."""
+    return spectrogram.amax(dim=(0, 2)) < below
+
+
 def seed_of(*parts: int) -> int:
     """Mix whole numbers into one seed for torch."""
     return int(np.random.SeedSequence(parts).generate_state(1, np.uint64)[0] >> np.uint64(1))
@@ -89,11 +94,17 @@ class SliceStream(Dataset[RangeSlices]):
         How much of the ensemble may be kept in memory.
     share : (int, int)
         Which part of each batch this device gets, and of how many parts.
+    silent_share : float
+        Which part of the silent slices is met at all, drawn once by the seed; single slices alone.
+    silent_below : float
+        Magnitude that no cell of a silent slice reaches.
 
     Raises
     ------
     SettingsError
         If a batch is smaller than the number of devices.
+    ValueError
+        If whole poses are to go without their silence.
     """
 
     def __init__(
@@ -107,6 +118,8 @@ class SliceStream(Dataset[RangeSlices]):
         seed: int,
         memory_bytes: int,
         share: tuple[int, int] = (0, 1),
+        silent_share: float = 1.0,
+        silent_below: float = 0.0,
     ) -> None:
         self.reader = PoseReader(store, memory_bytes)
         self.poses = torch.as_tensor(store.indices(split))
@@ -116,7 +129,13 @@ class SliceStream(Dataset[RangeSlices]):
         self.frequencies = len(store.frequency)
         self.axis = store.range
         self.whole_poses = whole_poses
-        self.items = len(self.poses) if whole_poses else len(self.poses) * self.ranges
+        self.met: Tensor | None = None  # which slices, where not all
+        if silent_share < 1.0:
+            if whole_poses:
+                raise ValueError("whole poses are met with their silence")
+            self.met = self._met(silent_share, silent_below, seed)
+        every = len(self.poses) if whole_poses else len(self.poses) * self.ranges
+        self.items = every if self.met is None else len(self.met)
         self.batch = min(batch, self.items)
         if self.batch < share[1]:
             raise SettingsError(
@@ -133,6 +152,15 @@ class SliceStream(Dataset[RangeSlices]):
         """Steps in which every pose or slice is met once."""
         return -(-self.items // self.batch)
 
+    def _met(self, silent_share: float, silent_below: float, seed: int) -> Tensor:
+        """Return the slices that sound and some of those that do not, ascending."""
+        poses = self.poses.tolist()
+        silent = torch.cat([_silent(self.reader[pose], silent_below) for pose in poses])
+        sounding, rest = (mask.nonzero()[:, 0] for mask in (~silent, silent))
+        generator = torch.Generator().manual_seed(seed_of(seed, 3))
+        drawn = torch.randperm(len(rest), generator=generator)[: round(silent_share * len(rest))]
+        return torch.cat((sounding, rest[drawn])).sort().values
+
     def _items_of(self, step: int) -> Tensor:
         turn, part = divmod(step, self.batches_per_pass)
         if self._order[0] != turn:
@@ -140,7 +168,8 @@ class SliceStream(Dataset[RangeSlices]):
             self._order = (turn, torch.randperm(self.items, generator=generator))
         # The last batch of a pass is filled up from its beginning, so all have one size.
         index = torch.arange(part * self.batch, (part + 1) * self.batch) % self.items
-        return self._order[1][index][self.share[0] :: self.share[1]]
+        items = self._order[1][index][self.share[0] :: self.share[1]]
+        return items if self.met is None else self.met[items]
 
     def __getitem__(self, step: int) -> RangeSlices:
         """Return batch ``step``."""

@@ -20,11 +20,11 @@ from sononerf.data.datamodule import EchoDataModule
 from sononerf.data.first_echo import first_echoes
 from sononerf.data.region import WITNESS_GAIN, EchoEvidence, echo_power, echo_reach
 from sononerf.data.store import EnsembleStore
-from sononerf.errors import InputError, NumericalError
+from sononerf.errors import InputError, NumericalError, SettingsError
 from sononerf.field.field import Field
 from sononerf.geometry.hull import EchoHull
 from sononerf.geometry.late_echo import without_late
-from sononerf.module import EchoModule
+from sononerf.module import ACTIVE_DB, EchoModule
 from sononerf.renderer.renderer import Acquisition, Possible, Renderer
 from sononerf.simulation.simulator import DEFAULT_SPEED, DEFAULT_TEMPERATURE
 
@@ -193,7 +193,14 @@ def field_and_renderer(settings: Settings, region: Tensor) -> tuple[Field, Rende
 def check_plugins(settings: Settings) -> None:
     """Refuse unknown kinds and options before anything expensive."""
     region = torch.tensor([[-0.05] * 3, [0.05] * 3])
-    field_and_renderer(settings, region)
+    _, renderer = field_and_renderer(settings, region)
+    if settings.fit.silent_share < 1.0 and renderer.whole_poses:
+        with faults_of(settings.source):
+            raise SettingsError(
+                f"fit.silent_share: found {settings.fit.silent_share:g}, but renderer "
+                f"{settings.renderer.kind!r} takes whole poses; lower fit.silent_weight instead, "
+                "or take a renderer of single slices, such as shell"
+            )
 
 
 def data_for(settings: Settings, store: EnsembleStore, renderer: Renderer) -> EchoDataModule:
@@ -207,6 +214,8 @@ def data_for(settings: Settings, store: EnsembleStore, renderer: Renderer) -> Ec
         seed=fit.seed,
         workers=settings.data.workers,
         memory_bytes=settings.data.memory_bytes,
+        silent_share=fit.silent_share,
+        silent_below=float(store.attributes["reference"]) * (10 ** (ACTIVE_DB / 20) - 1),
     )
 
 

@@ -109,6 +109,30 @@ def test_the_last_batch_of_a_pass_is_filled_up(store):
     assert poses[7:] == poses[:2]
 
 
+def test_of_silent_slices_a_share_is_met_and_of_the_others_all(store):
+    # In pose p, row r the loudest cell is 1000 p + 100 + 10 r + 4: with 3134 as the bound the rows
+    # 0 to 2 of pose 3 are silent, and all of poses 0 and 2.
+    options = {"whole_poses": False, "batch": 1, "silent_below": 3134.0}
+    sounding = {(3, row) for row in (3, 4, 5)} | {(p, r) for p in TRAIN[3:] for r in range(RANGES)}
+
+    def met(**more):
+        found = stream(store, **options, **more)
+        batches = [found[step] for step in range(found.batches_per_pass)]
+        return [(int(batch.pose), int(batch.rows)) for batch in batches]
+
+    assert sorted(met(silent_share=0.0)) == sorted(sounding)
+    some = met(silent_share=0.4)
+    assert len(some) == len(set(some)) == len(sounding) + 6  # of 15
+    assert sounding < set(some)
+    assert met(silent_share=0.4, seed=5) != some
+    assert len(met(silent_share=1.0)) == RANGES * len(TRAIN)
+
+
+def test_whole_poses_are_met_with_their_silence(store):
+    with pytest.raises(ValueError, match="silence"):
+        stream(store, silent_share=0.5)
+
+
 def test_a_batch_is_no_larger_than_what_there_is(store):
     found = stream(store, batch=100, batch_frequencies=100)
     assert sorted(found[0].pose.tolist()) == TRAIN

@@ -21,6 +21,7 @@ from sononerf.experiment import build
 from sononerf.experiment.build import (
     acquisition,
     check_plugins,
+    data_for,
     echo_hull,
     echo_region,
     field_and_renderer,
@@ -91,6 +92,29 @@ def test_the_module_is_told_what_is_heard_at_first(tiny):
     module = module_for(settings, *field_and_renderer(settings, BOX), reference=1.0, total_steps=8)
     whole = settings.spectrogram.dynamic_range_db
     assert [module.range_db(step) for step in (0, 3, 4)] == [25.0, 25.0, whole]
+
+
+def test_slices_without_an_active_cell_are_silent(tiny):
+    settings = tiny(
+        renderer={"kind": "shell", "options": {}}, fit={"silent_share": 0.0, "batch_slices": 1}
+    )
+    known = acquisition(settings)
+    heard = torch.zeros(2, len(known.range), len(known.frequency))
+    heard[1, 3, 2] = 0.41  # 2.98 dB where the reference is 1
+    heard[0, 5, 1] = 0.42  # 3.05 dB
+    store = SimpleNamespace(
+        indices=lambda split: np.array([0]),
+        positions=np.zeros((1, 3)),
+        rotations=np.eye(3)[None],
+        range=known.range.numpy(),
+        frequency=known.frequency.numpy(),
+        attributes={"reference": 1.0},
+        read_pose=lambda number: heard.numpy(),
+    )
+    _, renderer = field_and_renderer(settings, BOX)
+    stream = data_for(settings, store, renderer).stream()
+    assert stream.items == 1
+    assert int(stream[0].rows) == 5
 
 
 def nothing_left(*given, **options):
@@ -225,6 +249,7 @@ def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):
             {"field": {"options": {"finest": 0.03}}},
             r"field\.options\.finest: found 0\.03; must not lie above coarsest, 0\.02$",
         ),
+        ({"fit": {"silent_share": 0.2}}, r"fit\.silent_share: found 0\.2, .*'profile' takes whole"),
     ],
 )
 def test_wrong_kinds_and_options_are_refused(tiny, changes, message):
