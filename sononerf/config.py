@@ -272,6 +272,16 @@ class ReconstructionSettings(_Section):
     level: Annotated[float, Field(ge=0)] | Literal["auto"] = "auto"
     method: Literal["auto", "oriented", "hull", "isosurface"] = "auto"
     directions: Annotated[int, Field(ge=6)] = 100
+    smoothing: Annotated[float, Field(ge=0, le=1)] = 0.0  # side of a box over the volume, m
+
+    @model_validator(mode="after")
+    def _smooths_what_is_cut(self) -> ReconstructionSettings:
+        if self.smoothing and self.method != "isosurface":
+            raise ValueError(
+                f"smoothing is of the method isosurface, not of {self.method}; set method, or "
+                "leave it out"
+            )
+        return self
 
 
 class Settings(_Section):

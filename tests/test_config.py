@@ -280,3 +280,12 @@ def test_another_scene_does_not_inherit_the_options_of_the_files_scene(tmp_path)
 def test_poses_of_an_arrangement_say_what_it_needs_and_nothing_else(write, poses, said):
     (line,) = faults(write(SCENE + f"poses: {poses if poses[0] == '{' else '{' + poses + '}'}\n"))
     assert f": poses: {said}" in line
+
+
+def test_only_an_isosurface_is_smoothed(write):
+    (line,) = faults(write(SCENE + "reconstruction: {smoothing: 0.045}\n"))
+    assert ": reconstruction: smoothing is of the method isosurface, not of auto" in line
+    settings = load_settings(
+        write(SCENE + "reconstruction: {smoothing: 0.045, method: isosurface}\n")
+    )
+    assert settings.reconstruction.smoothing == 0.045

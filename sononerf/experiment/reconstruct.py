@@ -97,6 +97,7 @@ def reconstruct(
                 level=level,
                 method=method,
                 directions=options.directions,
+                smoothing=options.smoothing if method == "isosurface" else 0.0,
                 progress=lambda done, total: task.advance(1000 * done // total - task.done),
             )
         if folder.resolve() == (path / "reconstruction").resolve():

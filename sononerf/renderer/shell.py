@@ -20,7 +20,8 @@ class ShellRenderer(Renderer):
 
     The equation's phase factor depends on frequency and range alone and cancels in the
     magnitude. There is no spreading, no absorption and no delay between the ears, as there.
-    The gain g and the call spectrum c are learned. Places outside the field's region are zero
+    The gain g is learned. Of a call spectrum c the equation knows nothing: it is 1, or learned as
+    the published code does. Places outside the field's region are zero
     and are not computed.
 
     Parameters
@@ -34,6 +35,8 @@ class ShellRenderer(Renderer):
     direction : {"incidence", "sensor"}
         What the field is told: the direction from each place to the head, or, as the published
         code does, the sensor's own look direction (reversed) for all places of a call.
+    call_spectrum : {"flat", "learned"}
+        Whether each frequency has a gain of its own.
 
     References
     ----------
@@ -51,6 +54,7 @@ class ShellRenderer(Renderer):
         *,
         directions: Annotated[int, Option(ge=1)] = 600,
         direction: Literal["incidence", "sensor"] = "incidence",
+        call_spectrum: Literal["flat", "learned"] = "flat",
     ) -> None:
         super().__init__(region, acquisition)
         self.told = direction
@@ -65,7 +69,9 @@ class ShellRenderer(Renderer):
             ]
         )
         self.register_buffer("transfer", ears)  # (E, D, F)
-        self.log_spectrum = nn.Parameter(torch.zeros(len(acquisition.frequency)))
+        self.log_spectrum = nn.Parameter(
+            torch.zeros(len(acquisition.frequency)), requires_grad=call_spectrum == "learned"
+        )
 
     def forward(
         self,
@@ -75,7 +81,7 @@ class ShellRenderer(Renderer):
         rows: Tensor,
         bins: Tensor | None = None,
     ) -> Tensor:
-        """Render; see the base class. Differentiable in the field, the gain and the spectrum."""
+        """Render; see the base class. Differentiable in the field, the gain and a learned spectrum."""
         transfer = self.transfer if bins is None else self.transfer[..., bins]
         spectrum = self.log_spectrum if bins is None else self.log_spectrum[bins]
         world = torch.einsum("pij,dj->pdi", rotation, self.directions)  # (P, D, 3)

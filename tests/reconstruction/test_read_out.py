@@ -304,6 +304,22 @@ def test_a_field_without_lobes_is_read_at_a_level():
     assert low.mesh.volume > half.mesh.volume
 
 
+@pytest.mark.parametrize(
+    ("smoothing", "width"),
+    [(0.0025, 1), (0.0075, 3), (0.009, 3), (0.0125, 5), (0.045, 19)],  # of voxels of 2.5 mm
+)
+def test_a_box_may_be_averaged_over_before_the_surface_is_drawn(smoothing, width):
+    options = {"spacing": 0.0025, "directions": 2, "method": "isosurface"}
+    plain = reconstruct(Blob(), **options).volume.values
+    smooth = reconstruct(Blob(), smoothing=smoothing, **options).volume.values
+    # Beyond the grid its outermost values go on, as in MATLAB's smooth3.
+    half = width // 2
+    padded = np.pad(np.asarray(plain, dtype=np.float64), half, mode="edge")
+    for i, j, k in ((0, 0, 0), (10, 12, 9), (18, 12, 12)):
+        box = padded[i : i + width, j : j + width, k : k + width]
+        assert smooth[i, j, k] == pytest.approx(box.mean(), rel=1e-4, abs=1e-6)
+
+
 def test_finer_voxels_come_nearer():
     errors = []
     for spacing in (0.006, 0.003, 0.0015):

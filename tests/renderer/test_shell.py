@@ -69,6 +69,16 @@ def test_equation_17_against_a_slow_loop(head, acquisition, field, told):
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=2e-10)
 
 
+@pytest.mark.parametrize(("call_spectrum", "learned"), [("flat", False), ("learned", True)])
+def test_a_call_spectrum_is_learned_where_it_is_asked_for(
+    acquisition, field, call_spectrum, learned
+):
+    renderer = ShellRenderer(REGION, acquisition, call_spectrum=call_spectrum).double()
+    renderer(field, *poses(), ROWS).sum().backward()
+    assert renderer.log_gain.grad is not None
+    assert (renderer.log_spectrum.grad is not None) == learned
+
+
 def test_six_hundred_even_directions_over_the_forward_hemisphere(renderer):
     directions = renderer.directions
     assert directions.shape == (600, 3)
