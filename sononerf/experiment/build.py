@@ -23,7 +23,7 @@ from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, NumericalError, SettingsError
 from sononerf.field.field import Field
 from sononerf.geometry.hull import EchoHull
-from sononerf.geometry.late_echo import without_late
+from sononerf.geometry.late_echo import corrected
 from sononerf.module import ACTIVE_DB, EchoModule
 from sononerf.renderer.renderer import Acquisition, Possible, Renderer
 from sononerf.simulation.simulator import DEFAULT_SPEED, DEFAULT_TEMPERATURE
@@ -71,7 +71,7 @@ def acquisition(settings: Settings) -> Acquisition:
 
 
 def echo_hull(settings: Settings, store: EnsembleStore) -> EchoHull:
-    """Return the space that the first echoes of the training poses leave, without late ones."""
+    """Return the space that the first echoes of the training poses leave, late ones corrected."""
     known = acquisition(settings)
     first = first_echoes(
         store,
@@ -97,7 +97,7 @@ def echo_hull(settings: Settings, store: EnsembleStore) -> EchoHull:
     except NumericalError:
         return hull  # whoever needs a region will say why there is none
     margin = MARGIN_OF_SOUND * (upper - lower)
-    return without_late(hull, lower - margin, upper + margin)
+    return corrected(hull, lower - margin, upper + margin)
 
 
 def _evidence(settings: Settings, store: EnsembleStore, hull: EchoHull | None) -> EchoEvidence:

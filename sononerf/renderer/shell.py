@@ -81,7 +81,7 @@ class ShellRenderer(Renderer):
         rows: Tensor,
         bins: Tensor | None = None,
     ) -> Tensor:
-        """Render; see the base class. Differentiable in the field, the gain and a learned spectrum."""
+        """Render; see the base class. Differentiable in the field and in what is learned."""
         transfer = self.transfer if bins is None else self.transfer[..., bins]
         spectrum = self.log_spectrum if bins is None else self.log_spectrum[bins]
         world = torch.einsum("pij,dj->pdi", rotation, self.directions)  # (P, D, 3)

@@ -165,7 +165,7 @@ def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeyp
 def test_the_hull_leaves_late_first_echoes_out(tiny, echoes, monkeypatch):
     """Their origins are sought around all sound, whatever the first echoes themselves leave."""
     asked = []
-    monkeypatch.setattr(build, "without_late", lambda *given: asked.append(given) or "the others")
+    monkeypatch.setattr(build, "corrected", lambda *given: asked.append(given) or "the others")
     store = EnsembleStore.open(echoes)
     settings = tiny(region={"lower": (-0.001,) * 3, "upper": (0.001,) * 3})
     assert echo_hull(settings, store) == "the others"
