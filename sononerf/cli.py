@@ -376,6 +376,23 @@ def compare(
     _print(f"wrote {folder}")
 
 
+@app.command()
+def report(
+    run: Run,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="Also draw the counterparts of the paper's figures.")
+    ] = False,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder of the page; RUN/report where none.")
+    ] = None,
+) -> None:
+    """Write one page of a run: numbers beside the baselines', pictures, settings."""
+    from sononerf.experiment.report import report as report_run
+    from sononerf.progress import Progress
+
+    _print(f"wrote {report_run(run, paper=paper, output=output, progress=Progress())}")
+
+
 class _SignalledError(BaseException):
     """A signal came; nothing on the way may take it for a fault and go on."""
 

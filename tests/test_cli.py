@@ -34,7 +34,7 @@ from sononerf.weights import load_weights, save_weights
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 SMOKE = str(CONFIGS / "smoke.yaml")
-COMMANDS = "scenes new-scene simulate fit predict reconstruct evaluate compare".split()
+COMMANDS = "scenes new-scene simulate fit predict reconstruct evaluate compare report".split()
 SHORT = [  # of the smoke settings, so that a fit takes a second
     "poses.count=6",
     "poses.validation=1",
@@ -637,12 +637,23 @@ def test_wrong_numbers_for_the_read_out(smoke, clean, options):
     assert tree(clean) == {}
 
 
+def test_a_run_has_a_page(at_home, tmp_path):
+    before = tree(at_home.run)
+    for extra in ([], ["--paper"]):
+        said = done("report", "runs/smoke", "--output", tmp_path / "page", *extra).err
+        assert f"wrote {tmp_path / 'page' / 'report.md'}" in said
+        page = (tmp_path / "page" / "report.md").read_text()
+        assert "# smoke" in page
+        assert ("As in the paper" in page) == bool(extra)
+    assert tree(at_home.run) == before
+
+
 def test_a_surface_that_is_not_there(smoke, clean):
     refused(5, "reconstruct", smoke.run, "--level", "1e9", "--output", "there/out")
     assert tree(clean) == {}
 
 
-@pytest.mark.parametrize("command", ["predict", "reconstruct", "compare"])
+@pytest.mark.parametrize("command", ["predict", "reconstruct", "compare", "report"])
 def test_results_do_not_go_into_a_runs_own_folder(at_home, tmp_path, command):
     before, given = tree(at_home.run), ["runs/smoke"]
     if command == "compare":

@@ -1,0 +1,264 @@
+# SPDX-License-Identifier: MIT
+"""One page of a run: its numbers beside those of the baselines, its pictures, its settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+
+from sononerf import storage
+from sononerf.acoustics.spectrogram import compress
+from sononerf.config import dump_yaml
+from sononerf.errors import InputError, NumericalError
+from sononerf.experiment.fitted import Fitted, load_fitted
+from sononerf.experiment.reconstruct import true_mesh
+from sononerf.experiment.run_folder import RunFolder, results_folder
+from sononerf.progress import Progress
+from sononerf.reconstruction.read_out import reconstruct as read_out
+from sononerf.render.mesh import mesh_png
+from sononerf.render.scene import scene_png
+from sononerf.simulation.ensemble import ensemble_poses
+
+PAGE = "report.md"
+Table = list[tuple[str, ...]]
+
+
+def report(
+    path: Path,
+    *,
+    paper: bool = False,
+    output: Path | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write one page of Markdown with its pictures beside it; it can be moved as it is.
+
+    Parameters
+    ----------
+    path : Path
+        A fitted run.
+    paper : bool
+        Whether the counterparts of the paper's figures 4 to 8 are drawn too: the scene with its
+        poses, an iso-surface of the summed reflectivity, and, where the run was compared with
+        others, what was heard in it and not in them.
+    output : Path or None
+        Folder of the page; ``RUN/report`` where None.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    page : Path
+        ``report.md``. What the run has not come to yet is named with the command that makes it.
+
+    Raises
+    ------
+    InputError
+        If it is no fitted run, or one of its files is damaged.
+
+    References
+    ----------
+    .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, figures 4 to 8.
+    """
+    progress = progress or Progress(quiet=True)
+    fitted = load_fitted(path)
+    folder = output or path / "report"
+    with results_folder(folder):
+        parts = [f"# {path.resolve().name}", _made(path, fitted)]
+        heldout = fitted.settings.poses.heldout > 0
+        parts += _numbers(path, heldout)
+        if heldout:
+            parts += _predictions(path, folder)
+        parts += _surface(path, folder)
+        if paper:
+            parts += _figures(path, folder, fitted, progress)
+        parts += ["## Settings", f"```yaml\n{dump_yaml(fitted.settings).rstrip()}\n```"]
+        storage.commit_text(folder / PAGE, "\n\n".join(parts) + "\n")
+    return folder / PAGE
+
+
+def _made(path: Path, fitted: Fitted) -> str:
+    metrics = RunFolder(path).read_metrics()
+    cost = metrics.get("cost") or {}
+    settings = fitted.settings
+    said = [
+        f"Scene `{settings.scene.name}`, {settings.poses.count} poses for training; field "
+        f"`{settings.field.kind}` through renderer `{settings.renderer.kind}`"
+    ]
+    if cost.get("steps") is not None:
+        said.append(f"{cost['steps']} steps")
+    if cost.get("fit_s") is not None:
+        said.append(f"{cost['fit_s']:.0f} s of fit on {cost.get('device', 'an unknown device')}")
+    if cost.get("peak_memory_bytes") is not None:
+        said.append(f"{cost['peak_memory_bytes'] / 1e9:.1f} GB of memory at most")
+    if cost.get("parameters") is not None:
+        said.append(f"{cost['parameters']} parameters")
+    return ", ".join(said) + "."
+
+
+PREDICTED = (
+    ("all cells", "mae_db", "mean_predictor_mae_db", "noise_floor_mae_db", "rendered_mae_db"),
+    (
+        "active cells",
+        "mae_db_active",
+        "mean_predictor_mae_db_active",
+        "noise_floor_mae_db_active",
+        "rendered_mae_db_active",
+    ),
+)
+SHAPE = (
+    ("Chamfer distance, mm", "chamfer_m", 1e3, ".2f"),
+    ("thickness bias, mm", "thickness_bias_m", 1e3, "+.2f"),
+    ("volume over true volume", "volume_ratio", 1.0, ".2f"),
+    ("intersection over union", "iou", 1.0, ".2f"),
+    ("normal consistency", "normal_consistency", 1.0, ".2f"),
+    ("parts", "components", 1.0, ".0f"),
+)
+
+
+def _numbers(path: Path, heldout: bool) -> Iterator[str]:
+    metrics = RunFolder(path).read_metrics()
+    prediction, geometry = metrics.get("prediction") or {}, metrics.get("geometry") or {}
+    yield "## Numbers"
+    if prediction:
+        heads = ("held-out error, dB", "this run", "mean spectrogram", "noise floor", "field alone")
+        yield _table(
+            [
+                heads,
+                *((name, *(_shown(prediction.get(k)) for k in keys)) for name, *keys in PREDICTED),
+            ]
+        )
+        yield f"Mean of {prediction.get('poses')} {prediction.get('split')} poses."
+    elif heldout:
+        yield f"No prediction of held-out poses yet: `sononerf predict {path}`."
+    else:
+        yield "No pose was held out (`poses.heldout: 0`), so nothing is predicted."
+    if not geometry:
+        yield f"No geometry yet: `sononerf evaluate {path}`; it needs the true mesh."
+        return
+    baseline = metrics.get("baseline") or {}
+    columns = [geometry, baseline.get("backprojection") or {}, baseline.get("voxels") or {}]
+    rows: Table = [("geometry", "this run", "backprojection", "voxel fit")]
+    for limit in geometry.get("fscore", {}):
+        scores = [(column.get("fscore") or {}).get(limit) for column in columns]
+        rows.append((f"F-score at {1e3 * float(limit):g} mm", *(_shown(s) for s in scores)))
+    for name, key, scale, form in SHAPE:
+        rows.append((name, *(_shown(column.get(key), scale, form) for column in columns)))
+    yield _table(rows)
+    yield (
+        f"In truth there are {geometry.get('components_true')} parts. The baselines are given the "
+        "best of several levels, chosen with the truth."
+    )
+
+
+def _table(rows: Sequence[tuple[str, ...]]) -> str:
+    lines = ["| " + " | ".join(row) + " |" for row in rows]
+    return "\n".join([lines[0], "|" + "---|" * len(rows[0]), *lines[1:]])
+
+
+def _shown(value: float | None, scale: float = 1.0, form: str = ".2f") -> str:
+    return "-" if value is None else f"{scale * value:{form}}"
+
+
+def _predictions(path: Path, folder: Path) -> Iterator[str]:
+    """Show the best, the median and the worst predicted of the held-out poses."""
+    yield "## Spectrograms of poses that were never heard"
+    file = path / "prediction" / "spectrograms.npz"
+    if not file.is_file():
+        yield f"None yet: `sononerf predict {path}`."
+        return
+    try:
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
+            reference = float(arrays["reference"])
+            measured, predicted = (
+                compress(arrays[k], reference) for k in ("measured", "predicted")
+            )
+            numbers = arrays["pose"].astype(int)
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise InputError(
+            f"{file}: damaged ({error}); `sononerf predict {path}` makes it anew"
+        ) from None
+    error_db = np.abs(predicted - measured).mean(axis=(1, 2, 3))
+    order = np.argsort(error_db, kind="stable")
+    chosen = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
+    for name, row in reversed(chosen.items()):
+        picture = f"pose_{numbers[row]:04d}.png"
+        yield f"Pose {numbers[row]}, the {name} of {len(order)}: {error_db[row]:.2f} dB."
+        yield _picture(path / "prediction" / picture, folder, path)
+
+
+def _picture(source: Path, folder: Path, run: Path, name: str | None = None) -> str:
+    """Put a picture beside the page, and return how it is shown there."""
+    name = name or source.name
+    if not source.is_file():
+        return f"{source} is missing; `sononerf fit {run / 'config.yaml'} --output {run}` makes it."
+    storage.commit_bytes(folder / name, source.read_bytes())
+    return f"![{Path(name).stem}]({name})"
+
+
+def _surface(path: Path, folder: Path) -> Iterator[str]:
+    yield "## Surface and projections"
+    source = path / "reconstruction"
+    if not source.is_dir():
+        yield f"None yet: `sononerf reconstruct {path}`."
+        return
+    yield _picture(source / "view.png", folder, path)
+    for axis in "xyz":
+        yield f"Largest along {axis}:"
+        yield _picture(source / f"mip_{axis}.png", folder, path)
+
+
+def _figures(path: Path, folder: Path, fitted: Fitted, progress: Progress) -> Iterator[str]:
+    yield "## As in the paper"
+    yield "### Scene and poses (figures 4 to 6)"
+    mesh = true_mesh(fitted)
+    if mesh is None:
+        yield f"Scene `{fitted.settings.scene.name}` is not installed here."
+    else:
+        poses, split = ensemble_poses(fitted.settings)
+        drawn = scene_png(mesh, poses.positions, poses.rotations[:, :, 0], split=split)
+        storage.commit_bytes(folder / "scene.png", drawn)
+        yield "![scene](scene.png)"
+    yield "### Iso-surface of the summed reflectivity (figures 4 to 6)"
+    options = fitted.settings.reconstruction
+    try:
+        with progress.task("reading out", 1000) as task, torch.inference_mode():
+            found = read_out(
+                fitted.module.field,
+                spacing=options.spacing,
+                method="isosurface",
+                directions=options.directions,
+                smoothing=options.smoothing,
+                progress=lambda done, total: task.advance(1000 * done // total - task.done),
+            )
+        storage.commit_bytes(folder / "isosurface.png", mesh_png(found.mesh))
+        yield (
+            f"Sum over {options.directions} directions, voxels of "
+            f"{1e3 * found.volume.spacing:.3g} mm, level by Otsu's rule: {found.level:.3g}."
+        )
+        yield "![isosurface](isosurface.png)"
+    except NumericalError as error:
+        yield f"None: {error}."
+    yield "### What was heard here and not there (figures 7 and 8)"
+    folders = sorted(f.parent for f in path.glob("*/comparison.json"))
+    if not folders:
+        yield f"Not compared with another run yet: `sononerf compare {path} OTHER`."
+    for source in folders:
+        yield from _comparison(source, folder, path)
+
+
+def _comparison(source: Path, folder: Path, run: Path) -> Iterator[str]:
+    told: dict[str, Any] = storage.read_json(source / "comparison.json")
+    away = told.get("distance_m")
+    yield (
+        f"Beside `{told.get('second')}`: {_shown(told.get('score'))} of the common maximum"
+        + ("" if away is None else f", {1e3 * away:.1f} mm from the middle of what was added")
+        + "."
+    )
+    for name in ("mip_x", "mip_y", "mip_z", "overlay"):
+        if (source / f"{name}.png").is_file():
+            yield _picture(source / f"{name}.png", folder, run, f"{source.name}-{name}.png")
