@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 import math
+import re
+import shlex
 from pathlib import Path
 
 import pytest
 import torch
 
 from sononerf.config import dump_yaml, load_settings, read_yaml, validate_settings
-from sononerf.experiment.build import field_and_renderer
+from sononerf.experiment.build import check_plugins, field_and_renderer
 from sononerf.experiment.fit import fit
 from sononerf.module import EchoModule
 from sononerf.scene import load_scene
@@ -77,6 +79,30 @@ def test_the_papers_training_is_the_papers():
     assert (fit_settings.learning_rate, fit_settings.loss) == (0.01, "l2")
     assert (fit_settings.schedule, fit_settings.staircase_factor) == ("staircase", 0.97)
     assert fit_settings.staircase_epochs == 10
+
+
+def test_the_options_for_the_published_code_are_known():
+    page = (CONFIGS.parent / "docs" / "paper.md").read_text()
+    rows = [line for line in page.splitlines() if line.startswith("| ")]
+    told = [found for row in rows for found in re.findall(r"`([^`]+=[^`]+)`", row)]
+    assert len(told) > 10
+    for options in told:
+        settings = load_settings(PAPER, shlex.split(options.replace("NUMBER", "20000")))
+        check_plugins(settings)
+        assert settings != load_settings(PAPER), options
+
+
+def test_the_papers_scenes_differ_in_scene_and_poses_alone():
+    settings = {path.stem: read_yaml(path) for path in PAPER.parent.glob("*.yaml")}
+    own = {name: (data.pop("scene"), data.pop("poses", {})) for name, data in settings.items()}
+    assert own == {
+        "three_spheres": ({"name": "three_spheres"}, {}),
+        "three_spheres_100": ({"name": "three_spheres"}, {"count": 100}),
+        "ua": ({"name": "ua"}, {}),
+        "leaf": ({"name": "leaf"}, {}),
+        "leaf_dragonfly": ({"name": "leaf_dragonfly"}, {}),
+    }
+    assert all(data == settings["three_spheres"] for data in settings.values())
 
 
 @pytest.mark.parametrize(
