@@ -10,6 +10,8 @@
     python tools/benchmark.py poses [--scene three_spheres] [--counts 12 25 50 100 200 400]
     python tools/benchmark.py paper [--scene three_spheres] [--minutes 60] [--steps N]
     python tools/benchmark.py step [--accelerator cpu] [--compare OLD.json]
+    python tools/benchmark.py fit [--scene three_spheres] [--error 0.45] [--compare OLD.json]
+    python tools/benchmark.py reconstruct RUN [RUN ...] [--spacings 0.002 0.001]
     python tools/benchmark.py prey [--placements 20] [--others 5] [--conditions NAME ...]
 
 ``simulate``: seconds per pose, against those that embreex alone needs for the same rays, those for
@@ -20,8 +22,9 @@ in the rows of a dechirped sweep.
 
 ``step``: what a step of a fit costs for each field through each renderer, medians of at least
 five, beside equation 17 of the paper written down as it stands (which takes 9 GB of memory), the
-machine's matrix product and its copying; the file is named by version, machine and device, and
-``--compare`` prints what has changed.
+machine's matrix product and its copying. ``fit``: how long the default takes to a held-out error.
+``reconstruct``: how long fitted runs take to be read out. The files of these three are named by
+version, machine and device, and ``--compare`` prints what has changed.
 
 ``shapes``: the whole default experiment for shapes that nobody chose, each from its seed.
 ``poses``: the same for one scene and ever more calls. ``paper``: how much sooner the default gets
@@ -43,10 +46,12 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # the parts of this command, and the tests' exact solutions
 
+from tools.benchmarks.fit import fit  # noqa: E402
 from tools.benchmarks.paper import paper  # noqa: E402
 from tools.benchmarks.physics import dechirp, physics  # noqa: E402
 from tools.benchmarks.poses import COUNTS, poses  # noqa: E402
 from tools.benchmarks.prey import CONDITIONS, prey  # noqa: E402
+from tools.benchmarks.reconstruct import reconstruct  # noqa: E402
 from tools.benchmarks.shapes import shapes  # noqa: E402
 from tools.benchmarks.simulator import noise, simulate  # noqa: E402
 from tools.benchmarks.step import step  # noqa: E402
@@ -55,6 +60,8 @@ MAIN_HELP = "places of prey under the conditions 100-calls and clutter (20)"
 OTHER_HELP = "places of prey under every other condition (5)"
 CONDITIONS_HELP = "fewer or more calls, no ears, noise (signal to noise in dB), clutter; all"
 SECONDS_HELP = "fits that take longer are marked in the table (60)"
+ERROR_HELP = "over all cells of held-out poses, dB (0.45)"
+SPACINGS_HELP = "voxel sizes in metres; half of the field's resolution where none"
 SET_HELP = "laid over the settings of every run"
 
 
@@ -71,7 +78,7 @@ def main() -> None:
             command.add_argument("--bounces", type=int, default=3)
         if run is simulate:
             command.add_argument("--rays", type=int, default=300_000)
-    for series in (shapes, poses, paper, prey, step):
+    for series in (shapes, poses, paper, prey, step, fit, reconstruct):
         command = commands.add_parser(series.__name__, help=(series.__doc__ or "").split("\n")[0])
         command.set_defaults(run=series)
         if series is shapes:
@@ -84,17 +91,25 @@ def main() -> None:
             command.add_argument("--conditions", nargs="+", choices=names, help=CONDITIONS_HELP)
         if series is step:
             command.add_argument("--accelerator", choices=("auto", "cpu", "gpu"), default="auto")
+        if series in (step, fit, reconstruct):
             command.add_argument("--compare", type=Path, metavar="OLD.json", help="print ratios")
-        if series in (poses, paper, step):
+        if series is fit:
+            command.add_argument("--error", type=float, default=0.45, help=ERROR_HELP)
+        if series is reconstruct:
+            command.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="fitted runs")
+            command.add_argument("--spacings", type=float, nargs="+", help=SPACINGS_HELP)
+        if series in (poses, paper, step, fit):
             command.add_argument("--scene", default="three_spheres")
         if series is poses:
             command.add_argument("--counts", type=int, nargs="+", default=COUNTS)
         if series is paper:
             command.add_argument("--minutes", type=float, default=60.0, help="of the paper's fit")
             command.add_argument("--steps", type=int, help="of the paper's fit; none are timed")
-        elif series is not step:
+        elif series not in (step, fit, reconstruct):
             command.add_argument("--seconds", type=float, default=60.0, help=SECONDS_HELP)
         command.add_argument("--output", type=Path, help="folder of runs and table")
+        if series is reconstruct:
+            continue
         command.add_argument("--data", type=Path, help="folder of the ensembles; DIR/data")
         command.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help=SET_HELP)
     arguments = parser.parse_args()

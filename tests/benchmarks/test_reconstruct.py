@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: MIT
+"""The clock around a read-out that does nothing."""
+
+from __future__ import annotations
+
+import json
+from argparse import Namespace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sononerf.config import validate_settings
+from tools.benchmarks import reconstruct as module
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What was read out, each taking longer than the one before: 1, 2, 3, ... s."""
+    given, clock = [], [0.0]
+
+    def read_out(field, **options):
+        given.append(options)
+        clock[0] += len(given)
+        volume = SimpleNamespace(values=np.zeros((10, 20, 6)))
+        return SimpleNamespace(volume=volume, method=options["method"])
+
+    settings = validate_settings({"scene": {"name": "ua"}}, "test")
+    field = SimpleNamespace(resolution=0.004)
+    fitted = SimpleNamespace(
+        settings=settings, hull="the hull", module=SimpleNamespace(field=field)
+    )
+    monkeypatch.setattr(module, "read_out", read_out)
+    monkeypatch.setattr(module, "load_fitted", lambda run: fitted)
+    monkeypatch.setattr(module, "borne_out", lambda run: "hull")
+    monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
+    return given
+
+
+def go(output, **other):
+    chosen = {"runs": [Path("runs/a")], "spacings": None, "output": output, "compare": None}
+    text = module.reconstruct(Namespace(**{**chosen, **other}))
+    (file,) = output.glob("reconstruct-*-cpu.json")
+    return text, json.loads(file.read_text())
+
+
+def test_the_median_of_five(asked, tmp_path):
+    text, found = go(tmp_path)
+    assert len(asked) == 5
+    assert all(options["spacing"] == 0.002 for options in asked)
+    assert all(options["hull"] == "the hull" for options in asked)
+    (row,) = found["rows"]
+    # Of 1, 2, 3, 4 and 5 s; 1,200 voxels.
+    assert (row["reconstruct_s"], row["voxels"], row["voxels_per_s"]) == (3.0, 1200, 400.0)
+    assert (row["name"], row["method"]) == ("a, 2 mm", "hull")
+    assert text.splitlines()[1].split() == ["a,", "2", "mm", "hull", "1,200", "3.00", "400"]
+
+
+def test_each_run_at_each_voxel_size(asked, tmp_path):
+    runs = [Path("runs/a"), Path("runs/b")]
+    _, found = go(tmp_path, runs=runs, spacings=[0.004, 0.001])
+    names = ["a, 4 mm", "a, 1 mm", "b, 4 mm", "b, 1 mm"]
+    assert [row["name"] for row in found["rows"]] == names
+    assert [options["spacing"] for options in asked[::5]] == [0.004, 0.001, 0.004, 0.001]
+
+
+def test_what_is_no_run_is_one_line(tmp_path):
+    with pytest.raises(SystemExit, match="no fitted run"):
+        go(tmp_path, runs=[tmp_path / "nothing"])

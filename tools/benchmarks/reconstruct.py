@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+"""What reading a fitted field out costs: seconds for each voxel size, medians of five."""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+import time
+from pathlib import Path
+
+import torch
+
+from sononerf import storage
+from sononerf.experiment.borne_out import borne_out
+from sononerf.experiment.fitted import load_fitted
+from sononerf.reconstruction.read_out import reconstruct as read_out
+from tools.benchmarks.experiment import Row, aligned, ending
+from tools.benchmarks.record import keep, ratios
+
+REPEATS = 5
+
+
+def reconstruct(arguments: argparse.Namespace) -> str:
+    """Time volume and surface of fitted runs; on the CPU, no files are written but the table."""
+    output = arguments.output or Path("runs") / "reconstruct"
+    with ending(output):
+        if arguments.compare is not None:
+            storage.read_json(arguments.compare)
+        rows: list[Row] = []
+        for run in arguments.runs:
+            resolution = load_fitted(run).module.field.resolution
+            for spacing in arguments.spacings or [resolution / 2]:
+                rows.append(_timed(run, spacing))
+                print(f"{rows[-1]['name']}: done", file=sys.stderr, flush=True)
+        found = {"rows": rows}
+        text = f"{table(rows)}\nwrote {keep(output, 'reconstruct', 'cpu', found)}"
+        return text if arguments.compare is None else f"{text}\n{ratios(arguments.compare, found)}"
+
+
+def _timed(run: Path, spacing: float) -> Row:
+    fitted = load_fitted(run)
+    options = fitted.settings.reconstruction
+    free = (options.method, options.level) == ("auto", "auto")
+    method = borne_out(run) if free else options.method
+    seconds = []
+    for _ in range(REPEATS):
+        began = time.perf_counter()
+        with torch.inference_mode():
+            found = read_out(
+                fitted.module.field,
+                hull=fitted.hull,
+                spacing=spacing,
+                level=options.level,
+                method=method,
+                directions=options.directions,
+                smoothing=options.smoothing if method == "isosurface" else 0.0,
+            )
+        seconds.append(time.perf_counter() - began)
+    median = statistics.median(seconds)
+    voxels = found.volume.values.size
+    return {
+        "name": f"{run.resolve().name}, {1e3 * spacing:g} mm",
+        "method": found.method,
+        "voxels": voxels,
+        "reconstruct_s": median,
+        "voxels_per_s": voxels / median,
+    }
+
+
+def table(rows: list[Row]) -> str:
+    """Return one line for each run and voxel size."""
+    lines = [["run", "surface", "voxels", "s", "voxels/s"]]
+    for row in rows:
+        seconds, rate = f"{row['reconstruct_s']:.2f}", f"{row['voxels_per_s']:,.0f}"
+        lines.append([row["name"], row["method"], f"{row['voxels']:,}", seconds, rate])
+    return "\n".join(aligned(lines))
