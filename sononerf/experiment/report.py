@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -67,18 +69,34 @@ def report(
     progress = progress or Progress(quiet=True)
     fitted = load_fitted(path)
     folder = output or path / "report"
+    heldout = fitted.settings.poses.heldout > 0
+    pictures: dict[str, bytes] = {}
     with results_folder(folder):
-        parts = [f"# {path.resolve().name}", _made(path, fitted)]
-        heldout = fitted.settings.poses.heldout > 0
-        parts += _numbers(path, heldout)
+        parts = [f"# {path.resolve().name}"]
+        with _damage_named(RunFolder(path).metrics):
+            parts += [_made(path, fitted), *_numbers(path, heldout)]
         if heldout:
-            parts += _predictions(path, folder)
-        parts += _surface(path, folder)
+            parts += _predictions(path, pictures)
+        parts += _surface(path, pictures)
         if paper:
-            parts += _figures(path, folder, fitted, progress)
+            parts += _figures(path, pictures, fitted, progress)
         parts += ["## Settings", f"```yaml\n{dump_yaml(fitted.settings).rstrip()}\n```"]
+        # Nothing is written before all is known, and the page after what it shows.
+        for name, data in pictures.items():
+            storage.commit_bytes(folder / name, data)
         storage.commit_text(folder / PAGE, "\n\n".join(parts) + "\n")
     return folder / PAGE
+
+
+@contextmanager
+def _damage_named(file: Path) -> Iterator[None]:
+    """Name a JSON file that holds something else than numbers where these should be."""
+    try:
+        yield
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{file}: damaged ({error}); remove it and repeat the command that wrote it"
+        ) from None
 
 
 def _made(path: Path, fitted: Fitted) -> str:
@@ -132,13 +150,21 @@ def _numbers(path: Path, heldout: bool) -> Iterator[str]:
                 *((name, *(_shown(prediction.get(k)) for k in keys)) for name, *keys in PREDICTED),
             ]
         )
-        yield f"Mean of {prediction.get('poses')} {prediction.get('split')} poses."
+        yield (
+            f"Mean over {prediction.get('poses')} poses that were never trained on, in decibels "
+            "above 60 dB below the loudest training echo. Active cells: measured or predicted is "
+            "3 dB or more. Noise floor: the same echoes simulated with other rays. Field alone: "
+            "without the calls that are traced off the run's own mesh."
+        )
     elif heldout:
-        yield f"No prediction of held-out poses yet: `sononerf predict {path}`."
+        yield f"No numbers of held-out poses yet: {_command('predict', path)}."
     else:
         yield "No pose was held out (`poses.heldout: 0`), so nothing is predicted."
     if not geometry:
-        yield f"No geometry yet: `sononerf evaluate {path}`; it needs the true mesh."
+        yield (
+            f"No geometry yet: {_command('evaluate', path)}; it needs the true mesh, and that the "
+            "field has a surface."
+        )
         return
     baseline = metrics.get("baseline") or {}
     columns = [geometry, baseline.get("backprojection") or {}, baseline.get("voxels") or {}]
@@ -149,6 +175,10 @@ def _numbers(path: Path, heldout: bool) -> Iterator[str]:
     for name, key, scale, form in SHAPE:
         rows.append((name, *(_shown(column.get(key), scale, form) for column in columns)))
     yield _table(rows)
+    target = (geometry.get("target") or {}).get("fscore") or {}
+    if target:
+        alone = (f"{_shown(s)} at {1e3 * float(limit):g} mm" for limit, s in target.items())
+        yield f"F-score of the target alone, without its background: {', '.join(alone)}."
     yield (
         f"In truth there are {geometry.get('components_true')} parts. The baselines are given the "
         "best of several levels, chosen with the truth."
@@ -164,12 +194,12 @@ def _shown(value: float | None, scale: float = 1.0, form: str = ".2f") -> str:
     return "-" if value is None else f"{scale * value:{form}}"
 
 
-def _predictions(path: Path, folder: Path) -> Iterator[str]:
+def _predictions(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
     """Show the best, the median and the worst predicted of the held-out poses."""
     yield "## Spectrograms of poses that were never heard"
     file = path / "prediction" / "spectrograms.npz"
     if not file.is_file():
-        yield f"None yet: `sononerf predict {path}`."
+        yield f"None yet: {_command('predict', path)}."
         return
     try:
         with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
@@ -180,39 +210,47 @@ def _predictions(path: Path, folder: Path) -> Iterator[str]:
             numbers = arrays["pose"].astype(int)
     except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
         raise InputError(
-            f"{file}: damaged ({error}); `sononerf predict {path}` makes it anew"
+            f"{file}: damaged ({error}); {_command('predict', path)} makes it anew"
         ) from None
     error_db = np.abs(predicted - measured).mean(axis=(1, 2, 3))
     order = np.argsort(error_db, kind="stable")
     chosen = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
     for name, row in reversed(chosen.items()):
         picture = f"pose_{numbers[row]:04d}.png"
-        yield f"Pose {numbers[row]}, the {name} of {len(order)}: {error_db[row]:.2f} dB."
-        yield _picture(path / "prediction" / picture, folder, path)
+        yield f"Pose {numbers[row]}, the {name} of {len(order)}: {error_db[row]:.2f} dB, all cells."
+        yield _picture(path / "prediction" / picture, pictures, _command("predict", path))
 
 
-def _picture(source: Path, folder: Path, run: Path, name: str | None = None) -> str:
+def _command(name: str, run: Path, rest: str = "") -> str:
+    return f"`sononerf {name} {shlex.quote(str(run))}{rest}`"
+
+
+def _picture(
+    source: Path, pictures: dict[str, bytes], command: str, name: str | None = None
+) -> str:
     """Put a picture beside the page, and return how it is shown there."""
     name = name or source.name
     if not source.is_file():
-        return f"{source} is missing; `sononerf fit {run / 'config.yaml'} --output {run}` makes it."
-    storage.commit_bytes(folder / name, source.read_bytes())
+        return f"{source} is missing; {command} makes it."
+    pictures[name] = source.read_bytes()
     return f"![{Path(name).stem}]({name})"
 
 
-def _surface(path: Path, folder: Path) -> Iterator[str]:
+def _surface(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
     yield "## Surface and projections"
-    source = path / "reconstruction"
+    source, command = path / "reconstruction", _command("reconstruct", path)
     if not source.is_dir():
-        yield f"None yet: `sononerf reconstruct {path}`."
+        yield f"None yet: {command}."
         return
-    yield _picture(source / "view.png", folder, path)
+    yield _picture(source / "view.png", pictures, command)
     for axis in "xyz":
-        yield f"Largest along {axis}:"
-        yield _picture(source / f"mip_{axis}.png", folder, path)
+        yield f"Reflectivity, the largest along {axis}:"
+        yield _picture(source / f"mip_{axis}.png", pictures, command)
 
 
-def _figures(path: Path, folder: Path, fitted: Fitted, progress: Progress) -> Iterator[str]:
+def _figures(
+    path: Path, pictures: dict[str, bytes], fitted: Fitted, progress: Progress
+) -> Iterator[str]:
     yield "## As in the paper"
     yield "### Scene and poses (figures 4 to 6)"
     mesh = true_mesh(fitted)
@@ -220,45 +258,63 @@ def _figures(path: Path, folder: Path, fitted: Fitted, progress: Progress) -> It
         yield f"Scene `{fitted.settings.scene.name}` is not installed here."
     else:
         poses, split = ensemble_poses(fitted.settings)
-        drawn = scene_png(mesh, poses.positions, poses.rotations[:, :, 0], split=split)
-        storage.commit_bytes(folder / "scene.png", drawn)
+        looks = poses.rotations[:, :, 0]
+        pictures["scene.png"] = scene_png(mesh, poses.positions, looks, split=split)
         yield "![scene](scene.png)"
+    # Read before the long work, for they may be damaged.
+    compared = list(_comparisons(path, pictures))
     yield "### Iso-surface of the summed reflectivity (figures 4 to 6)"
+    yield from _isosurface(fitted, pictures, progress)
+    yield "### What was heard here and not there (figures 7 and 8)"
+    yield from compared or [
+        f"Not compared with another run yet: {_command('compare', path, ' OTHER')}."
+    ]
+
+
+def _isosurface(fitted: Fitted, pictures: dict[str, bytes], progress: Progress) -> Iterator[str]:
     options = fitted.settings.reconstruction
+    # A level is one of the surface that the settings ask for.
+    level = options.level if options.method == "isosurface" else "auto"
     try:
         with progress.task("reading out", 1000) as task, torch.inference_mode():
             found = read_out(
                 fitted.module.field,
                 spacing=options.spacing,
+                level=level,
                 method="isosurface",
                 directions=options.directions,
                 smoothing=options.smoothing,
                 progress=lambda done, total: task.advance(1000 * done // total - task.done),
             )
-        storage.commit_bytes(folder / "isosurface.png", mesh_png(found.mesh))
-        yield (
-            f"Sum over {options.directions} directions, voxels of "
-            f"{1e3 * found.volume.spacing:.3g} mm, level by Otsu's rule: {found.level:.3g}."
-        )
-        yield "![isosurface](isosurface.png)"
+        pictures["isosurface.png"] = mesh_png(found.mesh)
     except NumericalError as error:
         yield f"None: {error}."
-    yield "### What was heard here and not there (figures 7 and 8)"
-    folders = sorted(f.parent for f in path.glob("*/comparison.json"))
-    if not folders:
-        yield f"Not compared with another run yet: `sononerf compare {path} OTHER`."
-    for source in folders:
-        yield from _comparison(source, folder, path)
-
-
-def _comparison(source: Path, folder: Path, run: Path) -> Iterator[str]:
-    told: dict[str, Any] = storage.read_json(source / "comparison.json")
-    away = told.get("distance_m")
+        return
     yield (
-        f"Beside `{told.get('second')}`: {_shown(told.get('score'))} of the common maximum"
-        + ("" if away is None else f", {1e3 * away:.1f} mm from the middle of what was added")
-        + "."
+        f"Sum over {options.directions} directions, voxels of "
+        f"{1e3 * found.volume.spacing:.3g} mm, level "
+        + ("by Otsu's rule" if level == "auto" else "as set")
+        + f": {found.level:.3g}."
     )
-    for name in ("mip_x", "mip_y", "mip_z", "overlay"):
-        if (source / f"{name}.png").is_file():
-            yield _picture(source / f"{name}.png", folder, run, f"{source.name}-{name}.png")
+    yield "![isosurface](isosurface.png)"
+
+
+def _comparisons(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
+    for file in sorted(path.glob("*/comparison.json")):
+        with _damage_named(file):
+            told: dict[str, Any] = storage.read_json(file)
+            away = told.get("distance_m")
+            said = (
+                f"Beside `{told.get('second')}` the strongest difference is "
+                f"{_shown(told.get('score'))} of the common maximum"
+                + (
+                    ""
+                    if away is None
+                    else f", {1e3 * away:.1f} mm from the middle of what was added"
+                )
+            )
+        yield f"{said}."
+        for name in ("mip_x", "mip_y", "mip_z", "overlay"):
+            picture = file.with_name(f"{name}.png")
+            if picture.is_file():  # without a true surface there is no overlay
+                yield _picture(picture, pictures, "", f"{file.parent.name}-{name}.png")

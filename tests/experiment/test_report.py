@@ -6,9 +6,11 @@ from __future__ import annotations
 import json
 import re
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 
 from sononerf.errors import InputError, NumericalError
 from sononerf.experiment import report as report_module
@@ -33,6 +35,7 @@ METRICS = {
         "thickness_bias_m": -0.00072,
         "components": 2,
         "components_true": 3,
+        "target": {"fscore": {"0.005": 0.61}},
     },
     "baseline": {"backprojection": {"chamfer_m": 0.0046, "fscore": {"0.005": 0.74}}},
 }
@@ -96,7 +99,8 @@ def test_numbers_stand_beside_those_of_the_baselines(finished):
     text = page.read_text()
     assert text.startswith("# leaf-7\n")
     assert "12 steps, 61 s of fit on cpu, 0.7 GB of memory" in text
-    assert "Mean of 5 test poses." in text
+    assert "Mean over 5 poses that were never trained on" in text
+    assert "F-score of the target alone, without its background: 0.61 at 5 mm." in text
     assert "In truth there are 3 parts." in text
     assert "radius: 0.02" in text  # the settings
 
@@ -129,7 +133,7 @@ def test_what_is_not_there_yet_is_named_with_its_command(run):
 def test_a_missing_picture_is_named(finished):
     (finished / "reconstruction" / "mip_y.png").unlink()
     page = report(finished)
-    assert "mip_y.png is missing" in page.read_text()
+    assert f"mip_y.png is missing; `sononerf reconstruct {finished}` makes it" in page.read_text()
     assert "mip_y.png" not in pictures_of(page)
 
 
@@ -164,7 +168,7 @@ def test_the_papers_figures_have_their_counterparts(finished, monkeypatch):
         assert (page.parent / name).read_bytes().startswith(b"\x89PNG")
     assert (page.parent / "compare-empty-mip_x.png").read_bytes() == b"difference"
     text = page.read_text()
-    assert "Beside `empty`: 0.55 of the common maximum, 6.3 mm from the middle" in text
+    assert "Beside `empty` the strongest difference is 0.55 of the common maximum, 6.3 mm" in text
     assert "Sum over 100 directions" in text
 
 
@@ -182,7 +186,65 @@ def test_a_damaged_prediction_is_named(finished):
     (finished / "prediction" / "spectrograms.npz").write_bytes(b"PK\x03\x04 cut off")
     with pytest.raises(InputError, match=r"spectrograms\.npz: damaged .*sononerf predict"):
         report(finished)
-    assert not (finished / "report").exists() or not any((finished / "report").iterdir())
+    assert not (finished / "report").exists()
+
+
+@pytest.mark.parametrize(
+    ("section", "holds"),
+    [
+        ("cost", {"fit_s": "long"}),
+        ("prediction", {"mae_db": "x"}),
+        ("geometry", [1]),
+        ("geometry", {"fscore": {"a": 1}}),
+        ("geometry", {"fscore": {}, "components": "three"}),
+        ("baseline", "no"),
+    ],
+)
+def test_numbers_that_are_none_are_named(finished, section, holds):
+    (finished / "metrics.json").write_text(json.dumps({**METRICS, section: holds}))
+    with pytest.raises(InputError, match=r"metrics\.json: damaged .*; remove it and repeat"):
+        report(finished)
+
+
+@pytest.mark.parametrize("text", ["[]", '{"score": "x"}', '{"score": 0.'])
+def test_a_damaged_comparison_is_told_before_the_long_work(finished, monkeypatch, text):
+    (finished / "compare-a").mkdir()
+    (finished / "compare-a" / "comparison.json").write_text(text)
+    monkeypatch.setattr(report_module, "read_out", lambda *given, **more: pytest.fail("read out"))
+    with pytest.raises(InputError, match=r"comparison\.json"):
+        report(finished, paper=True)
+    assert not (finished / "report").exists()  # nor pictures without a page
+
+
+@pytest.mark.parametrize(
+    ("method", "level", "said"),
+    [("isosurface", 2.5, "level as set: 2.5"), ("oriented", 2.5, "level by Otsu's rule")],
+)
+def test_the_isosurface_is_drawn_as_the_settings_say(finished, monkeypatch, method, level, said):
+    description = json.loads((finished / "model.json").read_text())
+    own = {"method": method, "level": level, "spacing": 0.005, "directions": 12}
+    own |= {"smoothing": 0.045} if method == "isosurface" else {}
+    description["settings"]["reconstruction"] = own
+    (finished / "model.json").write_text(json.dumps(description))
+    asked = {}
+
+    def read_out(field, **options):
+        asked.update(options)
+        mesh = trimesh.creation.icosphere()
+        volume = SimpleNamespace(spacing=options["spacing"])
+        return SimpleNamespace(mesh=mesh, volume=volume, level=2.5)
+
+    monkeypatch.setattr(report_module, "read_out", read_out)
+    assert said in report(finished, paper=True).read_text()
+    assert asked["level"] == (level if method == "isosurface" else "auto")
+    assert asked["method"] == "isosurface"
+    assert (asked["spacing"], asked["directions"]) == (0.005, 12)
+    assert asked["smoothing"] == own.get("smoothing", 0.0)
+
+
+def test_commands_can_be_copied_whatever_the_run_is_called(run):
+    odd = run.rename(run.with_name("my leaf"))
+    assert f"`sononerf predict '{odd}'`" in report(odd).read_text()
 
 
 def test_a_run_is_no_place_for_a_page(finished):
