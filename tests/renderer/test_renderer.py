@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -84,7 +85,11 @@ FIELDS = {
 
 
 @pytest.mark.parametrize("kind", FIELDS)
-@pytest.mark.parametrize("heard_by", [ShellRenderer, ProfileRenderer])
+@pytest.mark.parametrize(
+    "heard_by",
+    [partial(ShellRenderer, call_spectrum="learned"), ProfileRenderer],
+    ids=["shell", "profile"],
+)
 def test_any_field_works_with_any_renderer(acquisition, kind, heard_by, device):
     torch.manual_seed(0)
     field = FIELDS[kind](REGION.float(), acquisition.frequency.float()).to(device)
