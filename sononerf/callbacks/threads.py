@@ -14,7 +14,8 @@ WORTH_THREADS = 40_000
 """Places per step below which threads wait for one another longer than they compute.
 
 Measured on two cores: with 12,000 places two threads take three quarters of the time of one on an
-idle machine, and two and a half times as long as one where something else runs beside."""
+idle machine, and two and a half times as long as one where something else runs beside. That is of
+lobes; a network computes so much for a place that threads never wait."""
 
 
 class ThreadsCallback(lightning.Callback):
@@ -32,8 +33,10 @@ class ThreadsCallback(lightning.Callback):
     ) -> None:
         """Choose for this step."""
         del trainer, batch_idx
-        places = echo_module(pl_module).renderer.places_per_pose
+        module = echo_module(pl_module)
+        places = module.renderer.places_per_pose
         small = places is not None and places * len(batch.pose) < WORTH_THREADS
+        small = small and not module.field.costly
         torch.set_num_threads(1 if small else self.most)
 
     def teardown(

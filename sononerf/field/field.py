@@ -39,6 +39,8 @@ class Field(nn.Module):
     """What Adam starts with where the settings name no rate."""
     knows_directions: bool = False
     """Whether lobes are explicit, so that the oriented read-out is the better one."""
+    costly: bool = False
+    """Whether a place asks for so many operations that any number of them is worth threads."""
 
     def __init__(self, region: Tensor, frequency: Tensor) -> None:
         super().__init__()

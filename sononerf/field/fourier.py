@@ -10,6 +10,7 @@ import torch
 from pydantic import Field as Option
 from torch import Tensor, nn
 
+from sononerf.errors import SettingsError
 from sononerf.field.field import Field
 
 
@@ -53,10 +54,19 @@ class FourierField(Field):
         Which of the two networks.
     octaves : int
         Number of sines per input, half an octave apart.
+    direction_octaves : int or None
+        Number of sines per component of the direction, of ``inputs="direction"``; as many as
+        for the position where None. Many of them let directions that were never heard from be
+        anything.
     width : int
         Width of the hidden layers.
     scale : float, 1/m
         What positions in metres are multiplied by before the embedding.
+    spacing : float or None, m
+        Spacing of places that resolves the field; a hundredth of the region's longest side where
+        None, for the network itself has none.
+    precision : {"float32", "bfloat16"}
+        What the layers multiply in; parameters, sums and the answer are float32 in any case.
     rate : float
         What Adam starts with where the settings name no rate.
 
@@ -65,7 +75,9 @@ class FourierField(Field):
     .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, section 2.
     """
 
+    costly = True
     _first: Tensor
+    _turns: Tensor
     _second: Tensor
 
     def __init__(
@@ -75,18 +87,30 @@ class FourierField(Field):
         *,
         inputs: Literal["direction", "angles"] = "direction",
         octaves: Annotated[int, Option(ge=1, le=64)] = 30,
+        direction_octaves: Annotated[int, Option(ge=1, le=64)] | None = None,
         width: Annotated[int, Option(ge=8)] = 256,
         scale: Annotated[float, Option(gt=0)] = 1.0,
+        spacing: Annotated[float, Option(gt=0, le=0.1)] | None = None,
+        precision: Literal["float32", "bfloat16"] = "float32",
         rate: Annotated[float, Option(gt=0)] = 7e-4,
     ) -> None:
         super().__init__(region, frequency)
         self.inputs = inputs
         self.scale = scale
+        self.spacing = spacing
+        self.precision = precision
         self.learning_rate = rate
-        count = 6 if inputs == "direction" else 5
-        first = count * octaves + (0 if inputs == "direction" else count)
-        second = first if inputs == "direction" else count * 20
+        if inputs == "angles" and direction_octaves is not None:
+            raise SettingsError(
+                "field.options.direction_octaves is of inputs direction, not of inputs angles; "
+                "leave it out"
+            )
+        told = direction_octaves or octaves
+        first = 5 * (octaves + 1) if inputs == "angles" else 3 * (octaves + told)
+        second = 5 * 20 if inputs == "angles" else first
         self.register_buffer("_first", math.pi * math.sqrt(2.0) ** torch.arange(octaves))
+        turns = math.pi * math.sqrt(2.0) ** torch.arange(told)
+        self.register_buffer("_turns", turns, persistent=False)  # of a file: told by its settings
         self.register_buffer("_second", math.pi * 2.0 ** torch.arange(20))
         affine = (lambda n: _Affine(n)) if inputs == "angles" else (lambda _: nn.Identity())
         self.enter = affine(first)
@@ -99,17 +123,20 @@ class FourierField(Field):
 
     @property
     def resolution(self) -> float:
-        """One hundredth of the region's longest side, in metres: the network itself has none."""
-        return float((self.region[1] - self.region[0]).max()) / 100
+        """See ``spacing``."""
+        return self.spacing or float((self.region[1] - self.region[0]).max()) / 100
 
-    def _numbers(self, positions: Tensor, directions: Tensor) -> Tensor:
+    def _embedded(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what enters the first layers, and the last ones."""
         if self.inputs == "direction":
-            return torch.cat((positions * self.scale, directions), dim=-1)
+            place = self._sines(positions * self.scale, self._first)
+            both = torch.cat((place, self._sines(directions, self._turns)), dim=-1)
+            return both, both
         look = -directions
         yaw = torch.atan2(look[..., 1], look[..., 0])
         pitch = -torch.asin(look[..., 2].clamp(-1.0, 1.0))  # positive looks down
-        angles = torch.stack((pitch, yaw), dim=-1)
-        return torch.cat((positions * self.scale, angles), dim=-1)
+        x = torch.cat((positions * self.scale, torch.stack((pitch, yaw), dim=-1)), dim=-1)
+        return torch.cat((x, self._sines(x, self._first)), dim=-1), self._sines(x, self._second)
 
     @staticmethod
     def _sines(x: Tensor, frequencies: Tensor) -> Tensor:
@@ -120,16 +147,11 @@ class FourierField(Field):
         shape = torch.broadcast_shapes(positions.shape, directions.shape)
         positions, directions = positions.expand(shape), directions.expand(shape)
         inside = self.inside(positions)
-        x = self._numbers(positions[inside], directions[inside])
-        first = self._sines(x, self._first)
-        if self.inputs == "angles":
-            first = torch.cat((x, first), dim=-1)
-            second = self._sines(x, self._second)
-        else:
-            second = first
-        hidden = self.middle(self.trunk(self.enter(first)))
-        hidden = self.leave(self.branch(torch.cat((hidden, first), dim=-1)))
-        real, imaginary = self.out(self.head(torch.cat((hidden, second), dim=-1))).chunk(2, dim=-1)
-        response = torch.complex(real, imaginary)
+        first, second = self._embedded(positions[inside], directions[inside])
+        with torch.autocast(positions.device.type, torch.bfloat16, self.precision == "bfloat16"):
+            hidden = self.middle(self.trunk(self.enter(first)))
+            hidden = self.leave(self.branch(torch.cat((hidden, first), dim=-1)))
+            answer = self.out(self.head(torch.cat((hidden, second), dim=-1)))
+        response = torch.complex(*answer.to(positions.dtype).chunk(2, dim=-1))
         result = response.new_zeros(*shape[:-1], response.shape[-1])
         return result.index_put((inside,), response)

@@ -18,16 +18,19 @@ def two_threads(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("places", "poses", "expected"),
+    ("places", "poses", "costly", "expected"),
     [
-        (WORTH_THREADS // 4 - 1, 4, 1),
-        (WORTH_THREADS // 4, 4, 2),
-        (None, 4, 2),  # not known: as torch would
+        (WORTH_THREADS // 4 - 1, 4, False, 1),
+        (WORTH_THREADS // 4, 4, False, 2),
+        (100, 4, True, 2),  # a network
+        (None, 4, False, 2),  # not known: as torch would
     ],
 )
-def test_small_steps_take_one_thread(two_threads, places, poses, expected):
+def test_small_steps_take_one_thread(two_threads, places, poses, costly, expected):
     callback = ThreadsCallback()
-    module = SimpleNamespace(renderer=SimpleNamespace(places_per_pose=places))
+    module = SimpleNamespace(
+        renderer=SimpleNamespace(places_per_pose=places), field=SimpleNamespace(costly=costly)
+    )
     callback.on_train_batch_start(None, module, SimpleNamespace(pose=range(poses)), 0)
     assert torch.get_num_threads() == expected
     callback.teardown(None, module, "fit")

@@ -4,8 +4,10 @@ import math
 import pytest
 import torch
 
+from sononerf.errors import SettingsError
 from sononerf.field.field import sphere_directions
 from sononerf.field.fourier import FourierField
+from sononerf.field.grid import GridField
 from sononerf.geometry.poses import rotation_from_euler
 
 REGION = torch.tensor([[-0.1] * 3, [0.1] * 3], dtype=torch.float64)
@@ -143,3 +145,48 @@ def test_weights_are_read_back():
     other.load_state_dict(field.state_dict())
     places, directions = places_in(20), sphere_directions(20, REGION)
     assert torch.equal(other(places, directions), field(places, directions))
+
+
+def test_direction_octaves_are_those_of_the_direction_alone():
+    field = fourier(octaves=5, direction_octaves=2, width=8)
+    assert field.trunk[0].in_features == 3 * 5 + 3 * 2
+    assert fourier(octaves=5, width=8).trunk[0].in_features == 6 * 5
+    middle, along_x = torch.zeros(1, 3).double(), torch.tensor([[0.1, 0.0, 0.0]]).double()
+    told = field._embedded(middle, along_x)[0][0]
+    place, turns = told[:15], told[15:]
+    assert (place == 0).all()
+    expected = torch.sin(math.pi * 0.1 * torch.tensor([1.0, math.sqrt(2.0)], dtype=torch.float64))
+    torch.testing.assert_close(turns[:2], expected, rtol=1e-6, atol=0)
+    assert (turns[2:] == 0).all()
+
+
+def test_the_codes_network_has_no_direction_to_embed():
+    with pytest.raises(SettingsError, match=r"direction_octaves is of inputs direction"):
+        fourier("angles", direction_octaves=3)
+
+
+@BOTH
+def test_products_in_half_precision_answer_alike_and_learn(inputs):
+    exact = fourier(inputs, 5, octaves=6, width=64).float()
+    field = fourier(inputs, 5, octaves=6, width=64, precision="bfloat16").float()
+    field.load_state_dict(exact.state_dict())
+    places, directions = places_in(200).float(), sphere_directions(200, REGION).float()
+    true, found = exact(places, directions), field(places, directions)
+    assert found.dtype == torch.complex64
+    differ = (found - true).detach().abs().max() / true.detach().abs().max()
+    # bfloat16 keeps eight bits: each product is good to 0.4 %, and nine layers add them up.
+    assert 1e-5 < float(differ) < 0.03
+    found.abs().sum().backward()
+    true.abs().sum().backward()
+    for (name, ours), theirs in zip(field.named_parameters(), exact.parameters(), strict=True):
+        assert ours.grad.dtype == torch.float32, name
+        assert float((ours.grad - theirs.grad).norm() / theirs.grad.norm()) < 0.1, name
+
+
+def test_the_spacing_that_resolves_it_may_be_given():
+    assert fourier(octaves=3, width=8, spacing=0.004).resolution == 0.004
+
+
+def test_a_network_is_worth_threads_where_lobes_are_not():
+    assert FourierField.costly
+    assert not GridField.costly

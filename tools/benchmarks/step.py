@@ -110,8 +110,13 @@ class EquationSeventeen(ShellRenderer):
 
 
 def _network(field: FourierField, places: Tensor, toward: Tensor) -> Tensor:
-    x = torch.cat((places * field.scale, toward), dim=-1)
-    embedded = torch.sin(x[..., None] * field._first).flatten(-2)
+    embedded = torch.cat(
+        [
+            torch.sin(x[..., None] * f).flatten(-2)
+            for x, f in ((places * field.scale, field._first), (toward, field._turns))
+        ],
+        dim=-1,
+    )
     hidden = field.trunk(embedded)
     hidden = field.branch(torch.cat((hidden, embedded), dim=-1))
     real, imaginary = field.out(field.head(torch.cat((hidden, embedded), dim=-1))).chunk(2, dim=-1)
