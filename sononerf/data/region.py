@@ -15,6 +15,7 @@ from sononerf.acoustics.ears import Ears
 from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.config import CallSettings, SpectrogramSettings
+from sononerf.data.first_echo import asked_poses
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import NumericalError
 from sononerf.geometry.hull import EchoHull
@@ -93,7 +94,7 @@ class EchoEvidence:
     Parameters
     ----------
     store : EnsembleStore
-        A sealed ensemble; only its training poses are looked at.
+        A sealed ensemble; only its :func:`~sononerf.data.first_echo.asked_poses` are looked at.
     ears : Ears
         Gains and places of emitter and ears.
     reach : float, m
@@ -101,7 +102,7 @@ class EchoEvidence:
     hull : EchoHull or None
         What the first echoes leave, where it is known.
     most : int
-        How many poses are asked at most, evenly spread over the training poses.
+        How many poses are asked at most, evenly spread over these.
 
     Raises
     ------
@@ -120,7 +121,7 @@ class EchoEvidence:
     ) -> None:
         self.reach = reach
         self.hull = hull
-        indices = np.asarray(store.indices("train"))
+        indices = asked_poses(store)  # whose first echoes the hull is of
         chosen = np.linspace(0, len(indices) - 1, min(most, len(indices))).astype(int)
         indices = indices[chosen]
         self.range = np.asarray(store.range, dtype=np.float64)

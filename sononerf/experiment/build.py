@@ -17,7 +17,7 @@ from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import Settings, faults_of
 from sononerf.data.datamodule import EchoDataModule
-from sononerf.data.first_echo import first_echoes
+from sononerf.data.first_echo import asked_poses, first_echoes
 from sononerf.data.region import WITNESS_GAIN, EchoEvidence, echo_power, echo_reach
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, NumericalError, SettingsError
@@ -71,7 +71,7 @@ def acquisition(settings: Settings) -> Acquisition:
 
 
 def echo_hull(settings: Settings, store: EnsembleStore) -> EchoHull:
-    """Return the space that the first echoes of the training poses leave, late ones corrected."""
+    """Return the space that the first echoes of the asked poses leave, late ones corrected."""
     known = acquisition(settings)
     first = first_echoes(
         store,
@@ -80,9 +80,9 @@ def echo_hull(settings: Settings, store: EnsembleStore) -> EchoHull:
     )
     if known.lag is not None:
         first = first - float(known.lag.max())  # rows of a sweep may hear it that much too far off
-    train = store.indices("train")
-    positions = np.asarray(store.positions, dtype=np.float64)[train]
-    rotations = np.asarray(store.rotations, dtype=np.float64)[train]
+    asked = asked_poses(store)
+    positions = np.asarray(store.positions, dtype=np.float64)[asked]
+    rotations = np.asarray(store.rotations, dtype=np.float64)[asked]
     ears = known.ear_positions.double().numpy()
     hull = EchoHull(
         emitters=positions + rotations @ known.emitter.double().numpy(),

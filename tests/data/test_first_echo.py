@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sononerf.data import first_echo
-from sononerf.data.first_echo import first_echoes
+from sononerf.data.first_echo import asked_poses, first_echoes
 from sononerf.data.store import EnsembleStore
 
 LENGTH, HOP = 64, 4
@@ -134,6 +134,30 @@ def test_only_training_poses_are_looked_at(tmp_path):
     )
     for index in (0, 2):  # the other is not even there
         store.write_pose(index, spectrograms([echo(ranges[index])] * 2))
+    found = first_echoes(store, WINDOW, SAMPLE)
+    np.testing.assert_allclose(found, [[0.25] * 2, [0.35] * 2], rtol=0, atol=FOUND)
+
+
+EVERY_OTHER = [0, 2, 4, 7, 9, 11, 13, 15, 17, 20, 22, 24]
+
+
+@pytest.mark.parametrize(("count", "asked"), [(7, range(7)), (12, range(12)), (25, EVERY_OTHER)])
+def test_of_many_poses_some_are_asked_evenly(monkeypatch, count, asked):
+    monkeypatch.setattr(first_echo, "MOST_POSES", 12)
+    train = 3 * np.arange(count)  # others lie between
+    store = SimpleNamespace(indices=lambda split: {"train": train}[split])
+    assert asked_poses(store).tolist() == train[list(asked)].tolist()
+
+
+def test_only_asked_poses_are_read(monkeypatch):
+    monkeypatch.setattr(first_echo, "MOST_POSES", 2)
+    poses = [spectrograms([echo(at)] * 2) for at in (0.25, 0.3, 0.35)]
+    store = SimpleNamespace(
+        range=RANGE,
+        attributes={"reference": LOUDEST / 1000},
+        indices=lambda split: {"train": np.arange(3)}[split],
+        read_pose=lambda index: {0: poses[0], 2: poses[2]}[index],
+    )
     found = first_echoes(store, WINDOW, SAMPLE)
     np.testing.assert_allclose(found, [[0.25] * 2, [0.35] * 2], rtol=0, atol=FOUND)
 

@@ -14,6 +14,8 @@ from sononerf import plugins
 from sononerf.acoustics.ears import synthetic_ears
 from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis
+from sononerf.data import first_echo
+from sononerf.data.first_echo import asked_poses
 from sononerf.data.region import OUTSIDE, EchoEvidence, echo_reach
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, NumericalError, SettingsError
@@ -301,6 +303,24 @@ def test_the_region_is_told_how_long_an_echo_is(tiny, echoes, monkeypatch):
     impulse, other, sweep, *_ = told  # the late first echoes are sought first
     assert impulse == other == pytest.approx(31.5e-6 * 343 / 2)
     assert sweep > 3 * impulse
+
+
+def test_of_many_poses_hull_and_region_ask_the_same_ones(tiny, echoes, monkeypatch):
+    """First echoes of some poses told to others would leave no place."""
+    store = EnsembleStore.open(echoes)
+    whole = echo_region(tiny(), store)[0]
+    monkeypatch.setattr(first_echo, "MOST_POSES", 6)
+    asked = asked_poses(store)
+    hull = echo_hull(tiny(), store)
+    assert hull.first.shape == (6, 2)
+    assert len(asked) < len(store.indices("train"))
+    np.testing.assert_allclose(hull.axes, store.rotations[asked][:, :, 0])
+    evidence = build._evidence(tiny(), store, hull)
+    np.testing.assert_allclose(evidence.sources, hull.sources, atol=1e-6)
+    np.testing.assert_allclose(evidence.nearest, hull.first.min(axis=1))
+    few = echo_region(tiny(), store, hull)[0]
+    assert (few[0] <= whole[0] + 0.002).all()
+    assert (few[1] >= whole[1] - 0.002).all()
 
 
 def test_what_is_possible_is_what_the_hull_leaves(tiny, echoes):
