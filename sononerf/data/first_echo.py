@@ -69,7 +69,7 @@ def _first(power: Array, axis: Array, floor: float) -> float:
     """Return the range at which the first echo has risen to the onset."""
     inner = power[1:-1]
     noise = float(np.quantile(power, QUIET_SHARE)) * 10 ** (NOISE_DB / 10)
-    floor = min(floor, max(noise, floor * 10 ** (-FAINT_DB / 10)))
+    floor = max(noise, floor * 10 ** (-FAINT_DB / 10))
     least = max(floor, power.max() * 10 ** (-FAINTEST_DB / 10))
     tops = (inner >= power[:-2]) & (inner > power[2:]) & (inner > least)
     if not tops.any() or (power[0] > least and power[0] >= power[1]):

@@ -25,6 +25,9 @@ Mask = NDArray[np.bool_]
 
 HEARD_DB = 6.0
 """A range is heard where any cell of it reaches this, 60 dB below the loudest being zero."""
+NOISE_DB, QUIET_SHARE = 5.0, 0.1
+"""And where it is so much louder than the quietest tenth of the ranges that a pose hears: noise is
+about as loud everywhere, and its tops reach so high."""
 WITNESS_GAIN = 0.1
 """A pose is a witness of the places towards which its gain is at least this part of the best."""
 SILENT_SHARES = (0.02, 0.25)
@@ -132,7 +135,9 @@ class EchoEvidence:
             spectrogram = store.read_pose(int(index))
             loudest.append(spectrogram.max(axis=(0, 2)))
             power.append((spectrogram**2).sum(axis=(0, 2)))
-        self.heard = np.stack(loudest) >= threshold  # (P, R)
+        tops = np.stack(loudest)  # (P, R)
+        noise = np.quantile(tops, QUIET_SHARE, axis=1, keepdims=True) * 10 ** (NOISE_DB / 20)
+        self.heard = tops >= np.maximum(threshold, noise)
         if not self.heard.any():
             raise NumericalError("no pose received an echo; check scene, poses and range limits")
         total = np.stack(power) * self.heard

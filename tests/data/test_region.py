@@ -292,6 +292,20 @@ def test_validation_and_test_poses_are_not_asked(tmp_path):
     np.testing.assert_allclose(few.sources, expected)
 
 
+def test_noise_is_not_heard(tmp_path):
+    """36 dB below the echoes and so 24 dB above the zero of the decibels, with tops."""
+    generator = np.random.default_rng(0)
+
+    def noisy(position, rotation):
+        power = 0.1**2 * generator.gamma(10.0, 0.1, size=(2, len(RANGE), len(FREQUENCY)))
+        return np.sqrt(echoes(position, rotation, PLACES) ** 2 + power)
+
+    plain = evidence(tmp_path / "plain", *around(), PLACES)
+    found = evidence(tmp_path / "noisy", *around(), noisy)
+    assert found.heard.mean() < 1.1 * plain.heard.mean()
+    np.testing.assert_allclose(found.box(), plain.box(), rtol=0, atol=0.012)
+
+
 @pytest.mark.parametrize("looks", ["at", "along"])
 def test_a_flight_in_a_line(tmp_path, looks):
     """All poses in one plane, or on one side: the box has room off the plane as well."""

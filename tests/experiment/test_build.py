@@ -29,6 +29,7 @@ from sononerf.experiment.build import (
     field_and_renderer,
     module_for,
 )
+from sononerf.experiment.simulate import simulate
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.field.hash import HashField
@@ -286,6 +287,24 @@ def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):
         tiny(region={"lower": (-0.1, -0.1, -0.1), "upper": (0.1, 0.2, 0.3)}), store
     )
     torch.testing.assert_close(chosen[1], torch.tensor([0.1, 0.2, 0.3]))
+
+
+@pytest.mark.parametrize("snr_db", [40, 25, 10])
+def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path, snr_db):
+    """The noise of 40 dB and less lies above the zero of the reported decibels."""
+    poses = {"count": 24, "validation": 0, "heldout": 0}
+    plain = tiny(poses=poses, data={"store": str(tmp_path / "plain")})
+    noisy = tiny(poses=poses, noise={"snr_db": snr_db}, data={"store": str(tmp_path / "noisy")})
+    stores = [simulate(each, workers=1) for each in (plain, noisy)]
+    assert float(stores[1].read_pose(0).min()) > float(stores[0].read_pose(0).min())
+    (box, _), (found, _) = (echo_region(s, e) for s, e in zip((plain, noisy), stores, strict=True))
+    torch.testing.assert_close(found, box, rtol=0, atol=0.006)
+    # First echoes of a sphere: its front, or a little before, never behind.
+    hull = echo_hull(noisy, stores[1])
+    front = np.linalg.norm(hull.sources, axis=1) - 0.02
+    late = hull.first.mean(axis=1) - front
+    assert late.max() < 0.001
+    assert np.median(late) > -0.004
 
 
 def test_the_region_is_told_how_long_an_echo_is(tiny, echoes, monkeypatch):
