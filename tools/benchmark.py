@@ -10,6 +10,7 @@
     python tools/benchmark.py poses [--scene three_spheres] [--counts 12 25 50 100 200 400]
     python tools/benchmark.py paper [--scene three_spheres] [--minutes 60] [--steps N]
     python tools/benchmark.py variants [--scene three_spheres] [--epochs 10]
+    python tools/benchmark.py scale [--counts 100 400 1600] [--axes poses slices size places]
     python tools/benchmark.py step [--accelerator cpu] [--compare OLD.json]
     python tools/benchmark.py fit [--scene three_spheres] [--error 0.45] [--compare OLD.json]
     python tools/benchmark.py reconstruct RUN [RUN ...] [--spacings 0.002 0.001]
@@ -31,11 +32,12 @@ version, machine and device, and ``--compare`` prints what has changed.
 ``poses``: the same for one scene and ever more calls. ``paper``: how much sooner the default gets
 to the held-out error to which the paper's own field, renderer and training come in so many minutes,
 or steps. ``variants``: the paper's settings with one thing after the other as its published code
-has it. ``prey``: whether leaves with a dragonfly at places from seeds are told from the empty
-leaf, and how far off it is looked for, with fewer and more calls, without ears, in noise and amid
-clutter; about two minutes for each case on two cores. All five leave runs, a table as JSON and
-logs in a folder (``--output``), share ensembles (``--data``), go on where they were interrupted,
-and lay KEY=VALUE over the settings (``--set``).
+has it. ``scale``: what simulation, a step, reading out and memory come to with ever more poses,
+range slices, room and places. ``prey``: whether leaves with a dragonfly at places from seeds are
+told from the empty leaf, and how far off it is looked for, with fewer and more calls, without ears,
+in noise and amid clutter; about two minutes for each case on two cores. All six leave runs, a table
+as JSON and logs in a folder (``--output``), share ensembles (``--data``), go on where they were
+interrupted, and lay KEY=VALUE over the settings (``--set``).
 """
 
 from __future__ import annotations
@@ -54,6 +56,8 @@ from tools.benchmarks.physics import dechirp, physics  # noqa: E402
 from tools.benchmarks.poses import COUNTS, poses  # noqa: E402
 from tools.benchmarks.prey import CONDITIONS, prey  # noqa: E402
 from tools.benchmarks.reconstruct import reconstruct  # noqa: E402
+from tools.benchmarks.scale import COUNTS as SCALE_COUNTS  # noqa: E402
+from tools.benchmarks.scale import scale  # noqa: E402
 from tools.benchmarks.shapes import shapes  # noqa: E402
 from tools.benchmarks.simulator import noise, simulate  # noqa: E402
 from tools.benchmarks.step import step  # noqa: E402
@@ -81,7 +85,7 @@ def main() -> None:
             command.add_argument("--bounces", type=int, default=3)
         if run is simulate:
             command.add_argument("--rays", type=int, default=300_000)
-    for series in (shapes, poses, paper, variants, prey, step, fit, reconstruct):
+    for series in (shapes, poses, paper, variants, scale, prey, step, fit, reconstruct):
         command = commands.add_parser(series.__name__, help=(series.__doc__ or "").split("\n")[0])
         command.set_defaults(run=series)
         if series is shapes:
@@ -103,6 +107,10 @@ def main() -> None:
             command.add_argument("--spacings", type=float, nargs="+", help=SPACINGS_HELP)
         if series in (poses, paper, variants, step, fit):
             command.add_argument("--scene", default="three_spheres")
+        if series is scale:
+            command.add_argument("--counts", type=int, nargs="+", default=SCALE_COUNTS)
+            axes = ("poses", "slices", "size", "places")
+            command.add_argument("--axes", nargs="+", choices=axes, help="what grows; all")
         if series is poses:
             command.add_argument("--counts", type=int, nargs="+", default=COUNTS)
         if series is paper:
@@ -110,7 +118,7 @@ def main() -> None:
             command.add_argument("--steps", type=int, help="of the paper's fit; none are timed")
         elif series is variants:
             command.add_argument("--epochs", type=int, default=10, help="of each fit (10)")
-        elif series not in (step, fit, reconstruct):
+        elif series not in (scale, step, fit, reconstruct):
             command.add_argument("--seconds", type=float, default=60.0, help=SECONDS_HELP)
         command.add_argument("--output", type=Path, help="folder of runs and table")
         if series is reconstruct:
