@@ -289,12 +289,11 @@ def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):
     torch.testing.assert_close(chosen[1], torch.tensor([0.1, 0.2, 0.3]))
 
 
-@pytest.mark.parametrize("snr_db", [40, 25, 10])
-def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path, snr_db):
-    """The noise of 40 dB and less lies above the zero of the reported decibels."""
+def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
+    """The noise lies 20 dB above the zero of the reported decibels."""
     poses = {"count": 24, "validation": 0, "heldout": 0}
     plain = tiny(poses=poses, data={"store": str(tmp_path / "plain")})
-    noisy = tiny(poses=poses, noise={"snr_db": snr_db}, data={"store": str(tmp_path / "noisy")})
+    noisy = tiny(poses=poses, noise={"snr_db": 20}, data={"store": str(tmp_path / "noisy")})
     stores = [simulate(each, workers=1) for each in (plain, noisy)]
     assert float(stores[1].read_pose(0).min()) > float(stores[0].read_pose(0).min())
     (box, _), (found, _) = (echo_region(s, e) for s, e in zip((plain, noisy), stores, strict=True))
