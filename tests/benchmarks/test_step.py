@@ -32,6 +32,7 @@ def measured(tmp_path_factory):
         Pair(PAIRS[0].name, PAPER, FEW, 1, 2),
         Pair(PAIRS[1].name, PAPER, FEW, 1, 2),
         Pair(PAIRS[3].name, CONFIG, SMALL, 1, 2),
+        Pair("half", PAPER, (*FEW, "field.options.precision=bfloat16"), 1, 2),
     )
     output = tmp_path_factory.mktemp("step")
     given = Namespace(
@@ -39,7 +40,9 @@ def measured(tmp_path_factory):
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "PAIRS", pairs)
-        patch.setattr(module, "matrix_rate", lambda device: 1e9)
+        patch.setattr(
+            module, "matrix_rate", lambda device, kind: {"float32": 1e9, "bfloat16": 2e9}[kind]
+        )
         patch.setattr(module, "copy_rate", lambda device: 1e10)
         text = module.step(given)
     (file,) = output.glob("step-*-cpu.json")
@@ -53,10 +56,13 @@ def test_equation_17_as_it_stands_has_the_loss_of_the_shell_renderer(measured):
 
 def test_rates_follow_from_what_was_counted_and_timed(measured):
     _, found = measured
-    naive, shell, default = found["rows"]
+    naive, shell, default, half = found["rows"]
+    assert 0 < half["loss_differs"] < 0.02
+    assert half["points"] == shell["points"]
     assert naive["points"] == 20 * 40  # every direction of every slice
     assert 0 < shell["points"] < naive["points"]
     assert "flop" not in naive
+    assert half["over_matrix_rate"] == pytest.approx(half["flop"] / half["step_s"] / 2e9)
     for row in (shell, default):
         assert row["points_per_s"] == pytest.approx(row["points"] / row["step_s"])
         assert row["over_matrix_rate"] == pytest.approx(row["flop"] / row["step_s"] / 1e9)
@@ -71,10 +77,11 @@ def test_the_table_says_how_many_times_as_fast(measured):
     text, found = measured
     ratio = found["rows"][0]["step_s"] / found["rows"][1]["step_s"]
     assert f"fourier, shell: {ratio:.1f} times as fast as equation 17" in text
-    assert [line.strip().split("  ")[0] for line in text.splitlines()[1:4]] == [
+    assert [line.strip().split("  ")[0] for line in text.splitlines()[1:5]] == [
         "equation 17",
         "fourier, shell",
         "grid, profile",
+        "half",
     ]
 
 

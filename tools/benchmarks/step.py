@@ -4,11 +4,12 @@
 Every pair takes its steps in Lightning's own loop, as ``sononerf fit`` does, from a batch of the
 ensemble to the optimiser's update; what is reported is the median over the timed ones. Beside it:
 
-*Floating-point operations* are those of the matrix products that were executed, forward and
-backward, as torch counts them, in one more step; the rate is given over that of a plain product
-of two matrices of the same type on the same machine. *Bytes* are what the operations of that step
-read and write, each tensor once for each operation that touches it; the time that they would take
-at the rate at which the machine copies is what its memory allows.
+How far a loss lies from that of the exact renderer, or in float32, is told for the same batch and
+the same weights. *Floating-point operations* are those of the matrix products that were executed,
+forward and backward, as torch counts them, in one more step; the rate is given over that of a plain
+product of two matrices of the same type on the same machine. *Bytes* are what the operations of
+that step read and write, each tensor once for each operation that touches it; the time that they
+would take at the rate at which the machine copies is what its memory allows.
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ from tools.benchmarks.experiment import CONFIG, Row, aligned, ending
 from tools.benchmarks.record import device_name, keep, ratios
 
 PAPER = CONFIG.parent / "paper" / "three_spheres.yaml"
+NEURAL = CONFIG.parent / "neural.yaml"
 
 
 class Pair(NamedTuple):
@@ -68,7 +70,9 @@ PAIRS = (
     Pair("fourier, shell", PAPER, (), 5, 20),
     Pair("grid, shell", PAPER, ("field.kind=grid",), 5, 20),
     Pair("grid, profile", CONFIG, (), 200, 50),
-    Pair("fourier, profile", CONFIG, ("field.kind=fourier",), 3, 5),
+    Pair("fourier, profile", NEURAL, ("field.options.precision=float32",), 5, 20),
+    Pair("fourier in bfloat16, shell", PAPER, ("field.options.precision=bfloat16",), 5, 20),
+    Pair("fourier in bfloat16, profile", NEURAL, ("field.options.precision=bfloat16",), 5, 20),
 )
 NAIVE, SHELL, DEFAULT = PAIRS[0].name, PAIRS[1].name, PAIRS[3].name
 
@@ -215,16 +219,17 @@ def _step(arguments: argparse.Namespace, output: Path) -> str:
     if arguments.compare is not None:
         storage.read_json(arguments.compare)  # that it cannot be read is told before minutes pass
     device = device_name(arguments.accelerator)
-    product, copy = matrix_rate(device), copy_rate(device)
+    copy = copy_rate(device)
+    products = {kind: matrix_rate(device, kind) for kind in ("float32", "bfloat16")}
     rows: list[Row] = []
     for pair in PAIRS:
         settings = _settings(pair, arguments, output)
-        rows.append(_measured(pair, settings, arguments.accelerator, product, copy))
+        rows.append(_measured(pair, settings, arguments.accelerator, products, copy))
         print(f"{pair.name}: {1e3 * rows[-1]['step_s']:.1f} ms", file=sys.stderr, flush=True)
     by_name = {row["name"]: row for row in rows}
     found = {
         "scene": arguments.scene,
-        "matrix_flop_per_s": product,
+        "matrix_flop_per_s": products,
         "copy_bytes_per_s": copy,
         "shell_over_equation_17": by_name[NAIVE]["step_s"] / by_name[SHELL]["step_s"],
         "loss_of_equation_17_differs_by": by_name[NAIVE]["loss_differs"],
@@ -245,7 +250,9 @@ def _settings(pair: Pair, arguments: argparse.Namespace, output: Path) -> Settin
     return load_settings(pair.config, [*chosen, f"data.store={folder / store}"])
 
 
-def _measured(pair: Pair, settings: Settings, accelerator: str, product: float, copy: float) -> Row:
+def _measured(
+    pair: Pair, settings: Settings, accelerator: str, products: dict[str, float], copy: float
+) -> Row:
     store = ensemble(settings, progress=Progress())
     region, possible = echo_region(settings, store)
     field, renderer = field_and_renderer(settings, region)
@@ -294,6 +301,9 @@ def _measured(pair: Pair, settings: Settings, accelerator: str, product: float, 
     if naive:
         row["loss_differs"] = _loss_differs(module, data, settings, region)
         return row
+    if isinstance(field, FourierField) and field.precision != "float32":
+        row["loss_differs"] = _loss_in_float32_differs(module, field, data)
+    product = products[getattr(field, "precision", "float32")]
     allowed = watch.bytes / copy
     return {
         **row,
@@ -322,10 +332,23 @@ def _loss_differs(
     return abs(losses[1] / losses[0] - 1)
 
 
-def matrix_rate(device: str, size: int | None = None) -> float:
-    """Return the floating-point operations a second of a product of two square float32 matrices."""
+def _loss_in_float32_differs(
+    module: EchoModule, field: FourierField, data: EchoDataModule
+) -> float:
+    """Return by how much, of itself, the loss differs from that with products in float32."""
+    batch = next(iter(data.train_dataloader()))
+    chosen, losses = field.precision, []
+    module.cpu().eval()  # a step that draws places would draw others
+    with torch.no_grad():
+        for field.precision in ("float32", chosen):
+            losses.append(float(module._loss(module(batch), batch.spectrum)))
+    return abs(losses[1] / losses[0] - 1)
+
+
+def matrix_rate(device: str, kind: str = "float32", size: int | None = None) -> float:
+    """Return the floating-point operations a second of a product of two square matrices."""
     size = size or (8192 if device == "cuda" else 2048)
-    one = torch.rand(size, size, device=device)
+    one = torch.rand(size, size, device=device, dtype=getattr(torch, kind))
     return 2 * size**3 / _median_seconds(lambda: one @ one, device)
 
 
@@ -348,7 +371,7 @@ def _median_seconds(run: Callable[[], object], device: str) -> float:
     return statistics.median(seconds[1:])
 
 
-TITLES = ("pair", "steps", "ms", "points/s", "GFLOP", "of peak", "MB", "over memory")
+TITLES = ("pair", "steps", "ms", "points/s", "GFLOP", "of peak", "MB", "over memory", "loss apart")
 
 
 def table(rows: list[Row]) -> str:
@@ -368,6 +391,7 @@ def table(rows: list[Row]) -> str:
             shown(row.get("over_matrix_rate"), ".0%"),
             shown(row.get("bytes"), ".0f", 1e-6),
             shown(row.get("over_memory"), ".1f"),
+            shown(row.get("loss_differs"), ".0e"),
         ]
         for row in rows
     ]
@@ -376,8 +400,10 @@ def table(rows: list[Row]) -> str:
 
 def sentences(found: dict[str, Any]) -> str:
     """Return what the table comes to."""
+    rates = found["matrix_flop_per_s"]
     return (
-        f"matrix product {found['matrix_flop_per_s'] / 1e9:.0f} GFLOP/s, "
+        f"matrix product {rates['float32'] / 1e9:.0f} GFLOP/s, "
+        f"in bfloat16 {rates['bfloat16'] / 1e9:.0f} GFLOP/s, "
         f"copy {found['copy_bytes_per_s'] / 1e9:.1f} GB/s\n"
         f"fourier, shell: {found['shell_over_equation_17']:.1f} times as fast as equation 17, "
         f"loss {found['loss_of_equation_17_differs_by']:.0e} apart\n"
