@@ -119,7 +119,7 @@ def learn_retrace(
         progress.say(f"no echoes are traced off the mesh: {error}")
     surface: Surface = "auto"
     read_out = options.reconstruction
-    if fitted.module.field.knows_directions and (read_out.method, read_out.level) == ("auto",) * 2:
+    if (read_out.method, read_out.level) == ("auto", "auto"):
         with suppress(SonoNerfError):  # nor need there be a hull, or be one that can be traced
             other = trace(calmed(_hull_surface(fitted)))
             # Of two that nobody believes the better one proves nothing.

@@ -93,8 +93,9 @@ def reconstruct(
     level : float or "auto"
         Value of the volume, or of the oriented indicator, on the surface; of the hull the depth, m.
     method : {"auto", "oriented", "hull", "isosurface"}
-        ``auto`` is the oriented surface where the field knows directions. ``hull`` is what the
-        first echoes leave, whatever the field says: exact for a body without hollows.
+        ``auto`` is the oriented surface where the field knows directions, or the hull where it was
+        heard from. ``hull`` is what the first echoes leave, whatever the field says: exact for a
+        body without hollows.
     directions : int
         Size of the spherical lattice that is summed over where the field has no lobes.
     smoothing : float, m
@@ -124,7 +125,8 @@ def reconstruct(
             "at its narrowest); give metres"
         )
     if method == "auto":
-        method = "oriented" if field.knows_directions else "isosurface"
+        heard = field.knows_directions or hull is not None
+        method = "oriented" if heard else "isosurface"
     if method == "hull" and hull is None:
         raise SettingsError("method hull: it is not known where the field was heard from")
     volume = volume_from_function(

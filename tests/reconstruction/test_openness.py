@@ -231,6 +231,11 @@ def read(monkeypatch):
     return make
 
 
+def test_a_network_too_is_read_out_by_its_glints_where_poses_are_known(read):
+    assert read(hull_over(all_around()), method="auto").method == "oriented"
+    assert read(None, method="auto").method == "isosurface"
+
+
 def test_a_closed_surface_is_read_out_whole(read):
     found = read(hull_over(all_around()))
     assert found.openness.kind == "closed"
