@@ -16,7 +16,8 @@ another where the surface is drawn, and would no longer fit in memory."""
 FAINTEST_DB = 40.0
 """Below the pose's loudest. What is fainter may be the skirt of the window, no echo."""
 FAINT_DB = 20.0
-"""Below the zero of the reported decibels: so faint is a thin sheet's edge beside its flash."""
+"""Below the zero of the reported decibels: so faint is a thin sheet's edge beside its flash. Where
+noise does not lie that far below a pose's loudest, what is nearest may have answered under it."""
 NOISE_DB, QUIET_SHARE = 10.0, 0.1
 """Above the quietest tenth of what a pose heard: so high do the tops of noise reach."""
 ONSET_DB = 10.0
@@ -69,7 +70,10 @@ def _first(power: Array, axis: Array, floor: float) -> float:
     """Return the range at which the first echo has risen to the onset."""
     inner = power[1:-1]
     noise = float(np.quantile(power, QUIET_SHARE)) * 10 ** (NOISE_DB / 10)
-    floor = max(noise, floor * 10 ** (-FAINT_DB / 10))
+    faint = floor * 10 ** (-FAINT_DB / 10)
+    if noise > faint and power.max() < noise * 10 ** (FAINT_DB / 10):
+        return -np.inf
+    floor = max(noise, faint)
     least = max(floor, power.max() * 10 ** (-FAINTEST_DB / 10))
     tops = (inner >= power[:-2]) & (inner > power[2:]) & (inner > least)
     if not tops.any() or (power[0] > least and power[0] >= power[1]):

@@ -25,9 +25,13 @@ Mask = NDArray[np.bool_]
 
 HEARD_DB = 6.0
 """A range is heard where any cell of it reaches this, 60 dB below the loudest being zero."""
-NOISE_DB, QUIET_SHARE = 5.0, 0.1
-"""And where it is so much louder than the quietest tenth of the ranges that a pose hears: noise is
-about as loud everywhere, and its tops reach so high."""
+NOISE_DB, QUIET_SHARE = 10.0, 0.1
+"""And where it is so much louder than the quietest tenth of the ranges that a pose hears, if these
+are noise: of a hundred thousand ranges of noise none is. A pose that hears nothing else would have
+its echoes anywhere."""
+EVEN_DB = 2.0
+"""They are noise where the quietest tenth and the quietest twentieth lie no farther apart: noise is
+about as loud everywhere, while echoes fade."""
 WITNESS_GAIN = 0.1
 """A pose is a witness of the places towards which its gain is at least this part of the best."""
 SILENT_SHARES = (0.02, 0.25)
@@ -91,6 +95,13 @@ def echo_reach(call: CallSettings, analysis: SpectrogramSettings, speed_of_sound
     return float(sounding[-1] - sounding[0]) / 2.0 * speed_of_sound / 2.0 / analysis.sampling_rate
 
 
+def _tops_of_noise(loudness: Array) -> Array:
+    """Return the magnitude that no noise reaches, (P,), of (P, R); 0 where there is none."""
+    quiet, quieter = np.quantile(loudness, (QUIET_SHARE, QUIET_SHARE / 2), axis=1)
+    even = quiet <= quieter * 10 ** (EVEN_DB / 20)
+    return np.asarray(np.where(even, quiet * 10 ** (NOISE_DB / 20), 0.0))
+
+
 class EchoEvidence:
     """What the training poses say about places.
 
@@ -136,8 +147,10 @@ class EchoEvidence:
             loudest.append(spectrogram.max(axis=(0, 2)))
             power.append((spectrogram**2).sum(axis=(0, 2)))
         tops = np.stack(loudest)  # (P, R)
-        noise = np.quantile(tops, QUIET_SHARE, axis=1, keepdims=True) * 10 ** (NOISE_DB / 20)
-        self.heard = tops >= np.maximum(threshold, noise)
+        noise = _tops_of_noise(tops)
+        self.heard = tops >= np.maximum(threshold, noise[:, None])
+        # Under noise a faint echo is missed, so that silence tells less.
+        self.shares = SILENT_SHARES[-1:] if np.median(noise) > threshold else SILENT_SHARES
         if not self.heard.any():
             raise NumericalError("no pose received an echo; check scene, poses and range limits")
         total = np.stack(power) * self.heard
@@ -294,7 +307,7 @@ class EchoEvidence:
         keep = np.zeros(len(points), dtype=bool)
         covered = np.zeros_like(self.heard)
         inside = self._in_hull(points, tolerance)
-        for silent_share in SILENT_SHARES:
+        for silent_share in self.shares:
             for _ in range(ROUNDS):
                 evidence = self.about(points, tolerance, unexplained, silent_share)
                 energy = np.where(evidence.possible & inside, evidence.energy, 0.0)

@@ -6,7 +6,7 @@ from sononerf.acoustics.ears import synthetic_ears
 from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.config import CallSettings, EarSettings, SpectrogramSettings
-from sononerf.data.region import EchoEvidence, echo_power, echo_reach
+from sononerf.data.region import SILENT_SHARES, EchoEvidence, echo_power, echo_reach
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere
@@ -303,6 +303,8 @@ def test_noise_is_not_heard(tmp_path):
     plain = evidence(tmp_path / "plain", *around(), PLACES)
     found = evidence(tmp_path / "noisy", *around(), noisy)
     assert found.heard.mean() < 1.1 * plain.heard.mean()
+    # Silence tells less where something may lie under the noise.
+    assert (plain.shares, found.shares) == (SILENT_SHARES, SILENT_SHARES[-1:])
     np.testing.assert_allclose(found.box(), plain.box(), rtol=0, atol=0.012)
 
 
