@@ -29,9 +29,9 @@ NOISE_DB, QUIET_SHARE = 10.0, 0.1
 """And where it is so much louder than the quietest tenth of the ranges that a pose hears, if these
 are noise: of a hundred thousand ranges of noise none is. A pose that hears nothing else would have
 its echoes anywhere."""
-EVEN_DB = 2.0
-"""They are noise where the quietest tenth and the quietest twentieth lie no farther apart: noise is
-about as loud everywhere, while echoes fade."""
+EVEN_DB, EVEN_SHARES = 3.0, (0.05, 0.25)
+"""They are noise where these quantiles of the loudness lie no farther apart: noise is about as loud
+everywhere, while echoes fade."""
 WITNESS_GAIN = 0.1
 """A pose is a witness of the places towards which its gain is at least this part of the best."""
 SILENT_SHARES = (0.02, 0.25)
@@ -97,8 +97,9 @@ def echo_reach(call: CallSettings, analysis: SpectrogramSettings, speed_of_sound
 
 def _tops_of_noise(loudness: Array) -> Array:
     """Return the magnitude that no noise reaches, (P,), of (P, R); 0 where there is none."""
-    quiet, quieter = np.quantile(loudness, (QUIET_SHARE, QUIET_SHARE / 2), axis=1)
-    even = quiet <= quieter * 10 ** (EVEN_DB / 20)
+    quiet = np.quantile(loudness, QUIET_SHARE, axis=1)
+    low, high = np.quantile(loudness, EVEN_SHARES, axis=1)
+    even = high < low * 10 ** (EVEN_DB / 20)
     return np.asarray(np.where(even, quiet * 10 ** (NOISE_DB / 20), 0.0))
 
 
