@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf.data.noise_tops import noise_tops
 from sononerf.data.store import EnsembleStore
 
 Array = NDArray[np.float64]
@@ -18,10 +19,8 @@ FAINTEST_DB = 40.0
 FAINT_DB = 20.0
 """Below the zero of the reported decibels: so faint is a thin sheet's edge beside its flash. Where
 noise does not lie that far below a pose's loudest, what is nearest may have answered under it."""
-NOISE_DB, QUIET_SHARE = 10.0, 0.1
-"""Above the quietest tenth of what a pose heard: so high do the tops of noise reach."""
-EVEN_DB, EVEN_SHARES = 4.0, (0.05, 0.25)
-"""What is quiet is noise where these quantiles of what a pose heard lie no farther apart."""
+EVEN_DB = 4.0
+"""Quantiles of noise as one ear hears it lie no farther apart."""
 ONSET_DB = 10.0
 """Below an echo's top: where it has risen to this its place is read, for there the next one, which
 may follow closely, has not begun."""
@@ -71,15 +70,13 @@ def _rise(window: Array) -> float:
 def _first(power: Array, axis: Array, floor: float) -> float:
     """Return the range at which the first echo has risen to the onset."""
     inner = power[1:-1]
-    noise = float(np.quantile(power, QUIET_SHARE)) * 10 ** (NOISE_DB / 10)
-    faint = floor * 10 ** (-FAINT_DB / 10)
-    low, high = np.quantile(power, EVEN_SHARES)
-    if noise > floor and high < low * 10 ** (EVEN_DB / 10):  # echoes fade
+    noise, noisy = noise_tops(power, EVEN_DB)
+    if noisy and noise > floor:
         if power.max() < noise * 10 ** (FAINT_DB / 10):
             return -np.inf
-        floor = noise
+        floor = float(noise)
     else:
-        floor = min(floor, max(noise, faint))
+        floor = min(floor, max(float(noise), floor * 10 ** (-FAINT_DB / 10)))
     least = max(floor, power.max() * 10 ** (-FAINTEST_DB / 10))
     tops = (inner >= power[:-2]) & (inner > power[2:]) & (inner > least)
     if not tops.any() or (power[0] > least and power[0] >= power[1]):

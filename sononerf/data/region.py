@@ -16,6 +16,7 @@ from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.data.first_echo import asked_poses
+from sononerf.data.noise_tops import noise_tops
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import NumericalError
 from sononerf.geometry.hull import EchoHull
@@ -25,13 +26,9 @@ Mask = NDArray[np.bool_]
 
 HEARD_DB = 6.0
 """A range is heard where any cell of it reaches this, 60 dB below the loudest being zero."""
-NOISE_DB, QUIET_SHARE = 10.0, 0.1
-"""And where it is so much louder than the quietest tenth of the ranges that a pose hears, if these
-are noise: of a hundred thousand ranges of noise none is. A pose that hears nothing else would have
-its echoes anywhere."""
-EVEN_DB, EVEN_SHARES = 3.0, (0.05, 0.25)
-"""They are noise where these quantiles of the loudness lie no farther apart: noise is about as loud
-everywhere, while echoes fade."""
+EVEN_DB = 3.0
+"""And where it is no noise; of the loudest cells of both ears its quantiles lie no farther apart. A
+pose that hears nothing but noise would have its echoes anywhere."""
 WITNESS_GAIN = 0.1
 """A pose is a witness of the places towards which its gain is at least this part of the best."""
 SILENT_SHARES = (0.02, 0.25)
@@ -95,14 +92,6 @@ def echo_reach(call: CallSettings, analysis: SpectrogramSettings, speed_of_sound
     return float(sounding[-1] - sounding[0]) / 2.0 * speed_of_sound / 2.0 / analysis.sampling_rate
 
 
-def _tops_of_noise(loudness: Array) -> Array:
-    """Return the magnitude that no noise reaches, (P,), of (P, R); 0 where there is none."""
-    quiet = np.quantile(loudness, QUIET_SHARE, axis=1)
-    low, high = np.quantile(loudness, EVEN_SHARES, axis=1)
-    even = high < low * 10 ** (EVEN_DB / 20)
-    return np.asarray(np.where(even, quiet * 10 ** (NOISE_DB / 20), 0.0))
-
-
 class EchoEvidence:
     """What the training poses say about places.
 
@@ -148,7 +137,8 @@ class EchoEvidence:
             loudest.append(spectrogram.max(axis=(0, 2)))
             power.append((spectrogram**2).sum(axis=(0, 2)))
         tops = np.stack(loudest)  # (P, R)
-        noise = _tops_of_noise(tops)
+        power_of_noise, noisy = noise_tops(tops.astype(np.float64) ** 2, EVEN_DB)
+        noise = np.where(noisy, np.sqrt(power_of_noise), 0.0)
         self.heard = tops >= np.maximum(threshold, noise[:, None])
         # Under noise a faint echo is missed, so that silence tells less.
         self.shares = SILENT_SHARES[-1:] if np.median(noise) > threshold else SILENT_SHARES

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import subprocess
 import sys
@@ -12,7 +11,6 @@ from argparse import Namespace
 import pytest
 
 from sononerf.config import load_settings
-from sononerf.experiment import build
 from sononerf.experiment.build import acquisition, check_plugins
 from sononerf.scene import load_scene
 from tools.benchmarks import scale as module
@@ -87,14 +85,6 @@ def test_all_axes_are_looked_at_unless_some_are_chosen(monkeypatch, tmp_path):
     assert [name for name, _ in asked] == ["poses-100", "poses-400", *(c.name for c in OTHERS)]
     asked, _ = series(monkeypatch, tmp_path / "some", axes=("size",))
     assert [name for name, _ in asked] == ["size-1", "size-2", "size-3"]
-
-
-@pytest.fixture(scope="module")
-def quick_ears():
-    """Ears take a second each time, and most cases have the same."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "analysed_ears", functools.cache(build.analysed_ears))
-        yield
 
 
 @pytest.mark.parametrize("case", OTHERS, ids=lambda case: case.name)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 import re
 import shlex
@@ -13,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sononerf.config import load_settings
-from sononerf.experiment import build
+from sononerf.errors import SettingsError
 from sononerf.experiment.build import check_plugins
 from tools.benchmarks import variants as module
 from tools.benchmarks.paper import PAPER
@@ -37,14 +36,6 @@ def test_every_option_of_the_page_is_measured_and_every_measured_one_is_on_the_p
         ("reconstruction.level=NUMBER",),  # of one's own
     }
     assert measured == told() - not_a_fit
-
-
-@pytest.fixture(scope="module")
-def quick_ears():
-    """Ears take a second each time, and most variants have the same."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "analysed_ears", functools.cache(build.analysed_ears))
-        yield
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
@@ -73,7 +64,7 @@ def series(monkeypatch, output, fail=()):
     def experiment(folder, data, settings, *, config, enough):
         asked.append((folder, data, list(settings), config, enough))
         if folder.name in fail:
-            raise RuntimeError("exit code 3: no surface")
+            raise fail[folder.name]
         return METRICS
 
     monkeypatch.setattr(module, "run_experiment", experiment)
@@ -101,11 +92,25 @@ def test_what_is_traced_off_the_mesh_is_left_out():
 
 
 def test_one_that_fails_is_told_of_and_the_others_go_on(monkeypatch, tmp_path):
-    asked, text = series(monkeypatch, tmp_path, fail=("loss",))
+    asked, text = series(
+        monkeypatch, tmp_path, fail={"loss": RuntimeError("exit code 3: no surface")}
+    )
     assert len(asked) == len(VARIANTS)
     assert "loss: exit code 3: no surface" in text
     row = next(line.split() for line in text.splitlines() if line.split()[0] == "loss")
     assert row == ["loss", *["-"] * 8]
+
+
+def test_a_scene_without_what_a_variant_changes_has_the_others(monkeypatch, tmp_path):
+    unknown = SettingsError("scene.options.radius: unknown")
+    asked, text = series(monkeypatch, tmp_path, fail={"28.6-mm": unknown})
+    assert len(asked) == len(VARIANTS)
+    assert "28.6-mm: scene.options.radius: unknown" in text
+
+
+def test_settings_that_are_wrong_for_all_end_it(monkeypatch, tmp_path):
+    with pytest.raises(SystemExit, match="unknown scene"):
+        series(monkeypatch, tmp_path, fail={"paper": SettingsError("unknown scene 'nosuch'")})
 
 
 def test_a_run_without_a_surface_has_no_geometry():
