@@ -8,6 +8,7 @@ from typing import Any, Literal
 import lightning
 import torch
 from torch import Tensor
+from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torchmetrics import MeanMetric
 
 from sononerf.data.range_slices import RangeSlices, seed_of
@@ -120,7 +121,7 @@ class EchoModule(lightning.LightningModule):
         """Return the loss of one batch."""
         del batch_index
         step = self.global_step
-        torch.manual_seed(seed_of(self.seed, 3, step))
+        self._seed(seed_of(self.seed, 3, step))
         self.field.advance(step, self.total_steps)
         self.renderer.advance(step, self.total_steps)
         if self.renderer.prepare(self.field, self.possible, step):
@@ -128,11 +129,24 @@ class EchoModule(lightning.LightningModule):
                 self.renderer.calibrate(self(batch), batch.spectrum)
                 self._agree()
         loss = self._loss(self(batch), batch.spectrum)
-        # Under Lightning's own name, which would otherwise stay at 0: its one epoch has no end.
-        epoch = float(step // self.steps_per_epoch + 1)
-        self.log("epoch", epoch, batch_size=len(batch.pose))
-        self.log("train/loss", loss, prog_bar=True, batch_size=len(batch.pose))
+        if self._is_logged(step):
+            # Under Lightning's own name, which would otherwise stay at 0: its one epoch has no end.
+            epoch = float(step // self.steps_per_epoch + 1)
+            self.log("epoch", epoch, batch_size=len(batch.pose))
+            self.log("train/loss", loss, batch_size=len(batch.pose))
         return loss
+
+    def _seed(self, number: int) -> None:
+        if self.device.type == "cpu":
+            # torch.manual_seed asks all other kinds of device too, a tenth of a small step.
+            torch.default_generator.manual_seed(number)
+        else:
+            torch.manual_seed(number)
+
+    def _is_logged(self, step: int) -> bool:
+        """Whether the logger writes this step: what it leaves out is not handed to Lightning."""
+        every = int(getattr(self._trainer, "log_every_n_steps", 1))  # Lightning sets it untyped
+        return every > 0 and (step + 1) % every == 0
 
     def _agree(self) -> None:
         """Give all devices one gain: each was calibrated on its own share of the batch."""
@@ -172,20 +186,26 @@ class EchoModule(lightning.LightningModule):
         loudest = measured.amax(dim=(1, 2, 3), keepdim=True)
         return (loudest * 10 ** (-span / 20)).clamp_min(faintest)
 
-    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Stop before a gradient that is no number reaches the parameters."""
-        del optimizer
-        bad = [n for n, p in self.named_parameters() if p.grad is not None]
-        finite = torch.stack(
-            [p.grad.isfinite().all() for p in self.parameters() if p.grad is not None]
-        )
-        if not bool(finite.all()):
-            name = bad[int((~finite).nonzero()[0])]
-            raise NumericalError(
-                f"the gradient of {name} is not finite at step {self.global_step}; "
-                "the last checkpoint is sound; lower fit.learning_rate and start anew with "
-                "--overwrite"
-            )
+    def configure_gradient_clipping(
+        self,
+        optimizer: torch.optim.Optimizer,
+        gradient_clip_val: float | None = None,
+        gradient_clip_algorithm: str | None = None,
+    ) -> None:
+        """Clip the gradient's norm, and stop before one that is no number is stepped along."""
+        del optimizer, gradient_clip_algorithm
+        named = {n: p for n, p in self.named_parameters() if p.grad is not None}
+        norm = get_total_norm([p.grad for p in named.values() if p.grad is not None])
+        if not bool(norm.isfinite()):
+            for name, parameter in named.items():
+                if parameter.grad is not None and not bool(parameter.grad.isfinite().all()):
+                    raise NumericalError(
+                        f"the gradient of {name} is not finite at step {self.global_step}; "
+                        "the last checkpoint is sound; lower fit.learning_rate and start anew with "
+                        "--overwrite"
+                    )
+        if gradient_clip_val is not None:
+            clip_grads_with_norm_(named.values(), gradient_clip_val, norm)
 
     def validation_step(self, batch: RangeSlices, batch_index: int) -> None:
         """Gather the error over the validation poses, in the decibels of every report."""

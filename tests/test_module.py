@@ -270,16 +270,31 @@ def test_a_gradient_that_is_no_number_stops_the_fit_by_name(value):
     found = module(Given(PREDICTED))
     found.renderer.values.grad = torch.ones_like(PREDICTED)
     found.field.spectrum.grad = torch.zeros(3)
-    found.on_before_optimizer_step(None)
+    found.configure_gradient_clipping(None)
     found.field.spectrum.grad[1] = value
     with pytest.raises(
         NumericalError, match=r"gradient of field\.spectrum is not finite at step 0"
     ):
-        found.on_before_optimizer_step(None)
+        found.configure_gradient_clipping(None)
     found.field.spectrum.grad[1] = 0.0
     found.renderer.values.grad[0, 0, 0, 1] = value
     with pytest.raises(NumericalError, match=r"gradient of renderer\.values"):
-        found.on_before_optimizer_step(None)
+        found.configure_gradient_clipping(None, 1.0)
+
+
+def test_the_gradient_is_clipped_by_its_norm_over_all_parameters():
+    found = module(Given(PREDICTED))
+    field, renderer = found.field.spectrum, found.renderer.values
+    field.grad = torch.zeros(3)
+    renderer.grad = torch.zeros_like(PREDICTED)
+    field.grad[0], renderer.grad[0, 0, 0, 0] = 3.0, 4.0
+    found.configure_gradient_clipping(None)  # none is set
+    assert (field.grad[0], renderer.grad[0, 0, 0, 0]) == (3.0, 4.0)
+    found.configure_gradient_clipping(None, 2.5)
+    assert float(field.grad[0]) == pytest.approx(1.5, rel=1e-5)
+    assert float(renderer.grad[0, 0, 0, 0]) == pytest.approx(2.0, rel=1e-5)
+    found.configure_gradient_clipping(None, 10.0)  # it is less already
+    assert float(field.grad[0]) == pytest.approx(1.5, rel=1e-5)
 
 
 def test_validation_is_in_the_decibels_of_every_report(monkeypatch):
@@ -474,3 +489,13 @@ def test_tensorboard_counts_our_epochs(monkeypatch, step, epoch):
     monkeypatch.setattr(type(found), "global_step", step)
     found.training_step(batch(MEASURED), 0)
     assert values["epoch"] == epoch  # ten steps each
+
+
+@pytest.mark.parametrize(("step", "written"), [(0, False), (3, False), (4, True), (9, True)])
+def test_only_steps_that_the_logger_writes_are_logged(monkeypatch, step, written):
+    found = module(Given(MEASURED))
+    values = logged(found, monkeypatch)
+    monkeypatch.setattr(type(found), "global_step", step)
+    found._trainer = SimpleNamespace(log_every_n_steps=5)
+    found.training_step(batch(MEASURED), 0)
+    assert values.keys() == ({"epoch", "train/loss"} if written else set())

@@ -62,11 +62,12 @@ class PoseReader:
         self._kept: OrderedDict[int, Tensor] = OrderedDict()
 
     def __getitem__(self, index: int) -> Tensor:
-        """Return one pose's magnitude, (E, R, F)."""
+        """Return one pose's magnitude, (E, R, F); in memory one frequency after the other."""
         if index in self._kept:
             self._kept.move_to_end(index)
             return self._kept[index]
-        spectrogram = torch.from_numpy(self.store.read_pose(index))
+        read = torch.from_numpy(self.store.read_pose(index))
+        spectrogram = read.movedim(-1, 0).contiguous().movedim(0, -1)
         self._kept[index] = spectrogram
         if len(self._kept) > self.most:
             self._kept.popitem(last=False)
@@ -183,7 +184,8 @@ class SliceStream(Dataset[RangeSlices]):
         if self.whole_poses:
             pose = self.poses[items]
             rows = torch.arange(self.ranges).expand(len(pose), -1)
-            spectrum = torch.stack([self.reader[int(p)][..., bins] for p in pose])
+            by_frequency = [self.reader[int(p)].movedim(-1, 0).index_select(0, bins) for p in pose]
+            spectrum = torch.stack(by_frequency).movedim(1, -1)
         else:
             pose = self.poses[items // self.ranges]
             rows = (items % self.ranges)[:, None]

@@ -31,64 +31,82 @@ FREE = 0.012
 
 
 class _Deposit(torch.autograd.Function):
-    """Share (B, M) values out between the two bins next to (M,) or (B, M) places of (M,) rows.
+    """Share (..., M) values out between the two bins next to where they lie, of (M,) rows.
 
-    Those of places outside the bins are lost. By hand, for autograd would take three times as many
-    passes over all pairs.
+    Where they lie is (M,), or alike for some of the leading dimensions. What lies outside the bins
+    is lost. By hand, for autograd would take three times as many passes over all pairs.
     """
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, at: Tensor, row: Tensor, rows: int, bins: int) -> Tensor:
         left = at.floor()
-        part = at - left
+        far = at - left
         within = (left >= 0) & (left < bins - 1)
-        index = (row * bins + left.long().clamp(0, bins - 2)).expand(values.shape)
-        within_values = values * within
-        far = within_values * part
-        total = values.new_zeros(len(values), rows * bins)
-        total.scatter_add_(1, index, within_values - far)
-        total[:, 1:].scatter_add_(1, index, far)
-        ctx.save_for_backward(values, part, within, index)
-        return total.reshape(len(values), rows, bins)
+        near = (1 - far) * within
+        far = far * within
+        index = (row * bins + left.long().clamp_(0, bins - 2)).expand(values.shape)
+        total = values.new_zeros(*values.shape[:-1], rows * bins)
+        total.scatter_add_(-1, index, values * near)
+        total[..., 1:].scatter_add_(-1, index, values * far)
+        ctx.save_for_backward(values, near, far, index)
+        return total.unflatten(-1, (rows, bins))
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        values, part, within, index = ctx.saved_tensors
-        gradient = gradients[0].reshape(len(values), -1)
-        near = gradient.gather(1, index)
-        slope = (gradient[:, 1:].gather(1, index) - near) * within
+        values, near, far, index = ctx.saved_tensors
+        gradient = gradients[0].flatten(-2)
+        here, next_one = gradient.gather(-1, index), gradient[..., 1:].gather(-1, index)
         along = None
         if ctx.needs_input_grad[1]:
-            along = values * slope
-            along = along.sum(0) if part.ndim == 1 else along
-        return torch.addcmul(near * within, slope, part), along, None, None, None
+            slope = ((next_one - here).mul_(values)).sum_to_size(near.shape)
+            along = slope * (near + far)  # 1 within the bins
+        return here.mul_(near).addcmul_(next_one, far), along, None, None, None
 
 
 class _Window(torch.autograd.Function):
-    """See (N, B, K) profiles through (B, W) windows, a step at a time: (N, B, R).
+    """See (..., B, P, K) profiles through (B, W) windows, a step at a time: (..., B, P, R).
 
-    The steps have to end where the profiles do: K = (R - 1) step + W. By hand, for torch's own
-    gradient towards the window takes ten times as long on a CPU.
+    The steps have to end where the profiles do: K = (R - 1) step + W. By products with a band
+    matrix, each block of a profile with what sees it and the tile of slices before: a CPU is
+    slower with convolutions of one channel each.
     """
 
     @staticmethod
     def forward(ctx: Any, profiles: Tensor, kernel: Tensor, step: int) -> Tensor:
-        ctx.save_for_backward(profiles, kernel)
-        ctx.step = step
-        return F.conv1d(profiles, kernel[:, None], stride=step, groups=len(kernel))
+        *lead, poses, length = profiles.shape
+        taps = kernel.shape[1]
+        slices = (length - taps) // step + 1
+        tile = max(1, -(-taps // step) - 1)  # slices that see no more than two blocks
+        tiles, block = -(-slices // tile), tile * step
+        tap = torch.arange(block)[:, None, None] - step * torch.arange(tile)
+        tap = tap + block * torch.arange(2)[:, None]
+        tap = torch.where((tap >= 0) & (tap < taps), tap, taps).reshape(-1).to(kernel.device)
+        band = F.pad(kernel, (0, 1)).index_select(1, tap).reshape(-1, block, 2 * tile)
+        blocks = F.pad(profiles, (0, (tiles + 1) * block - length))
+        blocks = blocks.reshape(*lead, poses * (tiles + 1), block)
+        seen = (blocks @ band).reshape(*lead, poses, tiles + 1, 2, tile)
+        ctx.save_for_backward(blocks, band, tap)
+        ctx.sizes = length, taps, slices
+        found = seen[..., :-1, 0, :] + seen[..., 1:, 1, :]
+        return found.flatten(-2)[..., :slices]
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        profiles, kernel = ctx.saved_tensors
+        blocks, band, tap = ctx.saved_tensors
+        length, taps, slices = ctx.sizes
         (gradient,) = gradients
-        count, taps = kernel.shape
-        spread = F.conv_transpose1d(gradient, kernel[:, None], stride=ctx.step, groups=count)
-        # Each tap met each row of the profile a step farther on: a correlation, spread by steps.
-        rows = gradient.reshape(-1, 1, gradient.shape[2])
-        met = F.conv1d(
-            profiles.reshape(1, len(rows), -1), rows, dilation=ctx.step, groups=len(rows)
-        )
-        return spread, met.reshape(-1, count, taps).sum(0), None
+        *lead, poses, _ = gradient.shape
+        tile = band.shape[2] // 2
+        tiles = blocks.shape[-2] // poses - 1
+        part = F.pad(gradient, (0, tiles * tile - slices)).unflatten(-1, (tiles, tile))
+        seen = gradient.new_zeros(*lead, poses, tiles + 1, 2, tile)
+        seen[..., :-1, 0, :] = part
+        seen[..., 1:, 1, :] = part
+        seen = seen.reshape(*lead, poses * (tiles + 1), 2 * tile)
+        spread = (seen @ band.mT).reshape(*lead, poses, -1)[..., :length]
+        met = (blocks.mT @ seen).flatten(0, -4).sum(0).flatten(1)
+        weight = met.new_zeros(len(met), taps + 1).index_add_(1, tap, met)[:, :taps]
+        return spread, weight, None
 
 
 class ProfileRenderer(Renderer):
@@ -350,15 +368,14 @@ class ProfileRenderer(Renderer):
             bins = torch.arange(len(self.frequency), device=self.frequency.device)
         profile = self._profile(field, which, weight, position, rotation, bins)
         phased = bool(self.phased)
-        half = (self.log_kernel[bins] / (2 if phased else 1)).exp()
+        half = (self.log_kernel.index_select(0, bins) / (2 if phased else 1)).exp()
         kernel = torch.cat((half.flip(1), torch.ones_like(half[:, :1]), half), dim=1)
-        heard = _Window.apply(profile.flatten(0, 2), kernel, self.oversampling)
-        heard = heard.reshape(*profile.shape[:-1], -1)  # (1 or 2, P, E, B, R)
+        heard = _Window.apply(profile, kernel, self.oversampling)  # (1 or 2, E, B, P, R)
         heard = heard.square().sum(0) if phased else heard[0]
         gain = (2 * (self.log_gain + self.log_spectrum[bins])).exp()
         noise = (2 * self.log_noise[bins]).exp()
-        heard = heard * gain[:, None] + noise[:, None]
-        heard = heard.transpose(-1, -2)  # (P, E, R, B)
+        heard = torch.addcmul(noise[:, None, None], heard, gain[:, None, None])
+        heard = heard.permute(2, 0, 3, 1)  # (P, E, R, B)
         whole = torch.arange(len(self.range), device=rows.device).expand(len(rows), -1)
         if not torch.equal(rows, whole):
             heard = heard.gather(
@@ -375,14 +392,14 @@ class ProfileRenderer(Renderer):
         rotation: Tensor,
         bins: Tensor,
     ) -> Tensor:
-        """Return what fine range bins hold: power (1, P, E, B, K) or pressure (2, P, E, B, K)."""
+        """Return what fine range bins hold: power (1, E, B, P, K) or pressure (2, E, B, P, K)."""
         emitters = position + rotation @ self.emitter  # (P, 3)
         there = self._there()
         code = field.code_of_lattice(there, which)
         places = there if which is None else there[which]
-        count, ears = len(position), len(self.ears)
+        phased = bool(self.phased)
         with torch.no_grad():
-            # Vectors and frequencies come first in memory, pairs run along it: see LobeField.
+            # Ears, vectors and frequencies come first in memory, pairs run along it: see LobeField.
             pair = field.audible(places, emitters, code).reshape(-1).nonzero()[:, 0]
             pose = pair.div(len(places), rounding_mode="floor")
             place = pair - pose * len(places)
@@ -398,46 +415,65 @@ class ProfileRenderer(Renderer):
             turn = rotation.permute(2, 0, 1)  # (3, P, 3), world to head
             in_head = turn.reshape(-1, 3) @ places.T - (turn * position).sum(-1).reshape(-1, 1)
             in_head = in_head.reshape(3, -1).index_select(1, pair)
-            beam = look_up(self.beam[bins], ((in_head - self.emitter[:, None]) / out).T).T
-            share = None if weight is None else weight.index_select(0, place)
+            known, way, middle = self._paths(in_head, out, bins)
+            if not phased:
+                known.square_()
+            if weight is not None:
+                known *= weight.index_select(0, place)
         response, lead = field.echo(places, unit.T, bins, place, code)  # (M, B), (M,)
         response = response.T
-        phased = bool(self.phased)
-        squared = response.abs().square() if response.is_complex() else response.square()
         self.points_evaluated += len(place)
-        profiles = []
-        for ear in range(ears):
-            with torch.no_grad():
-                ray = in_head - self.ear_positions[ear][:, None]
-                back = _length(ray)
-                head = (ray / back).T
-                way = out + back
-                known = look_up(self.ears[ear, bins], head).T * beam
-                known *= torch.exp(-self.absorption[bins, None] * way)
-                known /= out * back
-                if not phased:
-                    known.square_()
-                if share is not None:
-                    known *= share
-                middle = (way / 2 - self.first) / self.bin
-                if self.lag is not None:
-                    middle = middle + look_up(self.lag[ear, bins], head).T / self.bin
-            at = middle - lead / self.bin  # (M,) or (B, M)
-            if phased:
-                turned = self.wave[bins, None] * (way / 2 - lead)
-                pressure = response * torch.polar(known, -turned)
-                echoes = [pressure.real, pressure.imag]
-            else:
-                echoes = [squared * known]
-            profiles.append([_Deposit.apply(echo, at, pose, count, self.bins) for echo in echoes])
-        # (E, 1 or 2, B, P, K) to (1 or 2, P, E, B, K)
-        stacked = torch.stack([torch.stack(parts) for parts in profiles])
-        return stacked.permute(1, 3, 0, 2, 4)
+        if phased:
+            turned = self.wave[bins, None] * (way / 2 - lead)[:, None]
+            pressure = response * torch.polar(known, -turned)
+            echoes = torch.stack((pressure.real, pressure.imag))
+        else:
+            squared = response.abs().square() if response.is_complex() else response.square()
+            echoes = (squared * known)[None]
+        return _Deposit.apply(echoes, middle - lead / self.bin, pose, len(position), self.bins)
+
+    def _paths(self, in_head: Tensor, out: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what the way to places and back does to pressure.
+
+        Parameters
+        ----------
+        in_head : (3, M) float, m
+            Places, each in the head of its pose.
+        out : (M,) float, m
+            How far they lie from the emitter.
+        bins : (B,) int
+            Which frequencies.
+
+        Returns
+        -------
+        known : (E, B, M) float
+            By beam, ears, air and spreading.
+        way : (E, M) float, m
+            There and back.
+        middle : (E, 1, M) or (E, B, M) float
+            The bin of the profile that the echo is heard in.
+        """
+        ray = in_head - self.ear_positions[..., None]  # (E, 3, M)
+        back = _length(ray)
+        head = (ray / back[:, None]).mT
+        way = out + back  # (E, M)
+        # Each pass over all of it is made once, and in place: memory is what they wait for.
+        known = look_up(self.ears.index_select(1, bins), head).mT
+        ray = (in_head - self.emitter[:, None]) / out
+        known *= look_up(self.beam.index_select(0, bins), ray.T).T
+        absorption = self.absorption[bins]
+        factors = torch.stack((absorption, torch.ones_like(absorption)), dim=1)
+        lengths = torch.stack((way, torch.log(out * back)), dim=1)
+        known *= (-factors @ lengths).exp_()
+        middle = ((way / 2 - self.first) / self.bin)[:, None]
+        if self.lag is not None:
+            middle = middle + look_up(self.lag.index_select(1, bins), head).mT / self.bin
+        return known, way, middle
 
 
 def _length(vectors: Tensor) -> Tensor:
-    """Return the lengths of (3, M) vectors, (M,)."""
-    x, y, z = vectors
+    """Return the lengths of (..., 3, M) vectors, (..., M)."""
+    x, y, z = vectors.unbind(-2)
     return (x * x + y * y + z * z).clamp_min(1e-12).sqrt()
 
 

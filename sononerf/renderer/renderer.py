@@ -69,22 +69,27 @@ def look_up(table: Tensor, directions: Tensor) -> Tensor:
 
     Parameters
     ----------
-    table : (C, L, A) float
+    table : (C, L, A) or (E, C, L, A) float
         Gains over elevation (-90 to 90 degrees) and azimuth (-180 to 180), both ends included.
-    directions : (..., 3) float
-        Unit vectors in the head frame (x forward, y left, z up).
+    directions : (..., 3) or (E, ..., 3) float
+        Unit vectors in the head frame (x forward, y left, z up); for each of E tables its own.
 
     Returns
     -------
-    gains : (..., C) float
+    gains : (..., C) or (E, ..., C) float
         In memory one channel after the other.
     """
-    x, y, z = directions.movedim(-1, 0).reshape(3, -1)  # side by side, for the sake of speed
+    x, y, z = directions.movedim(-1, 0).contiguous()  # side by side, for the sake of speed
     azimuth = torch.atan2(y, x) / math.pi
     elevation = torch.asin(z.clamp(-1.0, 1.0)) * (2 / math.pi)
-    grid = torch.stack((azimuth, elevation), dim=-1)[None, None]
-    read = F.grid_sample(table[None], grid, align_corners=True, padding_mode="border")
-    return read.reshape(len(table), *directions.shape[:-1]).movedim(0, -1)
+    several = table.ndim == 4
+    tables = table if several else table[None]
+    grid = torch.stack((azimuth, elevation), dim=-1).reshape(len(tables), 1, -1, 2)
+    read = F.grid_sample(tables, grid, align_corners=True, padding_mode="border")
+    shape = directions.shape[:-1]
+    if several:
+        return read.reshape(*read.shape[:2], *shape[1:]).movedim(1, -1)
+    return read.reshape(len(table), *shape).movedim(0, -1)
 
 
 class Renderer(nn.Module):
@@ -114,7 +119,8 @@ class Renderer(nn.Module):
         super().__init__()
         self.register_buffer("region", region.clone())
         for name in ("frequency", "range", "beam", "ears", "emitter", "ear_positions"):
-            self.register_buffer(name, getattr(acquisition, name).clone())
+            whole = getattr(acquisition, name).clone(memory_format=torch.contiguous_format)
+            self.register_buffer(name, whole)
         self.log_gain = nn.Parameter(torch.zeros(()))
         self.register_buffer("points_evaluated", torch.zeros((), dtype=torch.long))
 

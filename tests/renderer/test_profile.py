@@ -173,9 +173,9 @@ def test_a_sweeps_rows_hear_a_place_by_their_lag_farther_off(head, acquisition, 
 
 def heard_from_bins(renderer, monkeypatch):
     """Power in each slice from one unit of power in each fine bin, (K, R, F)."""
-    unit = torch.eye(renderer.bins, dtype=torch.float64)[:, None, None]
+    unit = torch.eye(renderer.bins, dtype=torch.float64)
     with monkeypatch.context() as patch:
-        patch.setattr(renderer, "_profile", lambda *_: unit.expand(-1, 1, 3, -1)[None])
+        patch.setattr(renderer, "_profile", lambda *_: unit.expand(1, 1, 3, -1, -1))
         some = torch.zeros(renderer.bins, 3, dtype=torch.float64)
         heard = renderer(None, some, some, rows(poses=renderer.bins))
     return (heard[:, 0].square()).detach().numpy()
@@ -748,12 +748,15 @@ def test_gradients_of_the_deposit_where_some_places_lie_outside_the_bins():
 def test_the_windows_gradients_are_those_of_a_plain_convolution(step):
     generator = torch.Generator().manual_seed(0)
     kernel = torch.rand(3, 5, dtype=torch.float64, generator=generator, requires_grad=True)
-    length = 6 * step + 5
-    seen = torch.rand(4, 3, length, dtype=torch.float64, generator=generator, requires_grad=True)
+    seen = torch.rand(
+        2, 3, 4, 6 * step + 5, dtype=torch.float64, generator=generator, requires_grad=True
+    )
     found = profile._Window.apply(seen, kernel, step)
-    expected = torch.nn.functional.conv1d(seen, kernel[:, None], stride=step, groups=3)
+    one_by_one = seen.movedim(1, 2).flatten(0, 1)
+    expected = torch.nn.functional.conv1d(one_by_one, kernel[:, None], stride=step, groups=3)
+    expected = expected.unflatten(0, (2, 4)).movedim(2, 1)
     torch.testing.assert_close(found, expected)
-    assert found.shape == (4, 3, 7)
+    assert found.shape == (2, 3, 4, 7)
     weight = torch.rand(found.shape, dtype=torch.float64, generator=generator)
     for mine, theirs in zip(
         torch.autograd.grad(found, (seen, kernel), weight),

@@ -242,7 +242,7 @@ def test_a_sample_of_the_places_has_the_right_pressure_on_average(cloud):
     renderer.train()
     torch.manual_seed(0)
     draws = torch.stack([pressure() for _ in range(300)])
-    assert whole.shape == draws.shape[1:] == (2, 1, 2, 3, renderer.bins)
+    assert whole.shape == draws.shape[1:] == (2, 2, 3, 1, renderer.bins)
     error = (draws.mean(0) - whole).abs()
     deviation = draws.std(0) / math.sqrt(len(draws))
     loud = whole.abs() > 0.2 * whole.abs().amax()

@@ -30,6 +30,14 @@ def test_gains_between_the_nodes_are_bilinear(head, acquisition, device):
     np.testing.assert_allclose(left, expected, rtol=1e-12)
 
 
+def test_several_tables_are_looked_up_each_in_its_own_directions(acquisition):
+    directions = sphere_directions(24, REGION).reshape(2, 3, 4, 3)
+    found = look_up(acquisition.ears, directions)
+    each = [look_up(*pair) for pair in zip(acquisition.ears, directions, strict=True)]
+    assert found.shape == (2, 3, 4, 3)
+    assert torch.equal(found, torch.stack(each))
+
+
 def test_gains_are_those_that_the_simulator_hears_with():
     ears = synthetic_ears(EarSettings(), [30e3, 60e3])
     directions = sphere_directions(500, REGION)
