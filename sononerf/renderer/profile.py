@@ -12,6 +12,7 @@ from pydantic import Field as Option
 from torch import Tensor, nn
 
 from sononerf.field.field import Field
+from sononerf.renderer.range_bins import Deposit, Window
 from sononerf.renderer.renderer import Acquisition, Possible, Renderer, look_up
 
 KERNEL_SKIRT = 31e-6
@@ -28,85 +29,6 @@ OPAQUE = 0.05
 """A place casts a shadow where it has this part of the strongest energy in its surroundings."""
 FREE = 0.012
 """So far in front of a place nothing shades it, m: a surface is some places thick."""
-
-
-class _Deposit(torch.autograd.Function):
-    """Share (..., M) values out between the two bins next to where they lie, of (M,) rows.
-
-    Where they lie is (M,), or alike for some of the leading dimensions. What lies outside the bins
-    is lost. By hand, for autograd would take three times as many passes over all pairs.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, values: Tensor, at: Tensor, row: Tensor, rows: int, bins: int) -> Tensor:
-        left = at.floor()
-        far = at - left
-        within = (left >= 0) & (left < bins - 1)
-        near = (1 - far) * within
-        far = far * within
-        index = (row * bins + left.long().clamp_(0, bins - 2)).expand(values.shape)
-        total = values.new_zeros(*values.shape[:-1], rows * bins)
-        total.scatter_add_(-1, index, values * near)
-        total[..., 1:].scatter_add_(-1, index, values * far)
-        ctx.save_for_backward(values, near, far, index)
-        return total.unflatten(-1, (rows, bins))
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        values, near, far, index = ctx.saved_tensors
-        gradient = gradients[0].flatten(-2)
-        here, next_one = gradient.gather(-1, index), gradient[..., 1:].gather(-1, index)
-        along = None
-        if ctx.needs_input_grad[1]:
-            slope = ((next_one - here).mul_(values)).sum_to_size(near.shape)
-            along = slope * (near + far)  # 1 within the bins
-        return here.mul_(near).addcmul_(next_one, far), along, None, None, None
-
-
-class _Window(torch.autograd.Function):
-    """See (..., B, P, K) profiles through (B, W) windows, a step at a time: (..., B, P, R).
-
-    The steps have to end where the profiles do: K = (R - 1) step + W. By products with a band
-    matrix, each block of a profile with what sees it and the tile of slices before: a CPU is
-    slower with convolutions of one channel each.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, profiles: Tensor, kernel: Tensor, step: int) -> Tensor:
-        *lead, poses, length = profiles.shape
-        taps = kernel.shape[1]
-        slices = (length - taps) // step + 1
-        tile = max(1, -(-taps // step) - 1)  # slices that see no more than two blocks
-        tiles, block = -(-slices // tile), tile * step
-        tap = torch.arange(block)[:, None, None] - step * torch.arange(tile)
-        tap = tap + block * torch.arange(2)[:, None]
-        tap = torch.where((tap >= 0) & (tap < taps), tap, taps).reshape(-1).to(kernel.device)
-        band = F.pad(kernel, (0, 1)).index_select(1, tap).reshape(-1, block, 2 * tile)
-        blocks = F.pad(profiles, (0, (tiles + 1) * block - length))
-        blocks = blocks.reshape(*lead, poses * (tiles + 1), block)
-        seen = (blocks @ band).reshape(*lead, poses, tiles + 1, 2, tile)
-        ctx.save_for_backward(blocks, band, tap)
-        ctx.sizes = length, taps, slices
-        found = seen[..., :-1, 0, :] + seen[..., 1:, 1, :]
-        return found.flatten(-2)[..., :slices]
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
-        blocks, band, tap = ctx.saved_tensors
-        length, taps, slices = ctx.sizes
-        (gradient,) = gradients
-        *lead, poses, _ = gradient.shape
-        tile = band.shape[2] // 2
-        tiles = blocks.shape[-2] // poses - 1
-        part = F.pad(gradient, (0, tiles * tile - slices)).unflatten(-1, (tiles, tile))
-        seen = gradient.new_zeros(*lead, poses, tiles + 1, 2, tile)
-        seen[..., :-1, 0, :] = part
-        seen[..., 1:, 1, :] = part
-        seen = seen.reshape(*lead, poses * (tiles + 1), 2 * tile)
-        spread = (seen @ band.mT).reshape(*lead, poses, -1)[..., :length]
-        met = (blocks.mT @ seen).flatten(0, -4).sum(0).flatten(1)
-        weight = met.new_zeros(len(met), taps + 1).index_add_(1, tap, met)[:, :taps]
-        return spread, weight, None
 
 
 class ProfileRenderer(Renderer):
@@ -370,7 +292,7 @@ class ProfileRenderer(Renderer):
         phased = bool(self.phased)
         half = (self.log_kernel.index_select(0, bins) / (2 if phased else 1)).exp()
         kernel = torch.cat((half.flip(1), torch.ones_like(half[:, :1]), half), dim=1)
-        heard = _Window.apply(profile, kernel, self.oversampling)  # (1 or 2, E, B, P, R)
+        heard = Window.apply(profile, kernel, self.oversampling)  # (1 or 2, E, B, P, R)
         heard = heard.square().sum(0) if phased else heard[0]
         gain = (2 * (self.log_gain + self.log_spectrum[bins])).exp()
         noise = (2 * self.log_noise[bins]).exp()
@@ -430,7 +352,7 @@ class ProfileRenderer(Renderer):
         else:
             squared = response.abs().square() if response.is_complex() else response.square()
             echoes = (squared * known)[None]
-        return _Deposit.apply(echoes, middle - lead / self.bin, pose, len(position), self.bins)
+        return Deposit.apply(echoes, middle - lead / self.bin, pose, len(position), self.bins)
 
     def _paths(self, in_head: Tensor, out: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return what the way to places and back does to pressure.
