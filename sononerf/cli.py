@@ -11,7 +11,7 @@ import logging
 import signal
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from enum import StrEnum
 from pathlib import Path
 from types import FrameType
@@ -172,17 +172,22 @@ def simulate(
     from sononerf.config import load_settings
 
     settings = load_settings(config, overrides or ())
+    from sononerf.experiment.run_folder import results_folder
     from sononerf.experiment.scenes import draw_ensemble
     from sononerf.experiment.simulate import simulate as run
     from sononerf.progress import Progress
 
     if workers is not None and scheduler is not None:
         raise SettingsError("--workers and --scheduler exclude each other; give one")
-    store = run(settings, output=output, workers=workers, scheduler=scheduler, progress=Progress())
-    _print(f"wrote {store.path} ({len(store)} poses)")
-    if preview is not None:
-        for path in draw_ensemble(settings, store, preview):
-            _print(f"wrote {path}")
+    # A folder that cannot be written is told before minutes of simulation.
+    with results_folder(preview) if preview is not None else nullcontext():
+        store = run(
+            settings, output=output, workers=workers, scheduler=scheduler, progress=Progress()
+        )
+        _print(f"wrote {store.path} ({len(store)} poses)")
+        if preview is not None:
+            for path in draw_ensemble(settings, store, preview):
+                _print(f"wrote {path}")
 
 
 @app.command()
@@ -250,7 +255,8 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
         _print(
             f"geometry: Chamfer {1000 * geometry['chamfer_m']:.2f} mm, F-score "
             f"{scores['0.002']:.2f} at 2 mm and {scores['0.005']:.2f} at 5 mm, "
-            f"{geometry['components']} parts (true: {geometry['components_true']})"
+            f"{geometry['components']} part{'s' * (geometry['components'] != 1)} "
+            f"(true: {geometry['components_true']})"
         )
         target = geometry.get("target")
         if target:

@@ -546,6 +546,13 @@ def test_pictures_of_scenes_need_a_folder(clean):
     assert "file" in refused(4, "scenes", "--preview", "file")
 
 
+def test_pictures_of_an_ensemble_need_a_folder_before_it_is_simulated(clean):
+    Path("file").write_text("x")
+    before = tree(clean)
+    assert "file" in refused(4, "simulate", SMOKE, *SHORT, "--preview", "file")
+    assert tree(clean) == before
+
+
 def test_a_folder_that_is_no_run(clean):
     Path("thesis").mkdir()
     Path("thesis/chapter.tex").write_text("mine")

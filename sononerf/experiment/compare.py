@@ -30,6 +30,8 @@ HEARING = ("air", "ears", "call", "spectrogram")
 """Sections in which two runs must not differ: else what differs is who listens."""
 VOXELS = 80
 """Along the longest side."""
+WRONG_WAY = 2.0
+"""So many times what the first has more the second must have more, for the order to look wrong."""
 MOST_POSES = 400
 
 
@@ -105,6 +107,12 @@ def compare_runs(
         surfaces = [true_mesh(run) for run in runs]
         truth = _added(*surfaces)
         names = first.resolve().name, second.resolve().name
+        missing = -float(found.difference.values.min())
+        if missing > WRONG_WAY * found.score:
+            progress.say(
+                f"{names[1]} has up to {missing:.2f} of the maximum that {names[0]} has not; "
+                "what is looked for belongs into the first run"
+            )
         for name in ("first", "second", "difference"):
             storage.commit_bytes(folder / f"{name}.vti", vti_bytes(getattr(found, name), "level"))
         for axis, picture in difference_pngs(found, names, truth=truth).items():

@@ -209,7 +209,8 @@ def draw_ensemble(settings: Settings, store: EnsembleStore, folder: Path) -> lis
     StorageError
         If a picture cannot be written.
     """
-    scene = load_scene(settings.scene.name, settings.scene.options, source=settings.source)
+    with _quietly():  # who simulated it has been warned
+        scene = load_scene(settings.scene.name, settings.scene.options, source=settings.source)
     written = [folder / "scene.png"]
     forward = store.rotations[:, :, 0]
     storage.commit_bytes(

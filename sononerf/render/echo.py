@@ -117,7 +117,8 @@ def echo_png(
     distance = np.arange(waves.shape[1], dtype=np.float64) * speed_of_sound / (2.0 * sampling_rate)
     with figure(13.0, 6.6, 130) as drawn:
         left, right = drawn.subfigures(1, 2, width_ratios=[1.0, 1.08])
-        _draw_view(left, view, len(hits), int((relative >= -HIT_RANGE_DB).sum()))
+        unhit = "no hit: edges alone are heard" if waves.any() else "no hit is heard"
+        _draw_view(left, view, len(hits), int((relative >= -HIT_RANGE_DB).sum()), unhit)
         axes = right.subplots(4, 1, sharex=True, height_ratios=[1, 1, 1.5, 1.5])
         _draw_waves(axes[:2], distance, waves)
         _draw_spectrograms(right, axes[2:], sounds[:, shown], ranges[shown], frequencies)
@@ -128,7 +129,7 @@ def echo_png(
         return png_from_pixels(pixels_from_figure(drawn))
 
 
-def _draw_view(part: Any, view: NDArray[np.uint8], count: int, drawn: int) -> None:
+def _draw_view(part: Any, view: NDArray[np.uint8], count: int, drawn: int, unhit: str) -> None:
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -136,7 +137,7 @@ def _draw_view(part: Any, view: NDArray[np.uint8], count: int, drawn: int) -> No
     panel.imshow(view, origin="upper", interpolation="bilinear")
     panel.set_axis_off()
     said = f"{count} hits, {drawn} within {HIT_RANGE_DB:g} dB of the loudest"
-    panel.set_title(said if count else "no hit is heard")
+    panel.set_title(said if count else unhit)
     scale = ScalarMappable(Normalize(-HIT_RANGE_DB, 0.0), HIT_MAP)
     bar = part.colorbar(scale, ax=panel, orientation="horizontal", aspect=40, shrink=0.8, pad=0.02)
     bar.set_label("strength of a hit (dB below the loudest)")

@@ -212,7 +212,7 @@ def deaf(range_min: float, range_max: float) -> str:
     """Say that no pose hears anything within the range limits."""
     return (
         f"no pose received an echo between {range_min} and {range_max} m; check poses.radius, "
-        "the scene's size and the range limits"
+        "the scene's size (of a file, its unit) and the range limits"
     )
 
 

@@ -13,6 +13,7 @@ from PIL import Image
 from sononerf.config import validate_settings
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.experiment.compare import compare_runs
+from sononerf.progress import Progress
 from sononerf.weights import load_weights, save_weights
 
 RADIUS = 0.02  # of the sphere that the fitted run heard
@@ -74,8 +75,21 @@ def test_what_only_the_first_hears_is_found(run, tmp_path):
             assert min(image.size) > 100
     for name in ("first.vti", "second.vti", "difference.vti"):
         assert (folder / name).stat().st_size > 1000
-    turned = numbers(compare_runs(silent, one, output=tmp_path / "turned", accelerator="cpu"))
-    assert turned["score"] < 1e-3
+
+
+def test_runs_that_look_turned_round_are_said_to_be(run, tmp_path, capsys):
+    one, silent = run("one"), run("silent", gain=1e-6)
+    for first, second in ((one, silent), (silent, one)):
+        folder = tmp_path / f"{first.name}-first"
+        compare_runs(first, second, output=folder, accelerator="cpu", progress=Progress())
+        score, said = numbers(folder)["score"], capsys.readouterr().err
+        if first is one:
+            assert score > 0.99
+            assert "belongs into the first run" not in said
+        else:
+            assert score < 1e-3
+            assert "one has up to 1.00 of the maximum that silent has not" in said
+            assert "belongs into the first run" in said
 
 
 def test_poses_of_both_runs_are_listened_from(run):

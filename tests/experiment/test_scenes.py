@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import sys
 
 import numpy as np
@@ -150,7 +151,7 @@ def test_a_folder_that_is_a_file_is_refused_before_the_work(tmp_path, monkeypatc
 
 
 def test_an_ensemble_is_drawn_with_the_echo_of_its_first_test_pose(
-    tiny, echoes, tmp_path, monkeypatch
+    tiny, echoes, tmp_path, monkeypatch, caplog
 ):
     drawn = {}
     real = scenes_module.echo_png
@@ -161,7 +162,15 @@ def test_an_ensemble_is_drawn_with_the_echo_of_its_first_test_pose(
 
     monkeypatch.setattr(scenes_module, "echo_png", keep)
     store = EnsembleStore.open(echoes)
+    load = scenes_module.load_scene
+
+    def warn(*given, **named):
+        logging.getLogger("sononerf").warning("parts intersect")
+        return load(*given, **named)
+
+    monkeypatch.setattr(scenes_module, "load_scene", warn)
     written = draw_ensemble(tiny(), store, tmp_path)
+    assert caplog.text == ""  # it was said before the simulation
     assert [path.name for path in written] == ["scene.png", "pose_0010.png"]
     assert all(min(size_of(path)) > 100 for path in written)
     assert store.split[10] == 2

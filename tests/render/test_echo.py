@@ -8,6 +8,7 @@ from PIL import Image
 
 from sononerf.errors import NumericalError
 from sononerf.geometry.poses import look_at
+from sononerf.render import echo
 from sononerf.render.echo import EARS, echo_png, hits_image
 
 RANGE = np.linspace(0.15, 0.75, 121)
@@ -130,6 +131,15 @@ def test_silence_without_hits(ball):
     drawn = pixels(draw(ball, points=np.zeros((0, 3)), level_db=[], **silent))
     assert (drawn[400:800, 1000:1500].sum(axis=-1) < 250).mean() > 0.8  # dark
     assert (drawn[100:300, 1000:1500].sum(axis=-1) > 700).mean() > 0.8  # two flat lines on white
+
+
+def test_an_echo_without_a_hit_is_that_of_edges(ball, monkeypatch):
+    said = []
+    monkeypatch.setattr(echo, "_draw_view", lambda *given: said.append(given[-1]))
+    silent = {"echo": np.zeros((2, 100)), "spectrogram_db": np.zeros((2, 121, 47))}
+    for heard in ({}, silent):
+        draw(ball, points=np.zeros((0, 3)), level_db=[], **heard)
+    assert said == ["no hit: edges alone are heard", "no hit is heard"]
 
 
 def test_wrong_input_is_refused(ball):
