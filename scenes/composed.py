@@ -56,7 +56,12 @@ class PartOptions(BaseModel):
 def composed(
     parts: Annotated[list[PartOptions], Field(min_length=1, max_length=MOST_PARTS)],
 ) -> Scene:
-    """Put scenes together, each at its position (m), turned (degrees or a matrix) and scaled."""
+    """Put scenes together, each at its position (m), turned (degrees or a matrix) and scaled.
+
+    Each of ``parts`` has ``scene``, a name, and may have ``options`` of that scene, ``position``
+    (m), ``yaw``, ``pitch``, ``roll`` (degrees) or ``rotation`` (3 x 3), ``scale``, ``material``,
+    and ``background: true`` where it is heard but is not the target.
+    """
     placed = [_part(options, f"{OWN}.parts.{number}") for number, options in enumerate(parts)]
     try:
         return compose(placed)
