@@ -144,9 +144,10 @@ class EchoModule(lightning.LightningModule):
             torch.manual_seed(number)
 
     def _is_logged(self, step: int) -> bool:
-        """Whether the logger writes this step: what it leaves out is not handed to Lightning."""
+        """Whether somebody reads this step's loss: the logger, or a preview after an epoch."""
         every = int(getattr(self._trainer, "log_every_n_steps", 1))  # Lightning sets it untyped
-        return every > 0 and (step + 1) % every == 0
+        written = every > 0 and (step + 1) % every == 0
+        return written or (step + 1) % self.steps_per_epoch == 0 or step + 1 == self.total_steps
 
     def _agree(self) -> None:
         """Give all devices one gain: each was calibrated on its own share of the batch."""

@@ -491,11 +491,14 @@ def test_tensorboard_counts_our_epochs(monkeypatch, step, epoch):
     assert values["epoch"] == epoch  # ten steps each
 
 
-@pytest.mark.parametrize(("step", "written"), [(0, False), (3, False), (4, True), (9, True)])
-def test_only_steps_that_the_logger_writes_are_logged(monkeypatch, step, written):
-    found = module(Given(MEASURED))
+@pytest.mark.parametrize(
+    ("step", "read"), [(0, False), (3, False), (4, True), (10, False), (11, True), (12, True)]
+)
+def test_only_steps_that_somebody_reads_are_logged(monkeypatch, step, read):
+    """The logger every fifth, a preview each twelfth, and the last."""
+    found = module(Given(MEASURED), total_steps=13, steps_per_epoch=12)
     values = logged(found, monkeypatch)
     monkeypatch.setattr(type(found), "global_step", step)
     found._trainer = SimpleNamespace(log_every_n_steps=5)
     found.training_step(batch(MEASURED), 0)
-    assert values.keys() == ({"epoch", "train/loss"} if written else set())
+    assert values.keys() == ({"epoch", "train/loss"} if read else set())
