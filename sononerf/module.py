@@ -163,8 +163,8 @@ class EchoModule(lightning.LightningModule):
     def _loss(self, predicted: Tensor, measured: Tensor) -> Tensor:
         span = self.range_db(self.global_step)
         reference = self._reference(measured, span)
-        target = decibels(measured, reference)
-        error = (decibels(predicted, reference) - target) / span
+        # The difference of both decibels by fewer passes: every cell is looked at in each step.
+        error = torch.log10((predicted + reference) / (measured + reference)) * (20.0 / span)
         if self.loss == "l1":
             cost = error.abs()
         elif self.loss == "l2":
@@ -172,7 +172,8 @@ class EchoModule(lightning.LightningModule):
         else:
             cost = error.abs() + 4.0 * error.square()
         if self.silent_weight != 1.0:
-            silent = (target < ACTIVE_DB) & (decibels(predicted, reference) < ACTIVE_DB)
+            loudest = torch.maximum(predicted.detach(), measured)
+            silent = decibels(loudest, reference) < ACTIVE_DB
             weight = torch.where(silent, self.silent_weight, 1.0)
             return (cost * weight).sum() / weight.sum()
         return cost.mean()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -129,6 +129,7 @@ def synthetic_ears(settings: EarSettings, frequency: ArrayLike) -> Ears:
     )
 
 
+@lru_cache(maxsize=4)  # a fit and its read-out ask nine times; no one may write to the arrays
 def analysed_ears(
     settings: EarSettings, call: CallSettings, analysis: SpectrogramSettings
 ) -> tuple[Ears, NDArray[np.float32] | None]:

@@ -48,6 +48,7 @@ class Field(nn.Module):
         self.register_buffer("frequency", frequency.clone())
         self.register_buffer("occupancy", torch.ones(1, 1, 1, dtype=torch.bool))
         self.register_buffer("cell", (region[1] - region[0]).clone() * 2)
+        self._asked: tuple[Tensor, Tensor, Tensor | None] | None = None  # see outside
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
         # The fit finds out what is occupied, and how finely; a loaded map replaces ours whole.
@@ -238,6 +239,26 @@ class Field(nn.Module):
         index = ((positions - self.region[0]) / self.cell).round().long()
         index = index.clamp_min(0).minimum(size - 1)
         return within & self.occupancy[index[..., 0], index[..., 1], index[..., 2]]
+
+    def outside(self, lattice: Tensor) -> Tensor | None:
+        """Return where places do not lie in the region, for places asked for again and again.
+
+        Parameters
+        ----------
+        lattice : (L, 3) float, m
+            The same tensor as long as the places are the same: the answer is kept.
+
+        Returns
+        -------
+        outside : (L,) bool or None
+            None where all lie inside, so that nothing need be made zero.
+        """
+        asked = self._asked
+        if asked is None or asked[0] is not lattice or asked[1] is not self.occupancy:
+            with torch.inference_mode(False):
+                outside = ~self.inside(lattice)
+            self._asked = asked = (lattice, self.occupancy, outside if outside.any() else None)
+        return asked[2]
 
     @torch.no_grad()
     def oriented(self, positions: Tensor, directions: int) -> tuple[Tensor, Tensor]:

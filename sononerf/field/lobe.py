@@ -169,15 +169,18 @@ class LobeField(Field):
     ) -> tuple[Tensor, Tensor]:
         """Return the reflectivity, (M, B), and how much nearer it comes from, (M,) m."""
         code = (self.code(positions) if code is None else code).T
-        inside = self.inside(positions)
+        outside = self.outside(positions)
         if place is not None:
-            code, inside = code.index_select(1, place), inside.index_select(0, place)
+            code = code.index_select(1, place)
+            outside = None if outside is None else outside.index_select(0, place)
         response = self._log_response(code.T, positions, directions, bins, place).exp()
         lobe = code[1:4].detach()  # the range must not turn the lobes
         length = along(lobe.T, lobe).sqrt()
         cosine = along(directions, lobe) / length.clamp_min(1e-6)
         off = (1 - cosine) * (1 - (-length.square()).exp())
-        return response * inside[:, None], RADIUS_UNIT * self.curved * code[4] * off
+        if outside is not None:
+            response = response.masked_fill(outside[:, None], 0.0)
+        return response, RADIUS_UNIT * self.curved * code[4] * off
 
     def forward(self, positions: Tensor, directions: Tensor) -> Tensor:
         """Return the reflectivity, (..., F) float."""

@@ -133,7 +133,6 @@ class ProfileRenderer(Renderer):
         skirt = torch.where(offsets >= 0, skirt, KERNEL_FLOOR).float()
         self.log_kernel = nn.Parameter(skirt[:, 1:].clone())
         self.first = float(acquisition.range[0]) - reach * self.bin
-        self.bins = (len(acquisition.range) - 1) * oversampling + 2 * reach + 1
         self.register_buffer("absorption", acquisition.absorption.clone())
         self.register_buffer("lag", acquisition.lag)
         self.log_spectrum = nn.Parameter(torch.zeros(len(acquisition.frequency)))
@@ -288,12 +287,13 @@ class ProfileRenderer(Renderer):
         which, weight = self._draw()
         if bins is None:
             bins = torch.arange(len(self.frequency), device=self.frequency.device)
-        profile = self._profile(field, which, weight, position, rotation, bins)
+        profile, slices = self._profile(field, which, weight, position, rotation, bins)
         phased = bool(self.phased)
         half = (self.log_kernel.index_select(0, bins) / (2 if phased else 1)).exp()
         kernel = torch.cat((half.flip(1), torch.ones_like(half[:, :1]), half), dim=1)
-        heard = Window.apply(profile, kernel, self.oversampling)  # (1 or 2, E, B, P, R)
+        heard = Window.apply(profile, kernel, self.oversampling)  # (1 or 2, E, B, P, n)
         heard = heard.square().sum(0) if phased else heard[0]
+        heard = F.pad(heard, (slices.start, len(self.range) - slices.stop))
         gain = (2 * (self.log_gain + self.log_spectrum[bins])).exp()
         noise = (2 * self.log_noise[bins]).exp()
         heard = torch.addcmul(noise[:, None, None], heard, gain[:, None, None])
@@ -313,8 +313,11 @@ class ProfileRenderer(Renderer):
         position: Tensor,
         rotation: Tensor,
         bins: Tensor,
-    ) -> Tensor:
-        """Return what fine range bins hold: power (1, E, B, P, K) or pressure (2, E, B, P, K)."""
+    ) -> tuple[Tensor, range]:
+        """Return what fine range bins hold, and which slices see them; all others see nothing.
+
+        Power (1, E, B, P, K) or pressure (2, E, B, P, K).
+        """
         emitters = position + rotation @ self.emitter  # (P, 3)
         there = self._there()
         code = field.code_of_lattice(there, which)
@@ -352,7 +355,26 @@ class ProfileRenderer(Renderer):
         else:
             squared = response.abs().square() if response.is_complex() else response.square()
             echoes = (squared * known)[None]
-        return Deposit.apply(echoes, middle - lead / self.bin, pose, len(position), self.bins)
+        at = middle - lead / self.bin
+        slices = self._sounding(at)
+        held = (len(slices) - 1) * self.oversampling + self._taps
+        at = at - slices.start * self.oversampling
+        return Deposit.apply(echoes, at, pose, len(position), held), slices
+
+    @property
+    def _taps(self) -> int:
+        return 2 * self.log_kernel.shape[1] + 1
+
+    def _sounding(self, at: Tensor) -> range:
+        """Return the slices that may see one of the bins, counted from the first; never none."""
+        last = len(self.range) - 1
+        if not at.numel():
+            return range(1)
+        nearest, farthest = torch.stack(at.detach().aminmax()).nan_to_num().tolist()
+        first = (math.floor(nearest) - self._taps) // self.oversampling
+        end = (math.floor(farthest) + 1) // self.oversampling + 1
+        first = min(max(first, 0), last)
+        return range(first, min(max(end, first), last) + 1)
 
     def _paths(self, in_head: Tensor, out: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return what the way to places and back does to pressure.

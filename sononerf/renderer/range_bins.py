@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import torch
@@ -59,11 +60,8 @@ class Window(torch.autograd.Function):
         *lead, poses, length = profiles.shape
         taps = kernel.shape[1]
         slices = (length - taps) // step + 1
-        tile = max(1, -(-taps // step) - 1)
-        tiles, block = -(-slices // tile), tile * step
-        tap = torch.arange(block)[:, None, None] - step * torch.arange(tile)
-        tap = tap + block * torch.arange(2)[:, None]
-        tap = torch.where((tap >= 0) & (tap < taps), tap, taps).reshape(-1).to(kernel.device)
+        tile, block, tap = _band(taps, step, kernel.device)
+        tiles = -(-slices // tile)
         band = F.pad(kernel, (0, 1)).index_select(1, tap).reshape(-1, block, 2 * tile)
         blocks = F.pad(profiles, (0, (tiles + 1) * block - length))
         blocks = blocks.reshape(*lead, poses * (tiles + 1), block)
@@ -91,3 +89,15 @@ class Window(torch.autograd.Function):
         met = (blocks.mT @ seen).flatten(0, -4).sum(0).flatten(1)
         weight = met.new_zeros(len(met), taps + 1).index_add_(1, tap, met)[:, :taps]
         return spread, weight, None
+
+
+@lru_cache(maxsize=8)
+def _band(taps: int, step: int, device: torch.device) -> tuple[int, int, Tensor]:
+    """Return slices of a tile, bins of a block, and which tap, or none, each bin meets."""
+    tile = max(1, -(-taps // step) - 1)
+    block = tile * step
+    with torch.inference_mode(False):  # a prediction may come first, a fit afterwards
+        tap = torch.arange(block)[:, None, None] - step * torch.arange(tile)
+        tap = tap + block * torch.arange(2)[:, None]
+        tap = torch.where((tap >= 0) & (tap < taps), tap, taps).reshape(-1)
+        return tile, block, tap.to(device)

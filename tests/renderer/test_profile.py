@@ -170,19 +170,25 @@ def test_a_sweeps_rows_hear_a_place_by_their_lag_farther_off(head, acquisition, 
         np.testing.assert_allclose(found, sign * lag(azimuth, elevation), atol=3e-5)
 
 
+def bins_of(renderer):
+    """Number of fine bins that any slice sees."""
+    return (len(renderer.range) - 1) * renderer.oversampling + 2 * renderer.log_kernel.shape[1] + 1
+
+
 def heard_from_bins(renderer, monkeypatch):
     """Power in each slice from one unit of power in each fine bin, (K, R, F)."""
-    unit = torch.eye(renderer.bins, dtype=torch.float64)
+    count = bins_of(renderer)
+    unit = torch.eye(count, dtype=torch.float64).expand(1, 1, 3, -1, -1)
     with monkeypatch.context() as patch:
-        patch.setattr(renderer, "_profile", lambda *_: unit.expand(1, 1, 3, -1, -1))
-        some = torch.zeros(renderer.bins, 3, dtype=torch.float64)
-        heard = renderer(None, some, some, rows(poses=renderer.bins))
+        patch.setattr(renderer, "_profile", lambda *_: (unit, range(len(renderer.range))))
+        some = torch.zeros(count, 3, dtype=torch.float64)
+        heard = renderer(None, some, some, rows(poses=count))
     return (heard[:, 0].square()).detach().numpy()
 
 
 def slow(head, renderer, reflectivity, position, rotation):
     """Power laid into fine bins, place by place, (E, K, F)."""
-    laid = np.zeros((2, renderer.bins, 3))
+    laid = np.zeros((2, bins_of(renderer), 3))
     for place in renderer.lattice.numpy():
         paths = place - position - (rotation @ np.vstack((head.emitter, head.ears)).T).T
         d = np.linalg.norm(paths, axis=1)
@@ -229,6 +235,36 @@ def heard_by_lobes(make, acquisition, **options):
     renderer = quiet(ProfileRenderer(REGION, acquisition, **options))
     renderer.prepare(field, None, 0)
     return field, renderer, lambda: renderer(field, *tensors(POSITION, ROTATION), rows(poses=2))
+
+
+# Ranges run from 0.25 to 0.33 m: in their midst, across either end, and beyond them.
+@pytest.mark.parametrize("far", [0.29, 0.25, 0.34, 0.2, 0.4])
+@pytest.mark.parametrize("mode", ["power", "coherent"])
+def test_only_slices_that_may_sound_are_looked_at_and_nothing_is_lost(
+    acquisition, formula, far, mode, monkeypatch
+):
+    region = REGION + torch.tensor([0.30 - far, 0.0, 0.0])
+    field = formula(region, acquisition.frequency, smooth, spacing=0.005)
+    renderer = quiet(ProfileRenderer(region, acquisition, mode=mode, oversampling=3))
+    renderer.prepare(field, None, 0)
+    renderer.advance(1, 1)
+    given = (*tensors(POSITION[0], ROTATION[0]), rows())
+    sounding = renderer._sounding
+    looked = []
+    monkeypatch.setattr(renderer, "_sounding", lambda at: looked.append(sounding(at)) or looked[0])
+    some = renderer(field, *given)
+    monkeypatch.setattr(renderer, "_sounding", lambda _: range(120))
+    whole = renderer(field, *given)
+    torch.testing.assert_close(some, whole, rtol=1e-12, atol=1e-15)
+    parameters = [renderer.log_kernel, renderer.log_gain, renderer.log_noise]
+    for mine, theirs in zip(
+        torch.autograd.grad(some.sum(), parameters),
+        torch.autograd.grad(whole.sum(), parameters),
+        strict=True,
+    ):
+        torch.testing.assert_close(mine, theirs)
+    assert len(looked[0]) < 110
+    assert (float(whole.detach().max()) < 1e-9) == (far in (0.2, 0.4))
 
 
 @LOBES
