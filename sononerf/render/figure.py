@@ -38,9 +38,12 @@ def figure(
     height: float,
     dpi: int,
     *,
-    layout: Literal["constrained", "compressed"] = "constrained",
+    layout: Literal["constrained", "compressed"] | None = "constrained",
 ) -> Iterator[Any]:
-    """Open a figure of so many inches in our style; draw in the block, then take its pixels."""
+    """Open a figure of so many inches in our style; draw in the block, then take its pixels.
+
+    To find a layout takes twice as long as to draw.
+    """
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

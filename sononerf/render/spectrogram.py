@@ -15,6 +15,9 @@ from sononerf.render.figure import figure, pixels_from_figure, png_from_pixels
 ACTIVE_DB = 3.0
 MARGIN = 0.02
 LEVEL_MAP, DIFFERENCE_MAP = "magma", "RdBu_r"
+# Inches: what labels need on each side of the panels, between them, and for a colour bar.
+LEFT, TOP, BOTTOM, GAP = 0.76, 0.48, 0.46, 0.13
+BAR, BAR_GAP, BAR_WIDTH = 0.82, 0.08, 0.19
 
 
 def spectrogram_png(
@@ -131,27 +134,54 @@ def _pixels(
         panels["predicted − measured"] = panels["predicted"] - panels["measured"]
     names = ["left ear", "right ear"] if ears == 2 else [f"ear {ear}" for ear in range(ears)]
     extent = (*axis_edges(ranges), *axis_edges(frequencies / 1e3))
-    with figure(10.5 * len(panels) / 3 + (len(panels) == 1), 0.9 + 2.3 * ears, dpi) as drawn:
-        axes = drawn.subplots(ears, len(panels), sharex=True, sharey=True, squeeze=False)
+    width, height = 10.5 * len(panels) / 3 + (len(panels) == 1), 0.9 + 2.3 * ears
+    with figure(width, height, dpi, layout=None) as drawn:
+        axes, bars = _axes(drawn, ears, columns, len(panels))
         for column, (name, values) in enumerate(panels.items()):
             options: dict[str, Any] = {"cmap": LEVEL_MAP, "vmin": 0, "vmax": top}
             if column == 2:
                 # A single odd cell must not bleach all the others.
                 worst = _round_up(float(np.quantile(np.abs(values), 0.998)), 3)
                 options = {"cmap": DIFFERENCE_MAP, "vmin": -worst, "vmax": worst}
-            axes[0, column].set_title(name)
-            axes[-1, column].set_xlabel("range (m)")
-            for panel, level in zip(axes[:, column], values, strict=True):
-                picture = panel.imshow(level.T, extent=extent, aspect="auto", **options)
-                panel.locator_params(axis="x", nbins=5)  # more labels would touch one another
-            if column == columns - 1:
-                bar = axes[:, :columns]
-                drawn.colorbar(picture, ax=bar, label="level (dB)", pad=0.01, aspect=12 * ears)
-            elif column == 2:
-                bar = axes[:, 2:]
-                drawn.colorbar(picture, ax=bar, label="difference (dB)", pad=0.02, aspect=12 * ears)
-        for panel, name in zip(axes[:, 0], names, strict=True):
-            panel.set_ylabel(f"{name}\nfrequency (kHz)")
+            axes[0][column].set_title(name)
+            axes[-1][column].set_xlabel("range (m)")
+            for row, level in zip(axes, values, strict=True):
+                picture = row[column].imshow(level.T, extent=extent, aspect="auto", **options)
+                row[column].locator_params(axis="x", nbins=5)  # more would touch one another
+            if column in bars:
+                label = "difference (dB)" if column == 2 else "level (dB)"
+                drawn.colorbar(picture, cax=bars[column], label=label)
+        for row, name in zip(axes, names, strict=True):
+            row[0].set_ylabel(f"{name}\nfrequency (kHz)")
         if title:
-            drawn.suptitle(title, fontsize=10)
+            drawn.suptitle(title, fontsize=10, y=1 - 0.06 / height, va="top")
         return pixels_from_figure(drawn)
+
+
+def _axes(
+    drawn: Any, ears: int, columns: int, panels: int
+) -> tuple[list[list[Any]], dict[int, Any]]:
+    """Return axes by ear and column, and a bar's beside the last level and the difference.
+
+    Where all pictures have the same parts, a layout need not be found for each of them.
+    """
+    width, height = drawn.get_size_inches()
+    last = {columns - 1, panels - 1}  # a bar follows
+    wide = (width - LEFT - len(last) * BAR - (panels - len(last)) * GAP) / panels
+    tall = (height - TOP - BOTTOM - (ears - 1) * GAP) / ears
+
+    def part(x: float, y: float, w: float, h: float) -> Any:
+        return drawn.add_axes((x / width, y / height, w / width, h / height))
+
+    axes: list[list[Any]] = [[] for _ in range(ears)]
+    bars = {}
+    x = LEFT
+    for column in range(panels):
+        for ear, row in enumerate(axes):
+            row.append(part(x, BOTTOM + (ears - 1 - ear) * (tall + GAP), wide, tall))
+            row[-1].tick_params(labelleft=column == 0, labelbottom=ear == ears - 1)
+        x += wide
+        if column in last:
+            bars[column] = part(x + BAR_GAP, BOTTOM, BAR_WIDTH, height - TOP - BOTTOM)
+        x += BAR if column in last else GAP
+    return axes, bars

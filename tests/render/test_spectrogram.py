@@ -42,6 +42,16 @@ def test_any_number_of_ears_and_silence(ears):
     assert pixels.std() > 1
 
 
+@pytest.mark.parametrize("ears", [1, 2, 3])
+@pytest.mark.parametrize("alone", [True, False])
+def test_labels_with_the_longest_numbers_have_room(ears, alone):
+    measured = None if alone else 0.6 * echo(ears)
+    pixels = spectrogram_image(measured, echo(ears), RANGE, 2 * FREQUENCY, "pose 3")
+    for edge in (pixels[:2], pixels[-2:], pixels[:, :2], pixels[:, -2:]):
+        assert (edge == 255).all()
+    assert (pixels[:, 2:12] < 255).any()  # the names of the ears are there at all
+
+
 def test_one_range_and_one_frequency():
     image = spectrogram_image([[[5.0]]], [[[0.0]]], [0.4], [40e3])
     # One cell fills each panel: the top of the scale, its bottom, and the greatest fall.
