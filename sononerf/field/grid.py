@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from sononerf.errors import SettingsError
 from sononerf.field.correction import Correction
-from sononerf.field.lobe import CODE, LobeField
+from sononerf.field.lobe import CODE, LobeField, Lobes, Places
 
 SLIGHT = 1e-5
 """A vertex is not read where its weight is less: places of a lattice are off by roundings."""
@@ -209,14 +209,9 @@ class GridField(LobeField):
         return code if which is None else code.index_select(0, which)
 
     def _log_response(
-        self,
-        code: Tensor,
-        positions: Tensor,
-        directions: Tensor,
-        bins: Tensor | None,
-        place: Tensor | None = None,
+        self, lobes: Lobes, tilt: Tensor, seen: Places, bins: Tensor | None
     ) -> Tensor:
-        response = super()._log_response(code, positions, directions, bins, place)
+        response = super()._log_response(lobes, tilt, seen, bins)
         if self.correction is None:
             return response
-        return response + self.correction(positions, directions, bins, place)
+        return response + self.correction(seen.positions, seen.directions, bins, seen.of)

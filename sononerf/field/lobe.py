@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -46,8 +47,37 @@ class CalmLayer(nn.Linear):
 
 def along(vectors: Tensor, axes: Tensor) -> Tensor:
     """Return the scalar product of (..., N, 3) vectors with (3, N) axes, (..., N)."""
-    x, y, z = vectors.unbind(-1)
-    return x * axes[0] + y * axes[1] + z * axes[2]
+    # Unbound rather than indexed: each index would have a pass of its own in the gradient.
+    (x, y, z), (a, b, c) = vectors.unbind(-1), axes.unbind(0)
+    return x * a + y * b + z * c
+
+
+class Places(NamedTuple):
+    """Where N places lie and from where they are looked at."""
+
+    positions: Tensor  # (N, 3) m
+    directions: Tensor  # (..., N, 3) unit vectors, or (M, 3) of M pairs
+    of: Tensor | None = None  # (M,) int, which place each pair is for
+
+
+class Lobes(NamedTuple):
+    """What codes say, a column for each of N lobes."""
+
+    strength: Tensor  # (1, N), natural logarithm
+    vector: Tensor  # (3, N)
+    radius: Tensor  # (1, N), in RADIUS_UNIT
+    own: Tensor  # (rank, N), coefficients of the spectra that are added
+
+    @classmethod
+    def of(cls, code: Tensor) -> Lobes:
+        """Read (5 + rank, N) codes."""
+        return cls(*code.split((1, 3, 1, len(code) - CODE)))
+
+    def tilt(self, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """Return m . u - |m| towards (..., N, 3), (..., N), zero on the axis; and |m|, (N,)."""
+        # The small number keeps the gradient finite where there is no lobe yet.
+        length = (along(self.vector.T, self.vector) + 1e-6).sqrt()
+        return along(directions, self.vector) - length, length
 
 
 def hidden_layers(start: int, width: int) -> nn.Sequential:
@@ -114,32 +144,20 @@ class LobeField(Field):
     # Below, numbers of a place and frequencies come first in memory: what is done to them then
     # runs along the places, several times as fast as along three or six neighbours.
 
-    def _spectrum(self, code: Tensor, bins: Tensor | slice) -> Tensor:
+    def _spectrum(self, own: Tensor, bins: Tensor | slice) -> Tensor:
         """Return the log spectrum along the axis: (B, 1), or (B, N) where places have their own."""
         spectrum = self.spectrum[bins, None]
         if self.basis is None:
             return spectrum
-        return spectrum + self.basis[:, bins].T @ code.T[CODE:]
+        return spectrum + self.basis[:, bins].T @ own
 
     def _log_response(
-        self,
-        code: Tensor,
-        positions: Tensor,
-        directions: Tensor,
-        bins: Tensor | None,
-        place: Tensor | None = None,
+        self, lobes: Lobes, tilt: Tensor, seen: Places, bins: Tensor | None
     ) -> Tensor:
-        """Return the log reflectivity of (N, 3) places towards (..., N, 3), (..., N, B).
-
-        Where (M,) ``place`` is given, codes and directions are those of M pairs.
-        """
-        del positions, place
+        """Return the log reflectivity of N lobes seen at a (..., N) tilt, (..., N, B)."""
+        del seen
         which = slice(None) if bins is None else bins
-        lobe = code.T[1:4]
-        # The small number keeps the gradient finite where there is no lobe yet.
-        length = (along(lobe.T, lobe) + 1e-6).sqrt()
-        tilt = along(directions, lobe) - length  # (..., N), zero on the axis
-        strength = code.T[0].clamp_min(LOG_STRENGTH_FLOOR) + self._spectrum(code, which)  # (B, N)
+        strength = lobes.strength.clamp_min(LOG_STRENGTH_FLOOR) + self._spectrum(lobes.own, which)
         sharpness = self.sharpness[which].exp()[:, None]
         for _ in range(tilt.ndim - 1):
             strength, sharpness = strength[:, None], sharpness[:, None]
@@ -147,7 +165,9 @@ class LobeField(Field):
 
     def select(self, positions: Tensor, directions: Tensor, bins: Tensor | None) -> Tensor:
         """Return the reflectivity of (N, 3) places towards (..., N, 3) directions."""
-        response = self._log_response(self.code(positions), positions, directions, bins).exp()
+        lobes = Lobes.of(self.code(positions).T)
+        tilt, _ = lobes.tilt(directions)
+        response = self._log_response(lobes, tilt, Places(positions, directions), bins).exp()
         return response * self.inside(positions)[:, None]
 
     @torch.no_grad()
@@ -173,14 +193,15 @@ class LobeField(Field):
         if place is not None:
             code = code.index_select(1, place)
             outside = None if outside is None else outside.index_select(0, place)
-        response = self._log_response(code.T, positions, directions, bins, place).exp()
-        lobe = code[1:4].detach()  # the range must not turn the lobes
-        length = along(lobe.T, lobe).sqrt()
-        cosine = along(directions, lobe) / length.clamp_min(1e-6)
-        off = (1 - cosine) * (1 - (-length.square()).exp())
+        lobes = Lobes.of(code)
+        tilt, length = lobes.tilt(directions)
+        response = self._log_response(lobes, tilt, Places(positions, directions, place), bins).exp()
         if outside is not None:
             response = response.masked_fill(outside[:, None], 0.0)
-        return response, RADIUS_UNIT * self.curved * code[4] * off
+        with torch.no_grad():  # the range must not turn the lobes
+            off = tilt / length * torch.expm1(-length.square())  # (1 - cos)(1 - exp(-|m|^2))
+            off *= RADIUS_UNIT * self.curved
+        return response, lobes.radius.squeeze(0) * off
 
     def forward(self, positions: Tensor, directions: Tensor) -> Tensor:
         """Return the reflectivity, (..., F) float."""
@@ -196,12 +217,12 @@ class LobeField(Field):
         The mean over the sphere of :math:`e^{2k(\cos - 1)}` is :math:`(1 - e^{-4k})/(4k)`.
         """
         del directions
-        code = self.code(positions).T
-        length = along(code[1:4].T, code[1:4]).sqrt()
+        lobes = Lobes.of(self.code(positions).T)
+        length = along(lobes.vector.T, lobes.vector).sqrt()
         concentration = length * self.sharpness.exp()[:, None]
         mean = -torch.expm1(-4 * concentration) / (4 * concentration).clamp_min(1e-12)
         mean = torch.where(concentration > 1e-6, mean, torch.ones_like(mean))
-        strength = code[0].clamp_min(LOG_STRENGTH_FLOOR)
-        power = (2 * (strength + self._spectrum(code.T, slice(None)))).exp() * mean
+        strength = lobes.strength.clamp_min(LOG_STRENGTH_FLOOR)
+        power = (2 * (strength + self._spectrum(lobes.own, slice(None)))).exp() * mean
         energy = power.sum(0) * self.inside(positions)
-        return energy, (code[1:4] / length.clamp_min(1e-12)).T
+        return energy, (lobes.vector / length.clamp_min(1e-12)).T

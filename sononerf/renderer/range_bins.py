@@ -92,7 +92,7 @@ class Window(torch.autograd.Function):
 
 
 @lru_cache(maxsize=8)
-def _band(taps: int, step: int, device: torch.device) -> tuple[int, int, Tensor]:
+def _band(taps: int, step: int, where: torch.device) -> tuple[int, int, Tensor]:
     """Return slices of a tile, bins of a block, and which tap, or none, each bin meets."""
     tile = max(1, -(-taps // step) - 1)
     block = tile * step
@@ -100,4 +100,4 @@ def _band(taps: int, step: int, device: torch.device) -> tuple[int, int, Tensor]
         tap = torch.arange(block)[:, None, None] - step * torch.arange(tile)
         tap = tap + block * torch.arange(2)[:, None]
         tap = torch.where((tap >= 0) & (tap < taps), tap, taps).reshape(-1)
-        return tile, block, tap.to(device)
+        return tile, block, tap.to(where)

@@ -196,7 +196,7 @@ def test_the_lead_fades_with_the_lobe(make):
         field = say(make(), 0.0, *(LOBE * (length / 6)), 1.0)
         field.advance(1, 1)
         leads[length] = field.echo(place, behind, None)[1].item() / (2 * RADIUS_UNIT)
-    assert leads[0.0] == 0.0
+    assert leads[0.0] < 1e-6  # a part of the radius: no lobe is told by a small length
     assert leads[0.01] < 2e-4
     assert leads[0.1] < 0.02
     assert list(leads.values()) == sorted(leads.values())
