@@ -136,6 +136,11 @@ class EchoModule(lightning.LightningModule):
             self.log("train/loss", loss, batch_size=len(batch.pose))
         return loss
 
+    @property
+    def _may_ask(self) -> bool:
+        """Whether it costs nothing to ask the device for a number: a GPU would wait."""
+        return self.device.type == "cpu"
+
     def _seed(self, number: int) -> None:
         if self.device.type == "cpu":
             # torch.manual_seed asks all other kinds of device too, a tenth of a small step.
@@ -180,7 +185,7 @@ class EchoModule(lightning.LightningModule):
 
     def _reference(self, measured: Tensor, span: float) -> Tensor:
         """Return the magnitude at which the loss starts to hear, broadcastable over the batch."""
-        least = measured.new_tensor(self.reference * 10 ** ((REPORT_RANGE_DB - span) / 20))
+        least = measured.new_full((), self.reference * 10 ** ((REPORT_RANGE_DB - span) / 20))
         if span == self.dynamic_range_db or not self.renderer.whole_poses:
             return least
         # By the pose's own loudest echo: the flash of a flat face must not silence all others.
@@ -198,7 +203,8 @@ class EchoModule(lightning.LightningModule):
         del optimizer, gradient_clip_algorithm
         named = {n: p for n, p in self.named_parameters() if p.grad is not None}
         norm = get_total_norm([p.grad for p in named.values() if p.grad is not None])
-        if not bool(norm.isfinite()):
+        asked = self._may_ask or self._is_logged(self.global_step)  # what is no number stays none
+        if asked and not bool(norm.isfinite()):
             for name, parameter in named.items():
                 if parameter.grad is not None and not bool(parameter.grad.isfinite().all()):
                     raise NumericalError(
@@ -208,6 +214,16 @@ class EchoModule(lightning.LightningModule):
                     )
         if gradient_clip_val is not None:
             clip_grads_with_norm_(named.values(), gradient_clip_val, norm)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Refuse to replace a sound checkpoint by one that holds what is no number."""
+        del checkpoint
+        for name, parameter in self.named_parameters():
+            if not bool(parameter.isfinite().all()):
+                raise NumericalError(
+                    f"{name} is not finite at step {self.global_step}; the last checkpoint is "
+                    "sound; lower fit.learning_rate and start anew with --overwrite"
+                )
 
     def validation_step(self, batch: RangeSlices, batch_index: int) -> None:
         """Gather the error over the validation poses, in the decibels of every report."""

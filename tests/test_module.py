@@ -6,6 +6,7 @@ import lightning
 import numpy as np
 import pytest
 import torch
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from sononerf.data.datamodule import EchoDataModule
 from sononerf.data.range_slices import RangeSlices
@@ -280,6 +281,69 @@ def test_a_gradient_that_is_no_number_stops_the_fit_by_name(value):
     found.renderer.values.grad[0, 0, 0, 1] = value
     with pytest.raises(NumericalError, match=r"gradient of renderer\.values"):
         found.configure_gradient_clipping(None, 1.0)
+
+
+class Asked(TorchDispatchMode):
+    """Notes what a GPU could answer only once all that was asked of it before is done."""
+
+    WAITS = (
+        torch.ops.aten._local_scalar_dense,
+        torch.ops.aten.nonzero,
+        torch.ops.aten.equal,
+        torch.ops.aten.masked_select,
+        torch.ops.aten.unique_dim,
+    )
+
+    def __init__(self):
+        super().__init__()
+        self.found = []
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        masks = args[1] if func.overloadpacket is torch.ops.aten.index else ()
+        if func.overloadpacket in self.WAITS or any(
+            m is not None and m.dtype == torch.bool for m in masks
+        ):
+            self.found.append(str(func))
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize("mode", ["power", "coherent"])
+def test_a_step_on_a_gpu_waits_for_no_number(mode, monkeypatch):
+    field = GridField(REGION, FREQUENCY, spacing=0.01, levels=2)
+    found = module(ProfileRenderer(REGION, ACQUISITION, mode=mode), field, total_steps=4)
+    optimizer = found.configure_optimizers()["optimizer"]
+    monkeypatch.setattr(found, "_is_logged", lambda step: False)
+    monkeypatch.setattr(torch.Tensor, "tolist", lambda self: [x.item() for x in self])
+    generator = torch.Generator().manual_seed(0)
+    given = batch(torch.rand(2, 2, 150, 3, generator=generator))
+    given = given._replace(position=torch.tensor([[0.0, 0.0, 0.25], [0.0, 0.24, 0.0]]))
+
+    def asked(step):
+        monkeypatch.setattr(EchoModule, "global_step", step)
+        with Asked() as watched:
+            optimizer.zero_grad()
+            found.training_step(given, step).backward()
+            found.configure_gradient_clipping(optimizer, 1.0)
+            optimizer.step()
+        return watched.found
+
+    assert asked(0)  # the lattice is laid, and the first of a step's answers are kept
+    asked(3)  # the coherent one turns
+    assert asked(1)  # a CPU is asked
+    heard = found(given)
+    for asks in (found.renderer, found):
+        monkeypatch.setattr(type(asks), "_may_ask", False)
+    torch.testing.assert_close(found(given), heard)
+    assert asked(1) == []
+
+
+def test_a_checkpoint_of_what_is_no_number_is_refused():
+    found = module(Given(PREDICTED))
+    found.on_save_checkpoint({})
+    with torch.no_grad():
+        found.field.spectrum[1] = math.nan
+    with pytest.raises(NumericalError, match=r"^field\.spectrum is not finite at step 0"):
+        found.on_save_checkpoint({})
 
 
 def test_the_gradient_is_clipped_by_its_norm_over_all_parameters():

@@ -112,6 +112,7 @@ class ProfileRenderer(Renderer):
         self.surroundings = surroundings
         self.occlusion = occlusion
         self._turned = False
+        self._summed = (torch.zeros(0), -1, False)  # phased, as of when, and what it said
         self.oversampling = oversampling
         self.mode = mode
         self.register_buffer("phased", torch.zeros(()))
@@ -155,12 +156,26 @@ class ProfileRenderer(Renderer):
     @property
     def places_per_pose(self) -> int | None:
         """How many places a step evaluates per pose."""
-        return min(int(self.alive.sum()), self.points) if len(self.alive) else None
+        return min(len(self._there()), self.points) if len(self.alive) else None
+
+    @property
+    def _may_ask(self) -> bool:
+        """Whether to ask the device for numbers costs less than it saves: a GPU would wait."""
+        return self.log_gain.device.type == "cpu"
+
+    @property
+    def _sums_phase(self) -> bool:
+        """What ``phased`` says, asked for only where it has changed."""
+        phased, version, said = self._summed
+        if phased is not self.phased or version != self.phased._version:
+            said = bool(self.phased)
+            self._summed = (self.phased, self.phased._version, said)
+        return said
 
     def advance(self, step: int, total: int) -> None:
         """Sum with phase from some step on, if at all."""
         self._turned = (
-            self.mode == "coherent" and not self.phased and step >= COHERENT_AFTER * total
+            self.mode == "coherent" and not self._sums_phase and step >= COHERENT_AFTER * total
         )
         if self._turned:
             self.phased.fill_(1.0)
@@ -288,7 +303,7 @@ class ProfileRenderer(Renderer):
         if bins is None:
             bins = torch.arange(len(self.frequency), device=self.frequency.device)
         profile, slices = self._profile(field, which, weight, position, rotation, bins)
-        phased = bool(self.phased)
+        phased = self._sums_phase
         half = (self.log_kernel.index_select(0, bins) / (2 if phased else 1)).exp()
         kernel = torch.cat((half.flip(1), torch.ones_like(half[:, :1]), half), dim=1)
         heard = Window.apply(profile, kernel, self.oversampling)  # (1 or 2, E, B, P, n)
@@ -299,7 +314,7 @@ class ProfileRenderer(Renderer):
         heard = torch.addcmul(noise[:, None, None], heard, gain[:, None, None])
         heard = heard.permute(2, 0, 3, 1)  # (P, E, R, B)
         whole = torch.arange(len(self.range), device=rows.device).expand(len(rows), -1)
-        if not torch.equal(rows, whole):
+        if not (self._may_ask and torch.equal(rows, whole)):
             heard = heard.gather(
                 2, rows[:, None, :, None].expand(-1, heard.shape[1], -1, heard.shape[3])
             )
@@ -322,10 +337,13 @@ class ProfileRenderer(Renderer):
         there = self._there()
         code = field.code_of_lattice(there, which)
         places = there if which is None else there[which]
-        phased = bool(self.phased)
+        phased = self._sums_phase
         with torch.no_grad():
             # Ears, vectors and frequencies come first in memory, pairs run along it: see LobeField.
-            pair = field.audible(places, emitters, code).reshape(-1).nonzero()[:, 0]
+            if self._may_ask:
+                pair = field.audible(places, emitters, code).reshape(-1).nonzero()[:, 0]
+            else:
+                pair = torch.arange(len(position) * len(places), device=places.device)
             pose = pair.div(len(places), rounding_mode="floor")
             place = pair - pose * len(places)
             # From here on a column for each pair of a pose and a place that answers it.
@@ -370,6 +388,8 @@ class ProfileRenderer(Renderer):
         last = len(self.range) - 1
         if not at.numel():
             return range(1)
+        if not self._may_ask:
+            return range(last + 1)
         nearest, farthest = torch.stack(at.detach().aminmax()).nan_to_num().tolist()
         first = (math.floor(nearest) - self._taps) // self.oversampling
         end = (math.floor(farthest) + 1) // self.oversampling + 1
