@@ -117,6 +117,14 @@ class EchoModule(lightning.LightningModule):
         )
         return magnitude
 
+    def transfer_batch_to_device(
+        self, batch: Any, device: torch.device, dataloader_idx: int
+    ) -> Any:
+        """Leave a batch where it is on a CPU: Lightning would look through its parts each step."""
+        if device.type == "cpu":
+            return batch
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)
+
     def training_step(self, batch: RangeSlices, batch_index: int) -> Tensor:
         """Return the loss of one batch."""
         del batch_index
