@@ -144,11 +144,6 @@ class EchoModule(lightning.LightningModule):
             self.log("train/loss", loss, batch_size=len(batch.pose))
         return loss
 
-    @property
-    def _may_ask(self) -> bool:
-        """Whether it costs nothing to ask the device for a number: a GPU would wait."""
-        return self.device.type == "cpu"
-
     def _seed(self, number: int) -> None:
         if self.device.type == "cpu":
             # torch.manual_seed asks all other kinds of device too, a tenth of a small step.
@@ -211,7 +206,7 @@ class EchoModule(lightning.LightningModule):
         del optimizer, gradient_clip_algorithm
         named = {n: p for n, p in self.named_parameters() if p.grad is not None}
         norm = get_total_norm([p.grad for p in named.values() if p.grad is not None])
-        asked = self._may_ask or self._is_logged(self.global_step)  # what is no number stays none
+        asked = self.renderer.may_ask or self._is_logged(self.global_step)  # what is no number stays none
         if asked and not bool(norm.isfinite()):
             for name, parameter in named.items():
                 if parameter.grad is not None and not bool(parameter.grad.isfinite().all()):

@@ -159,11 +159,6 @@ class ProfileRenderer(Renderer):
         return min(len(self._there()), self.points) if len(self.alive) else None
 
     @property
-    def _may_ask(self) -> bool:
-        """Whether to ask the device for numbers costs less than it saves: a GPU would wait."""
-        return self.log_gain.device.type == "cpu"
-
-    @property
     def _sums_phase(self) -> bool:
         """What ``phased`` says, asked for only where it has changed."""
         phased, version, said = self._summed
@@ -314,7 +309,7 @@ class ProfileRenderer(Renderer):
         heard = torch.addcmul(noise[:, None, None], heard, gain[:, None, None])
         heard = heard.permute(2, 0, 3, 1)  # (P, E, R, B)
         whole = torch.arange(len(self.range), device=rows.device).expand(len(rows), -1)
-        if not (self._may_ask and torch.equal(rows, whole)):
+        if not (self.may_ask and torch.equal(rows, whole)):
             heard = heard.gather(
                 2, rows[:, None, :, None].expand(-1, heard.shape[1], -1, heard.shape[3])
             )
@@ -340,7 +335,7 @@ class ProfileRenderer(Renderer):
         phased = self._sums_phase
         with torch.no_grad():
             # Ears, vectors and frequencies come first in memory, pairs run along it: see LobeField.
-            if self._may_ask:
+            if self.may_ask:
                 pair = field.audible(places, emitters, code).reshape(-1).nonzero()[:, 0]
             else:
                 pair = torch.arange(len(position) * len(places), device=places.device)
@@ -388,7 +383,7 @@ class ProfileRenderer(Renderer):
         last = len(self.range) - 1
         if not at.numel():
             return range(1)
-        if not self._may_ask:
+        if not self.may_ask:
             return range(last + 1)
         nearest, farthest = torch.stack(at.detach().aminmax()).nan_to_num().tolist()
         first = (math.floor(nearest) - self._taps) // self.oversampling

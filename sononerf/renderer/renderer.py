@@ -124,6 +124,14 @@ class Renderer(nn.Module):
         self.log_gain = nn.Parameter(torch.zeros(()))
         self.register_buffer("points_evaluated", torch.zeros((), dtype=torch.long))
 
+    @property
+    def may_ask(self) -> bool:
+        """Whether to ask the device for a number costs nothing.
+
+        A GPU would wait for all that it was told before, so that a step has to do without.
+        """
+        return self.log_gain.device.type == "cpu"
+
     def advance(self, step: int, total: int) -> None:
         """Learn how far a fit has come; called before each training step.
 
