@@ -117,14 +117,6 @@ class EchoModule(lightning.LightningModule):
         )
         return magnitude
 
-    def transfer_batch_to_device(
-        self, batch: Any, device: torch.device, dataloader_idx: int
-    ) -> Any:
-        """Leave a batch where it is on a CPU: Lightning would look through its parts each step."""
-        if device.type == "cpu":
-            return batch
-        return super().transfer_batch_to_device(batch, device, dataloader_idx)
-
     def training_step(self, batch: RangeSlices, batch_index: int) -> Tensor:
         """Return the loss of one batch."""
         del batch_index
@@ -206,7 +198,8 @@ class EchoModule(lightning.LightningModule):
         del optimizer, gradient_clip_algorithm
         named = {n: p for n, p in self.named_parameters() if p.grad is not None}
         norm = get_total_norm([p.grad for p in named.values() if p.grad is not None])
-        asked = self.renderer.may_ask or self._is_logged(self.global_step)  # what is no number stays none
+        # What is no number stays none: a GPU is asked where the loss is logged too.
+        asked = self.renderer.may_ask or self._is_logged(self.global_step)
         if asked and not bool(norm.isfinite()):
             for name, parameter in named.items():
                 if parameter.grad is not None and not bool(parameter.grad.isfinite().all()):

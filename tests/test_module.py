@@ -283,13 +283,6 @@ def test_a_gradient_that_is_no_number_stops_the_fit_by_name(value):
         found.configure_gradient_clipping(None, 1.0)
 
 
-def test_a_batch_goes_to_the_device_and_stays_as_it_is_on_a_cpu():
-    found, given = module(Given(PREDICTED)), batch(PREDICTED)
-    assert found.transfer_batch_to_device(given, torch.device("cpu"), 0) is given
-    moved = found.transfer_batch_to_device(given, torch.device("meta"), 0)
-    assert {part.device.type for part in moved} == {"meta"}
-
-
 class Asked(TorchDispatchMode):
     """Notes what a GPU could answer only once all that was asked of it before is done."""
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Literal
+from typing import Any, Literal
 
 import lightning
 import torch
@@ -103,6 +103,14 @@ class EchoDataModule(lightning.LightningDataModule):
             PoseReader(self.store, self.memory_bytes // 4),
             numbers,
         )
+
+    def transfer_batch_to_device(
+        self, batch: Any, device: torch.device, dataloader_idx: int
+    ) -> Any:
+        """Leave a batch where it is on a CPU: Lightning would look through its parts each step."""
+        if device.type == "cpu":
+            return batch
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     def _loader(
         self, dataset: SliceStream | WholePoses, sampler: Sampler[int] | None

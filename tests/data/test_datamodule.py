@@ -106,3 +106,11 @@ def test_each_device_gets_its_share(store):
         data.trainer = SimpleNamespace(global_rank=rank, world_size=2)
         poses.append(data.stream()[3].pose)
     assert torch.equal(torch.stack(poses, 1).reshape(-1), alone[3].pose)
+
+
+def test_a_batch_goes_to_the_device_and_stays_as_it_is_on_a_cpu(store):
+    found = module(store)
+    given = found.stream()[0]
+    assert found.transfer_batch_to_device(given, torch.device("cpu"), 0) is given
+    moved = found.transfer_batch_to_device(given, torch.device("meta"), 0)
+    assert {part.device.type for part in moved} == {"meta"}
