@@ -29,7 +29,7 @@ class _Affine(nn.Module):
 def _layers(start: int, widths: list[int]) -> nn.Sequential:
     layers: list[nn.Module] = []
     for width in widths:
-        layers += [nn.Linear(start, width), nn.LeakyReLU(0.01)]
+        layers += [nn.Linear(start, width), nn.LeakyReLU(0.01, inplace=True)]
         start = width
     return nn.Sequential(*layers)
 
