@@ -38,10 +38,12 @@ class Task:
             self.note = note
         if self._bars is not None and self._id is not None:
             self._bars.update(self._id, completed=self.done, note=self.note)
-        elif not self._quiet and time.monotonic() - self._last >= LINE_SECONDS:
+        elif self.done < self.total and time.monotonic() - self._last >= LINE_SECONDS:
             self._line()
 
     def _line(self) -> None:
+        if self._quiet:
+            return
         self._last = time.monotonic()
         seconds = self._last - self._started
         text = f"{self.what}: {self.done} of {self.total}, {seconds:.0f} s {self.note}"
@@ -49,7 +51,7 @@ class Task:
 
     def finish(self) -> None:
         """Say in a plain line how it ended, if any line was said before or it took long."""
-        if self._bars is None and not self._quiet and time.monotonic() - self._started > 2.0:
+        if self._bars is None and time.monotonic() - self._started > 2.0:
             self._line()
 
 
