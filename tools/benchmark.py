@@ -68,7 +68,7 @@ OTHER_HELP = "places of prey under every other condition (5)"
 CONDITIONS_HELP = "fewer or more calls, no ears, noise (signal to noise in dB), clutter; all"
 SECONDS_HELP = "fits that take longer are marked in the table (60)"
 ERROR_HELP = "over all cells of held-out poses, dB (0.45)"
-SPACINGS_HELP = "voxel sizes in metres; half of the field's resolution where none"
+SPACINGS_HELP = "voxel sizes in metres; by default the run's own"
 SET_HELP = "laid over the settings of every run"
 
 

@@ -57,6 +57,14 @@ def test_the_median_of_five(asked, tmp_path):
     assert text.splitlines()[1].split() == ["a,", "2", "mm", "hull", "1,200", "3.00", "400"]
 
 
+def test_a_run_with_a_voxel_size_of_its_own_is_read_by_that(asked, tmp_path, monkeypatch):
+    given = {"scene": {"name": "ua"}, "reconstruction": {"spacing": 0.005}}
+    monkeypatch.setattr(module.load_fitted("any"), "settings", validate_settings(given, "test"))
+    _, found = go(tmp_path)
+    assert [row["name"] for row in found["rows"]] == ["a, 5 mm"]
+    assert all(options["spacing"] == 0.005 for options in asked)
+
+
 def test_each_run_at_each_voxel_size(asked, tmp_path):
     runs = [Path("runs/a"), Path("runs/b")]
     _, found = go(tmp_path, runs=runs, spacings=[0.004, 0.001])

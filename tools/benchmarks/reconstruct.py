@@ -29,8 +29,9 @@ def reconstruct(arguments: argparse.Namespace) -> str:
             storage.read_json(arguments.compare)
         rows: list[Row] = []
         for run in arguments.runs:
-            resolution = load_fitted(run).module.field.resolution
-            for spacing in arguments.spacings or [resolution / 2]:
+            fitted = load_fitted(run)
+            own = fitted.settings.reconstruction.spacing or fitted.module.field.resolution / 2
+            for spacing in arguments.spacings or [own]:
                 rows.append(_timed(run, spacing))
                 print(f"{rows[-1]['name']}: done", file=sys.stderr, flush=True)
         found = {"rows": rows}
