@@ -24,11 +24,13 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
+from sononerf.acoustics.ears import NOTCH_WIDTH
 from sononerf.config import SpectrogramSettings
 
-LOWEST_NODE = 5e3  # Hz
-HIGHEST_NODE = 150e3  # Hz
-NODE_SPACING = 11.2e3  # Hz; 14 nodes over the band above
+HIGHEST = 150e3  # Hz; up to here echoes are complete
+NODE_SPACING = NOTCH_WIDTH  # Hz; gains are followed for 1 / (2 spacing) = 62 us about an echo
+ROLL_OFF = 0.3  # of that limit, as a fraction; sharper rings longer between nodes, softer cuts more
+IMAGES = 2  # periods of the interpolation on each side; its kernel falls as the third power
 OVERSAMPLING = 4
 LEVELS = 10  # of bins, each twice as wide as the one before; the last smooths away even 10 kHz
 GUARD = 512  # samples behind the last frame, for what filters put before and after an echo
@@ -81,8 +83,9 @@ class Synthesis:
 def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     """Lay out nodes and filters for an analysis.
 
-    Between neighbouring nodes strengths run straight; below the lowest they stay, and above the
-    highest they fall smoothly to zero within a third of it. The factor ``j f`` that every
+    Between nodes strengths are interpolated by raised cosines (:func:`_between`). They are even
+    about zero frequency, as gains are, and stay what they are above the highest node; there the
+    echo falls smoothly to zero within a third of that frequency. The factor ``j f`` that every
     reflection has is part of the filters: a flat reflection is then a short derivative pulse and
     no long tail.
 
@@ -99,15 +102,14 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
         Time bins, nodes and filters.
     """
     rate = settings.sampling_rate
-    top = min(max(HIGHEST_NODE, 1.2 * settings.frequency_max), 0.45 * rate)
-    bottom = min(LOWEST_NODE, top / 2.0)
-    count = max(2, 1 + round((top - bottom) / NODE_SPACING))
-    nodes = np.linspace(bottom, top, count)
+    top = min(max(HIGHEST, 1.2 * settings.frequency_max), 0.45 * rate)
+    count = max(2, round(top / NODE_SPACING))
+    nodes = (np.arange(count) + 0.5) * (top / count)
     # The coarsest level must hold a whole number of bins.
     unit = 2 ** (LEVELS - 1)
     length = unit * int(scipy.fft.next_fast_len(math.ceil((samples + GUARD) / unit), real=True))
     frequency = np.fft.rfftfreq(length, 1.0 / rate)
-    hats = np.stack([np.interp(frequency, nodes, row) for row in np.eye(count)], axis=1)
+    hats = _between(np.minimum(frequency, top), nodes)
     end = min(top * 4.0 / 3.0, rate / 2.0)
     fall = np.clip((frequency - top) / (end - top), 0.0, 1.0)
     # Laying an echo between two of the finest bins damps it by this much, on average over where
@@ -116,6 +118,44 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     shape = 0.5 * (1.0 + np.cos(np.pi * fall)) / damping
     hats = (hats * shape[:, None]).astype(np.complex128)
     return Synthesis(nodes, hats, hats * (1j * frequency)[:, None], rate, samples, length)
+
+
+def _between(frequency: NDArray[np.float64], nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+    r"""Return the weight (K, F) of each node in a value at each frequency.
+
+    The interpolation is Nyquist's raised cosine, with :math:`x` the distance in node spacings and
+    :math:`\rho` the roll-off,
+
+    .. math:: \operatorname{sinc}(x) \frac{\cos \pi \rho x}{1 - (2 \rho x)^2}
+
+    In time it is a window that keeps what comes within :math:`1 / (2 \Delta f)` of an echo and
+    removes the rest. Straight lines between the nodes would repeat each echo there every
+    :math:`1 / \Delta f`, before it too. The nodes lie at odd multiples of half the spacing, so the
+    values are continued as an even function about zero and about the upper end.
+
+    Parameters
+    ----------
+    frequency : (K,) float64, Hz
+        From zero to the upper end, half a spacing above the last node.
+    nodes : (F,) float64, Hz
+        Odd multiples of half their spacing.
+
+    Returns
+    -------
+    weight : (K, F) float64
+        They sum to one for each frequency, within 1e-6.
+    """
+    spacing = 2.0 * nodes[0]
+    period = 2.0 * len(nodes) * spacing
+    weight = np.zeros((len(frequency), len(nodes)))
+    for image in range(-IMAGES, IMAGES + 1):
+        for side in (1.0, -1.0):
+            x = (frequency[:, None] - image * period - side * nodes) / spacing
+            below = 1.0 - np.square(2.0 * ROLL_OFF * x)
+            pole = np.abs(below) < 1e-9
+            roll = np.cos(np.pi * ROLL_OFF * x) / np.where(pole, 1.0, below)
+            weight += np.sinc(x) * np.where(pole, np.pi / 4.0, roll)
+    return weight
 
 
 def deposit(

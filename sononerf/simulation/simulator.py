@@ -22,7 +22,7 @@ from sononerf.simulation.rays import Rays
 
 logger = logging.getLogger("sononerf")
 
-VERSION = 2  # to be raised when the same settings give other echoes: stores are told apart by it
+VERSION = 3  # to be raised when the same settings give other echoes: stores are told apart by it
 DEFAULT_SPEED = 343.0  # m/s
 DEFAULT_TEMPERATURE = 20.0  # °C, for absorption where only the speed is fixed
 

@@ -4,6 +4,7 @@ import itertools
 import numpy as np
 import pytest
 
+from sononerf.acoustics.ears import NOTCH_WIDTH
 from sononerf.acoustics.spectrogram import echo_samples
 from sononerf.config import SpectrogramSettings
 from sononerf.simulation.impulse_response import air_loss, deposit, plan_synthesis, synthesise
@@ -33,18 +34,22 @@ def spectrum(echo, frequency, delay=0.0):
     return np.exp(-2j * np.pi * np.asarray(frequency)[:, None] * time) @ echo
 
 
-def test_nodes_cover_the_band(synthesis):
-    assert len(synthesis.nodes) == 14
-    np.testing.assert_allclose(synthesis.nodes[[0, -1]], [5e3, 150e3])
+def test_nodes_are_odd_multiples_of_half_their_spacing(synthesis):
+    """So even functions of frequency are sampled evenly across zero, without a node there."""
+    spacing = np.diff(synthesis.nodes)
+    np.testing.assert_allclose(spacing, spacing[0])
+    assert synthesis.nodes[0] == pytest.approx(spacing[0] / 2)
+    assert spacing[0] < NOTCH_WIDTH
+    assert synthesis.nodes[-1] + spacing[0] / 2 == pytest.approx(150e3)
     low = plan_synthesis(SpectrogramSettings(sampling_rate=200e3, hop=1, window=16), 1000)
-    assert low.nodes[-1] == pytest.approx(90e3)
+    assert low.nodes[-1] + low.nodes[0] == pytest.approx(90e3)
 
 
 def test_each_level_halves_the_bins(synthesis):
     sizes = synthesis.sizes
     assert sizes[0] == 4 * synthesis.length
     assert all(fine == 2 * coarse for fine, coarse in itertools.pairwise(sizes))
-    assert synthesis.silence().shape == (sum(sizes), 14)
+    assert synthesis.silence().shape == (sum(sizes), len(synthesis.nodes))
 
 
 @pytest.mark.parametrize("sample", [700.0, 700.125, 700.5])
@@ -62,11 +67,24 @@ def test_edges_have_no_factor_jf(synthesis):
     np.testing.assert_allclose(found, 2.0, rtol=0.008)
 
 
-def test_strengths_run_straight_between_nodes(synthesis):
-    frequency = np.array([20e3, 77e3, 143e3])
-    echo = echo_of(synthesis, 700.0, synthesis.nodes / 1e5)
+def notch(frequency, middle):
+    return 1.0 - 0.8 * np.exp(-0.5 * np.square((frequency - middle) / NOTCH_WIDTH))
+
+
+@pytest.mark.parametrize("middle", [45e3, 60e3, 71.3e3])
+def test_a_notch_is_heard_between_the_nodes_as_it_is(synthesis, middle):
+    frequency = np.linspace(10e3, 140e3, 131)
+    echo = echo_of(synthesis, 700.0, notch(synthesis.nodes, middle), basis=synthesis.hats)
     found = spectrum(echo, frequency, 700.0)
-    np.testing.assert_allclose(found.imag, frequency * frequency / 1e5, rtol=0.01)
+    np.testing.assert_allclose(found, notch(frequency, middle), atol=6e-3)
+
+
+@pytest.mark.parametrize("middle", [45e3, 60e3, 71.3e3])
+def test_nothing_rings_before_an_echo_or_behind_it(synthesis, middle):
+    """Straight lines between the nodes repeat an echo at one over their spacing, at -28 dB."""
+    echo = echo_of(synthesis, 700.0, notch(synthesis.nodes, middle))
+    far = np.abs(np.arange(len(echo)) - 700) > 100
+    assert np.abs(echo[far]).max() < 2e-4 * np.abs(echo).max()
 
 
 @pytest.mark.parametrize("spread", [0.02, 0.11, 0.3, 1.0, 2.5, 7.0, 30.0])

@@ -113,7 +113,7 @@ def test_level_does_not_depend_on_the_number_of_rays():
         simulator(scene, rays).spectrogram(position, rotation, seed=3) for rays in (30_000, 90_000)
     )
     assert few.max() == pytest.approx(many.max(), rel=5e-3)
-    assert active_error(few, many) < 0.3  # what 30,000 rays scatter by, not 20 log10(3) = 9.5
+    assert active_error(few, many) < 0.4  # what 30,000 rays scatter by, not 20 log10(3) = 9.5
 
 
 def test_turning_scene_and_head_together_changes_nothing():
