@@ -96,14 +96,17 @@ class PoseSettings(_Section):
 class SimulationSettings(_Section):
     """The echo simulator: rays per pose (after aiming), bounces, and the turn of the pattern.
 
-    The engine ``spheres`` solves the wave equation up to ``frequency_max``. It may be half the
-    sampling rate at most; where it is not set, the analysis decides.
+    The engine ``hybrid`` solves the wave equation of small bodies at low frequencies, with up to
+    ``sources`` unknowns, and traces rays at high ones. The engine ``spheres`` solves it up to
+    ``frequency_max``. It may be half the sampling rate at most; where it is not set, the analysis
+    decides.
     """
 
-    engine: Literal["rays", "kirchhoff", "spheres"] = "rays"
+    engine: Literal["hybrid", "rays", "kirchhoff", "spheres"] = "hybrid"
     rays: Annotated[int, Field(ge=100, le=100_000_000)] = 300_000
     bounces: Annotated[int, Field(ge=1, le=10)] = 3
     diffraction_points: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
+    sources: Annotated[int, Field(ge=10, le=20_000)] = 1000
     frequency_max: Positive | None = None  # Hz
     seed: Seed = 0
     noise_floor_poses: Annotated[int, Field(ge=0)] = 20

@@ -95,6 +95,15 @@ class Material:
             raise ValueError("material transition_slope is inf, expected a finite number")
 
     @property
+    def rigid(self) -> bool:
+        """Whether it is a smooth surface that reflects all sound at all frequencies."""
+        return (
+            self.lobe_width is None
+            and not math.isfinite(self.transition_curvature)
+            and all(value == 1.0 for value in (*self.strength, *self.reflection))
+        )
+
+    @property
     def mixed(self) -> bool:
         """Whether curvature changes anything."""
         return self.curved_lobe_width is not None or self.curved_strength is not None

@@ -30,7 +30,6 @@ from sononerf.simulation.ensemble import (
     simulate_ensemble,
 )
 from sononerf.simulation.simulator import VERSION, Simulator
-from sononerf.simulation.solved import Solved
 
 REFERENCE_RATIO = 1e-3
 """The reported decibels start 60 dB below the greatest magnitude of the training poses."""
@@ -278,10 +277,10 @@ def _fill(
 
 
 def _prepare(simulator: Simulator, poses: Poses, wanted: list[int], progress: Progress) -> None:
-    """Let an engine that solves for all poses at once do so, and show how long it takes."""
+    """Let the engine do what it does for all poses at once, and show how far it is."""
     engine = simulator.engine
-    if isinstance(engine, Solved):
-        with progress.task("solving", len(engine.frequency)) as task:
+    if wanted and engine.parts:
+        with progress.task("solving", engine.parts) as task:
             engine.prepare(
                 poses.positions[wanted], poses.rotations[wanted], lambda *_: task.advance()
             )

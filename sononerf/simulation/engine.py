@@ -30,10 +30,15 @@ class Engine:
     reflections : tuple of Reflection
         The scene's materials at the nodes of the synthesis.
     prepares : bool
-        Whether it solves for many poses at once, which :meth:`prepare` then does.
+        Whether :meth:`prepare` does all the work, so that nothing is left for other processes.
     """
 
     prepares: ClassVar[bool] = False
+
+    @property
+    def parts(self) -> int:
+        """Number of parts in which :meth:`prepare` works; none where it does nothing."""
+        return 0
 
     def __init__(self, scene: Scene, hearing: Hearing) -> None:
         self.scene = scene

@@ -74,10 +74,19 @@ class Rays(Engine):
         How often a ray may hit.
     diffraction_points : int
         Per pose, where a material diffracts.
+    band : (K,) float64, optional
+        By how much each frequency of the synthesis is multiplied; all whole where not given.
     """
 
     def __init__(
-        self, scene: Scene, hearing: Hearing, *, rays: int, bounces: int, diffraction_points: int
+        self,
+        scene: Scene,
+        hearing: Hearing,
+        *,
+        rays: int,
+        bounces: int,
+        diffraction_points: int,
+        band: NDArray[np.float64] | None = None,
     ) -> None:
         super().__init__(scene, hearing)
         self.rays = rays
@@ -93,7 +102,9 @@ class Rays(Engine):
         _, gain = unfaded(synthesis.frequency, speed_of_sound=hearing.speed_of_sound)
         self._smooth = np.array([r.material.lobe_width is None for r in self.reflections])
         any_smooth = bool(self._smooth.any())
-        self._basis = synthesis.hats * gain[:, None] if any_smooth else synthesis.basis
+        self._hats = synthesis.hats if band is None else synthesis.hats * band[:, None]
+        factor = gain if any_smooth else 1j * synthesis.frequency
+        self._basis = self._hats * factor[:, None]
         # Beside smooth surfaces lobed ones go through the same filters: their level is theirs.
         _, gain = unfaded(synthesis.nodes, speed_of_sound=hearing.speed_of_sound)
         self._lobed_level = synthesis.nodes / np.abs(gain) if any_smooth else 1.0
@@ -119,7 +130,7 @@ class Rays(Engine):
             edges = self._diffraction.sound(
                 self.hearing, position, rotation, points=self.diffraction_points, offset=third
             )
-            echo += self.hearing.echo(edges, self.hearing.synthesis.hats)
+            echo += self.hearing.echo(edges, self._hats)
         return echo
 
     def __getstate__(self) -> dict[str, Any]:

@@ -17,6 +17,7 @@ from sononerf.config import AirSettings, Settings, SimulationSettings, Spectrogr
 from sononerf.scene import Scene
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import Hearing
+from sononerf.simulation.hybrid import hybrid
 from sononerf.simulation.impulse_response import plan_synthesis
 from sononerf.simulation.kirchhoff import Kirchhoff
 from sononerf.simulation.rays import Rays
@@ -94,13 +95,23 @@ class Simulator:
                 )
             engine = Kirchhoff(scene, hearing, frequency_max=1.1 * analysis.frequency_max)
         else:
-            engine = Rays(
-                scene,
-                hearing,
-                rays=wanted.rays,
-                bounces=wanted.bounces,
-                diffraction_points=wanted.diffraction_points,
-            )
+            rays = {
+                "rays": wanted.rays,
+                "bounces": wanted.bounces,
+                "diffraction_points": wanted.diffraction_points,
+            }
+            if wanted.engine == "rays":
+                engine = Rays(scene, hearing, **rays)
+            else:
+                engine = hybrid(
+                    scene,
+                    hearing,
+                    gains=gains,
+                    absorption=absorption,
+                    sources=wanted.sources,
+                    frequency_min=analysis.frequency_min,
+                    **rays,
+                )
         ears = synthetic_ears(settings.ears, frequency_axis(analysis))
         return cls(engine, ears=ears, reception=reception)
 

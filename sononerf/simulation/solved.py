@@ -24,7 +24,7 @@ from sononerf.simulation.kirchhoff import Kirchhoff
 logger = logging.getLogger("sononerf")
 
 TAPER = 1.15  # the highest frequency over that from which the response falls
-PATH = 12.0  # radii of the bounding sphere; what comes later is more than 80 dB down
+PATH = 8.0  # radii of the bounding sphere; what comes later is more than 80 dB down
 LEAD = 5.0  # over the taper's width; it puts less than -80 dB farther before an arrival
 TAIL = 1.0  # over the taper's width, behind the last arrival
 FINE = 0.05  # of the bounding sphere's radius, between points that the first arrival is sought at
@@ -112,6 +112,8 @@ class Solved(Engine):
         Takes frequencies (K,) in Hz, returns the absorption of the air (K,) in dB/m.
     frequency_max : float, Hz
         Where the response has fallen to zero.
+    fall : float
+        That over the frequency from which on it falls.
 
     Attributes
     ----------
@@ -133,12 +135,13 @@ class Solved(Engine):
         gains: Callable[[NDArray[np.float64]], Ears],
         absorption: Callable[[NDArray[np.float64]], NDArray[np.float64]],
         frequency_max: float,
+        fall: float = TAPER,
     ) -> None:
         super().__init__(scene, hearing)
         self.gains, self.absorption = gains, absorption
         rate = hearing.synthesis.sampling_rate
         self.frequency_max = min(frequency_max, rate / 2.0)
-        self.frequency_full = self.frequency_max / TAPER
+        self.frequency_full = self.frequency_max / fall
         radius = _radius(scene)
         self._lead = LEAD / (self.frequency_max - self.frequency_full)
         tail = TAIL / (self.frequency_max - self.frequency_full)
@@ -150,6 +153,11 @@ class Solved(Engine):
         count = math.ceil(self.frequency_max / step) - 1
         self.frequency: NDArray[np.float64] = np.arange(1.0, count + 0.5) * step
         self._known: dict[bytes, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
+
+    @property
+    def parts(self) -> int:
+        """Frequencies that are solved for; see :meth:`prepare`."""
+        return len(self.frequency)
 
     def estimate(self, poses: int) -> tuple[float, float]:
         """Return the memory (bytes) and the time (s) that a number of poses will take.
@@ -250,6 +258,16 @@ class Solved(Engine):
             low, high = np.clip([begins, begins + self.period], 0, len(row))
             row[low:high] = pressure[low - begins : high - begins]
         return record
+
+    def first(
+        self, position: NDArray[np.float64], rotation: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return when sound can arrive at each ear of a pose at the earliest, (E,) s.
+
+        The way is the shortest from the emitter over the surface to the ear.
+        """
+        emitter, ears = self.hearing.places(position, rotation)
+        return self._first_path(emitter[None], ears[None])[0] / self.hearing.speed_of_sound
 
     def hits(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: MIT
+"""The default engine: low frequencies by the wave equation, high ones by rays, added in phase."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf.acoustics.ears import Ears
+from sononerf.scene import Scene
+from sononerf.simulation.engine import Engine
+from sononerf.simulation.hearing import Hearing
+from sononerf.simulation.impulse_response import NODE_SPACING
+from sononerf.simulation.rays import Rays
+from sononerf.simulation.sources import THIN, Sources, resolved_frequency, sources_worth
+
+logger = logging.getLogger("sononerf")
+
+FALL = 1.3  # the highest frequency of the low band over that from which it gives way to the rays
+WORTH = 1.5  # the same over the lowest analysed frequency; else the low band is left to the rays
+LARGEST_ERROR = 0.05  # of the sources, above which the rays do all
+EARLIEST = 0.5 / NODE_SPACING  # s before the first arrival; gains are not followed any longer
+
+
+class Hybrid(Engine):
+    """Echoes by equivalent sources at low frequencies and by rays at high ones.
+
+    Rays know neither sound that creeps around a body nor sound that bends into a shadow: below
+    ka of about 10 they are wrong by several decibels. The wave equation of small bodies is cheap at
+    just these frequencies. Both engines give pressure, with level and delay, so they are added:
+    the low band falls as a raised cosine where the high band rises. Nothing is kept that is
+    earlier than the shortest way over the surface allows, the ears' own response apart.
+
+    Parameters
+    ----------
+    low : Sources
+        For low frequencies.
+    high : Rays
+        For high frequencies; its band begins where that of ``low`` ends.
+    """
+
+    def __init__(self, low: Sources, high: Rays) -> None:
+        super().__init__(high.scene, high.hearing)
+        self.low, self.high = low, high
+
+    @property
+    def parts(self) -> int:
+        """Frequencies of the low band; see :meth:`prepare`."""
+        return self.low.parts
+
+    def prepare(
+        self,
+        positions: NDArray[np.float64],
+        rotations: NDArray[np.float64],
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Solve for the low band of all poses at once; see :meth:`Solved.prepare`."""
+        self.low.prepare(positions, rotations, progress)
+
+    def echo(
+        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
+    ) -> NDArray[np.float64]:
+        """Pressure at both ears; see :meth:`Engine.echo`."""
+        echo = self.low.echo(position, rotation, seed=seed)
+        echo += self.high.echo(position, rotation, seed=seed)
+        rate = self.hearing.synthesis.sampling_rate
+        time = np.arange(echo.shape[1]) / rate - self.low.first(position, rotation)[:, None]
+        rise = np.clip(2.0 + 2.0 * time / EARLIEST, 0.0, 1.0)
+        echo *= 0.5 * (1.0 - np.cos(math.pi * rise))
+        return echo
+
+    def hits(
+        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places that send sound straight back, by the rays; see :meth:`Engine.hits`."""
+        return self.high.hits(position, rotation, seed=seed)
+
+
+def hybrid(
+    scene: Scene,
+    hearing: Hearing,
+    *,
+    gains: Callable[[NDArray[np.float64]], Ears],
+    absorption: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    sources: int,
+    frequency_min: float,
+    **rays: Any,
+) -> Engine:
+    """Return the hybrid engine, or the rays alone where the low band cannot be solved for.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is ensonified.
+    hearing : Hearing
+        Head and air.
+    gains, absorption : callable
+        See :class:`Solved`.
+    sources : int
+        The most that may be used, which bounds the time.
+    frequency_min : float, Hz
+        The lowest that is analysed.
+    **rays
+        What :class:`Rays` takes.
+
+    Returns
+    -------
+    engine : Hybrid or Rays
+        Rays where a surface is open, not rigid, too large or too thin; a line of the log says so.
+    """
+    most = min(sources, sources_worth(scene))
+    found = _low_band(scene, hearing, gains, absorption, most, frequency_min)
+    if isinstance(found, str):
+        logger.info("all frequencies are traced by rays: %s", found)
+        return Rays(scene, hearing, **rays)
+    logger.info(
+        "up to %.0f to %.0f kHz the wave equation is solved (%d sources), above rays are traced",
+        found.frequency_full / 1e3,
+        found.frequency_max / 1e3,
+        most,
+    )
+    band = 1.0 - found.taper(hearing.synthesis.frequency)
+    return Hybrid(found, Rays(scene, hearing, band=band, **rays))
+
+
+def _low_band(
+    scene: Scene,
+    hearing: Hearing,
+    gains: Callable[[NDArray[np.float64]], Ears],
+    absorption: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    most: int,
+    frequency_min: float,
+) -> Sources | str:
+    """Return the engine of the low band, or why there is none."""
+    if not all(material.rigid for material in scene.materials):
+        return "a material is not rigid"
+    if not scene.mesh.is_watertight:
+        return "the surface is open"
+    highest = resolved_frequency(scene, most, speed_of_sound=hearing.speed_of_sound)
+    if highest < WORTH * frequency_min:
+        return (
+            f"the scene is so large that {most} sources reach {highest / 1e3:.2g} kHz; "
+            "simulation.sources raises that"
+        )
+    low = Sources(scene, hearing, gains=gains, absorption=absorption, most=most, fall=FALL)
+    if low.thin > THIN:
+        return "the body is too thin for equivalent sources"
+    error = low.trial()
+    if error > LARGEST_ERROR:
+        return f"equivalent sources meet the surface to {100 * error:.0f} % only"
+    return low
