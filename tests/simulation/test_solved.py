@@ -11,6 +11,7 @@ from sononerf.config import validate_settings
 from sononerf.errors import ResourceError, SettingsError
 from sononerf.geometry.poses import Poses, look_at
 from sononerf.scene import Scene, load_scene
+from sononerf.simulation import ensemble as ensemble_module
 from sononerf.simulation import solved as solved_module
 from sononerf.simulation.ensemble import simulate_ensemble
 from sononerf.simulation.simulator import Simulator
@@ -211,7 +212,8 @@ def test_what_takes_too_much_is_refused_before_it_starts(monkeypatch):
     assert found.engine.poses == 0
 
 
-def test_an_ensemble_is_prepared_here_and_at_once(caplog):
+def test_an_ensemble_is_prepared_here_and_at_once(caplog, monkeypatch):
+    monkeypatch.setattr(ensemble_module, "_workers", None)
     found, written, said = glint(), {}, []
     poses = Poses(np.stack([POSITION, POSITION + 0.1, POSITION + 0.2]), np.stack([POSE[1]] * 3))
     with caplog.at_level(logging.WARNING):
