@@ -94,12 +94,17 @@ class PoseSettings(_Section):
 
 
 class SimulationSettings(_Section):
-    """The echo simulator: rays per pose (after aiming), bounces, and the turn of the pattern."""
+    """The echo simulator: rays per pose (after aiming), bounces, and the turn of the pattern.
 
-    engine: Literal["rays", "kirchhoff"] = "rays"
+    The engine ``spheres`` solves the wave equation up to ``frequency_max``. It may be half the
+    sampling rate at most; where it is not set, the analysis decides.
+    """
+
+    engine: Literal["rays", "kirchhoff", "spheres"] = "rays"
     rays: Annotated[int, Field(ge=100, le=100_000_000)] = 300_000
     bounces: Annotated[int, Field(ge=1, le=10)] = 3
     diffraction_points: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
+    frequency_max: Positive | None = None  # Hz
     seed: Seed = 0
     noise_floor_poses: Annotated[int, Field(ge=0)] = 20
 
@@ -303,6 +308,16 @@ class Settings(_Section):
     preview: PreviewSettings = PreviewSettings()
     prediction: PredictionSettings = PredictionSettings()
     reconstruction: ReconstructionSettings = ReconstructionSettings()
+
+    @model_validator(mode="after")
+    def _solved_frequencies_are_sampled(self) -> Settings:
+        highest, half = self.simulation.frequency_max, self.spectrogram.sampling_rate / 2
+        if highest is not None and highest > half:
+            raise ValueError(
+                f"simulation.frequency_max is {highest:g} Hz, above half of "
+                f"spectrogram.sampling_rate ({half:g} Hz); lower it"
+            )
+        return self
 
     @model_validator(mode="after")
     def _call_is_sampled_and_heard(self) -> Settings:

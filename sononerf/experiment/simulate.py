@@ -30,6 +30,7 @@ from sononerf.simulation.ensemble import (
     simulate_ensemble,
 )
 from sononerf.simulation.simulator import VERSION, Simulator
+from sononerf.simulation.solved import Solved
 
 REFERENCE_RATIO = 1e-3
 """The reported decibels start 60 dB below the greatest magnitude of the training poses."""
@@ -233,10 +234,12 @@ def _fill(
     missing = store.missing()
     if workers is None:
         cores = min(len(os.sched_getaffinity(0)), MOST_WORKERS)
-        workers = cores if len(missing) >= WORTH_WORKERS else 1
+        alone = simulator.engine.prepares or len(missing) < WORTH_WORKERS
+        workers = 1 if alone else cores
     test = store.indices("test")[: settings.simulation.noise_floor_poses]
     again: dict[int, NDArray[np.float32]] = {}
     seed = settings.simulation.seed
+    _prepare(simulator, poses, [*missing, *test], progress)
     with progress.task("simulating", len(missing) + len(test)) as task:
         # The second simulation of the test poses goes first where it can share the processes.
         def keep(index: int, spectrogram: NDArray[np.float32]) -> None:
@@ -272,3 +275,13 @@ def _fill(
         noise["noise_floor_mae_db"] = mae_db(first, second)
         noise["noise_floor_mae_db_active"] = mae_db(first, second, active=True)
     store.update_attributes(reference=reference, **noise)
+
+
+def _prepare(simulator: Simulator, poses: Poses, wanted: list[int], progress: Progress) -> None:
+    """Let an engine that solves for all poses at once do so, and show how long it takes."""
+    engine = simulator.engine
+    if isinstance(engine, Solved):
+        with progress.task("solving", len(engine.frequency)) as task:
+            engine.prepare(
+                poses.positions[wanted], poses.rotations[wanted], lambda *_: task.advance()
+            )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import NumericalError, ResourceError
-from sononerf.reconstruction.memory import available_memory
+from sononerf.memory import available_memory
 
 # The value itself and the copies that an iso-surface takes, measured.
 BYTES_PER_VOXEL = 80

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,11 @@ class Engine:
     ----------
     reflections : tuple of Reflection
         The scene's materials at the nodes of the synthesis.
+    prepares : bool
+        Whether it solves for many poses at once, which :meth:`prepare` then does.
     """
+
+    prepares: ClassVar[bool] = False
 
     def __init__(self, scene: Scene, hearing: Hearing) -> None:
         self.scene = scene
@@ -50,6 +55,24 @@ class Engine:
         if self._caster is None:
             self._caster = RayCaster(self.scene.mesh)
         return self._caster
+
+    def prepare(
+        self,
+        positions: NDArray[np.float64],
+        rotations: NDArray[np.float64],
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Do at once what can be done for all poses at once.
+
+        Parameters
+        ----------
+        positions : (P, 3) float64, m
+            Of the head, world frame.
+        rotations : (P, 3, 3) float64
+            Head to world.
+        progress : callable, optional
+            Takes how many parts are done and how many there are.
+        """
 
     def echo(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int

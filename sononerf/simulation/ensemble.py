@@ -226,6 +226,7 @@ def simulate_ensemble(
     workers: int = 1,
     scheduler: str | None = None,
     progress: Progress | None = None,
+    preparing: Progress | None = None,
 ) -> None:
     """Simulate poses and hand over each spectrogram as it comes.
 
@@ -249,6 +250,9 @@ def simulate_ensemble(
         Address of a Dask scheduler whose workers are used instead.
     progress : callable, optional
         Takes how many are done and how many there are.
+    preparing : callable, optional
+        The same of the parts of an engine that solves for all poses at once; see
+        :meth:`Engine.prepare`. Such an engine works in this process.
 
     Raises
     ------
@@ -258,6 +262,14 @@ def simulate_ensemble(
         If the workers cannot be reached.
     """
     wanted = [int(index) for index in indices]
+    engine = simulator.engine
+    if engine.prepares and (scheduler is not None or workers > 1):
+        logger.warning(
+            "%s solves for all poses at once, in this process; workers and scheduler are not used",
+            type(engine).__name__,
+        )
+        workers, scheduler = 1, None
+    engine.prepare(poses.positions[wanted], poses.rotations[wanted], preparing)
     if scheduler is None and workers <= 1:
         results = _simulate_here(simulator, poses, wanted, seed)
         _hand_over(results, len(wanted), write, progress)

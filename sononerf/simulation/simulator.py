@@ -4,25 +4,29 @@
 from __future__ import annotations
 
 import logging
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.acoustics.air import air_absorption, speed_of_sound
 from sononerf.acoustics.ears import Ears, synthetic_ears
-from sononerf.acoustics.reception import Reception
+from sononerf.acoustics.reception import WINDOW_BANDWIDTH, Reception
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
-from sononerf.config import Settings
+from sononerf.config import AirSettings, Settings, SimulationSettings, SpectrogramSettings
 from sononerf.scene import Scene
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.impulse_response import plan_synthesis
 from sononerf.simulation.kirchhoff import Kirchhoff
 from sononerf.simulation.rays import Rays
+from sononerf.simulation.solved import TAPER
+from sononerf.simulation.spheres import Spheres
 
 logger = logging.getLogger("sononerf")
 
 VERSION = 2  # to be raised when the same settings give other echoes: stores are told apart by it
+LOWEST_OVER_PRESSURE = 4e-4  # Hz/Pa, of ISO 9613-1
 DEFAULT_SPEED = 343.0  # m/s
 DEFAULT_TEMPERATURE = 20.0  # °C, for absorption where only the speed is fixed
 
@@ -70,20 +74,19 @@ class Simulator:
         analysis = settings.spectrogram
         reception = Reception(settings.call, analysis, settings.noise, speed_of_sound=speed)
         synthesis = plan_synthesis(analysis, reception.samples)
-        hearing = Hearing(
-            synthetic_ears(settings.ears, synthesis.nodes),
-            synthesis,
-            air_absorption(
-                synthesis.nodes,
-                temperature_c=DEFAULT_TEMPERATURE if given is None else given,
-                relative_humidity=air.relative_humidity,
-                pressure=air.pressure_pa,
-            ),
-            speed,
-        )
+        gains, absorption = partial(synthetic_ears, settings.ears), partial(_absorption, air)
+        hearing = Hearing(gains(synthesis.nodes), synthesis, absorption(synthesis.nodes), speed)
         wanted = settings.simulation
         engine: Engine
-        if wanted.engine == "kirchhoff":
+        if wanted.engine == "spheres":
+            engine = Spheres(
+                scene,
+                hearing,
+                gains=gains,
+                absorption=absorption,
+                frequency_max=solved_frequency(wanted, analysis),
+            )
+        elif wanted.engine == "kirchhoff":
             if any(material.lobe_width is not None for material in scene.materials):
                 logger.warning(
                     "simulation.engine=kirchhoff takes surfaces as smooth; the material's lobes "
@@ -159,3 +162,33 @@ class Simulator:
         """
         echo = self.echo(position, rotation, seed=seed)
         return self.reception.receive(echo, seed=seed)
+
+
+def solved_frequency(wanted: SimulationSettings, analysis: SpectrogramSettings) -> float:
+    """Return the frequency (Hz) at which what is solved for has fallen to zero.
+
+    Where it is not set, the response is whole up to the highest analysed frequency and the
+    window's bandwidth (-6 dB) above it.
+    """
+    if wanted.frequency_max is None:
+        bandwidth = WINDOW_BANDWIDTH * analysis.sampling_rate / analysis.window
+        return min(TAPER * (analysis.frequency_max + bandwidth), analysis.sampling_rate / 2.0)
+    whole = wanted.frequency_max / TAPER
+    if whole < analysis.frequency_max:
+        logger.warning(
+            "simulation.frequency_max=%g Hz: what is heard fades from %.0f Hz on, below "
+            "spectrogram.frequency_max (%g Hz)",
+            *(wanted.frequency_max, whole, analysis.frequency_max),
+        )
+    return wanted.frequency_max
+
+
+def _absorption(air: AirSettings, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the air's absorption (K,), dB/m, at frequencies (K,), Hz."""
+    lowest = LOWEST_OVER_PRESSURE * air.pressure_pa  # below it there is next to none
+    return air_absorption(
+        np.maximum(frequency, lowest),
+        temperature_c=DEFAULT_TEMPERATURE if air.temperature_c is None else air.temperature_c,
+        relative_humidity=air.relative_humidity,
+        pressure=air.pressure_pa,
+    )

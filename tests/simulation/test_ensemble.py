@@ -232,8 +232,19 @@ def test_workers_of_ours_that_stay_away_are_not_waited_for(small, monkeypatch, c
     assert said == ["the Dask scheduler has no workers; waiting for some"]
 
 
+class Idle:
+    """An engine that has nothing to prepare."""
+
+    prepares = False
+
+    def prepare(self, *poses):
+        pass
+
+
 class Deadly:
     """A simulator that kills the process it runs in, so many times."""
+
+    engine = Idle()
 
     def __init__(self, folder, times):
         self.folder, self.times = folder, times
@@ -265,6 +276,8 @@ def test_a_pose_is_not_blamed_for_its_workers(tmp_path, caplog, times):
 
 class Deaf:
     """A simulator that returns whether Ctrl-C goes unheard where it runs."""
+
+    engine = Idle()
 
     def spectrogram(self, position, rotation, *, seed):
         blocked = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())

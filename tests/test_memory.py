@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-from sononerf.reconstruction.memory import available_memory
+from sononerf.memory import available_memory
 
 
 def test_available_memory_is_plausible():

@@ -1,0 +1,307 @@
+# SPDX-License-Identifier: MIT
+"""What engines share that solve the wave equation, one frequency after the other."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.fft
+import trimesh
+from numpy.typing import NDArray
+
+from sononerf.acoustics.ears import Ears, beam_gain, ear_gain
+from sononerf.errors import ResourceError
+from sononerf.memory import available_memory
+from sononerf.scene import Scene
+from sononerf.simulation.engine import Engine
+from sononerf.simulation.hearing import Hearing
+from sononerf.simulation.kirchhoff import Kirchhoff
+
+logger = logging.getLogger("sononerf")
+
+TAPER = 1.15  # the highest frequency over that from which the response falls
+PATH = 12.0  # radii of the bounding sphere; what comes later is more than 80 dB down
+LEAD = 5.0  # over the taper's width; it puts less than -80 dB farther before an arrival
+TAIL = 1.0  # over the taper's width, behind the last arrival
+FINE = 0.05  # of the bounding sphere's radius, between points that the first arrival is sought at
+LONGEST = 7.0 * 86_400.0  # s; a longer computation is refused
+
+
+@dataclass(frozen=True, eq=False)
+class Heads:
+    """All poses at one frequency.
+
+    Attributes
+    ----------
+    emitters : (P, 3) float64, m
+        World frame.
+    ears : (P, E, 3) float64, m
+        World frame.
+    rotations : (P, 3, 3) float64
+        Head to world.
+    gains : Ears
+        Tables of one frequency.
+    """
+
+    emitters: NDArray[np.float64]
+    ears: NDArray[np.float64]
+    rotations: NDArray[np.float64]
+    gains: Ears
+
+    def __len__(self) -> int:
+        """How many poses there are, P."""
+        return len(self.emitters)
+
+    def __getitem__(self, some: slice) -> Heads:
+        """Return some of the poses."""
+        return Heads(self.emitters[some], self.ears[some], self.rotations[some], self.gains)
+
+    def beam(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gains (P, N) of the emission towards points (N, 3) of the world, m."""
+        towards = self._towards(points, self.emitters)
+        return _by_pose(beam_gain(self.gains, towards), len(self))
+
+    def gain(self, ear: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the gains (P, N) of an ear for sound from points (N, 3) of the world, m."""
+        towards = self._towards(points, self.ears[:, ear])
+        return _by_pose(ear_gain(self.gains, ear, towards), len(self))
+
+    def _towards(
+        self, points: NDArray[np.float64], places: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the ways from places (P, 3) to points in the head frame (P N, 3), m."""
+        ways = (points[None] - places[:, None]) @ self.rotations
+        return ways.reshape(-1, 3)
+
+
+def _by_pose(gain: NDArray[np.float32], poses: int) -> NDArray[np.float64]:
+    return gain.reshape(poses, -1).astype(np.float64)
+
+
+class Solved(Engine):
+    r"""Echoes by a solution of the wave equation.
+
+    Time runs as :math:`e^{j \omega t}`. The emitter sends :math:`B\, e^{-j k r} / r` with
+    :math:`B` the gain of its beam, :math:`k = \omega / c - j \alpha \ln(10) / 20` and
+    :math:`\alpha` the air's absorption in dB/m. A subclass gives the scattered pressure at
+    the ears at one frequency (:meth:`respond`). The frequencies are the multiples of one over
+    the duration of the response. Up to ``frequency_max`` / 1.15 the response is whole; from
+    there to ``frequency_max`` it falls to zero as a raised cosine. At frequency zero it is zero:
+    a rigid body scatters as the square of frequency.
+
+    The response of a pose starts a whole number of samples before its first possible arrival,
+    the shortest way from the emitter over the surface to the ear, and is laid into the record
+    at that sample. So nothing is interpolated. Its duration is the time that sound takes for
+    twelve radii of the sphere around the scene, and six times one over the width of the fall. All
+    single echoes arrive within four radii of the first one. What is later than the duration wraps
+    around; for ``three_spheres`` it is more than 80 dB below the greatest pressure.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is ensonified.
+    hearing : Hearing
+        Head and air.
+    gains : callable
+        Takes frequencies (K,) in Hz, returns the tables of beam and ears at them.
+    absorption : callable
+        Takes frequencies (K,) in Hz, returns the absorption of the air (K,) in dB/m.
+    frequency_max : float, Hz
+        Where the response has fallen to zero.
+
+    Attributes
+    ----------
+    frequency : (K,) float64, Hz
+        Those that are solved for.
+    frequency_full : float, Hz
+        Up to which the response is whole.
+    period : int
+        Samples of a response.
+    """
+
+    prepares = True
+
+    def __init__(
+        self,
+        scene: Scene,
+        hearing: Hearing,
+        *,
+        gains: Callable[[NDArray[np.float64]], Ears],
+        absorption: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+        frequency_max: float,
+    ) -> None:
+        super().__init__(scene, hearing)
+        self.gains, self.absorption = gains, absorption
+        rate = hearing.synthesis.sampling_rate
+        self.frequency_max = min(frequency_max, rate / 2.0)
+        self.frequency_full = self.frequency_max / TAPER
+        radius = _radius(scene)
+        self._lead = LEAD / (self.frequency_max - self.frequency_full)
+        tail = TAIL / (self.frequency_max - self.frequency_full)
+        duration = PATH * radius / hearing.speed_of_sound + self._lead + tail
+        self._points = _points(scene, FINE * radius)
+        self.period = int(scipy.fft.next_fast_len(math.ceil(duration * rate), real=True))
+        step = rate / self.period
+        # At the highest of them the taper is zero already; it is not solved for.
+        count = math.ceil(self.frequency_max / step) - 1
+        self.frequency: NDArray[np.float64] = np.arange(1.0, count + 0.5) * step
+        self._known: dict[bytes, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
+
+    def estimate(self, poses: int) -> tuple[float, float]:
+        """Return the memory (bytes) and the time (s) that a number of poses will take.
+
+        A subclass says it; nothing is refused where it does not.
+        """
+        del poses
+        return 0.0, 0.0
+
+    def respond(self, wavenumber: complex, poses: Heads) -> NDArray[np.complex128]:
+        """Scattered pressure at the ears at one frequency.
+
+        Parameters
+        ----------
+        wavenumber : complex, 1/m
+            Of sound in air; its imaginary part is not positive.
+        poses : Heads
+            Where emitters and ears are, and their gains.
+
+        Returns
+        -------
+        pressure : (P, E) complex128
+            For an emission of pressure 1 at 1 m where the beam's gain is 1, ear's gain included.
+        """
+        raise NotImplementedError
+
+    def prepare(
+        self,
+        positions: NDArray[np.float64],
+        rotations: NDArray[np.float64],
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Solve for all poses that are not known yet, and keep their responses.
+
+        Parameters
+        ----------
+        positions : (P, 3) float64, m
+            Of the head, world frame.
+        rotations : (P, 3, 3) float64
+            Head to world.
+        progress : callable, optional
+            Takes how many frequencies are done and how many there are.
+
+        Raises
+        ------
+        ResourceError
+            If it would take too much memory or too long; nothing is solved then.
+        NumericalError
+            If a frequency cannot be solved.
+        """
+        pairs = zip(positions, rotations, strict=True)
+        wanted = {_key(*pose): pose for pose in pairs if _key(*pose) not in self._known}
+        if not wanted:
+            return
+        self._refuse(len(wanted))
+        places = np.stack([pose[0] for pose in wanted.values()])
+        turns = np.stack([pose[1] for pose in wanted.values()])
+        head = self.hearing.ears
+        emitters = places + turns @ head.emitter
+        ears = places[:, None] + np.einsum("pij,ej->pei", turns, head.positions)
+        rate = self.hearing.synthesis.sampling_rate
+        first = self._first_path(emitters, ears) / self.hearing.speed_of_sound
+        start = np.floor((first - self._lead) * rate).astype(np.int64)
+        spectrum = np.zeros((*start.shape, self.period // 2 + 1), dtype=np.complex128)
+        absorbed = self.absorption(self.frequency) * (math.log(10.0) / 20.0)
+        fall = self.taper(self.frequency)
+        for index, frequency in enumerate(self.frequency.tolist()):
+            turn = 2.0 * math.pi * frequency
+            wavenumber = complex(turn / self.hearing.speed_of_sound, -absorbed[index])
+            gains = self.gains(self.frequency[index : index + 1])
+            found = self.respond(wavenumber, Heads(emitters, ears, turns, gains))
+            spectrum[:, :, index + 1] = fall[index] * found * np.exp(1j * turn / rate * start)
+            if progress is not None:
+                progress(index + 1, len(self.frequency))
+        response = scipy.fft.irfft(spectrum, n=self.period, axis=-1)
+        for key, begins, pressure in zip(wanted, start, response, strict=True):
+            self._known[key] = begins, pressure
+
+    def taper(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return what is left of the response (K,) at frequencies (K,) in Hz."""
+        band = self.frequency_max - self.frequency_full
+        fall = np.clip((frequency - self.frequency_full) / band, 0.0, 1.0)
+        left: NDArray[np.float64] = 0.5 * (1.0 + np.cos(np.pi * fall))
+        return left
+
+    def echo(
+        self,
+        position: NDArray[np.float64],
+        rotation: NDArray[np.float64],
+        *,
+        seed: int,  # noqa: ARG002  (nothing is random)
+    ) -> NDArray[np.float64]:
+        """Pressure at both ears; see :meth:`Engine.echo`. A pose not prepared is solved alone."""
+        self.prepare(np.asarray(position)[None], np.asarray(rotation)[None])
+        start, response = self._known[_key(position, rotation)]
+        record = np.zeros((len(start), self.hearing.synthesis.samples))
+        for row, begins, pressure in zip(record, start, response, strict=True):
+            low, high = np.clip([begins, begins + self.period], 0, len(row))
+            row[low:high] = pressure[low - begins : high - begins]
+        return record
+
+    def hits(
+        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Places that send sound straight back by physical optics; see :meth:`Kirchhoff.hits`."""
+        optics = Kirchhoff(self.scene, self.hearing, frequency_max=self.frequency_full)
+        return optics.hits(position, rotation, seed=seed)
+
+    def _refuse(self, poses: int) -> None:
+        memory, seconds = self.estimate(poses)
+        memory += 16.0 * poses * len(self.hearing.ears.positions) * 2 * self.period
+        free = available_memory()
+        asked = f"{poses} poses at {len(self.frequency)} frequencies up to "
+        asked += f"{self.frequency_max / 1e3:.3g} kHz need about "
+        less = "lower simulation.frequency_max, or simulate fewer poses"
+        if free is not None and memory > free:
+            raise ResourceError(
+                f"{asked}{memory / 1e9:.2g} GB of memory, {free / 1e9:.2g} GB are free; {less}"
+            )
+        if seconds > LONGEST:
+            raise ResourceError(f"{asked}{seconds / 86_400.0:.2g} days of computation; {less}")
+
+    def _first_path(
+        self, emitters: NDArray[np.float64], ears: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the shortest way (P, E) from the emitter over the surface to the ear, m."""
+        shortest = np.zeros(ears.shape[:2])
+        for pose, (emitter, places) in enumerate(zip(emitters, ears, strict=True)):
+            out = np.linalg.norm(self._points - emitter, axis=1)
+            for ear, place in enumerate(places):
+                back = np.linalg.norm(self._points - place, axis=1)
+                shortest[pose, ear] = (out + back).min()
+        return shortest
+
+
+def _radius(scene: Scene) -> float:
+    """Return the radius of a sphere around the scene, m."""
+    corners = np.asarray(scene.mesh.vertices, dtype=np.float64)[np.asarray(scene.mesh.faces)]
+    corners = corners.reshape(-1, 3)
+    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
+    return float(np.linalg.norm(corners - middle, axis=1).max())
+
+
+def _points(scene: Scene, spacing: float) -> NDArray[np.float64]:
+    """Return points (N, 3) of the surface that are no farther apart than a spacing, m."""
+    vertices, faces = trimesh.remesh.subdivide_to_size(
+        scene.mesh.vertices, scene.mesh.faces, spacing, max_iter=20
+    )
+    used: NDArray[np.float64] = np.asarray(vertices, dtype=np.float64)[np.unique(faces)]
+    return np.unique(used, axis=0)
+
+
+def _key(position: NDArray[np.float64], rotation: NDArray[np.float64]) -> bytes:
+    parts = (np.ascontiguousarray(part, dtype=np.float64) for part in (position, rotation))
+    return b"".join(part.tobytes() for part in parts)
