@@ -96,11 +96,11 @@ class PoseSettings(_Section):
 class SimulationSettings(_Section):
     """The echo simulator: rays per pose (after aiming), bounces, and the turn of the pattern.
 
-    The engine ``spheres`` solves the wave equation up to ``frequency_max``. It may be half the
-    sampling rate at most; where it is not set, the analysis decides.
+    The engines ``spheres`` and ``bem`` solve the wave equation up to ``frequency_max``. It may be
+    half the sampling rate at most; where it is not set, the analysis decides.
     """
 
-    engine: Literal["rays", "kirchhoff", "spheres"] = "rays"
+    engine: Literal["rays", "kirchhoff", "spheres", "bem"] = "rays"
     rays: Annotated[int, Field(ge=100, le=100_000_000)] = 300_000
     bounces: Annotated[int, Field(ge=1, le=10)] = 3
     diffraction_points: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000

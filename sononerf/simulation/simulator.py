@@ -15,6 +15,7 @@ from sononerf.acoustics.reception import WINDOW_BANDWIDTH, Reception
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import AirSettings, Settings, SimulationSettings, SpectrogramSettings
 from sononerf.scene import Scene
+from sononerf.simulation.boundary import Boundary
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.impulse_response import plan_synthesis
@@ -78,8 +79,9 @@ class Simulator:
         hearing = Hearing(gains(synthesis.nodes), synthesis, absorption(synthesis.nodes), speed)
         wanted = settings.simulation
         engine: Engine
-        if wanted.engine == "spheres":
-            engine = Spheres(
+        if wanted.engine in ("spheres", "bem"):
+            solver = Spheres if wanted.engine == "spheres" else Boundary
+            engine = solver(
                 scene,
                 hearing,
                 gains=gains,
