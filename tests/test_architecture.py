@@ -31,7 +31,7 @@ PURE = {"field": {"errors", "field"}, "renderer": {"errors", "field", "renderer"
 
 WITHOUT_TEST_FILE = {
     "errors.py": "names and numbers only; each is met in the tests of who raises it",
-    "simulation/engine.py": "what the engines share, seen through rays and kirchhoff",
+    "simulation/engine.py": "what the engines share, seen through rays, kirchhoff and spheres",
     "data/attributes.py": "seen through the store, tests/data/test_store.py",
     "data/layout.py": "seen through the store, tests/data/test_store.py",
 }

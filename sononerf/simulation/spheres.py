@@ -23,6 +23,7 @@ from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.solved import Heads, Solved
 
 ROUND = 1e-3  # of the radius, by which vertices may lie beside the sphere
+TWICE = 1e-8  # of the scene's size, within which vertices stand at the same place
 FILLED = 0.95  # of the sphere's volume, that the mesh encloses at least
 APART = 0.01  # of the smaller radius, between any two spheres at least
 DIGITS = 4.0  # of the partial waves' truncation
@@ -459,11 +460,15 @@ def find_balls(scene: Scene) -> list[Ball]:
         If a part is no sphere, is open, inside out or too coarse.
     """
     vertices = np.asarray(scene.mesh.vertices, dtype=np.float64)
-    places, index = np.unique(vertices, axis=0, return_inverse=True)
-    faces = index.reshape(-1)[np.asarray(scene.mesh.faces)]
-    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    graph = coo_array((np.ones(len(edges)), edges.T), shape=(len(places), len(places)))
-    part = connected_components(graph, directed=False)[1][faces[:, 0]]
+    same = np.round(vertices / (TWICE * np.ptp(vertices, axis=0).max()))
+    _, first, index = np.unique(same, axis=0, return_index=True, return_inverse=True)
+    places, faces = vertices[first], index.reshape(-1)[np.asarray(scene.mesh.faces)]
+    # By edges: spheres that touch may share a vertex.
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edge = np.unique(edges, axis=0, return_inverse=True)[1].reshape(-1)
+    triangle = np.tile(np.arange(len(faces)), 3)
+    join = coo_array((np.ones(len(edge)), (triangle, edge)), shape=(len(faces), edge.max() + 1))
+    part = connected_components(join @ join.T, directed=False)[1]
     return [
         _ball(places, faces[part == number], name) for name, number in enumerate(np.unique(part))
     ]
