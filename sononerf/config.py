@@ -97,12 +97,12 @@ class SimulationSettings(_Section):
     """The echo simulator: rays per pose (after aiming), bounces, and the turn of the pattern.
 
     The engine ``hybrid`` solves the wave equation of small bodies at low frequencies, with up to
-    ``sources`` unknowns, and traces rays at high ones. The engine ``spheres`` solves it up to
-    ``frequency_max``. It may be half the sampling rate at most; where it is not set, the analysis
-    decides.
+    ``sources`` unknowns, and traces rays at high ones. The engines ``spheres`` and ``bem`` solve
+    it up to ``frequency_max``. It may be half the sampling rate at most; where it is not set, the
+    analysis decides.
     """
 
-    engine: Literal["hybrid", "rays", "kirchhoff", "spheres"] = "hybrid"
+    engine: Literal["hybrid", "rays", "kirchhoff", "spheres", "bem"] = "hybrid"
     rays: Annotated[int, Field(ge=100, le=100_000_000)] = 300_000
     bounces: Annotated[int, Field(ge=1, le=10)] = 3
     diffraction_points: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000

@@ -5,6 +5,7 @@
     python tools/benchmark.py simulate [--scene ua] [--rays 300000] [--poses 400]
     python tools/benchmark.py noise [--scene ua] [--poses 20]
     python tools/benchmark.py physics
+    python tools/benchmark.py wave [--bodies spheres leaf beaker] [--poses 8]
     python tools/benchmark.py dechirp
     python tools/benchmark.py shapes [--count 20] [--first 0] [--seconds 60]
     python tools/benchmark.py poses [--scene three_spheres] [--counts 12 25 50 100 200 400]
@@ -19,8 +20,9 @@
 ``simulate``: seconds per pose, against those that embreex alone needs for the same rays, those for
 visibility included, and the greatest memory. ``noise``: by how much two simulations differ that
 have other rays, 16 times as many, or twice as many; with the reported decibels, on active cells.
-``physics``: both engines against exact solutions. ``dechirp``: where and how long a point echo is
-in the rows of a dechirped sweep.
+``physics``: both engines against exact solutions. ``wave``: bem against exact spheres, then rays
+and kirchhoff against bem on a leaf and a beaker; some ten minutes. ``dechirp``: where and how long
+a point echo is in the rows of a dechirped sweep.
 
 ``step``: what a step of a fit costs for each field through each renderer, medians of at least
 five, beside equation 17 of the paper written down as it stands (which takes 9 GB of memory), the
@@ -62,6 +64,7 @@ from tools.benchmarks.shapes import shapes  # noqa: E402
 from tools.benchmarks.simulator import noise, simulate  # noqa: E402
 from tools.benchmarks.step import step  # noqa: E402
 from tools.benchmarks.variants import variants  # noqa: E402
+from tools.benchmarks.wave import wave  # noqa: E402
 
 MAIN_HELP = "places of prey under the conditions 100-calls and clutter (20)"
 OTHER_HELP = "places of prey under every other condition (5)"
@@ -85,6 +88,11 @@ def main() -> None:
             command.add_argument("--bounces", type=int, default=3)
         if run is simulate:
             command.add_argument("--rays", type=int, default=300_000)
+    command = commands.add_parser(wave.__name__, help=(wave.__doc__ or "").strip())
+    command.set_defaults(run=wave)
+    names = ("spheres", "leaf", "beaker")
+    command.add_argument("--bodies", nargs="+", choices=names, help="those three")
+    command.add_argument("--poses", type=int, default=8)
     for series in (shapes, poses, paper, variants, scale, prey, step, fit, reconstruct):
         command = commands.add_parser(series.__name__, help=(series.__doc__ or "").split("\n")[0])
         command.set_defaults(run=series)

@@ -46,8 +46,6 @@ def echo_hash(settings: Settings, scene: Scene) -> str:
     place is another ensemble, the same table at another place is not.
     """
     plain = settings.plain()
-    if plain["simulation"]["frequency_max"] is None:
-        del plain["simulation"]["frequency_max"]  # stores from before it was a setting stay valid
     digest = hashlib.sha256(f"simulator {VERSION}".encode())
     digest.update(json.dumps([plain[name] for name in HASHED_SECTIONS], sort_keys=True).encode())
     poses, split = ensemble_poses(settings)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sononerf.geometry.raycast import RayCaster
 from sononerf.scene import Scene
+from sononerf.simulation.arrival import Arrival
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.reflection import Reflection, reflection
 
@@ -49,6 +50,7 @@ class Engine:
             for material in scene.materials
         )
         self._caster: RayCaster | None = None
+        self._arrival: Arrival | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         # The search tree cannot be pickled; who receives the mesh builds it anew.
@@ -60,6 +62,13 @@ class Engine:
         if self._caster is None:
             self._caster = RayCaster(self.scene.mesh)
         return self._caster
+
+    @property
+    def arrival(self) -> Arrival:
+        """The shortest ways over the scene's surface, known when they are first needed."""
+        if self._arrival is None:
+            self._arrival = Arrival(self.scene)
+        return self._arrival
 
     def prepare(
         self,

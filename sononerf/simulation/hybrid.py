@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +14,6 @@ from sononerf.acoustics.ears import Ears
 from sononerf.scene import Scene
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import Hearing
-from sononerf.simulation.impulse_response import NODE_SPACING
 from sononerf.simulation.rays import Rays
 from sononerf.simulation.sources import THIN, Sources, resolved_frequency, sources_worth
 
@@ -24,7 +22,6 @@ logger = logging.getLogger("sononerf")
 FALL = 1.3  # the highest frequency of the low band over that from which it gives way to the rays
 WORTH = 1.5  # the same over the lowest analysed frequency; else the low band is left to the rays
 LARGEST_ERROR = 0.05  # of the sources, above which the rays do all
-EARLIEST = 0.5 / NODE_SPACING  # s before the first arrival; gains are not followed any longer
 
 
 class Hybrid(Engine):
@@ -33,8 +30,7 @@ class Hybrid(Engine):
     Rays know neither sound that creeps around a body nor sound that bends into a shadow: below
     ka of about 10 they are wrong by several decibels. The wave equation of small bodies is cheap at
     just these frequencies. Both engines give pressure, with level and delay, so they are added:
-    the low band falls as a raised cosine where the high band rises. Nothing is kept that is
-    earlier than the shortest way over the surface allows, the ears' own response apart.
+    the low band falls as a raised cosine where the high band rises.
 
     Parameters
     ----------
@@ -68,10 +64,6 @@ class Hybrid(Engine):
         """Pressure at both ears; see :meth:`Engine.echo`."""
         echo = self.low.echo(position, rotation, seed=seed)
         echo += self.high.echo(position, rotation, seed=seed)
-        rate = self.hearing.synthesis.sampling_rate
-        time = np.arange(echo.shape[1]) / rate - self.low.first(position, rotation)[:, None]
-        rise = np.clip(2.0 + 2.0 * time / EARLIEST, 0.0, 1.0)
-        echo *= 0.5 * (1.0 - np.cos(math.pi * rise))
         return echo
 
     def hits(

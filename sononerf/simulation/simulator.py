@@ -15,13 +15,15 @@ from sononerf.acoustics.reception import WINDOW_BANDWIDTH, Reception
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import AirSettings, Settings, SimulationSettings, SpectrogramSettings
 from sononerf.scene import Scene
+from sononerf.simulation.arrival import silence_before
+from sononerf.simulation.boundary import Boundary
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.hybrid import hybrid
 from sononerf.simulation.impulse_response import plan_synthesis
 from sononerf.simulation.kirchhoff import Kirchhoff
 from sononerf.simulation.rays import Rays
-from sononerf.simulation.solved import TAPER
+from sononerf.simulation.solved import TAPER, Solved
 from sononerf.simulation.spheres import Spheres
 
 logger = logging.getLogger("sononerf")
@@ -79,8 +81,9 @@ class Simulator:
         hearing = Hearing(gains(synthesis.nodes), synthesis, absorption(synthesis.nodes), speed)
         wanted = settings.simulation
         engine: Engine
-        if wanted.engine == "spheres":
-            engine = Spheres(
+        if wanted.engine in ("spheres", "bem"):
+            solver = Spheres if wanted.engine == "spheres" else Boundary
+            engine = solver(
                 scene,
                 hearing,
                 gains=gains,
@@ -126,8 +129,19 @@ class Simulator:
     def echo(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
     ) -> NDArray[np.float64]:
-        """Pressure at both ears for an impulse; see :meth:`Engine.echo`."""
-        return self.engine.echo(position, rotation, seed=seed)
+        """Pressure at both ears for an impulse; see :meth:`Engine.echo`.
+
+        Engines that solve the wave equation hear with the head as it is; of the others nothing is
+        kept that comes before sound can arrive, see :func:`silence_before`.
+        """
+        engine = self.engine
+        echo = engine.echo(position, rotation, seed=seed)
+        if isinstance(engine, Solved):
+            return echo
+        emitter, ears = engine.hearing.places(position, rotation)
+        first = engine.arrival.shortest(emitter[None], ears[None])[0] / self.speed_of_sound
+        rate = engine.hearing.synthesis.sampling_rate
+        return silence_before(echo, first, sampling_rate=rate)
 
     def spectrogram(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int

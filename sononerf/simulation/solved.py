@@ -7,10 +7,10 @@ import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import scipy.fft
-import trimesh
 from numpy.typing import NDArray
 
 from sononerf.acoustics.ears import Ears, beam_gain, ear_gain
@@ -24,10 +24,9 @@ from sononerf.simulation.kirchhoff import Kirchhoff
 logger = logging.getLogger("sononerf")
 
 TAPER = 1.15  # the highest frequency over that from which the response falls
-PATH = 8.0  # radii of the bounding sphere; what comes later is more than 80 dB down
+PATH = 12.0  # radii of the bounding sphere; what comes later is more than 80 dB down
 LEAD = 5.0  # over the taper's width; it puts less than -80 dB farther before an arrival
 TAIL = 1.0  # over the taper's width, behind the last arrival
-FINE = 0.05  # of the bounding sphere's radius, between points that the first arrival is sought at
 LONGEST = 7.0 * 86_400.0  # s; a longer computation is refused
 
 
@@ -126,6 +125,7 @@ class Solved(Engine):
     """
 
     prepares = True
+    path: ClassVar[float] = PATH
 
     def __init__(
         self,
@@ -142,11 +142,9 @@ class Solved(Engine):
         rate = hearing.synthesis.sampling_rate
         self.frequency_max = min(frequency_max, rate / 2.0)
         self.frequency_full = self.frequency_max / fall
-        radius = _radius(scene)
         self._lead = LEAD / (self.frequency_max - self.frequency_full)
         tail = TAIL / (self.frequency_max - self.frequency_full)
-        duration = PATH * radius / hearing.speed_of_sound + self._lead + tail
-        self._points = _points(scene, FINE * radius)
+        duration = self.path * self.arrival.radius / hearing.speed_of_sound + self._lead + tail
         self.period = int(scipy.fft.next_fast_len(math.ceil(duration * rate), real=True))
         step = rate / self.period
         # At the highest of them the taper is zero already; it is not solved for.
@@ -219,7 +217,7 @@ class Solved(Engine):
         emitters = places + turns @ head.emitter
         ears = places[:, None] + np.einsum("pij,ej->pei", turns, head.positions)
         rate = self.hearing.synthesis.sampling_rate
-        first = self._first_path(emitters, ears) / self.hearing.speed_of_sound
+        first = self.arrival.shortest(emitters, ears) / self.hearing.speed_of_sound
         start = np.floor((first - self._lead) * rate).astype(np.int64)
         spectrum = np.zeros((*start.shape, self.period // 2 + 1), dtype=np.complex128)
         absorbed = self.absorption(self.frequency) * (math.log(10.0) / 20.0)
@@ -259,16 +257,6 @@ class Solved(Engine):
             row[low:high] = pressure[low - begins : high - begins]
         return record
 
-    def first(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return when sound can arrive at each ear of a pose at the earliest, (E,) s.
-
-        The way is the shortest from the emitter over the surface to the ear.
-        """
-        emitter, ears = self.hearing.places(position, rotation)
-        return self._first_path(emitter[None], ears[None])[0] / self.hearing.speed_of_sound
-
     def hits(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -289,35 +277,6 @@ class Solved(Engine):
             )
         if seconds > LONGEST:
             raise ResourceError(f"{asked}{seconds / 86_400.0:.2g} days of computation; {less}")
-
-    def _first_path(
-        self, emitters: NDArray[np.float64], ears: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the shortest way (P, E) from the emitter over the surface to the ear, m."""
-        shortest = np.zeros(ears.shape[:2])
-        for pose, (emitter, places) in enumerate(zip(emitters, ears, strict=True)):
-            out = np.linalg.norm(self._points - emitter, axis=1)
-            for ear, place in enumerate(places):
-                back = np.linalg.norm(self._points - place, axis=1)
-                shortest[pose, ear] = (out + back).min()
-        return shortest
-
-
-def _radius(scene: Scene) -> float:
-    """Return the radius of a sphere around the scene, m."""
-    corners = np.asarray(scene.mesh.vertices, dtype=np.float64)[np.asarray(scene.mesh.faces)]
-    corners = corners.reshape(-1, 3)
-    middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
-    return float(np.linalg.norm(corners - middle, axis=1).max())
-
-
-def _points(scene: Scene, spacing: float) -> NDArray[np.float64]:
-    """Return points (N, 3) of the surface that are no farther apart than a spacing, m."""
-    vertices, faces = trimesh.remesh.subdivide_to_size(
-        scene.mesh.vertices, scene.mesh.faces, spacing, max_iter=20
-    )
-    used: NDArray[np.float64] = np.asarray(vertices, dtype=np.float64)[np.unique(faces)]
-    return np.unique(used, axis=0)
 
 
 def _key(position: NDArray[np.float64], rotation: NDArray[np.float64]) -> bytes:

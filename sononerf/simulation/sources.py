@@ -28,6 +28,7 @@ THIN = 0.05  # of the surface may be thinner than that
 REGULARISATION = 1e-12  # of the mean diagonal of the normal equations, near the rounding error
 CHECKS = 200  # further points of the surface, which tell the error
 BLOCK = 32  # poses; always so many, so that a pose's rounding does not depend on the others
+PATH = 8.0  # radii of the sphere around the scene; what comes later is some 60 dB down
 LARGEST_KA = 12.0  # wavenumber times radius, above which rays are as good
 
 
@@ -71,6 +72,8 @@ class Sources(Solved):
     .. [1] G. H. Koopmann, L. Song and J. B. Fahnline, "A method for computing acoustic fields
        based on the principle of wave superposition", JASA 86, 1989.
     """
+
+    path = PATH
 
     def __init__(
         self,
@@ -188,9 +191,7 @@ class _System:
         )
         return strength
 
-    def error(
-        self, incident: NDArray[np.complex128], strength: NDArray[np.complex128]
-    ) -> float:
+    def error(self, incident: NDArray[np.complex128], strength: NDArray[np.complex128]) -> float:
         """Return what is left of the normal slope at the points that were left out, relative."""
         arriving = incident[self._asked :]
         left = self._checks @ strength + arriving
@@ -204,9 +205,9 @@ def resolved_frequency(scene: Scene, sources: int, *, speed_of_sound: float) -> 
 
 
 def sources_worth(scene: Scene) -> int:
-    """Return how many sources reach the frequency above which rays are as good.
+    r"""Return how many sources reach the frequency above which rays are as good.
 
-    A sphere of radius a has the area :math:`4 \\pi a^2`; for a body that is none, a is what its
+    A sphere of radius a has the area :math:`4 \pi a^2`; for a body that is none, a is what its
     area says.
     """
     per_body = math.pi * (PER_WAVELENGTH * LARGEST_KA / math.pi) ** 2

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: MIT
+"""When sound can arrive at the earliest, and that nothing is heard before."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from sononerf.scene import Scene
+from sononerf.simulation.impulse_response import NODE_SPACING
+
+FINE = 0.05  # of the radius of a sphere around the scene; no two neighbouring points are farther
+SILENT = 0.21 / NODE_SPACING  # s before the first arrival (25 us), and earlier: nothing is kept
+WHOLE = 0.207 / NODE_SPACING  # s before the first arrival (10 us), and later: all is kept
+
+
+class Arrival:
+    """The shortest ways from an emitter over the surface of a scene to an ear.
+
+    Parameters
+    ----------
+    scene : Scene
+        What is ensonified.
+
+    Attributes
+    ----------
+    radius : float, m
+        Of a sphere around the scene.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        corners = np.asarray(scene.mesh.vertices, dtype=np.float64)[np.asarray(scene.mesh.faces)]
+        corners = corners.reshape(-1, 3)
+        middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
+        self.radius = float(np.linalg.norm(corners - middle, axis=1).max())
+        vertices, faces = trimesh.remesh.subdivide_to_size(
+            scene.mesh.vertices, scene.mesh.faces, FINE * self.radius, max_iter=20
+        )
+        used = np.asarray(vertices, dtype=np.float64)[np.unique(faces)]
+        self._points: NDArray[np.float64] = np.unique(used, axis=0)
+
+    def shortest(
+        self, emitters: NDArray[np.float64], ears: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the shortest way (P, E), m.
+
+        Parameters
+        ----------
+        emitters : (P, 3) float64, m
+            World frame.
+        ears : (P, E, 3) float64, m
+            World frame.
+        """
+        found = np.zeros(ears.shape[:2])
+        for pose, (emitter, places) in enumerate(zip(emitters, ears, strict=True)):
+            out = np.linalg.norm(self._points - emitter, axis=1)
+            for ear, place in enumerate(places):
+                back = np.linalg.norm(self._points - place, axis=1)
+                found[pose, ear] = (out + back).min()
+        return found
+
+
+def silence_before(
+    echo: NDArray[np.float64], first: NDArray[np.float64], *, sampling_rate: float
+) -> NDArray[np.float64]:
+    """Fade out what comes before sound can arrive.
+
+    Beam and ears are real gains, so their responses are even in time: half of them comes before
+    the echo. Of the first echo this part is cut off, with a raised cosine; so the analysis of
+    what comes before it hears nothing but its own window.
+
+    Parameters
+    ----------
+    echo : (E, S) float64
+        Pressure from the emission on.
+    first : (E,) float64, s
+        First possible arrival at each ear.
+    sampling_rate : float, Hz
+        Of the echo.
+
+    Returns
+    -------
+    echo : (E, S) float64
+        Zero up to 25 us before the first arrival, whole from 10 us before it on.
+    """
+    before = first[:, None] - np.arange(echo.shape[1]) / sampling_rate
+    rise = np.clip((SILENT - before) / (SILENT - WHOLE), 0.0, 1.0)
+    faded: NDArray[np.float64] = echo * (0.5 - 0.5 * np.cos(math.pi * rise))
+    return faded
