@@ -238,7 +238,8 @@ def _fill(
     test = store.indices("test")[: settings.simulation.noise_floor_poses]
     again: dict[int, NDArray[np.float32]] = {}
     seed = settings.simulation.seed
-    _prepare(simulator, poses, [*missing, *test], progress)
+    wanted = [*missing, *test]
+    prepare(simulator, poses.positions[wanted], poses.rotations[wanted], progress)
     with progress.task("simulating", len(missing) + len(test)) as task:
         # The second simulation of the test poses goes first where it can share the processes.
         def keep(index: int, spectrogram: NDArray[np.float32]) -> None:
@@ -276,11 +277,26 @@ def _fill(
     store.update_attributes(reference=reference, **noise)
 
 
-def _prepare(simulator: Simulator, poses: Poses, wanted: list[int], progress: Progress) -> None:
-    """Let the engine do what it does for all poses at once, and show how far it is."""
+def prepare(
+    simulator: Simulator,
+    positions: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    progress: Progress,
+) -> None:
+    """Let the engine do what it does for all poses at once, and show how far it is.
+
+    Parameters
+    ----------
+    simulator : Simulator
+        Scene and head.
+    positions : (P, 3) float64, m
+        Of the head, world frame.
+    rotations : (P, 3, 3) float64
+        Head to world.
+    progress : Progress
+        Where to show it.
+    """
     engine = simulator.engine
-    if wanted and engine.parts:
+    if len(positions) and engine.parts:
         with progress.task("solving", engine.parts) as task:
-            engine.prepare(
-                poses.positions[wanted], poses.rotations[wanted], lambda *_: task.advance()
-            )
+            engine.prepare(positions, rotations, lambda *_: task.advance())

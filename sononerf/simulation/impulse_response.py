@@ -104,7 +104,7 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     rate = settings.sampling_rate
     top = min(max(HIGHEST, 1.2 * settings.frequency_max), 0.45 * rate)
     count = max(2, round(top / NODE_SPACING))
-    nodes = (np.arange(count) + 0.5) * (top / count)
+    nodes: NDArray[np.float64] = (np.arange(count, dtype=np.float64) + 0.5) * (top / count)
     # The coarsest level must hold a whole number of bins.
     unit = 2 ** (LEVELS - 1)
     length = unit * int(scipy.fft.next_fast_len(math.ceil((samples + GUARD) / unit), real=True))

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,7 +99,7 @@ class Simulator:
                 )
             engine = Kirchhoff(scene, hearing, frequency_max=1.1 * analysis.frequency_max)
         else:
-            rays = {
+            rays: dict[str, Any] = {
                 "rays": wanted.rays,
                 "bounces": wanted.bounces,
                 "diffraction_points": wanted.diffraction_points,

@@ -55,7 +55,7 @@ class Heads:
         """How many poses there are, P."""
         return len(self.emitters)
 
-    def __getitem__(self, some: slice) -> Heads:
+    def __getitem__(self, some: slice | NDArray[np.int64]) -> Heads:
         """Return some of the poses."""
         return Heads(self.emitters[some], self.ears[some], self.rotations[some], self.gains)
 

@@ -96,7 +96,9 @@ class Sources(Solved):
             fall=fall,
         )
         self.error: dict[float, float] = {}
-        self._surface: tuple[NDArray[np.float64], ...] | None = None
+        self._surface: (
+            tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None
+        ) = None
 
     @property
     def surface(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
@@ -136,17 +138,17 @@ class Sources(Solved):
         """Scattered pressure at the ears at one frequency; see :meth:`Solved.respond`."""
         frequency = wavenumber.real * self.hearing.speed_of_sound / (2.0 * math.pi)
         system = _System(self, frequency, wavenumber)
-        heard = np.zeros(poses.ears.shape[:2], dtype=np.complex128)
+        ears = poses.ears.shape[1]
+        heard = np.zeros((len(poses), ears), dtype=np.complex128)
         squares = []
         for start in range(0, len(poses), BLOCK):
-            index = np.arange(start, start + BLOCK).clip(max=len(poses) - 1)
-            some = poses[index]
+            some = poses[np.arange(start, start + BLOCK).clip(max=len(poses) - 1)]
             incident = _arriving(system.points, system.normals, some.emitters, wavenumber)
             incident *= some.beam(system.points).T
             strength = system.solve(incident)
             squares.append(np.square(system.error(incident, strength)))
             count = min(BLOCK, len(poses) - start)
-            for ear in range(heard.shape[1]):
+            for ear in range(ears):
                 distance = np.linalg.norm(some.ears[:, ear, None] - system.places, axis=2)
                 wave = np.exp(-1j * wavenumber * distance) / (4.0 * math.pi * distance)
                 wave *= some.gain(ear, system.places)
