@@ -106,8 +106,10 @@ def suited(bodies: trimesh.Trimesh, edge: float) -> trimesh.Trimesh:
     least = expected_vertices(bodies.area, edge)
     best = halved(bodies, LONG * edge)
     wanted = least // 2  # long edges are halved later
-    while FINER * wanted < len(bodies.vertices):
-        coarse = _coarser(bodies, wanted, DEVIATION * edge)
+    # Facets that are narrow and long need both: they are divided first, then made coarser.
+    fine = max(bodies, best, key=lambda mesh: len(mesh.vertices))
+    while FINER * wanted < len(fine.vertices):
+        coarse = _coarser(fine, wanted, DEVIATION * edge)
         if coarse is not None:
             coarse = halved(coarse, LONG * edge)
             if len(coarse.vertices) < len(best.vertices):

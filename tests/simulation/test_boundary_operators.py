@@ -50,3 +50,36 @@ def test_harmonics_of_a_sphere_are_eigenfunctions(degree, wavenumber):
 
 def test_the_coupling_belongs_to_outgoing_waves():
     assert coupling(complex(50.0, -0.1)) == pytest.approx(-0.02j)
+
+
+def fine_points(corners, times):
+    """Middles (4^times, 3) of the pieces of a triangle, and their barycentric coordinates."""
+    pieces = np.eye(3)[None]
+    for _ in range(times):
+        middles = (pieces + np.roll(pieces, -1, axis=1)) / 2  # of corners 0 1, 1 2, 2 0
+        parts = [np.stack([pieces[:, k], middles[:, k], middles[:, k - 1]], 1) for k in range(3)]
+        pieces = np.concatenate([*parts, middles])
+    coordinates = pieces.mean(axis=1)
+    return coordinates @ corners, coordinates
+
+
+@pytest.mark.parametrize("gap", [0.3, 0.5])
+def test_near_triangles_are_integrated_at_any_wavenumber(gap):
+    """Two plates that face each other, an edge long 1/5 wavelength, by thousands of points."""
+    lower = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.4, 0.9, 0.0]])
+    upper = lower[[0, 2, 1]] + [0.15, 0.05, gap]
+    upper[0, 2] += 0.1
+    panels = Panels.of(np.concatenate([lower, upper]), [[0, 1, 2], [3, 4, 5]])
+    k = 2 * np.pi / 5
+    found = Operators(panels).matrix(k)[:3, 3:]
+    (x, a), (y, b) = fine_points(lower, 5), fine_points(upper, 5)
+    away = x[:, None] - y[None]
+    distance = np.linalg.norm(away, axis=2)
+    green = np.exp(-1j * k * distance) / (4 * np.pi * distance)
+    green *= np.prod(panels.area) / len(x) / len(y)
+    layer = away @ panels.normals[1] / distance**2 * (1 + 1j * k * distance) * green
+    curls = np.cross(panels.normals[:, None], panels.slopes)
+    hyper = k**2 * panels.normals[0] @ panels.normals[1] * (a.T @ green @ b)
+    hyper -= curls[0] @ curls[1].T * green.sum()
+    exact = -(a.T @ layer @ b) - coupling(k) * hyper
+    assert np.abs(found - exact).max() < 0.0014 * np.abs(exact).max()
