@@ -21,7 +21,7 @@ logger = logging.getLogger("sononerf")
 
 FALL = 1.3  # the highest frequency of the low band over that from which it gives way to the rays
 WORTH = 1.5  # the same over the lowest analysed frequency; else the low band is left to the rays
-LARGEST_ERROR = 0.05  # of the sources, above which the rays do all
+LARGEST_ERROR = 0.1  # of the sources, above which the rays do all
 
 
 class Hybrid(Engine):
