@@ -167,7 +167,8 @@ def trace_poses(
 
 def _simulator(settings: Settings, mesh: trimesh.Trimesh) -> Simulator:
     """Return the default engine on a mesh, with fewer rays and without noise."""
-    few = {"engine": "hybrid", "rays": RAYS, "sources": SOURCES}
+    sources = min(SOURCES, settings.simulation.sources)
+    few = {"engine": "hybrid", "rays": RAYS, "sources": sources}
     simulation = settings.simulation.model_copy(update=few)
     changed = {"simulation": simulation, "noise": NoiseSettings()}
     return Simulator.from_settings(_scene(mesh), settings.model_copy(update=changed))

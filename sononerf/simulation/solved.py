@@ -190,6 +190,8 @@ class Solved(Engine):
     ) -> None:
         """Solve for all poses that are not known yet, and keep their responses.
 
+        Poses that are no finite numbers are left out; :meth:`echo` refuses them.
+
         Parameters
         ----------
         positions : (P, 3) float64, m
@@ -206,7 +208,8 @@ class Solved(Engine):
         NumericalError
             If a frequency cannot be solved.
         """
-        pairs = zip(positions, rotations, strict=True)
+        finite = np.isfinite(positions).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
+        pairs = zip(positions[finite], rotations[finite], strict=True)
         wanted = {_key(*pose): pose for pose in pairs if _key(*pose) not in self._known}
         if not wanted:
             return
@@ -249,6 +252,8 @@ class Solved(Engine):
         seed: int,  # noqa: ARG002  (nothing is random)
     ) -> NDArray[np.float64]:
         """Pressure at both ears; see :meth:`Engine.echo`. A pose not prepared is solved alone."""
+        if not (np.isfinite(position).all() and np.isfinite(rotation).all()):
+            raise ValueError("the pose is no finite number")
         self.prepare(np.asarray(position)[None], np.asarray(rotation)[None])
         start, response = self._known[_key(position, rotation)]
         record = np.zeros((len(start), self.hearing.synthesis.samples))

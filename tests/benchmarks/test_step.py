@@ -17,6 +17,7 @@ ECHOES = [
     "poses.validation=2",
     "poses.heldout=2",
     "simulation.rays=500",
+    "simulation.sources=60",
     "simulation.noise_floor_poses=1",
     "spectrogram.range_min=0.34",
     "spectrogram.range_max=0.45",

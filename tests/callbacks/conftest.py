@@ -20,7 +20,7 @@ from sononerf.experiment.simulate import simulate
 SETTINGS = {
     "scene": {"name": "sphere", "options": {"radius": 0.02}},
     "poses": {"count": 8, "validation": 2, "heldout": 0},
-    "simulation": {"rays": 500},
+    "simulation": {"rays": 500, "sources": 60},
     "spectrogram": {"range_min": 0.34, "range_max": 0.45},
     "field": {"options": {"finest": 0.01, "levels": 2}},
     "renderer": {"options": {"start": 2000}},

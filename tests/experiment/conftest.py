@@ -16,7 +16,7 @@ from sononerf.experiment.simulate import simulate
 TINY = {
     "scene": {"name": "sphere", "options": {"radius": 0.02}},
     "poses": {"count": 8, "validation": 2, "heldout": 2},
-    "simulation": {"rays": 500, "noise_floor_poses": 1},
+    "simulation": {"rays": 500, "sources": 60, "noise_floor_poses": 1},
     "spectrogram": {"range_min": 0.34, "range_max": 0.45},
     "field": {"options": {"finest": 0.01, "levels": 2}},
     # Lattices are sampled, pruned and refined within few steps, so that all of a fit's state moves.

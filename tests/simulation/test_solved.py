@@ -17,7 +17,7 @@ from sononerf.simulation.ensemble import simulate_ensemble
 from sononerf.simulation.simulator import Simulator
 from sononerf.simulation.solved import Heads, Solved
 from tests.simulation.exact import SPEED, rigid_sphere
-from tests.simulation.listening import ball, level_db, spectrum, wall
+from tests.simulation.listening import ball, level_db, spectrum
 
 POINT_HEAD = {
     "emitter": [0, 0, 0], "left": [0, 0, 0], "beam_radius": 0, "azimuth_deg": 0,
@@ -185,19 +185,6 @@ def test_far_and_near_poses_are_cut_to_the_record():
     assert not found.echo(np.array([2.0, 0.0, 0.0]), np.eye(3), seed=0).any()
     near = found.echo(np.array([0.03, 0.0, 0.0]), np.eye(3), seed=0)
     assert np.abs(near[0]).argmax() == round(0.03 / SPEED * 1e6)
-
-
-def test_the_first_arrival_off_a_large_triangle_is_that_of_its_middle():
-    found = glint(Scene(ball(0.015))).engine
-    plate = Glint(
-        Scene(wall(0.0, (-0.2, -0.2), (0.2, 0.2))),
-        found.hearing,
-        gains=found.gains,
-        absorption=found.absorption,
-        frequency_max=found.frequency_max,
-    )
-    place = np.array([[0.3, 0.01, 0.02]])
-    assert plate._first_path(place, place[:, None])[0, 0] == pytest.approx(0.6, abs=1e-3)
 
 
 def test_what_takes_too_much_is_refused_before_it_starts(monkeypatch):
