@@ -5,6 +5,7 @@
     python tools/benchmark.py simulate [--scene ua] [--rays 300000] [--poses 400]
     python tools/benchmark.py noise [--scene ua] [--poses 20]
     python tools/benchmark.py physics
+    python tools/benchmark.py exact [--scene three_spheres] [--engines hybrid rays] [--poses 8]
     python tools/benchmark.py wave [--bodies spheres leaf beaker] [--poses 8]
     python tools/benchmark.py dechirp
     python tools/benchmark.py shapes [--count 20] [--first 0] [--seconds 60]
@@ -20,9 +21,10 @@
 ``simulate``: seconds per pose, against those that embreex alone needs for the same rays, those for
 visibility included, and the greatest memory. ``noise``: by how much two simulations differ that
 have other rays, 16 times as many, or twice as many; with the reported decibels, on active cells.
-``physics``: both engines against exact solutions. ``wave``: bem against exact spheres, then rays
-and kirchhoff against bem on a leaf and a beaker; some ten minutes. ``dechirp``: where and how long
-a point echo is in the rows of a dechirped sweep.
+``physics``: both engines against exact solutions. ``exact``: engines against exact multiple
+scattering of spheres, by band, and what they put before the first echo. ``wave``: bem against exact
+spheres, then the others against bem on a leaf and a beaker; some ten minutes. ``dechirp``: where
+and how long a point echo is in the rows of a dechirped sweep.
 
 ``step``: what a step of a fit costs for each field through each renderer, medians of at least
 five, beside equation 17 of the paper written down as it stands (which takes 9 GB of memory), the
@@ -52,6 +54,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # the parts of this command, and the tests' exact solutions
 
+from tools.benchmarks.exact import exact  # noqa: E402
 from tools.benchmarks.fit import fit  # noqa: E402
 from tools.benchmarks.paper import paper  # noqa: E402
 from tools.benchmarks.physics import dechirp, physics  # noqa: E402
@@ -88,6 +91,11 @@ def main() -> None:
             command.add_argument("--bounces", type=int, default=3)
         if run is simulate:
             command.add_argument("--rays", type=int, default=300_000)
+    command = commands.add_parser(exact.__name__, help=(exact.__doc__ or "").strip())
+    command.set_defaults(run=exact)
+    command.add_argument("--scene", default="three_spheres")
+    command.add_argument("--engines", nargs="+", default=["hybrid", "rays", "kirchhoff"])
+    command.add_argument("--poses", type=int, default=8)
     command = commands.add_parser(wave.__name__, help=(wave.__doc__ or "").strip())
     command.set_defaults(run=wave)
     names = ("spheres", "leaf", "beaker")

@@ -52,7 +52,7 @@ def wave(arguments: argparse.Namespace) -> dict[str, Any]:
     for name in arguments.bodies or scenes:
         judge = "spheres" if name == "spheres" else "bem"
         truth = _heard(scenes[name], judge, arguments.poses)
-        for engine in ("bem", "kirchhoff", "rays"):
+        for engine in ("bem", "kirchhoff", "rays", "hybrid"):
             if engine != judge:
                 found = _heard(scenes[name], engine, arguments.poses)
                 rows += _compared(name, engine, found, judge, truth)
