@@ -30,6 +30,7 @@ from sononerf.simulation.ensemble import (
     simulate_ensemble,
 )
 from sononerf.simulation.simulator import VERSION, Simulator
+from sononerf.simulation.validity import expected_error_db
 
 REFERENCE_RATIO = 1e-3
 """The reported decibels start 60 dB below the greatest magnitude of the training poses."""
@@ -205,12 +206,17 @@ def simulate(
 
 def _attributes(settings: Settings, wanted: str, simulator: Simulator) -> dict[str, object]:
     plain = settings.plain()
+    engine = simulator.engine
+    error = expected_error_db(engine, engine.scene, simulator.frequency)
     return {
         "echo_hash": wanted,
         "origin": "simulated",
         "scene": plain["scene"],
         "settings": {name: plain[name] for name in ("poses", *HASHED_SECTIONS)},
         "speed_of_sound": simulator.speed_of_sound,
+        "expected_error_db": None
+        if error is None
+        else [round(value, 2) for value in error.tolist()],
         "units": {
             "spectrogram": "linear magnitude, sound pressure over that of the call at 1 m",
             "position": "m",
