@@ -726,7 +726,7 @@ def test_a_tiny_sphere_sounds_where_and_as_long_as_the_simulator_hears_it(kind):
     settings = validate_settings(
         {
             "scene": {"name": "test"},
-            "simulation": {"rays": 20_000, "sources": 60},
+            "simulation": {"engine": "rays", "rays": 20_000},  # nothing creeps around
             "call": {"kind": kind, "duration": 1e-3, "frequency_end": 30e3},
             "spectrogram": analysis,
         },

@@ -30,7 +30,9 @@ def settings(**sections):
 
 @pytest.fixture(scope="module")
 def small():
-    found = settings(simulation={"rays": 2000}, poses={"count": 4, "validation": 1, "heldout": 1})
+    found = settings(
+        simulation={"rays": 2000, "sources": 60}, poses={"count": 4, "validation": 1, "heldout": 1}
+    )
     return Simulator.from_settings(load_scene("sphere"), found), ensemble_poses(found)[0]
 
 

@@ -36,7 +36,7 @@ def test_it_is_the_default_and_closer_to_the_truth_than_rays_at_low_frequencies(
     assert isinstance(default.engine, Hybrid)
     highest = default.engine.low.frequency_full
     assert highest > 15e3
-    exact = levels(simulator(scene, engine="spheres"))
+    exact = levels(simulator(scene, engine="spheres", frequency_max=60e3))
     error = {}
     for name, found in (("hybrid", default), ("rays", simulator(scene, engine="rays"))):
         heard = exact > exact.max() - 30

@@ -27,7 +27,8 @@ PLAIN = replace(RIGID, diffraction=None)
 
 
 def simulator(scene, rays=40_000, **sections):
-    sections = {"simulation": {"rays": rays, "sources": 120}, **sections}
+    simulation = {"rays": rays, "sources": 60, **sections.pop("simulation", {})}
+    sections["simulation"] = simulation
     settings = validate_settings({"scene": {"name": "test"}, **sections}, "test")
     return Simulator.from_settings(scene, settings)
 
