@@ -37,14 +37,21 @@ class Sound:
         self._synthesis = synthesis
         self.bins = np.stack([synthesis.silence() for _ in range(ears)])
         self._waiting: list[list[tuple[NDArray[Any], ...]]] = [[] for _ in range(ears)]
+        self._heard = False
 
     def add(
         self, ear: int, delay: NDArray[Any], spread: NDArray[Any], strength: NDArray[Any]
     ) -> None:
         """Add echoes: delay (N,) s, spread (N,) s, strength (N, F)."""
+        self._heard = True
         self._waiting[ear].append((delay, spread, strength))
         if sum(len(echoes[0]) for echoes in self._waiting[ear]) > MOST_WAITING:
             self.settle(ear)
+
+    @property
+    def heard(self) -> bool:
+        """Whether any echo was added."""
+        return self._heard
 
     def settle(self, ear: int) -> NDArray[np.float64]:
         """Lay what waits into an ear's bins (B, F), and return them."""

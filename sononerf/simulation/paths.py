@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.geometry.directions import CapSpiral, Cells
-from sononerf.geometry.raycast import RayCaster
+from sononerf.geometry.raycast import Hits, RayCaster
 from sononerf.simulation.footprint import Footprint, Real, across, dots, land
 from sononerf.simulation.reflection import keep_outside, mirror
 
 SPLIT = 2  # along each side of a divided cell
 CHUNK = 49_152  # rays; fewer and calls add up, more and they leave the processor's cache
+
+Beyond = Callable[[Hits, NDArray[np.float64]], tuple[Hits, NDArray[np.float64]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +50,8 @@ class Bounce:
         Of the bundles.
     triangles : (H, n) int64
         Which were hit, this one last.
+    hidden : bool
+        Whether the rays went through an obstacle as if it were not there.
     """
 
     number: int
@@ -61,6 +65,7 @@ class Bounce:
     length: NDArray[np.float64]
     footprint: Footprint
     triangles: NDArray[np.int64]
+    hidden: bool = False
 
     def detour(
         self, towards: NDArray[np.float64], distance: NDArray[np.float64]
@@ -101,6 +106,7 @@ class Bounce:
             self.length.take(chosen),
             self.footprint[chosen],
             self.triangles.take(chosen, axis=0),
+            self.hidden,
         )
 
 
@@ -142,6 +148,7 @@ def trace(
     bounces: int,
     *,
     solid_angle: float,
+    beyond: Beyond | None = None,
 ) -> Iterator[Bounce]:
     """Follow rays over mirror bounces.
 
@@ -159,6 +166,9 @@ def trace(
         How often a ray may hit.
     solid_angle : float, sr
         What each ray stands for.
+    beyond : callable, optional
+        Takes what is hit first and all directions (N, 3); returns what is to count as hit instead,
+        and how far it is from the emitter (M,), m.
 
     Yields
     ------
@@ -167,11 +177,14 @@ def trace(
     """
     origins = np.broadcast_to(emitter, directions.shape)
     hits = caster.first_hit(origins, directions)
+    length = hits.distance
+    if beyond is not None:
+        hits, length = beyond(hits, directions)
     ray, emitted = hits.ray, directions.take(hits.ray, axis=0)
-    incoming, length = emitted, hits.distance
+    incoming = emitted
     # Turned at the emitter, not moved there.
     turn = across(_single(incoming))
-    shift = hits.distance.astype(np.float32) * turn
+    shift = length.astype(np.float32) * turn
     triangles = hits.triangle[:, None]
     for number in range(1, bounces + 1):
         if len(ray) == 0:
@@ -223,6 +236,7 @@ def echo_paths(
     bounces: int,
     extra: int,
     judge: Callable[[Bounce], tuple[NDArray[np.bool_], NDArray[np.float64]]],
+    beyond: Beyond | None = None,
 ) -> Iterator[Bounce]:
     """Follow the rays of a cap, with more of them where a few would be noise.
 
@@ -246,6 +260,8 @@ def echo_paths(
     judge : callable
         Takes hits; returns which of them (H,) can be heard at all, and how much of each (H,) may
         be wrong for the size of its cell, in any unit, zero where it is small enough.
+    beyond : callable, optional
+        See :func:`trace`.
 
     Yields
     ------
@@ -260,7 +276,9 @@ def echo_paths(
         solid_angle = cap.solid_angle / parts
         for start in range(0, len(directions), CHUNK):
             chunk = directions[start : start + CHUNK]
-            for bounce in trace(caster, emitter, chunk, bounces, solid_angle=solid_angle):
+            for bounce in trace(
+                caster, emitter, chunk, bounces, solid_angle=solid_angle, beyond=beyond
+            ):
                 bounce = replace(bounce, ray=bounce.ray + start)
                 if extra < SPLIT**2:
                     found.append(bounce)  # none can be divided any more

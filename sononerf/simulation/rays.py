@@ -5,12 +5,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
+from itertools import chain
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.geometry.directions import CapSpiral
+from sononerf.geometry.raycast import Hits
 from sononerf.scene import Scene
 from sononerf.simulation.diffraction import Diffraction
 from sononerf.simulation.engine import Engine
@@ -18,7 +21,10 @@ from sononerf.simulation.footprint import Real
 from sononerf.simulation.hearing import Hearing, Sound
 from sononerf.simulation.paths import Bounce, aim, echo_paths
 from sononerf.simulation.reflection import coarse_gain, unfaded
+from sononerf.simulation.shadows import LEAST, Outlines, Shadow, behind
 
+HIDDEN_SHARE = 0.15  # as many rays again, for what lies behind obstacles
+HIDDEN_DIVIDED = 0.4  # of these, kept as above
 DIVIDED_SHARE = 0.6  # of the rays, kept for where a few would be noise
 FINE = 0.3  # rad; a cell over which the path bends by less lacks nothing
 SILENT = 7.0  # e to the minus this is -61 dB
@@ -61,6 +67,10 @@ class Rays(Engine):
     :math:`dA = \cos\vartheta\, dS`: so the level is absolute and does not depend on the number
     of rays, a plate answers as :math:`1/2h` and a sphere as :math:`a / 2 r^2`. Phase shifts at
     foci of hollow surfaces are left out, but for those after the last bounce.
+
+    The first hits are lit, and heard, past obstacles as the Fresnel zone says: each of the two
+    ways has a factor, :class:`Shadow`. What lies behind an obstacle is sought by rays that go
+    through it. Shadows of later bounces are sharp.
 
     Parameters
     ----------
@@ -114,16 +124,22 @@ class Rays(Engine):
         self.diffraction_points = diffraction_points
         self._diffracts = any(reflection.diffraction.any() for reflection in self.reflections)
         self._diffraction: Diffraction | None = None
+        self._outlines: Outlines | None = None
 
     def echo(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
     ) -> NDArray[np.float64]:
         """Pressure at both ears; the seed turns and shifts the pattern of rays as a whole."""
         first, second, third = np.random.default_rng(seed).random(3)
-        sound = self.hearing.silence()
-        for bounce in self._paths(position, rotation, (first, second), self.bounces):
-            self._hear(sound, bounce, position, rotation)
+        sound, turned = self.hearing.silence(), self.hearing.silence()
+        shadows = self._shadows(position, rotation)
+        lit = self._paths(position, rotation, (first, second), self.bounces)
+        hidden = self._hidden(position, rotation, (first, second), shadows[0])
+        for bounce in chain(lit, hidden):
+            self._hear(sound, turned, bounce, position, rotation, shadows)
         echo = self.hearing.echo(sound, self._basis)
+        if turned.heard:
+            echo += self.hearing.echo(turned, 1j * self._basis)
         if self._diffracts:
             if self._diffraction is None:
                 self._diffraction = Diffraction(self.scene, self.caster, self.reflections)
@@ -134,7 +150,26 @@ class Rays(Engine):
         return echo
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_diffraction": None}
+        return {**super().__getstate__(), "_diffraction": None, "_outlines": None}
+
+    def _shadows(
+        self, position: NDArray[np.float64], rotation: NDArray[np.float64]
+    ) -> list[Shadow]:
+        """Shadows of the emitter and of each ear."""
+        if self._outlines is None:
+            self._outlines = Outlines(self.scene.mesh)
+        emitter, ears = self.hearing.places(position, rotation)
+        return [
+            Shadow(
+                self._outlines,
+                self.caster,
+                place,
+                wavenumber=self._wavenumber.astype(np.float64),
+                speed_of_sound=self.hearing.speed_of_sound,
+                size=self._radius,
+            )
+            for place in (emitter, *ears)
+        ]
 
     def hits(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
@@ -146,7 +181,7 @@ class Rays(Engine):
             total = np.zeros(len(bounce.ray))
             level = self._level(bounce) * self.hearing.beam(bounce.emitted, rotation)
             for place in self.hearing.places(position, rotation)[1]:
-                heard, gain, _ = self._heard(bounce, place)
+                heard, gain, _, _ = self._heard(bounce, place)
                 total[heard] += np.square(gain * level[heard]).mean(axis=1)
             # Of one size: a divided cell is smaller than a whole one.
             points.append(bounce.points)
@@ -179,6 +214,41 @@ class Rays(Engine):
             return audible, doubt
 
         return echo_paths(self.caster, emitter, cap, bounces=bounces, extra=extra, judge=judge)
+
+    def _hidden(
+        self,
+        position: NDArray[np.float64],
+        rotation: NDArray[np.float64],
+        offset: tuple[float, float],
+        shadow: Shadow,
+    ) -> Iterator[Bounce]:
+        """First hits behind obstacles, as if these were not there."""
+        outlines = self._outlines
+        if shadow.none or outlines is None:
+            return
+        emitter, ears = self.hearing.places(position, rotation)
+        middle = ears.mean(axis=0)
+        rays = round(self.rays * HIDDEN_SHARE)
+        extra = round(rays * HIDDEN_DIVIDED)
+        axis, half_angle = aim(emitter, self._centre, self._radius)
+        cap = CapSpiral(max(rays - extra, 1), axis @ rotation, half_angle, offset, rotation)
+
+        def judge(bounce: Bounce) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+            audible, doubt = self._judge(bounce, middle)
+            chosen = np.flatnonzero(audible)
+            level = shadow.level(bounce.points[chosen], bounce.triangles[chosen, -1])
+            audible[chosen] = level > LEAST
+            passed = np.zeros(len(doubt))
+            passed[chosen] = level
+            return audible, doubt * passed
+
+        def beyond(hits: Hits, directions: NDArray[np.float64]) -> tuple[Hits, NDArray[np.float64]]:
+            return behind(self.caster, outlines, hits, directions)
+
+        for bounce in echo_paths(
+            self.caster, emitter, cap, bounces=1, extra=extra, judge=judge, beyond=beyond
+        ):
+            yield replace(bounce, hidden=True)
 
     def _judge(
         self, bounce: Bounce, listener: NDArray[np.float64]
@@ -213,37 +283,62 @@ class Rays(Engine):
     def _hear(
         self,
         sound: Sound,
+        turned: Sound,
         bounce: Bounce,
         position: NDArray[np.float64],
         rotation: NDArray[np.float64],
+        shadows: list[Shadow],
     ) -> None:
         heard_by = [
-            self._heard(bounce, place) for place in self.hearing.places(position, rotation)[1]
+            self._heard(bounce, place, *((shadows[0], shadow) if bounce.number == 1 else ()))
+            for place, shadow in zip(
+                self.hearing.places(position, rotation)[1], shadows[1:], strict=True
+            )
         ]
         anyone = np.zeros(len(bounce.ray), dtype=bool)
-        for heard, _, _ in heard_by:
+        for heard, _, _, _ in heard_by:
             anyone[heard] = True
         chosen = np.flatnonzero(anyone)
         level = self.hearing.beam(bounce.emitted.take(chosen, axis=0), rotation)
         level *= self._level(bounce).take(chosen, axis=0)
         place_of = np.cumsum(anyone) - 1
-        for ear, (heard, gain, spread) in enumerate(heard_by):
+        for ear, (heard, gain, spread, shaded) in enumerate(heard_by):
             gain *= level.take(place_of.take(heard), axis=0)
-            self.hearing.add(
-                sound,
-                ear,
-                bounce.points.take(heard, axis=0),
-                length=bounce.length.take(heard),
-                spread=spread,
-                level=gain,
-                position=position,
-                rotation=rotation,
-            )
+            every = np.arange(len(heard))
+            parts = [(sound, every, gain)]
+            if shaded is not None:
+                dim, passed = shaded
+                parts.append((turned, dim, (gain[dim] * passed.imag).astype(np.float32)))
+                gain[dim] *= passed.real
+            for into, which, strength in parts:
+                some = heard.take(which)
+                self.hearing.add(
+                    into,
+                    ear,
+                    bounce.points.take(some, axis=0),
+                    length=bounce.length.take(some),
+                    spread=spread.take(which),
+                    level=strength,
+                    position=position,
+                    rotation=rotation,
+                )
 
     def _heard(
-        self, bounce: Bounce, ear: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.floating[Any]], Real]:
-        """Which hits an ear hears (N,), by what gain (N, F), and their paths' spread (N,), m."""
+        self,
+        bounce: Bounce,
+        ear: NDArray[np.float64],
+        lit: Shadow | None = None,
+        shadow: Shadow | None = None,
+    ) -> tuple[
+        NDArray[np.int64],
+        NDArray[np.floating[Any]],
+        Real,
+        tuple[NDArray[np.int64], NDArray[np.complex128]] | None,
+    ]:
+        """Which hits an ear hears (N,), by what gain (N, F), and their paths' spread (N,), m.
+
+        At last which of these are shaded (M,), and what passes of them (M, F), or None.
+        """
         away = ear - bounce.points
         distance = np.sqrt(_dot(away, away))
         towards = away / distance[:, None]
@@ -255,13 +350,51 @@ class Rays(Engine):
         seen = self.caster.visible(
             bounce.points.take(near, axis=0), ear, normals=bounce.flat.take(near, axis=0)
         )
+        seen, shaded = self._shaded(bounce, near, seen, lit, shadow)
         near = near[np.flatnonzero(seen)]
         gain = self._gain(bounce, near, towards.take(near, axis=0), detour.take(near))
         bend = stiffness.take(near) * np.float32(bounce.solid_angle)
         coarse = bend * self._wavenumber[-1] > FINE
         coarse = np.flatnonzero(coarse & self._smooth[self._part(bounce.triangles[near, -1])])
         gain[coarse] *= coarse_gain(np.multiply.outer(bend.take(coarse), self._wavenumber))
-        return near, gain, spread.take(near)
+        return near, gain, spread.take(near), shaded
+
+    def _shaded(
+        self,
+        bounce: Bounce,
+        near: NDArray[np.int64],
+        seen: NDArray[np.bool_],
+        lit: Shadow | None,
+        shadow: Shadow | None,
+    ) -> tuple[NDArray[np.bool_], tuple[NDArray[np.int64], NDArray[np.complex128]] | None]:
+        """Which hits pass obstacles, and what passes of those near an outline."""
+        points, triangle = bounce.points.take(near, axis=0), bounce.triangles[near, -1]
+        whole = np.broadcast_to(~np.bool_(bounce.hidden), near.shape)
+        legs = [(lit, whole), (shadow, seen)]
+        rows = []
+        dim = np.zeros(len(near), dtype=bool)
+        passes = np.ones(len(near), dtype=bool)
+        for leg, free in legs:
+            if leg is None:
+                row, table = np.full(len(near), -1), np.ones((1, 1), dtype=np.complex128)
+            else:
+                row, table = leg.passed(points, triangle)
+            rows.append((row, table))
+            dim |= row >= 0
+            passes &= free | (row >= 0)
+        dim &= passes
+        if not dim.any():
+            return passes, None
+        chosen = np.flatnonzero(dim)
+        passed = np.ones((len(chosen), len(self._wavenumber)), dtype=np.complex128)
+        for row, table in rows:
+            of = row[chosen]
+            some = np.flatnonzero(of >= 0)
+            passed[some] *= table[of[some]]
+        strong = np.abs(passed).max(axis=1) > LEAST
+        passes[chosen[~strong]] = False
+        place_of = np.cumsum(passes) - 1
+        return passes, (place_of[chosen[strong]], passed[strong])
 
     def _level(self, bounce: Bounce) -> NDArray[np.float64]:
         """Level without lobe and beam, (H, 1) or (H, F) m."""

@@ -169,7 +169,7 @@ def test_what_a_plate_hides_is_not_heard():
     )  # the tail of the plate; of the ball 40 times it
 
 
-def test_an_ear_behind_a_plate_hears_nothing_though_the_other_does():
+def test_an_ear_behind_a_plate_hears_next_to_nothing_though_the_other_does():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.03)
     ball.apply_translation([0.5, 0.0, 0.0])
     before_left_ear = plate([0.2, 0.06, -0.1], [0.21, 0.3, 0.1])
@@ -178,7 +178,8 @@ def test_an_ear_behind_a_plate_hears_nothing_though_the_other_does():
     found = simulator(scene, ears=apart, simulation={"rays": 40_000, "bounces": 1})
     left, right = found.spectrogram(np.zeros(3), np.eye(3), seed=0)
     beyond = found.range > 0.45  # the ball's echo comes from (0.47 + 0.51) / 2
-    assert left[beyond].max() < 0.02 * right[beyond].max()
+    # 60 mm inside the shadow of the plate's edge: a knife edge leaves 0.12 at 20 kHz.
+    assert left[beyond].max() < 0.13 * right[beyond].max()
 
 
 def test_the_left_ear_hears_the_left_first():
