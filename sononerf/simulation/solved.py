@@ -126,6 +126,7 @@ class Solved(Engine):
 
     prepares = True
     path: ClassVar[float] = PATH
+    lead: ClassVar[float] = LEAD
 
     def __init__(
         self,
@@ -142,7 +143,7 @@ class Solved(Engine):
         rate = hearing.synthesis.sampling_rate
         self.frequency_max = min(frequency_max, rate / 2.0)
         self.frequency_full = self.frequency_max / fall
-        self._lead = LEAD / (self.frequency_max - self.frequency_full)
+        self._lead = self.lead / (self.frequency_max - self.frequency_full)
         tail = TAIL / (self.frequency_max - self.frequency_full)
         duration = self.path * self.arrival.radius / hearing.speed_of_sound + self._lead + tail
         self.period = int(scipy.fft.next_fast_len(math.ceil(duration * rate), real=True))

@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg
@@ -17,17 +19,20 @@ from sononerf.scene import Scene
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.solved import Heads, Solved
 
-PER_WAVELENGTH = 3.0  # sources along a wavelength at the highest frequency; there it errs by 1 %
+PER_WAVELENGTH = 3.0  # sources along a wavelength at the highest frequency; there it errs by 3 %
 FEWEST = 0.5  # of the sources at low frequencies, as a fraction; more is not needed below 0.1 %
 LEVELS = 4  # numbers of sources between these two; at each jump the error jumps
 POINTS = 1.5  # of the surface per source, at which the surface is asked to be rigid
-DEPTH = 2.0  # of the sources below the surface, in their spacings; deeper is ill-conditioned
+DEPTH = 1.5  # of the sources below the surface, in their spacings; deeper is ill-conditioned
 INSIDE = 0.3  # of the thickness of the body; no source lies deeper
 SHALLOWEST = 0.8  # spacings; nearer to the surface single sources show
 THIN = 0.05  # of the surface may be thinner than that
 REGULARISATION = 1e-8  # of the mean diagonal of the normal equations; rough meshes need it
 CHECKS = 200  # further points of the surface, which tell the error
+CONTROL = 100  # points of the surface at which gains are looked up
+ORDER = 3  # of the polynomial over the place through them
 BLOCK = 32  # poses; always so many, so that a pose's rounding does not depend on the others
+LEAD = 2.5  # over the width of the fall; what it puts earlier is cut off, see `silence_before`
 PATH = 8.0  # radii of the sphere around the scene; what comes later is some 60 dB down
 LARGEST_KA = 12.0  # wavenumber times radius, above which rays are as good
 
@@ -42,8 +47,8 @@ class Sources(Solved):
     .. math:: \sum_j q_j\, \partial_n \frac{e^{-j k |x_i - y_j|}}{4 \pi |x_i - y_j|}
         = -\partial_n p_{in}(x_i)
 
-    For smooth bodies the error falls exponentially with the number of sources: with 3.3 along a
-    wavelength it is 1 %. It is measured at further points of the surface. Edges are rounded, and
+    For smooth bodies the error falls exponentially with the number of sources: with 3 along a
+    wavelength it is 3 %. It is measured at further points of the surface. Edges are rounded, and
     bodies thinner than about 2.5 spacings of the sources cannot be done. The engine is as exact as
     the boundary-element engine where it works, at a tenth of the unknowns, so it
     solves the low frequencies of :class:`Hybrid`.
@@ -73,7 +78,7 @@ class Sources(Solved):
        based on the principle of wave superposition", JASA 86, 1989.
     """
 
-    path = PATH
+    path, lead = PATH, LEAD
 
     def __init__(
         self,
@@ -112,6 +117,22 @@ class Sources(Solved):
             self._surface = points, normals, thickness
         return self._surface
 
+    @cached_property
+    def _blend(self) -> NDArray[np.float64]:
+        """Weights (N, C) by which the gains at control points make those at all points.
+
+        A polynomial over the place is fitted to them. Tables have bends between their nodes, and
+        no sources inside the body make a field that bends so.
+        """
+        points = self.surface[0] - self.surface[0].mean(axis=0)
+        points /= np.abs(points).max()
+        powers = [
+            power for power in itertools.product(range(ORDER + 1), repeat=3) if sum(power) <= ORDER
+        ]
+        terms = np.stack([np.prod(points**power, axis=1) for power in powers], axis=1)
+        blend: NDArray[np.float64] = terms @ np.linalg.pinv(terms[:CONTROL], rcond=1e-6)
+        return blend
+
     @property
     def thin(self) -> float:
         """Fraction of the surface below which the body is too thin for the sources."""
@@ -138,20 +159,20 @@ class Sources(Solved):
         """Scattered pressure at the ears at one frequency; see :meth:`Solved.respond`."""
         frequency = wavenumber.real * self.hearing.speed_of_sound / (2.0 * math.pi)
         system = _System(self, frequency, wavenumber)
-        ears = poses.ears.shape[1]
+        ears, control = poses.ears.shape[1], self.surface[0][:CONTROL]
+        points, sources = self._blend[system.chosen].T, self._blend[: len(system.places)].T
         heard = np.zeros((len(poses), ears), dtype=np.complex128)
         squares = []
         for start in range(0, len(poses), BLOCK):
             some = poses[np.arange(start, start + BLOCK).clip(max=len(poses) - 1)]
             incident = _arriving(system.points, system.normals, some.emitters, wavenumber)
-            incident *= some.beam(system.points).T
+            incident *= (some.beam(control) @ points).T
             strength = system.solve(incident)
             squares.append(np.square(system.error(incident, strength)))
             count = min(BLOCK, len(poses) - start)
             for ear in range(ears):
-                distance = np.linalg.norm(some.ears[:, ear, None] - system.places, axis=2)
-                wave = np.exp(-1j * wavenumber * distance) / (4.0 * math.pi * distance)
-                wave *= some.gain(ear, system.places)
+                wave = _waves(some.ears[:, ear], system.places, wavenumber)
+                wave *= some.gain(ear, control) @ sources
                 heard[start : start + count, ear] = (wave * strength.T).sum(axis=1)[:count]
         self.error[frequency] = math.sqrt(float(np.mean(squares)))
         return heard
@@ -168,11 +189,12 @@ class _System:
         self.places = points[:count] - depth[:, None] * normals[:count]
         self._asked = round(POINTS * count)
         # The last points stand in the gaps between all others.
-        chosen = np.r_[: self._asked, len(points) - CHECKS : len(points)]
-        self.points, self.normals = points[chosen], normals[chosen]
+        self.chosen = np.r_[: self._asked, len(points) - CHECKS : len(points)]
+        self.points, self.normals = points[self.chosen], normals[self.chosen]
         matrix = _slopes(self.points, self.normals, self.places, wavenumber)
-        self._used, self._checks = matrix[: self._asked], matrix[self._asked :]
-        normal = scipy.linalg.blas.zherk(1.0, np.asfortranarray(self._used), trans=2, lower=1)
+        used, self._checks = np.asfortranarray(matrix[: self._asked]), matrix[self._asked :]
+        self._adjoint = used.conj().T
+        normal = scipy.linalg.blas.zherk(1.0, used, trans=2, lower=1)
         diagonal = np.einsum("ii->i", normal)
         diagonal += REGULARISATION * float(diagonal.real.mean())
         try:
@@ -187,7 +209,7 @@ class _System:
 
     def solve(self, incident: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the sources' strengths (M, P) for normal slopes of pressure (N, P)."""
-        wanted = self._used.conj().T @ -incident[: self._asked]
+        wanted = self._adjoint @ -incident[: self._asked]
         strength: NDArray[np.complex128] = scipy.linalg.cho_solve(
             self._factor, wanted, check_finite=False
         )
@@ -223,9 +245,7 @@ def _slopes(
     wavenumber: complex,
 ) -> NDArray[np.complex128]:
     r"""Return :math:`\partial_n e^{-j k r} / 4 \pi r` at points (N, 3) for sources (M, 3)."""
-    # Products in place of differences: coordinates are as small as the distances.
-    square = np.square(points).sum(axis=1)[:, None] + np.square(places).sum(axis=1)
-    square -= 2.0 * points @ places.T
+    square = _squares(points, places)
     distance = np.sqrt(square)
     across = np.einsum("nd,nd->n", points, normals)[:, None] - normals @ places.T
     phase = -wavenumber.real * distance
@@ -234,6 +254,26 @@ def _slopes(
     slope.real, slope.imag = size * np.cos(phase), size * np.sin(phase)
     slope *= -1j * wavenumber * distance - 1.0
     return slope
+
+
+def _waves(
+    points: NDArray[np.float64], places: NDArray[np.float64], wavenumber: complex
+) -> NDArray[np.complex128]:
+    r"""Return :math:`e^{-j k r} / 4 \pi r` at points (N, 3) for sources (M, 3)."""
+    distance = np.sqrt(_squares(points, places))
+    size = np.exp(wavenumber.imag * distance) / (4.0 * math.pi * distance)
+    wave = np.zeros(distance.shape, dtype=np.complex128)
+    phase = -wavenumber.real * distance
+    wave.real, wave.imag = size * np.cos(phase), size * np.sin(phase)
+    return wave
+
+
+def _squares(points: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return squared distances (N, M), m²; products suffice, for coordinates are as small."""
+    square = np.square(points).sum(axis=1)[:, None] + np.square(places).sum(axis=1)
+    square -= 2.0 * points @ places.T
+    found: NDArray[np.float64] = square
+    return found
 
 
 def _arriving(
