@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 from sononerf.scene import Scene
 from sononerf.simulation.impulse_response import NODE_SPACING
 
-FINE = 0.05  # of the radius of a sphere around the scene; no two neighbouring points are farther
-SILENT = 0.21 / NODE_SPACING  # s before the first arrival (25 us), and earlier: nothing is kept
-WHOLE = 0.207 / NODE_SPACING  # s before the first arrival (10 us), and later: all is kept
+FINE = 0.05
+"""Distance between points at which the first arrival is sought, in radii of a sphere around the
+scene. The path is then at most 0.1 % of that radius too long."""
+SILENT = 0.21 / NODE_SPACING
+"""Time before the first arrival up to which the echo is zero, s (26 us). With half an analysis
+window of 32 us nothing is heard more than 10 mm before the nearest point."""
+WHOLE = 0.207 / NODE_SPACING
+"""Time before the first arrival from which on all of the echo is kept, s."""
 
 
 class Arrival:
@@ -66,11 +71,11 @@ class Arrival:
 def silence_before(
     echo: NDArray[np.float64], first: NDArray[np.float64], *, sampling_rate: float
 ) -> NDArray[np.float64]:
-    """Fade out what comes before sound can arrive.
+    """Cut off what comes before sound can arrive.
 
     Beam and ears are real gains, so their responses are even in time: half of them comes before
-    the echo. Of the first echo this part is cut off, with a raised cosine; so the analysis of
-    what comes before it hears nothing but its own window.
+    the echo. Of the first echo this part is cut off, down to what one analysis window hides. So
+    onsets and free space are found from sound that has arrived.
 
     Parameters
     ----------
@@ -84,7 +89,7 @@ def silence_before(
     Returns
     -------
     echo : (E, S) float64
-        Zero up to 25 us before the first arrival, whole from 10 us before it on.
+        Zero up to 26 us before the first arrival, whole from there on.
     """
     before = first[:, None] - np.arange(echo.shape[1]) / sampling_rate
     rise = np.clip((SILENT - before) / (SILENT - WHOLE), 0.0, 1.0)

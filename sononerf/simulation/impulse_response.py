@@ -27,10 +27,15 @@ from scipy.sparse import csc_array
 from sononerf.acoustics.ears import NOTCH_WIDTH
 from sononerf.config import SpectrogramSettings
 
-HIGHEST = 150e3  # Hz; up to here echoes are complete
-NODE_SPACING = NOTCH_WIDTH  # Hz; gains are followed for 1 / (2 spacing) = 62 us about an echo
-ROLL_OFF = 0.3  # of that limit, as a fraction; sharper rings longer between nodes, softer cuts more
-IMAGES = 2  # periods of the interpolation on each side; its kernel falls as the third power
+HIGHEST = 150e3
+"""Frequency up to which echoes are complete, Hz. Half more than the default band needs."""
+NODE_SPACING = NOTCH_WIDTH
+"""Distance between frequency nodes, Hz. The responses of ears are then kept for 62 us about an
+echo, three standard deviations of the response of their notch."""
+ROLL_OFF = 0.3
+"""Width of the end of that limit, as a fraction of it. Less rings longer, more cuts more."""
+IMAGES = 2
+"""Periods of the nodes on each side that count; the kernel falls as the third power."""
 OVERSAMPLING = 4
 LEVELS = 10  # of bins, each twice as wide as the one before; the last smooths away even 10 kHz
 GUARD = 512  # samples behind the last frame, for what filters put before and after an echo

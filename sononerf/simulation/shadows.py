@@ -18,16 +18,26 @@ from sononerf.geometry.raycast import Hits, RayCaster
 from sononerf.geometry.surface import CREASE, corner_normals, weight_gradients
 from sononerf.simulation.impulse_response import NODE_SPACING
 
-RESOLVED_FREQUENCY = 80e3  # Hz; at this one shadows are resolved
-CELL = 0.25  # of the root of wavelength times size: surface over which a shadow hardly changes
-LONGEST = 0.4 / NODE_SPACING  # s; detours up to this, as much as gains at the nodes can follow
-STEPS = 12  # per wavelength, by which detours are told apart
-LAYERS = 3  # surfaces a hidden ray may pass: into the obstacle, out of it, and one more
+RESOLVED_FREQUENCY = 80e3
+"""Frequency at which shadows are resolved, Hz; near the top of the default band."""
+CELL = 0.25
+"""Size of a piece of surface with one obstacle factor, over the root of wavelength times the radius
+of the scene, which is the width of the first Fresnel zone. Finer cells changed little."""
+LONGEST = 0.4 / NODE_SPACING
+"""Longest detour over an outline that is kept, s; longer ones turn too fast between the nodes."""
+STEPS = 12
+"""Steps per wavelength in which detours are sorted."""
+LAYERS = 3
+"""Surfaces that a ray through an obstacle may pass: into it, out of it, and one more."""
 UNKNOWN = -2
-LEAST = 0.02  # what is weaker by this is not heard
-# Pekeris' function q* of a rigid surface, fitted within 0.013 from -0.6 to 1.8; time as e^{jwt}.
+"""Number of a cell that has not been solved for."""
+LEAST = 0.02
+"""Obstacle factor below which nothing is heard, -34 dB."""
 PEKERIS = (-0.2660 - 0.1478j, 0.1392 + 0.2246j, -0.0010 - 0.0536j)
-LIT, SHADED = 1.2, 1.8  # its argument, at which it is let go in the light and held in the shadow
+"""Pekeris' function q* of a rigid surface as a polynomial of its argument, fitted within 0.013
+from -0.6 to 1.8; time as e^{jwt}."""
+LIT, SHADED = 1.2, 1.8
+"""Arguments of that function at which it has faded out in the light, and is held in the shadow."""
 
 
 class Outlines:

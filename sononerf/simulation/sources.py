@@ -19,39 +19,57 @@ from sononerf.scene import Scene
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.solved import Heads, Solved
 
-PER_WAVELENGTH = 3.0  # sources along a wavelength at the highest frequency; there it errs by 3 %
-FEWEST = 0.5  # of the sources at low frequencies, as a fraction; more is not needed below 0.1 %
-LEVELS = 4  # numbers of sources between these two; at each jump the error jumps
-POINTS = 1.5  # of the surface per source, at which the surface is asked to be rigid
-DEPTH = 1.5  # of the sources below the surface, in their spacings; deeper is ill-conditioned
-INSIDE = 0.3  # of the thickness of the body; no source lies deeper
-SHALLOWEST = 0.8  # spacings; nearer to the surface single sources show
-THIN = 0.05  # of the surface may be thinner than that
-REGULARISATION = 1e-8  # of the mean diagonal of the normal equations; rough meshes need it
-CHECKS = 200  # further points of the surface, which tell the error
-CONTROL = 100  # points of the surface at which gains are looked up
-ORDER = 3  # of the polynomial over the place through them
-BLOCK = 32  # poses; always so many, so that a pose's rounding does not depend on the others
-LEAD = 2.5  # over the width of the fall; what it puts earlier is cut off, see `silence_before`
-PATH = 8.0  # radii of the sphere around the scene; what comes later is some 60 dB down
-LARGEST_KA = 12.0  # wavenumber times radius, above which rays are as good
+PER_WAVELENGTH = 3.0
+"""Sources along one wavelength at the highest frequency. With 3 the velocity errs by 3 %."""
+FEWEST = 0.5
+"""Sources at low frequencies over those at the highest. The error is then below 0.5 %."""
+LEVELS = 4
+"""Different numbers of sources between these two. The error jumps where the number changes."""
+POINTS = 1.5
+"""Points of the surface per source where the boundary condition holds; 2 gave the same error."""
+DEPTH = 1.5
+"""Depth of a source below the surface, in distances between sources. Deeper sources are more exact
+on smooth meshes, but on reconstructed meshes the equations become ill-conditioned."""
+INSIDE = 0.3
+"""Greatest depth of a source, as a fraction of the thickness of the body there."""
+SHALLOWEST = 0.8
+"""Least depth, in distances between sources. Above it the pattern of single sources is heard."""
+THIN = 0.05
+"""Greatest fraction of the surface where the body is too thin for the least depth."""
+REGULARISATION = 1e-8
+"""Added to the normal equations, as a fraction of their mean diagonal. On a reconstructed mesh less
+of it lets the response ring; more of it loses accuracy."""
+CHECKS = 200
+"""Points of the surface that are left out of the solution and give its error."""
+CONTROL = 100
+"""Points of the surface at which the gains of beam and ears are looked up."""
+ORDER = 3
+"""Degree of the polynomial over position that is fitted to these gains. 5 gave the same echoes."""
+BLOCK = 32
+"""Poses that are solved for together. It is fixed, so that the rounding of a pose's result does not
+depend on the other poses."""
+LEAD = 2.5
+"""Time kept before the first arrival, over the inverse width of the fall of the band."""
+PATH = 8.0
+"""Path that the response lasts for after the first arrival, in radii of a sphere around the scene.
+What comes later wraps around; for ``three_spheres`` it is 60 dB down."""
+LARGEST_KA = 12.0
+"""Wavenumber times radius above which rays are as good, see ``docs/simulator.md``."""
 
 
 class Sources(Solved):
     r"""Echoes by equivalent sources [1]_, also called the method of fundamental solutions.
 
-    Point sources lie inside the bodies, a few of their spacings below the surface. Their
-    strengths :math:`q` are such that the normal velocity on the surface is zero. It is asked for
-    at half as many points more :math:`x_i` as there are sources, in the sense of least squares,
+    Point sources lie inside the bodies, 1.5 of their distances below the surface. Their
+    strengths :math:`q` make the normal velocity on the surface zero, by least squares at points
+    :math:`x_i`, 1.5 per source,
 
     .. math:: \sum_j q_j\, \partial_n \frac{e^{-j k |x_i - y_j|}}{4 \pi |x_i - y_j|}
         = -\partial_n p_{in}(x_i)
 
-    For smooth bodies the error falls exponentially with the number of sources: with 3 along a
-    wavelength it is 3 %. It is measured at further points of the surface. Edges are rounded, and
-    bodies thinner than about 2.5 spacings of the sources cannot be done. The engine is as exact as
-    the boundary-element engine where it works, at a tenth of the unknowns, so it
-    solves the low frequencies of :class:`Hybrid`.
+    The error is measured at further points of the surface. Edges are rounded, and bodies thinner
+    than about three distances between sources cannot be solved for. A smooth body needs a tenth of
+    the unknowns of boundary elements, so this engine solves the low band of :class:`Hybrid`.
 
     Parameters
     ----------
