@@ -189,6 +189,8 @@ def simulate(
         range_max=settings.spectrogram.range_max,
     )
     storage.probe_writable(path)
+    if simulator.engine.note:
+        progress.say(f"echoes: {simulator.engine.note}")
     with storage.lock(path):
         store = EnsembleStore.create(
             path,

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
@@ -18,8 +16,6 @@ scene. The path is then at most 0.1 % of that radius too long."""
 SILENT = 0.21 / NODE_SPACING
 """Time before the first arrival up to which the echo is zero, s (26 us). With half an analysis
 window of 32 us nothing is heard more than 10 mm before the nearest point."""
-WHOLE = 0.207 / NODE_SPACING
-"""Time before the first arrival from which on all of the echo is kept, s."""
 
 
 class Arrival:
@@ -92,6 +88,4 @@ def silence_before(
         Zero up to 26 us before the first arrival, whole from there on.
     """
     before = first[:, None] - np.arange(echo.shape[1]) / sampling_rate
-    rise = np.clip((SILENT - before) / (SILENT - WHOLE), 0.0, 1.0)
-    faded: NDArray[np.float64] = echo * (0.5 - 0.5 * np.cos(math.pi * rise))
-    return faded
+    return np.where(before < SILENT, echo, 0.0)

@@ -14,7 +14,6 @@ from scipy.linalg import lu_factor, lu_solve
 
 from sononerf.acoustics.ears import Ears
 from sononerf.errors import NumericalError, ResourceError
-from sononerf.material import RIGID
 from sononerf.memory import available_memory
 from sononerf.scene import Scene
 from sononerf.simulation.boundary_mesh import check_apart, closed_bodies, expected_vertices, suited
@@ -96,7 +95,7 @@ class Boundary(Solved):
         frequency_max: float,
         edges_per_wavelength: float = 5.0,
     ) -> None:
-        if any(material != RIGID for material in scene.materials):
+        if not all(material.rigid for material in scene.materials):
             logger.warning(
                 "simulation.engine=bem takes surfaces as smooth and rigid; roughness, lobes and "
                 "strength are left out, simulation.engine=rays has them"

@@ -30,6 +30,8 @@ class Engine:
     ----------
     reflections : tuple of Reflection
         The scene's materials at the nodes of the synthesis.
+    note : str
+        What a user should know about how this scene is simulated; empty for nothing.
     prepares : bool
         Whether :meth:`prepare` does all the work, so that nothing is left for other processes.
     """
@@ -49,6 +51,7 @@ class Engine:
             reflection(material, nodes, speed_of_sound=hearing.speed_of_sound)
             for material in scene.materials
         )
+        self.note = ""
         self._caster: RayCaster | None = None
         self._arrival: Arrival | None = None
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from typing import Any
 
@@ -17,8 +16,6 @@ from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.rays import Rays
 from sononerf.simulation.sources import THIN, Sources, resolved_frequency, sources_worth
 
-logger = logging.getLogger("sononerf")
-
 FALL = 1.3
 """Highest frequency of the low band over the one from which it gives way to the rays. A wider
 crossing keeps more of the error of the rays, a narrower one rings longer."""
@@ -31,10 +28,10 @@ LARGEST_ERROR = 0.1
 class Hybrid(Engine):
     """Echoes by equivalent sources at low frequencies and by rays at high ones.
 
-    Rays know neither sound that creeps around a body nor sound that bends into a shadow: below
-    ka of about 10 they are wrong by several decibels. The wave equation of small bodies is cheap at
-    just these frequencies. Both engines give pressure, with level and delay, so they are added:
-    the low band falls as a raised cosine where the high band rises.
+    Rays do not simulate sound that creeps around a body. Where ka is below about 8 they are
+    wrong by several decibels. At these frequencies the wave equation of small bodies is cheap.
+    Both engines give pressure with level and delay, so they are added. Between the bands the low
+    one falls as a raised cosine, and the high one rises.
 
     Parameters
     ----------
@@ -107,21 +104,21 @@ def hybrid(
     Returns
     -------
     engine : Hybrid or Rays
-        Rays where a surface is open, not rigid, too large or too thin; a line of the log says so.
+        Rays where a surface is open, not rigid, too large or too thin; its ``note`` says why.
     """
     most = min(sources, sources_worth(scene))
     found = _low_band(scene, hearing, gains, absorption, most, frequency_min)
     if isinstance(found, str):
-        logger.info("all frequencies are traced by rays: %s", found)
-        return Rays(scene, hearing, **rays)
-    logger.info(
-        "up to %.0f to %.0f kHz the wave equation is solved (%d sources), above rays are traced",
-        found.frequency_full / 1e3,
-        found.frequency_max / 1e3,
-        most,
-    )
+        alone = Rays(scene, hearing, **rays)
+        alone.note = f"rays at all frequencies, because {found}"
+        return alone
     band = 1.0 - found.taper(hearing.synthesis.frequency)
-    return Hybrid(found, Rays(scene, hearing, band=band, **rays))
+    both = Hybrid(found, Rays(scene, hearing, band=band, **rays))
+    both.note = (
+        f"wave equation up to {found.frequency_full / 1e3:.0f} kHz with {most} sources, "
+        f"rays from {found.frequency_max / 1e3:.0f} kHz on"
+    )
+    return both
 
 
 def _low_band(
@@ -148,5 +145,5 @@ def _low_band(
         return "the body is too thin for equivalent sources"
     error = low.trial()
     if error > LARGEST_ERROR:
-        return f"equivalent sources meet the surface to {100 * error:.0f} % only"
+        return f"equivalent sources err by {100 * error:.0f} % on the surface"
     return low

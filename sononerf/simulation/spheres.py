@@ -509,13 +509,12 @@ def _ball(places: NDArray[np.float64], faces: NDArray[np.int64], name: int) -> B
 
 def _refuse_soft(material: Material) -> None:
     """Refuse what is not rigid."""
-    curves = (material.strength, material.reflection, material.curved_strength or (1.0,))
-    soft = any(value != 1.0 for curve in curves for value in curve)
-    if soft or material.lobe_width is not None:
+    if not material.rigid:
+        least = min((*material.strength, *material.reflection))
         raise InputError(
             "simulation.engine=spheres solves for rigid surfaces alone, and a material of the "
-            f"scene has lobes or a strength of {min(min(curve) for curve in curves):.3g}; take the "
-            "material rigid, or simulation.engine=rays"
+            f"scene has lobes or a strength of {least:.3g}; take the material rigid, or "
+            "simulation.engine=rays"
         )
 
 
