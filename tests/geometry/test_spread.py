@@ -8,9 +8,12 @@ from sononerf.geometry.spread import spread_points
 
 
 def uneven():
-    """Return a box of which one face has a thousand times as many triangles as the others."""
-    mesh = trimesh.creation.box((0.04, 0.05, 0.06))
-    return mesh.subdivide([0]).subdivide([0, 1]).subdivide([0, 1, 2, 3])
+    """Return a box of which two triangles are divided into 2,048, and the others are not."""
+    box = trimesh.creation.box((0.04, 0.05, 0.06))
+    first, others = box.submesh([[0, 1], range(2, 12)])
+    for _ in range(5):
+        first = first.subdivide()
+    return trimesh.util.concatenate([first, others])
 
 
 @pytest.mark.parametrize("first", [40, 100, 250])
