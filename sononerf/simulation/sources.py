@@ -67,8 +67,9 @@ class Sources(Solved):
     .. math:: \sum_j q_j\, \partial_n \frac{e^{-j k |x_i - y_j|}}{4 \pi |x_i - y_j|}
         = -\partial_n p_{in}(x_i)
 
-    The error is measured at further points of the surface. Edges are rounded, and bodies thinner
-    than about three distances between sources cannot be solved for. A smooth body needs a tenth of
+    The error is measured at further points of the surface. Bodies with sharp edges, such as a box,
+    have a large error, and bodies thinner than about three distances between sources cannot be
+    solved for; :func:`hybrid` leaves both to the rays. A smooth body needs a tenth of
     the unknowns of boundary elements, so this engine solves the low band of :class:`Hybrid`.
 
     Parameters
