@@ -70,8 +70,8 @@ def silence_before(
     """Cut off what comes before sound can arrive.
 
     Beam and ears are real gains, so their responses are even in time: half of them comes before
-    the echo. Of the first echo this part is cut off, down to what one analysis window hides. So
-    onsets and free space are found from sound that has arrived.
+    the echo. Everything that is more than 26 us earlier than the first possible arrival is set to
+    zero. Onsets and free space are then found from sound that has arrived.
 
     Parameters
     ----------

@@ -239,3 +239,12 @@ def test_what_wraps_around_is_below_80_db():
     for _, response in found.engine._known.values():
         loudest = np.abs(response).max(axis=1)
         assert (np.abs(response[:, -500:]).max(axis=1) < 1e-4 * loudest).all()
+
+
+def test_a_pose_that_is_no_number_is_left_out_and_refused_by_itself():
+    found = glint()
+    places = np.stack([POSE[0], np.full(3, np.nan)])
+    found.engine.prepare(places, np.stack([POSE[1], POSE[1]]))
+    assert found.echo(*POSE, seed=0).any()
+    with pytest.raises(ValueError, match="no finite number"):
+        found.echo(places[1], POSE[1], seed=0)
