@@ -11,7 +11,7 @@ from sononerf.scene import load_scene
 
 @pytest.mark.parametrize(
     ("radius", "rise", "turns", "wire"),
-    [(0.03, 0.025, 4.0, 0.003), (0.02, 0.03, 2.5, 0.005), (0.04, 0.01, 1.0, 0.0022)],
+    [(0.03, 0.025, 4.0, 0.003), (0.02, 0.03, 2.25, 0.005), (0.04, 0.01, 1.0, 0.0022)],
 )
 def test_a_helix_is_a_round_wire_along_its_line(radius, rise, turns, wire):
     options = {"radius": radius, "pitch_length": rise, "turns": turns, "wire_radius": wire}
@@ -33,7 +33,7 @@ def test_all_of_the_wire_is_a_radius_away_from_a_right_handed_line():
     angle = np.linspace(0.0, 4.0 * np.pi, 20000)
     line = np.stack([0.03 * np.cos(angle), 0.03 * np.sin(angle), 0.025 * angle / 2 / np.pi], 1)
     # The middle of two turns was moved to the origin.
-    distance = cKDTree(line).query(mesh.vertices + [0.0, 0.0, 0.025])[0]
+    distance = cKDTree(line).query(mesh.vertices + np.array([0.0, 0.0, 0.025]))[0]
     np.testing.assert_allclose(distance, 0.003, atol=3e-5)
 
 
