@@ -115,6 +115,9 @@ class Rays(Engine):
         self._hats = synthesis.hats if band is None else synthesis.hats * band[:, None]
         factor = gain if any_smooth else 1j * synthesis.frequency
         self._basis = self._hats * factor[:, None]
+        # What a shadow turns is an imaginary part, and so an odd function of frequency.
+        odd_hats = synthesis.odd_hats if band is None else synthesis.odd_hats * band[:, None]
+        self._turned_basis = odd_hats * (1j * factor)[:, None]
         # Beside smooth surfaces lobed ones go through the same filters: their level is theirs.
         _, gain = unfaded(synthesis.nodes, speed_of_sound=hearing.speed_of_sound)
         self._lobed_level = synthesis.nodes / np.abs(gain) if any_smooth else 1.0
@@ -139,7 +142,7 @@ class Rays(Engine):
             self._hear(sound, turned, bounce, position, rotation, shadows)
         echo = self.hearing.echo(sound, self._basis)
         if turned.heard:
-            echo += self.hearing.echo(turned, 1j * self._basis)
+            echo += self.hearing.echo(turned, self._turned_basis)
         if self._diffracts:
             if self._diffraction is None:
                 self._diffraction = Diffraction(self.scene, self.caster, self.reflections)
