@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from sononerf.geometry.directions import CapSpiral
 from sononerf.geometry.raycast import Hits
+from sononerf.geometry.surface import bodies, enclosing_balls
 from sononerf.scene import Scene
 from sononerf.simulation.diffraction import Diffraction
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.footprint import Real
 from sononerf.simulation.hearing import Hearing, Sound
-from sononerf.simulation.paths import Bounce, aim, echo_paths
+from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
 from sononerf.simulation.reflection import coarse_gain, unfaded
 from sononerf.simulation.shadows import LEAST, Outlines, Shadow, behind
 
@@ -37,6 +38,7 @@ REACHED = 1.0  # sides; how far from the middle of a cell a mirror point may be 
 # A bundle wider than this may hold a mirror point of the next bounce that its ray does not show.
 WIDE = 5e-4  # m
 EXPLORE = 0.1  # of what such a bundle may bring, against what one with a mirror point brings
+BALLS = 32  # that hold the scene between them; rays that miss all of them are not traced
 EARS_APART = 0.03  # m; up to this what holds for the middle between the ears holds for each
 
 
@@ -104,6 +106,8 @@ class Rays(Engine):
         vertices = np.asarray(scene.mesh.vertices, dtype=np.float64)
         self._centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
         self._radius = float(np.linalg.norm(vertices - self._centre, axis=1).max())
+        corners = vertices[np.asarray(scene.mesh.faces)]
+        self._balls = enclosing_balls(corners, bodies(scene.mesh), BALLS)
         self._farthest = max(
             math.inf if of_part.material.lobe_width else SILENT / float(of_part.fade.min())
             for of_part in self.reflections
@@ -138,7 +142,7 @@ class Rays(Engine):
         shadows = self._shadows(position, rotation)
         lit = self._paths(position, rotation, (first, second), self.bounces)
         hidden = self._hidden(position, rotation, (first, second), shadows[0])
-        for bounce in chain(lit, hidden):
+        for bounce in gathered(chain(lit, hidden)):
             self._hear(sound, turned, bounce, position, rotation, shadows)
         echo = self.hearing.echo(sound, self._basis)
         if turned.heard:
@@ -216,7 +220,20 @@ class Rays(Engine):
                 np.maximum(doubt, more, out=doubt)
             return audible, doubt
 
-        return echo_paths(self.caster, emitter, cap, bounces=bounces, extra=extra, judge=judge)
+        index = self._reaching(cap, emitter)
+        return echo_paths(
+            self.caster, emitter, cap, bounces=bounces, extra=extra, judge=judge, index=index
+        )
+
+    def _reaching(self, cap: CapSpiral, emitter: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return which rays of a cap may hit the scene."""
+        centres, radii = self._balls
+        ways = centres - emitter
+        distance = np.linalg.norm(ways, axis=1)
+        # The caster's single precision is far finer than this margin.
+        sine = radii * 1.001 / np.maximum(distance, 1e-300)
+        half_angle = np.where(sine < 1.0, np.arcsin(np.minimum(sine, 1.0)), math.pi)
+        return cap.reaching(ways / np.maximum(distance, 1e-300)[:, None], half_angle)
 
     def _hidden(
         self,
@@ -248,9 +265,11 @@ class Rays(Engine):
         def beyond(hits: Hits, directions: NDArray[np.float64]) -> tuple[Hits, NDArray[np.float64]]:
             return behind(self.caster, outlines, hits, directions)
 
+        index = self._reaching(cap, emitter)
         for bounce in echo_paths(
-            self.caster, emitter, cap, bounces=1, extra=extra, judge=judge, beyond=beyond
-        ):
+            self.caster, emitter, cap, bounces=1, extra=extra, judge=judge, beyond=beyond,
+            index=index,
+        ):  # fmt: skip
             yield replace(bounce, hidden=True)
 
     def _judge(
@@ -265,7 +284,7 @@ class Rays(Engine):
         facing = rise * distance > -EARS_APART
         audible = facing & (detour < 1.25 * self._farthest)
         k = np.float32(2.0 * math.pi * RESOLVED_FREQUENCY / self.hearing.speed_of_sound)
-        side = math.sqrt(bounce.solid_angle)
+        side = np.sqrt(bounce.solid_angle)
         # Counted in turns of the ray at the emitter, the mirror point is this far from the cell.
         off = np.sqrt(2.0 * detour / np.maximum(stiffness, np.float32(1e-12))) - REACHED * side
         least = 0.5 * stiffness * np.square(np.maximum(off, 0.0))
@@ -311,7 +330,7 @@ class Rays(Engine):
             parts = [(sound, every, gain)]
             if shaded is not None:
                 dim, passed = shaded
-                parts.append((turned, dim, (gain[dim] * passed.imag).astype(np.float32)))
+                parts.append((turned, dim, gain[dim] * passed.imag))
                 gain[dim] *= passed.real
             for into, which, strength in parts:
                 some = heard.take(which)
@@ -336,7 +355,7 @@ class Rays(Engine):
         NDArray[np.int64],
         NDArray[np.floating[Any]],
         Real,
-        tuple[NDArray[np.int64], NDArray[np.complex128]] | None,
+        tuple[NDArray[np.int64], NDArray[np.complex64]] | None,
     ]:
         """Which hits an ear hears (N,), by what gain (N, F), and their paths' spread (N,), m.
 
@@ -356,7 +375,7 @@ class Rays(Engine):
         seen, shaded = self._shaded(bounce, near, seen, lit, shadow)
         near = near[np.flatnonzero(seen)]
         gain = self._gain(bounce, near, towards.take(near, axis=0), detour.take(near))
-        bend = stiffness.take(near) * np.float32(bounce.solid_angle)
+        bend = (stiffness * np.asarray(bounce.solid_angle, dtype=np.float32)).take(near)
         coarse = bend * self._wavenumber[-1] > FINE
         coarse = np.flatnonzero(coarse & self._smooth[self._part(bounce.triangles[near, -1])])
         gain[coarse] *= coarse_gain(np.multiply.outer(bend.take(coarse), self._wavenumber))
@@ -369,7 +388,7 @@ class Rays(Engine):
         seen: NDArray[np.bool_],
         lit: Shadow | None,
         shadow: Shadow | None,
-    ) -> tuple[NDArray[np.bool_], tuple[NDArray[np.int64], NDArray[np.complex128]] | None]:
+    ) -> tuple[NDArray[np.bool_], tuple[NDArray[np.int64], NDArray[np.complex64]] | None]:
         """Which hits pass obstacles, and what passes of those near an outline."""
         points, triangle = bounce.points.take(near, axis=0), bounce.triangles[near, -1]
         whole = np.broadcast_to(~np.bool_(bounce.hidden), near.shape)
@@ -379,7 +398,7 @@ class Rays(Engine):
         passes = np.ones(len(near), dtype=bool)
         for leg, free in legs:
             if leg is None:
-                row, table = np.full(len(near), -1), np.ones((1, 1), dtype=np.complex128)
+                row, table = np.full(len(near), -1), np.ones((1, 1), dtype=np.complex64)
             else:
                 row, table = leg.passed(points, triangle)
             rows.append((row, table))
@@ -389,7 +408,7 @@ class Rays(Engine):
         if not dim.any():
             return passes, None
         chosen = np.flatnonzero(dim)
-        passed = np.ones((len(chosen), len(self._wavenumber)), dtype=np.complex128)
+        passed = np.ones((len(chosen), len(self._wavenumber)), dtype=np.complex64)
         for row, table in rows:
             of = row[chosen]
             some = np.flatnonzero(of >= 0)
