@@ -12,7 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 CREASE = math.radians(30.0)
-TIGHTER = 0.8  # radius of balls around halves, over that around the whole, that is worth it
+TIGHTER = 0.95  # radius of balls around halves, over that around the whole, that is worth it
 
 
 def corner_normals(mesh: trimesh.Trimesh, *, crease: float = CREASE) -> NDArray[np.float64]:
@@ -166,7 +166,7 @@ def enclosing_balls(
     bodies = np.unique(label)
     alone = [np.flatnonzero(label == body) for body in bodies] if len(bodies) <= count else []
     open_ = [ball(group) for group in alone or [np.arange(len(corners))]]
-    done = []
+    done: list[tuple[NDArray[np.float64], float, NDArray[np.int64]]] = []
     while open_ and len(open_) + len(done) < count:
         whole = open_.pop(int(np.argmax([radius for _, radius, _ in open_])))
         group = whole[2]

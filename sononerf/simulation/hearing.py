@@ -126,6 +126,7 @@ class Hearing:
         level: NDArray[np.floating[Any]],
         position: NDArray[np.float64],
         rotation: NDArray[np.float64],
+        shaded: tuple[Sound, NDArray[np.int64], NDArray[np.complex64]] | None = None,
     ) -> None:
         r"""Add what one ear hears of points.
 
@@ -151,6 +152,9 @@ class Hearing:
             Of the head.
         rotation : (3, 3) float64
             Head to world.
+        shaded : tuple, optional
+            A second sound, indices (M,) of points that are partly hidden, and what passes of them
+            (M, F). The second sound takes the imaginary part, to be heard a quarter turn later.
         """
         place = position + rotation @ self.ears.positions[ear]
         towards = points - place
@@ -159,8 +163,13 @@ class Hearing:
         gain = self.gain(ear, towards, rotation)
         gain *= level
         gain /= (self.speed_of_sound * distance).astype(np.float32)[:, None]
-        delay = (length + distance) / self.speed_of_sound
-        sound.add(ear, delay, spread / self.speed_of_sound, gain)
+        delay, spread = (length + distance) / self.speed_of_sound, spread / self.speed_of_sound
+        if shaded is not None:
+            turned, dim, passed = shaded
+            part = gain.take(dim, axis=0)
+            turned.add(ear, delay.take(dim), spread.take(dim), part * passed.imag)
+            gain[dim] = part * passed.real
+        sound.add(ear, delay, spread, gain)
 
     def echo(
         self, sound: Sound, basis: NDArray[np.complex128] | None = None

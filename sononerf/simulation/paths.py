@@ -135,25 +135,17 @@ def _joined(bounces: list[Bounce]) -> Bounce:
     if len(bounces) == 1:
         return bounces[0]
 
-    def all_of(name: str) -> NDArray[Any]:
+    def of_hits(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(bounce, name) for bounce in bounces])
 
+    def of_footprints(name: str) -> Real:
+        return np.concatenate([getattr(bounce.footprint, name) for bounce in bounces], axis=-1)
+
     angles = [np.broadcast_to(bounce.solid_angle, len(bounce.ray)) for bounce in bounces]
-    prints = [bounce.footprint for bounce in bounces]
-    return Bounce(
-        bounces[0].number,
-        np.concatenate(angles),
-        *(all_of(name) for name in ("ray", "emitted", "incoming", "points", "flat", "mirrored")),
-        all_of("length"),
-        Footprint(
-            *(
-                np.concatenate([getattr(part, field.name) for part in prints], axis=-1)
-                for field in fields(Footprint)
-            )
-        ),
-        all_of("triangles"),
-        bounces[0].hidden,
-    )
+    names = ("ray", "emitted", "incoming", "points", "flat", "mirrored", "length", "triangles")
+    joined: dict[str, Any] = {name: of_hits(name) for name in names}
+    footprint = Footprint(**{of.name: of_footprints(of.name) for of in fields(Footprint)})
+    return replace(bounces[0], solid_angle=np.concatenate(angles), footprint=footprint, **joined)
 
 
 def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -326,24 +326,17 @@ class Rays(Engine):
         place_of = np.cumsum(anyone) - 1
         for ear, (heard, gain, spread, shaded) in enumerate(heard_by):
             gain *= level.take(place_of.take(heard), axis=0)
-            every = np.arange(len(heard))
-            parts = [(sound, every, gain)]
-            if shaded is not None:
-                dim, passed = shaded
-                parts.append((turned, dim, gain[dim] * passed.imag))
-                gain[dim] *= passed.real
-            for into, which, strength in parts:
-                some = heard.take(which)
-                self.hearing.add(
-                    into,
-                    ear,
-                    bounce.points.take(some, axis=0),
-                    length=bounce.length.take(some),
-                    spread=spread.take(which),
-                    level=strength,
-                    position=position,
-                    rotation=rotation,
-                )
+            self.hearing.add(
+                sound,
+                ear,
+                bounce.points.take(heard, axis=0),
+                length=bounce.length.take(heard),
+                spread=spread,
+                level=gain,
+                position=position,
+                rotation=rotation,
+                shaded=None if shaded is None else (turned, *shaded),
+            )
 
     def _heard(
         self,

@@ -385,7 +385,7 @@ class Shadow:
             return table
 
         lit = self._caster.visible(points[used] - self._cell * way[used], self._place)
-        found = lit[:, None] + lay(swept) @ self._turns
+        found = lit[:, None] + _product(lay(swept), self._turns)
         curve = pieces.curve[piece]
         if curve.any():
             # How far the way is in the shadow, as an angle by which sound bends.
@@ -396,11 +396,17 @@ class Shadow:
             weight = length / reduced * curve * np.clip(1.0 + bent * grazing / LIT, 0.0, 1.0)
             bent = np.minimum(bent, SHADED / grazing) * curve
             for factor in self._creep:
-                found += lay(weight) @ factor
+                found += _product(lay(weight), factor)
                 weight = weight * bent
         rows[used] = len(self._table) + np.arange(len(used))
         self._table = np.concatenate([self._table, found.astype(np.complex64)])
         return rows
+
+
+def _product(real: NDArray[np.float64], factor: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Multiply a real matrix by a complex one, without making the real one complex."""
+    product: NDArray[np.complex128] = (real @ factor.view(np.float64)).view(np.complex128)
+    return product
 
 
 def behind(
