@@ -142,7 +142,7 @@ class Rays(Engine):
         shadows = self._shadows(position, rotation)
         lit = self._paths(position, rotation, (first, second), self.bounces)
         hidden = self._hidden(position, rotation, (first, second), shadows[0])
-        for bounce in gathered(chain(lit, hidden)):
+        for bounce in chain(gathered(lit), gathered(hidden)):
             self._hear(sound, turned, bounce, position, rotation, shadows)
         echo = self.hearing.echo(sound, self._basis)
         if turned.heard:
