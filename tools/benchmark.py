@@ -3,6 +3,7 @@
 """Measure what sononerf costs and how well it does.
 
     python tools/benchmark.py simulate [--scene ua] [--rays 300000] [--poses 400]
+    python tools/benchmark.py cost configs/three_spheres.yaml [--poses 20]
     python tools/benchmark.py noise [--scene ua] [--poses 20]
     python tools/benchmark.py physics
     python tools/benchmark.py exact [--scene three_spheres] [--engines hybrid rays] [--poses 8]
@@ -20,8 +21,10 @@
     python tools/benchmark.py prey [--placements 20] [--others 5] [--conditions NAME ...]
 
 ``simulate``: seconds per pose, against those that embreex alone needs for the same rays, those for
-visibility included, and the greatest memory. ``noise``: by how much two simulations differ that
-have other rays, 16 times as many, or twice as many; with the reported decibels, on active cells.
+visibility included, and the greatest memory. ``cost``: CPU seconds per pose of a configuration, the
+low band of all its poses included; set OMP_NUM_THREADS=1 first. ``noise``: by how much two
+simulations differ that have other rays, 16 times as many, or twice as many; with the reported
+decibels, on active cells.
 ``physics``: both engines against exact solutions. ``exact``: engines against exact multiple
 scattering of spheres, by band, and what they put before the first echo. ``wave``: bem against exact
 spheres, then the others against bem on a leaf and a beaker; some ten minutes. ``dechirp``: where
@@ -57,6 +60,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # the parts of this command, and the tests' exact solutions
 
+from tools.benchmarks.cost import cost  # noqa: E402
 from tools.benchmarks.exact import exact  # noqa: E402
 from tools.benchmarks.fit import fit  # noqa: E402
 from tools.benchmarks.paper import paper  # noqa: E402
@@ -98,6 +102,10 @@ def main() -> None:
             command.add_argument("--bounces", type=int, default=3)
         if run is simulate:
             command.add_argument("--rays", type=int, default=300_000)
+    command = commands.add_parser(cost.__name__, help=(cost.__doc__ or "").strip())
+    command.set_defaults(run=cost)
+    command.add_argument("config", type=Path)
+    command.add_argument("--poses", type=int, default=20, help="that are traced (20)")
     command = commands.add_parser(exact.__name__, help=(exact.__doc__ or "").strip())
     command.set_defaults(run=exact)
     command.add_argument("--scene", default="three_spheres")
