@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,15 @@ from sononerf.acoustics.ears import Ears, beam_gain, ear_gain
 from sononerf.simulation.impulse_response import Bins, Synthesis, air_loss, deposit, synthesise
 
 MOST_WAITING = 300_000  # echoes; laying them into bins goes over all bins, so it is done seldom
+
+
+class Listener(Protocol):
+    """What takes the echoes of points one by one; see :meth:`Sound.add`."""
+
+    def add(
+        self, ear: int, delay: NDArray[Any], spread: NDArray[Any], strength: NDArray[Any]
+    ) -> None:
+        """Take echoes of one ear."""
 
 
 class Sound:
@@ -117,7 +126,7 @@ class Hearing:
 
     def add(
         self,
-        sound: Sound,
+        sound: Listener,
         ear: int,
         points: NDArray[np.float64],
         *,
@@ -126,7 +135,7 @@ class Hearing:
         level: NDArray[np.floating[Any]],
         position: NDArray[np.float64],
         rotation: NDArray[np.float64],
-        shaded: tuple[Sound, NDArray[np.int64], NDArray[np.complex64]] | None = None,
+        shaded: tuple[Listener, NDArray[np.int64], NDArray[np.complex64]] | None = None,
     ) -> None:
         r"""Add what one ear hears of points.
 

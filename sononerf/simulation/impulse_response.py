@@ -116,7 +116,7 @@ class Bins:
 def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     """Lay out nodes and filters for an analysis.
 
-    Between nodes strengths are interpolated by raised cosines (:func:`_between`). They are even
+    Between nodes strengths are interpolated by raised cosines (:func:`between`). They are even
     about zero frequency, as gains are, and stay what they are above the highest node; there the
     echo falls smoothly to zero within a third of that frequency. The factor ``j f`` that every
     reflection has is part of the filters: a flat reflection is then a short derivative pulse and
@@ -142,7 +142,7 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     unit = 2 ** (LEVELS - 1)
     length = unit * int(scipy.fft.next_fast_len(math.ceil((samples + GUARD) / unit), real=True))
     frequency = np.fft.rfftfreq(length, 1.0 / rate)
-    even, odd = _between(np.minimum(frequency, top), nodes)
+    even, odd = between(np.minimum(frequency, top), nodes)
     end = min(top * 4.0 / 3.0, rate / 2.0)
     fall = np.clip((frequency - top) / (end - top), 0.0, 1.0)
     # Laying an echo between two of the finest bins damps it by this much, on average over where
@@ -154,7 +154,7 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     return Synthesis(nodes, hats, basis, odd_hats, rate, samples, length)
 
 
-def _between(
+def between(
     frequency: NDArray[np.float64], nodes: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     r"""Return the weight (K, F) of each node in a value at each frequency.

@@ -19,7 +19,7 @@ from sononerf.scene import Scene
 from sononerf.simulation.diffraction import Diffraction
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.footprint import Real
-from sononerf.simulation.hearing import Hearing, Sound
+from sononerf.simulation.hearing import Hearing, Listener
 from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
 from sononerf.simulation.reflection import coarse_gain, unfaded
 from sononerf.simulation.shadows import LEAST, Outlines, Shadow, behind
@@ -155,6 +155,20 @@ class Rays(Engine):
             )
             echo += self.hearing.echo(edges, self._hats)
         return echo
+
+    def later(
+        self,
+        sound: Listener,
+        position: NDArray[np.float64],
+        rotation: NDArray[np.float64],
+        *,
+        seed: int,
+    ) -> None:
+        """Tell a listener what is heard after the first bounce; edges are left out."""
+        first, second, _ = np.random.default_rng(seed).random(3)
+        for bounce in self._paths(position, rotation, (first, second), self.bounces):
+            if bounce.number > 1:
+                self._hear(sound, sound, bounce, position, rotation, [])
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_diffraction": None, "_outlines": None}
@@ -304,18 +318,17 @@ class Rays(Engine):
 
     def _hear(
         self,
-        sound: Sound,
-        turned: Sound,
+        sound: Listener,
+        turned: Listener,
         bounce: Bounce,
         position: NDArray[np.float64],
         rotation: NDArray[np.float64],
         shadows: list[Shadow],
     ) -> None:
+        soft = bounce.number == 1
         heard_by = [
-            self._heard(bounce, place, *((shadows[0], shadow) if bounce.number == 1 else ()))
-            for place, shadow in zip(
-                self.hearing.places(position, rotation)[1], shadows[1:], strict=True
-            )
+            self._heard(bounce, place, *((shadows[0], shadows[1 + ear]) if soft else ()))
+            for ear, place in enumerate(self.hearing.places(position, rotation)[1])
         ]
         anyone = np.zeros(len(bounce.ray), dtype=bool)
         for heard, _, _, _ in heard_by:

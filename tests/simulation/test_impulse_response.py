@@ -73,7 +73,7 @@ def notch(frequency, middle):
 
 
 @pytest.mark.parametrize("middle", [45e3, 60e3, 71.3e3])
-def test_a_notch_is_heard_between_the_nodes_as_it_is(synthesis, middle):
+def test_a_notch_is_heardbetween_the_nodes_as_it_is(synthesis, middle):
     frequency = np.linspace(10e3, 140e3, 131)
     echo = echo_of(synthesis, 700.0, notch(synthesis.nodes, middle), basis=synthesis.hats)
     found = spectrum(echo, frequency, 700.0)
