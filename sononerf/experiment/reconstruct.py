@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from sononerf.experiment.build import acquisition
 from sononerf.experiment.fitted import Fitted, load_fitted, store_of
 from sononerf.experiment.run_folder import RunFolder, results_folder
 from sononerf.experiment.surface import refine_surface
-from sononerf.progress import Progress
+from sononerf.progress import Progress, Task
 from sononerf.reconstruction.baseline import backprojection, best_level_surface
 from sononerf.reconstruction.confidence import poses_that_saw
 from sononerf.reconstruction.mesh import MeshFormat, mesh_bytes
@@ -93,25 +93,25 @@ def reconstruct(
         level = options.level
     if method is None:
         method = options.method
+    automatic = method == "auto" and level == "auto"
+    refines = options.refine and automatic
     with results_folder(folder):
-        with progress.task("reconstructing", 1000) as task, torch.inference_mode():
-            found = read_out(
-                fitted.module.field,
-                hull=fitted.hull,
-                spacing=spacing or options.spacing,
-                level=level,
-                method=method,
-                directions=options.directions,
-                smoothing=options.smoothing if method == "isosurface" else 0.0,
-                progress=lambda done, total: task.advance(1000 * done // total - task.done),
-            )
+        starts = _read_out(
+            fitted,
+            methods=("auto", "hull") if automatic else (method,),
+            several=refines,
+            spacing=spacing or options.spacing,
+            level=level,
+            progress=progress,
+        )
         if folder.resolve() == (path / "reconstruction").resolve():
             RunFolder(path).drop_metrics("geometry")  # of the mesh that is replaced
-        refined = None
-        if options.refine and method == "auto" and level == "auto":
-            refined = _refined(path, fitted, found.mesh, accelerator, progress)
+        found, refined = starts[0], None
+        if refines:
+            meshes = [start.mesh for start in starts]
+            refined = _refined(path, fitted, meshes, accelerator, progress)
         if refined is not None:
-            found = replace(found, mesh=refined.mesh)
+            found = replace(starts[refined.start], mesh=refined.mesh)
         _write(folder, found, refined, true_mesh(fitted))
     if found.openness is not None and found.openness.kind in OPEN:
         progress.say(OPEN[found.openness.kind].format(found.openness))
@@ -122,8 +122,58 @@ def reconstruct(
     return folder
 
 
+def _read_out(
+    fitted: Fitted,
+    *,
+    methods: Sequence[Method],
+    several: bool,
+    spacing: float | None,
+    level: float | Literal["auto"],
+    progress: Progress,
+) -> list[Reconstruction]:
+    """Read surfaces out of the field by some methods: all of them, or the first that gives one.
+
+    Raises
+    ------
+    NumericalError
+        If none gives a surface.
+    """
+    options = fitted.settings.reconstruction
+    found: list[Reconstruction] = []
+    error: NumericalError | None = None
+    for method in methods:
+        if found and not several:
+            break
+        try:
+            with progress.task("reconstructing", 1000) as task, torch.inference_mode():
+
+                def shown(done: int, total: int, task: Task = task) -> None:
+                    task.advance(1000 * done // total - task.done)
+
+                one = read_out(
+                    fitted.module.field,
+                    hull=fitted.hull,
+                    spacing=spacing,
+                    level=level,
+                    method=method,
+                    directions=options.directions,
+                    smoothing=options.smoothing if method == "isosurface" else 0.0,
+                    progress=shown,
+                )
+            found.append(one)
+        except NumericalError as raised:
+            error = error or raised
+    if error is not None and not found:
+        raise error
+    return found
+
+
 def _refined(
-    path: Path, fitted: Fitted, start: trimesh.Trimesh, accelerator: str, progress: Progress
+    path: Path,
+    fitted: Fitted,
+    starts: Sequence[trimesh.Trimesh],
+    accelerator: str,
+    progress: Progress,
 ) -> Refined | None:
     """Return the refined surface; None where the run's echoes are not there."""
     try:
@@ -131,7 +181,7 @@ def _refined(
     except InputError as error:
         progress.say(f"the surface is not refined: {error}")
         return None
-    return refine_surface(path, fitted, start, accelerator=accelerator, progress=progress)
+    return refine_surface(path, fitted, starts, accelerator=accelerator, progress=progress)
 
 
 def _write(

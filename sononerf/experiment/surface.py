@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -33,7 +34,7 @@ RAYS = 20_000
 def refine_surface(
     path: Path,
     fitted: Fitted,
-    start: trimesh.Trimesh,
+    starts: Sequence[trimesh.Trimesh],
     *,
     accelerator: str = "auto",
     progress: Progress,
@@ -46,8 +47,8 @@ def refine_surface(
         The run's folder; the state is kept there until the refinement is done.
     fitted : Fitted
         The run.
-    start : Trimesh
-        The surface to start from, m.
+    starts : sequence of Trimesh
+        Surfaces to start from, m; the one that explains the validation poses best is refined.
     accelerator : {"auto", "cpu", "gpu"}
         What to compute on.
     progress : Progress
@@ -63,15 +64,16 @@ def refine_surface(
     require_accelerator(accelerator)
     settings = fitted.settings
     store = store_of(fitted)
-    optics = optics_of(settings, quiet_scene(start)).to(_device(accelerator))
+    optics = optics_of(settings, quiet_scene(starts[0])).to(_device(accelerator))
     work = Refinement(
-        start,
+        starts,
         Echoes.of(store),
         optics,
         simulate=partial(surface_simulator, settings, rays=RAYS),
         seed=settings.fit.seed,
     )
-    identity = f"{model_checksum(path)} {hashlib.sha256(start.vertices.tobytes()).hexdigest()}"
+    digest = hashlib.sha256(b"".join(mesh.vertices.tobytes() for mesh in starts))
+    identity = f"{model_checksum(path)} {digest.hexdigest()}"
     file = path / STATE
     _restore(file, work, identity)
     saved = time.monotonic()

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -84,6 +84,8 @@ class Refined:
         What rendered magnitudes are multiplied by, learned on training poses.
     support : (V,) float64
         How many training poses see each vertex near the direction of a mirror.
+    start : int
+        Which of the starts was refined.
     kept : bool
         True where the refined surface explains the validation poses better than the start.
     error_db : float
@@ -95,6 +97,7 @@ class Refined:
     mesh: trimesh.Trimesh
     gain: NDArray[np.float64]
     support: NDArray[np.float64]
+    start: int
     kept: bool
     error_db: float
     history: list[dict[str, Any]]
@@ -105,8 +108,8 @@ class Refinement:
 
     Parameters
     ----------
-    mesh : Trimesh
-        Where to start, m.
+    meshes : sequence of Trimesh
+        Where to start, m; of several the one that explains the validation poses best.
     echoes : Echoes
         What was measured.
     optics : Optics
@@ -124,7 +127,7 @@ class Refinement:
 
     def __init__(
         self,
-        mesh: trimesh.Trimesh,
+        meshes: Sequence[trimesh.Trimesh],
         echoes: Echoes,
         optics: Optics,
         *,
@@ -138,7 +141,8 @@ class Refinement:
         self.echoes, self.optics, self.seed, self.stages = echoes, optics, seed, stages
         like = optics.get_buffer("wavenumber")
         self.level = Level(optics.ears, len(optics.frequencies), like)
-        self.candidates = [_plain(mesh)]
+        self.candidates = [_plain(mesh) for mesh in meshes]
+        self.start: int | None = 0 if len(meshes) == 1 else None
         self.stage, self.step, self.drawn = 0, 0, 0
         self.history: list[dict[str, Any]] = []
         self._descent: Descent | None = None
@@ -160,6 +164,8 @@ class Refinement:
     def advance(self) -> float:
         """Do one step; return its mismatch, dB."""
         stage = self.stages[self.stage]
+        if self.start is None:
+            self._choose()
         if self._descent is None:
             unit = self.optics.wavelength
             made = remesh(self.candidates[-1], stage.edge * unit, stage.blur * unit)
@@ -174,6 +180,12 @@ class Refinement:
             self._descent = None
             self.stage, self.step = self.stage + 1, 0
         return mismatch
+
+    def _choose(self) -> None:
+        """Keep the start that explains the validation poses best."""
+        self.start = int(np.argmin(self.errors()))
+        self.candidates = [self.candidates[self.start]]
+        self._traced = {0: self._traced[self.start]}
 
     def _descend(self, mesh: trimesh.Trimesh) -> Descent:
         stage = self.stages[self.stage]
@@ -252,7 +264,9 @@ class Refinement:
     def state(self) -> dict[str, Tensor]:
         """Return all that is needed to go on, as plain tensors."""
         found = {
-            "progress": torch.tensor([self.stage, self.step, self.drawn]),
+            "progress": torch.tensor(
+                [self.stage, self.step, self.drawn, -1 if self.start is None else self.start]
+            ),
             **{f"level.{name}": part for name, part in self.level.state().items()},
         }
         for number, mesh in enumerate(self.candidates):
@@ -266,8 +280,9 @@ class Refinement:
         return found
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Go on from a state; mesh, echoes, optics, seed and stages must be the same."""
-        self.stage, self.step, self.drawn = (int(part) for part in state["progress"])
+        """Go on from a state; meshes, echoes, optics, seed and stages must be the same."""
+        self.stage, self.step, self.drawn, start = (int(part) for part in state["progress"])
+        self.start = None if start < 0 else start
         self.level.load({name: state[f"level.{name}"] for name in self.level.state()})
         count = sum(key.endswith(".vertices") and key.startswith("candidate.") for key in state)
         self.candidates = [
@@ -301,7 +316,8 @@ class Refinement:
         if best:
             mesh, support = finer(mesh, support, self.optics.wavelength)
         gain = self.level.gain.exp().double().cpu().numpy()
-        return Refined(mesh, gain, support, best > 0, errors[best], self.history)
+        start = self.start or 0
+        return Refined(mesh, gain, support, start, best > 0, errors[best], self.history)
 
 
 def _plain(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -313,7 +329,7 @@ def _plain(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def refine(
-    mesh: trimesh.Trimesh,
+    meshes: Sequence[trimesh.Trimesh],
     echoes: Echoes,
     optics: Optics,
     *,
@@ -329,7 +345,7 @@ def refine(
 
     Parameters
     ----------
-    mesh, echoes, optics, simulate, seed, stages, calibrated
+    meshes, echoes, optics, simulate, seed, stages, calibrated
         As there.
     progress : callable, optional
         Takes how many steps are done, how many there are, and the mismatch in dB.
@@ -339,7 +355,7 @@ def refine(
         Called after each step; it may save the state, or raise to stop.
     """
     work = Refinement(
-        mesh,
+        meshes,
         echoes,
         optics,
         simulate=simulate,

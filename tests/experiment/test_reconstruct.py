@@ -246,3 +246,22 @@ def test_a_damaged_mesh_is_told(run, content, no_projections):
     (run / "reconstruction" / "mesh.ply").write_bytes(content)
     with pytest.raises(InputError, match=r"mesh\.ply: .*reconstruct again"):
         evaluate(run)
+
+
+def test_the_hull_of_first_echoes_is_the_surface_where_the_field_has_none(
+    run, no_projections, monkeypatch
+):
+    real, asked = reconstruct_module.read_out, []
+
+    def only_the_hull(field, *, method, **options):
+        asked.append(method)
+        if method != "hull":
+            raise NumericalError("no surface: the indicator is empty")
+        return real(field, method=method, **options)
+
+    monkeypatch.setattr(reconstruct_module, "read_out", only_the_hull)
+    folder = reconstruct(run)
+    assert asked == ["auto", "hull"]
+    assert read_out(folder)["method"] == "hull"
+    with pytest.raises(NumericalError, match="the indicator is empty"):
+        reconstruct(run, method="oriented")

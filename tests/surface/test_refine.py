@@ -25,11 +25,11 @@ def unasked(mesh):
 
 
 def refined(mesh, echoes, optics, *, simulate=unasked, stages=None, **given):
-    return refine(mesh, echoes, optics, simulate=simulate, stages=stages or SHORT, **given)
+    return refine([mesh], echoes, optics, simulate=simulate, stages=stages or SHORT, **given)
 
 
 def started(mesh, echoes, optics, *, simulate=unasked, stages=None):
-    return Refinement(mesh, echoes, optics, simulate=simulate, seed=1, stages=stages or SHORT)
+    return Refinement([mesh], echoes, optics, simulate=simulate, seed=1, stages=stages or SHORT)
 
 
 SHORT = (
@@ -77,6 +77,19 @@ def test_a_surface_that_gets_worse_is_not_kept(echoes, optics, monkeypatch):
     found = refined(true, echoes, optics, seed=0)
     assert not found.kept
     assert np.array_equal(found.mesh.vertices, true.vertices)
+
+
+def test_of_two_starts_the_one_that_explains_more_is_refined(bumpy, echoes, optics):
+    half = bumpy.copy().apply_scale(0.5)
+    for place, starts in ((0, [bumpy, half]), (1, [half, bumpy])):
+        work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        work.advance()
+        assert work.start == place
+        assert len(work.candidates) == 1
+        np.testing.assert_array_equal(work.candidates[0].vertices, bumpy.vertices)
+        again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        again.load(work.state())
+        assert again.start == place
 
 
 @pytest.fixture
