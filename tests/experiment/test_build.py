@@ -9,15 +9,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from sononerf.data.first_echo import asked_poses
+from sononerf.data.region import OUTSIDE, EchoEvidence, echo_reach
 
 from sononerf import plugins
 from sononerf.acoustics.ears import synthetic_ears
 from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.data import first_echo
-from sononerf.data.first_echo import asked_poses
-from sononerf.data.region import OUTSIDE, EchoEvidence, echo_reach
 from sononerf.data.store import EnsembleStore
+from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import InputError, NumericalError, SettingsError
 from sononerf.experiment import build
 from sononerf.experiment.build import (
@@ -34,7 +35,6 @@ from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.field.hash import HashField
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.geometry.hull import EchoHull
 from sononerf.renderer.profile import ProfileRenderer
 from sononerf.renderer.shell import ShellRenderer
 

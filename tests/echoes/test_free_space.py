@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
+from sononerf.echoes.free_space import EchoHull
 from sononerf.geometry import hull as hull_module
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.geometry.hull import EchoHull
 
 AHEAD = np.array([1.0, 0.0, 0.0])
 
