@@ -26,16 +26,16 @@ from sononerf.echoes.free_space import EchoHull
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-ACCURACY = 0.2
+ACCURACY = 0.1
 """Greatest usual error of an onset's range, in range resolutions. Simulated bodies show it."""
 FEW = 0.05
 """Share of all onsets that may rule out a place and all be wrong, no unit. Of a thin leaf, where
 every twelfth onset is late, a larger share blames right ones, and a smaller one does too."""
 
 # Sizes of the search, not of what it finds: cells of the first lattice along the longest side, the
-# greatest number of pairs of a cell and an onset, and the last half diagonal of a cell in onset
-# errors.
-COARSE, MOST_PAIRS, FINEST = 24, 0.6e8, 1.25
+# greatest number of pairs of a cell and an onset, and how often the half diagonal of the last cells
+# is halved down to the error of an onset.
+COARSE, MOST_PAIRS, LEVELS = 24, 1.2e8, 4
 OCTANTS = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -49,20 +49,21 @@ def weighted(hull: EchoHull, resolution: float) -> EchoHull:
     resolution : float, m
         Range resolution.
     """
-    first = hull.trusted.reshape(-1)
-    weight = np.isfinite(first).astype(np.float64)
-    box = _heard_box(hull)
-    heard = np.flatnonzero(weight)
-    if not len(heard):
+    box, ears = _heard_box(hull), hull.first.shape[1]
+    if box is None:
         return hull
     error = ACCURACY * resolution
-    homeless = heard[~_cells(hull, box, heard, 0, error)[1].any(axis=0)]
-    if len(homeless):
-        ears = hull.first.shape[1]
-        few = max(int(FEW * len(heard)), 4 * ears)
-        against, meets = _cells(hull, box, homeless, few, error)
-        _remove(weight, homeless, against, meets, few, float(ears))
-    return replace(hull, weight=weight.reshape(hull.first.shape))
+    for scale in 2.0 ** -np.arange(LEVELS):  # gross outliers first
+        reach = error * scale * 2.0 ** (LEVELS - 1)
+        weight = np.array(hull.weight).reshape(-1)
+        heard = np.flatnonzero(weight)
+        homeless = heard[~_cells(hull, box, heard, 0, error, reach)[1].any(axis=0)]
+        if len(homeless):
+            few = max(int(FEW * scale * len(heard)), 4 * ears)
+            against, meets = _cells(hull, box, homeless, few, error, reach)
+            _remove(weight, homeless, against, meets, few, float(ears))
+            hull = replace(hull, weight=weight.reshape(hull.first.shape))
+    return hull
 
 
 def _remove(
@@ -95,10 +96,12 @@ def _remove(
     weight[homeless[least > few]] = 0.0
 
 
-def _heard_box(hull: EchoHull) -> Array:
+def _heard_box(hull: EchoHull) -> Array | None:
     """Return a box around where each first echo comes from if it lies ahead, (2, 3) m."""
     first = hull.trusted.max(axis=1)
     known = np.isfinite(first)
+    if not known.any():
+        return None
     ahead = hull.sources[known] + hull.axes[known] * first[known, None]
     lower, upper = ahead.min(axis=0), ahead.max(axis=0)
     # To the sides as well: half of the mean range at least.
@@ -108,9 +111,11 @@ def _heard_box(hull: EchoHull) -> Array:
 
 
 def _cells(
-    hull: EchoHull, box: Array, wanted: NDArray[np.intp], few: int, error: float
+    hull: EchoHull, box: Array, wanted: NDArray[np.intp], few: int, error: float, least: float
 ) -> tuple[Mask, Mask]:
     """Return cells at the range of wanted onsets that at most a few others rule out.
+
+    They are halved until half their diagonal is the least, m.
 
     Returns
     -------
@@ -134,7 +139,7 @@ def _cells(
             kept.append((part[keep], against[keep], meets[keep]))
         cells, against, meets = (np.concatenate(each) for each in zip(*kept, strict=True))
         finer = 8.0 * len(cells) * hull.first.size
-        if reach <= (FINEST + 1.0) * error or finer > MOST_PAIRS or not len(cells):
+        if reach <= least + error or finer > MOST_PAIRS or not len(cells):
             return against, meets
         cells = (cells[:, None] + side * OCTANTS).reshape(-1, 3)
         side /= 2
