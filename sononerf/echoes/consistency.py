@@ -88,11 +88,11 @@ def _remove(
         lost = (origins.T @ blocks) > 0  # (asks, onsets)
         blame = np.asarray(lost.multiply(1.0 / least[asks][:, None]).sum(axis=0)).reshape(-1)
         blame[weight == 0] = 0.0
-        worst = int(blame.argmax())
-        if blame[worst] < enough:
+        worst = np.flatnonzero(blame >= max(enough, blame.max() / 2))
+        if not len(worst):
             break
         weight[worst] = 0.0
-        count -= against[:, worst]
+        count -= against[:, worst].sum(axis=1)
     weight[homeless[least > few]] = 0.0
 
 

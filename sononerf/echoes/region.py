@@ -30,6 +30,11 @@ ENOUGH = 2
 """So many poses must hear something from a place, or share it as the origin of their onsets: one
 alone does not tell where on its ellipsoid the echo comes from."""
 
+NOTHING = (
+    "no pose received an echo that another one confirms; check scene, poses and range limits, or "
+    "set region.lower and region.upper"
+)
+
 # Sizes of the search: poses asked for their power, looks from coarse to fine, cells along the
 # longest side in each of them, passes over the power, and places looked at in one go.
 POSES, LOOKS, COARSE, ROUNDS, CHUNK = 200, 4, 28, 4, 2048
@@ -61,7 +66,7 @@ class EchoRegion:
         self, heard: Onsets, hull: EchoHull, ears: Ears, rotations: Array, resolution: float
     ) -> None:
         if not np.isfinite(hull.trusted).any():
-            raise NumericalError("no pose received an echo; check scene, poses and range limits")
+            raise NumericalError(NOTHING)
         self.hull, self.resolution, self.range = hull, resolution, heard.range
         self.step = float(heard.range[1] - heard.range[0])
         count = len(heard.poses)
@@ -142,8 +147,8 @@ class EchoRegion:
         looks = np.array([[3, 0, 0], [3, 2, 0], [3, -2, 0], [3, 0, 2], [3, 0, -2]])  # 34 degrees
         looks = looks / np.linalg.norm(looks, axis=1, keepdims=True)
         last = self.range[self.heard.shape[1] - 1 - self.heard[:, ::-1].argmax(axis=1)]
-        ends = [self.sources + self.rotations @ look * last[:, None] for look in looks]
-        ends = np.concatenate((self.sources, *ends))
+        ahead = [self.sources + self.rotations @ look * last[:, None] for look in looks]
+        ends = np.concatenate((self.sources, *ahead))
         lower, upper = ends.min(axis=0), ends.max(axis=0)
         for _ in range(LOOKS):  # coarse to fine
             spacing = float((upper - lower).max()) / COARSE
@@ -154,10 +159,7 @@ class EchoRegion:
             points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
             kept = points[self.needed(points, spacing * np.sqrt(3) / 2)]
             if not len(kept):
-                raise NumericalError(
-                    "the echoes leave no place where something could be; set region.lower and "
-                    "region.upper, or check the poses"
-                )
+                raise NumericalError(NOTHING)
             lower, upper = kept.min(axis=0) - spacing / 2, kept.max(axis=0) + spacing / 2
         margin = 2.0 * self.resolution
         return np.stack((lower - margin, upper + margin))
