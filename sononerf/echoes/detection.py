@@ -16,7 +16,9 @@ cells does not move it:
 with :math:`P_i(r)` the power of one ear at one pose, averaged over frequency, and :math:`r_i` the
 range of its loudest slice. A slice holds an echo where
 
-.. math:: P_i(r) > T \max\big(N_i, \max_{l \ge g} P_i(r + l) \, S(l)\big) .
+.. math:: P_i(r) > T \max\big(N_i, \max_{l \ge g} P_i(r + l) \, S(l)\big)
+
+with :math:`r + l` the local maxima behind it.
 
 The guard :math:`g` keeps an echo from its own flank: it is the first lag with :math:`T S(g) < 1`.
 
@@ -93,11 +95,20 @@ def threshold_levels(power: Array, looks: float) -> Levels:
     precursors = factor * _precursors(power.reshape(-1, power.shape[-1]))
     own = precursors >= 1.0
     guard = int(own.argmin()) if not own.all() else len(own)
+    tops = np.where(_is_top(power), power, 0.0)
     for lag, ratio in enumerate(precursors[guard:], start=guard + 1):
         if ratio > 0.0:
-            np.maximum(total[..., :-lag], power[..., lag:] * ratio, out=total[..., :-lag])
+            np.maximum(total[..., :-lag], tops[..., lag:] * ratio, out=total[..., :-lag])
     ahead = power[..., :1]
     return Levels(noise, np.where(ahead > total[..., :1], np.maximum(total, factor * ahead), total))
+
+
+def _is_top(power: Array) -> Mask:
+    """Tell which slices are louder than those beside them, (..., R); the last may be one."""
+    top = np.zeros(power.shape, dtype=bool)
+    top[..., 1:-1] = (power[..., 1:-1] >= power[..., :-2]) & (power[..., 1:-1] > power[..., 2:])
+    top[..., -1] = power[..., -1] > power[..., -2]
+    return top
 
 
 def _precursors(power: Array) -> Array:
@@ -140,8 +151,7 @@ def onsets(power: Array, levels: Levels, window: Array, fineness: float) -> Arra
     """
     rising, middle = _flank(window)
     found = np.full(len(power), -np.inf)
-    inner = (power[:, 1:-1] >= power[:, :-2]) & (power[:, 1:-1] > power[:, 2:])
-    inner &= power[:, 1:-1] > levels.total[:, 1:-1]
+    inner = (_is_top(power) & (power > levels.total))[:, 1:-1]
     for row in np.flatnonzero(inner.any(axis=1)):
         top = int(inner[row].argmax()) + 1
         echo = power[row, : top + 1] / power[row, top]

@@ -26,10 +26,6 @@ unit. Above a half, for of two places that share an echo neither has more than t
 UNEXPLAINED = 0.02
 """Fraction of the power that may stay without a place, no unit. Bounces among the parts of a body
 arrive late and have no place of their own; they hold about as much."""
-ENOUGH = 2
-"""So many poses must hear something from a place, or share it as the origin of their onsets: one
-alone does not tell where on its ellipsoid the echo comes from."""
-
 NOTHING = (
     "no pose received an echo that another one confirms; check scene, poses and range limits, or "
     "set region.lower and region.upper"
@@ -38,6 +34,7 @@ NOTHING = (
 # Sizes of the search: poses asked for their power, looks from coarse to fine, cells along the
 # longest side in each of them, passes over the power, and places looked at in one go.
 POSES, LOOKS, COARSE, ROUNDS, CHUNK = 200, 4, 28, 4, 2048
+ENOUGH = 2  # poses: one alone does not tell where on its ellipsoid an echo comes from
 
 
 class EchoRegion:
@@ -93,7 +90,7 @@ class EchoRegion:
 
     def _inside(self, points: Array, tolerance: float) -> Mask:
         clearance = self.hull.clearance(points)[0]
-        return np.asarray(clearance >= -(tolerance + ACCURACY * self.resolution / 2))
+        return np.asarray(clearance >= -(tolerance + ACCURACY * self.resolution))
 
     def _energy(
         self, points: Array, tolerance: float, power: Array | None = None

@@ -55,8 +55,8 @@ def test_echoes_are_found_between_slices_and_in_noise():
 def test_a_second_echo_does_not_move_the_first():
     first = 150 + np.linspace(0, 1, 10)
     for behind, power in ((10, 1.0), (20, 10.0), (60, 1000.0)):
-        rows = [echo(m) + echo(m + behind + i, power) for i, m in enumerate(first)]
-        np.testing.assert_allclose(found_in(rows), first, atol=0.6)  # of 32 slices
+        rows = [echo(m) + echo(m + behind, power) for m in first] + [echo(200.0)] * 5
+        np.testing.assert_allclose(found_in(rows)[:10], first, atol=0.6)  # of 32 slices
 
 
 def test_a_precursor_that_all_echoes_have_is_no_echo():

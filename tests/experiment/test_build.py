@@ -288,9 +288,9 @@ def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
     for snr_db, error in ((40, 0.001), (20, 0.002), (10, 0.003)):
         found, hull = heard(f"at {snr_db} dB", snr_db=snr_db)
         torch.testing.assert_close(found, box, rtol=0, atol=0.010)
-        late = hull.first - (np.linalg.norm(hull.sources, axis=1) - 0.02)[:, None]
-        late = late[hull.weight > 0]
-        assert len(late) > 40
+        both = hull.first[(hull.weight > 0).all(axis=1)].mean(axis=1)
+        late = both - (np.linalg.norm(hull.sources, axis=1) - 0.02)[(hull.weight > 0).all(axis=1)]
+        assert len(late) > 20
         assert np.abs(late).max() < error
 
 
@@ -319,9 +319,9 @@ def test_what_is_possible_is_what_the_hull_leaves(tiny, echoes):
     found = given[1](places, 0.002)
     assert torch.equal(own[1](places, 0.002), found)
     clearance = hull.clearance(places.double().numpy())[0]
-    # A quarter of how far a place speaks for its surroundings, and half an onset's error.
-    assert clearance[found.numpy()].min() >= -0.0008
-    assert (clearance < -0.0008).any()
+    # A quarter of how far a place speaks for its surroundings, and an onset's error.
+    assert clearance[found.numpy()].min() >= -0.0011
+    assert (clearance < -0.0011).any()
     # The middle of the sphere is where nobody hears anything come from, and the front is.
     front = 0.02 * hull.sources / np.linalg.norm(hull.sources, axis=1)[:, None]
     assert given[1](torch.as_tensor(front).float(), 0.002).all()
