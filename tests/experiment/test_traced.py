@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Echoes off the reconstruction are believed as far as unseen poses bear them out, no further."""
+"""The weight of echoes traced off the surface comes from validation poses alone."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ import trimesh
 
 from sononerf.acoustics.spectrogram import compress
 from sononerf.data.store import EnsembleStore
-from sononerf.errors import InputError, NumericalError
+from sononerf.errors import InputError
 from sononerf.experiment import predict as predict_module
-from sononerf.experiment import retrace as retrace_module
-from sononerf.experiment.borne_out import NAME, borne_out
+from sononerf.experiment import traced as traced_module
 from sononerf.experiment.fitted import load_fitted, poses_of, render_poses, store_of
 from sononerf.experiment.predict import predict
-from sononerf.experiment.reconstruct import read_mesh, reconstruct
-from sononerf.experiment.retrace import Retrace, learn_retrace, load_retrace, trace_poses
+from sononerf.experiment.reconstruct import read_mesh
+from sononerf.experiment.traced import NAME, Traced, learn_traced, load_traced, trace_poses
 from sononerf.progress import Progress
-from sononerf.reconstruction.retrace import blend, calmed
+from sononerf.reconstruction.mixture import mix
 from sononerf.scene import Scene
 from sononerf.simulation.simulator import Simulator
 from sononerf.weights import load_weights, save_weights
 
 CSV = "x,y,z,yaw,pitch,roll\n-0.4,0,0,0,0,0\n0,0,0.4,0,90,0\n"
 QUIET = Progress(quiet=True)
+ROWS = 47  # frequencies
 SPHERE = trimesh.creation.icosphere(subdivisions=4, radius=0.02)  # the scene, as it is
 
 pytestmark = pytest.mark.usefixtures("without_pictures")
@@ -47,10 +47,6 @@ class Heard(Progress):
         self.said.append(text)
 
 
-def no_hull(fitted):
-    raise NumericalError("first echoes leave nothing")
-
-
 def reconstruct_as(path, mesh):
     (path / "reconstruction").mkdir(exist_ok=True)
     (path / "reconstruction" / "mesh.ply").write_bytes(mesh.export(file_type="ply"))
@@ -59,8 +55,7 @@ def reconstruct_as(path, mesh):
 @pytest.fixture
 def run(fitted_run, tmp_path, monkeypatch):
     """A run that was hardly fitted, yet whose reconstruction is the true surface."""
-    monkeypatch.setattr(retrace_module, "RAYS", 500)
-    monkeypatch.setattr(retrace_module, "_hull_surface", no_hull)
+    monkeypatch.setattr(traced_module, "RAYS", 500)
     monkeypatch.setattr(predict_module, "spectrogram_png", lambda *given: b"")
     path = tmp_path / "run"
     path.mkdir()
@@ -71,7 +66,7 @@ def run(fitted_run, tmp_path, monkeypatch):
 
 
 def learn(path, **options):
-    return learn_retrace(path, accelerator="cpu", **options)
+    return learn_traced(path, accelerator="cpu", **options)
 
 
 @pytest.fixture(scope="module")
@@ -81,21 +76,20 @@ def learned(fitted_run, without_pictures, tmp_path_factory):
     shutil.copytree(fitted_run, path)
     reconstruct_as(path, SPHERE)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(retrace_module, "RAYS", 500)
-        patch.setattr(retrace_module, "_hull_surface", no_hull)
+        patch.setattr(traced_module, "RAYS", 500)
         learn(path)
     return (path / NAME).read_bytes()
 
 
 @pytest.fixture
 def believe(learned):
-    """Put what was learned into a run, with a share of one's own."""
+    """Put what was learned into a run, with one weight for all frequencies."""
 
     def put(path, share):
         digest = hashlib.sha256((path / "model.safetensors").read_bytes()).hexdigest()
         tensors = {
             **safetensors.torch.load(learned),
-            "share": torch.tensor(share, dtype=torch.float64),
+            "weight": torch.full((ROWS,), share, dtype=torch.float64),
         }
         (path / NAME).write_bytes(safetensors.torch.save(tensors, {"model": digest}))
 
@@ -115,52 +109,52 @@ def tree(folder):
 # Learning.
 
 
-def test_a_true_surface_is_believed_whole(run):
-    assert learn(run) == 1
-    found = load_retrace(run)
-    assert found.share == 1
-    # Both are simulated; 500 rays tell a level to some tenths of a decibel.
+def test_echoes_of_the_true_surface_have_a_great_weight(run):
+    weight = learn(run)
+    assert weight.mean() > 0.9
+    found = load_traced(run)
+    np.testing.assert_array_equal(found.weight, weight)
+    # Both are simulated; 500 rays give a level to some tenths of a decibel.
     np.testing.assert_allclose(found.gain_db, 0, atol=0.5)
-    surface = calmed(read_mesh(run / "reconstruction" / "mesh.ply"))
+    surface = read_mesh(run / "reconstruction" / "mesh.ply")
     np.testing.assert_array_equal(found.mesh.vertices, surface.vertices)
     np.testing.assert_array_equal(found.mesh.faces, surface.faces)
 
 
-def test_where_the_field_alone_is_right_nothing_is_traced(run, monkeypatch):
+def test_nothing_is_traced_where_the_field_alone_is_right(run, monkeypatch):
     def right(fitted, poses, **options):
         return np.concatenate([poses[row].spectrum.numpy() for row in range(len(poses))])
 
-    monkeypatch.setattr(retrace_module, "render_poses", right)
-    assert learn(run) == 0
-    assert load_retrace(run).share == 0
+    monkeypatch.setattr(traced_module, "render_poses", right)
+    assert not learn(run).any()
+    assert not load_traced(run).weight.any()
 
 
-def test_the_share_is_that_of_rendered_and_tuned_echoes_of_the_validation_poses(run, monkeypatch):
+def test_the_regression_has_the_validation_poses_alone(run, monkeypatch):
     given = {}
 
-    def noted(measured, rendered, traced, reference):
-        given.update(measured=measured, rendered=rendered, traced=traced, reference=reference)
-        return 0.4
+    def noted(measured, rendered, traced):
+        given.update(measured=measured, rendered=rendered, traced=traced)
+        return np.full(measured.shape[-1], 0.4)
 
-    monkeypatch.setattr(retrace_module, "best_share", noted)
-    assert learn(run) == 0.4
-    fitted, retrace = load_fitted(run), load_retrace(run)
-    assert retrace.share == 0.4
-    store = store_of(fitted)
+    monkeypatch.setattr(traced_module, "regress_weight", noted)
+    assert (learn(run) == 0.4).all()
+    fitted, surface = load_fitted(run), load_traced(run)
+    assert (surface.weight == 0.4).all()
+    store, reference = store_of(fitted), fitted.module.reference
     poses = poses_of(store, "val", fitted.module.renderer)
-    numbers = store.indices("val")
-    np.testing.assert_array_equal(given["measured"], [store.read_pose(int(i)) for i in numbers])
+    measured = [store.read_pose(int(i)) for i in store.indices("val")]
+    np.testing.assert_array_equal(given["measured"], compress(measured, reference))
     rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
-    np.testing.assert_array_equal(given["rendered"], rendered)
-    traced = trace_poses(fitted.settings, retrace, poses, progress=QUIET)
-    np.testing.assert_array_equal(given["traced"], traced)
-    assert given["reference"] == fitted.module.reference
+    np.testing.assert_array_equal(given["rendered"], compress(rendered, reference))
+    traced = trace_poses(fitted.settings, surface, poses, progress=QUIET)
+    np.testing.assert_allclose(given["traced"], compress(traced, reference), rtol=1e-6, atol=1e-9)
 
 
 def test_the_gain_is_of_training_poses_alone(run, monkeypatch):
     read = EnsembleStore.read_pose
     learn(run)
-    gain = load_retrace(run).gain_db
+    gain = load_traced(run).gain_db
     louder = []
     monkeypatch.setattr(
         EnsembleStore,
@@ -169,12 +163,12 @@ def test_the_gain_is_of_training_poses_alone(run, monkeypatch):
     )
     louder[:] = [1, 2]  # validation and test
     learn(run)
-    np.testing.assert_array_equal(load_retrace(run).gain_db, gain)
+    np.testing.assert_array_equal(load_traced(run).gain_db, gain)
     louder[:] = [0]
     learn(run)
     # Twice the pressure is 6.02 dB; next to the threshold of 20 dB silence takes 0.45 dB of it,
     # and other cells pass the threshold.
-    np.testing.assert_allclose(load_retrace(run).gain_db - gain, 6.02, atol=0.7)
+    np.testing.assert_allclose(load_traced(run).gain_db - gain, 6.02, atol=0.7)
 
 
 def test_what_is_read_of_the_echoes(run, echoes, monkeypatch):
@@ -189,8 +183,8 @@ def test_what_is_read_of_the_echoes(run, echoes, monkeypatch):
         return read(self, index)
 
     monkeypatch.setattr(EnsembleStore, "read_pose", watched)
-    monkeypatch.setattr(retrace_module, "GAIN_POSES", 3)
-    assert learn(run) == 1
+    monkeypatch.setattr(traced_module, "GAIN_POSES", 3)
+    assert learn(run).mean() > 0.9
     train, val = store.indices("train"), store.indices("val")
     # From the first to the last, evenly.
     assert set(asked) == {*train[[0, 3, 7]].tolist(), *val.tolist()}
@@ -246,11 +240,11 @@ def test_what_cannot_be_borne_out_or_is_not_wanted_is_not_traced(run, believe, m
     believe(run, 1.0)  # as an earlier fit may have left it
     why(run, monkeypatch)
     monkeypatch.setattr(Simulator, "from_settings", never)
-    monkeypatch.setattr(retrace_module, "render_poses", never)
+    monkeypatch.setattr(traced_module, "render_poses", never)
     heard = Heard()
-    assert learn(run, progress=heard) == 0
+    assert not learn(run, progress=heard).any()
     assert heard.said == []
-    assert load_retrace(run).share == 0
+    assert not load_traced(run).weight.any()
 
 
 @pytest.mark.parametrize(
@@ -260,12 +254,12 @@ def test_a_surface_that_the_simulator_refuses_is_told_and_not_traced(run, believ
     believe(run, 1.0)
     reconstruct_as(run, SPHERE.copy().apply_scale(scale))
     heard = Heard()
-    assert learn(run, progress=heard) == 0
+    assert not learn(run, progress=heard).any()
     (line,) = heard.said
-    assert line.startswith("no echoes are traced off the mesh: the mesh is ")
+    assert line.startswith("no echoes are traced off the surface: the mesh is ")
     assert words in line
     assert "\n" not in line
-    assert load_retrace(run).share == 0
+    assert not load_traced(run).weight.any()
     predict(run, accelerator="cpu")
 
 
@@ -279,92 +273,6 @@ def test_a_mesh_that_is_gone_or_damaged_is_an_error(run):
     assert not (run / NAME).exists()
 
 
-# The hull of first echoes in place of the mesh.
-
-DENTED = SPHERE.copy()
-DENTED.vertices[DENTED.vertices[:, 0] > 0.005, 0] = 0.005
-
-
-@pytest.fixture
-def hull(run, monkeypatch):
-    """Say what the first echoes leave; keep how the run is reconstructed for it."""
-    asked = []
-
-    def redrawn(path, *, method, progress):
-        asked.append(method)
-
-    def put(mesh):
-        monkeypatch.setattr(retrace_module, "_hull_surface", lambda fitted: mesh)
-        return asked
-
-    monkeypatch.setattr(retrace_module, "reconstruct", redrawn)
-    return put
-
-
-def test_the_hull_is_the_surface_where_unseen_poses_bear_it_out(run, hull):
-    reconstruct_as(run, DENTED)
-    asked, heard = hull(SPHERE), Heard()
-    assert learn(run, progress=heard) == 1
-    assert asked == ["hull"]
-    assert borne_out(run) == "hull"
-    np.testing.assert_array_equal(load_retrace(run).mesh.vertices, calmed(SPHERE).vertices)
-    np.testing.assert_allclose(load_retrace(run).gain_db, 0, atol=0.5)
-    assert [text for text in heard.said if "hull of first echoes" in text] == heard.said[-1:]
-
-
-def test_the_mesh_stays_where_the_hull_is_no_better(run, hull):
-    asked = hull(DENTED)
-    assert learn(run) == 1
-    assert asked == []
-    assert borne_out(run) == "auto"
-    np.testing.assert_array_equal(
-        load_retrace(run).mesh.vertices,
-        calmed(read_mesh(run / "reconstruction" / "mesh.ply")).vertices,
-    )
-
-
-def test_of_two_that_nobody_believes_the_mesh_stays(run, hull, monkeypatch):
-    reconstruct_as(run, DENTED)
-    asked = hull(SPHERE)
-    monkeypatch.setattr(retrace_module, "best_share", lambda *given: 0.0)
-    assert learn(run) == 0
-    assert asked == []
-    assert borne_out(run) == "auto"
-
-
-def test_a_hull_may_be_traced_where_the_mesh_cannot(run, hull):
-    reconstruct_as(run, SPHERE.copy().apply_scale(1e-3))
-    asked = hull(SPHERE)
-    assert learn(run) == 1
-    assert asked == ["hull"]
-
-
-def settings_of(path, **changed):
-    description = json.loads((path / "model.json").read_text())
-    description["settings"]["reconstruction"].update(changed)
-    (path / "model.json").write_text(json.dumps(description))
-
-
-@pytest.mark.parametrize("changed", [{"method": "oriented"}, {"level": 0.4}])
-def test_who_says_how_the_surface_is_found_is_obeyed(run, monkeypatch, changed):
-    settings_of(run, **changed)
-    reconstruct_as(run, DENTED)
-    monkeypatch.setattr(retrace_module, "_hull_surface", never)
-    learn(run)
-    assert borne_out(run) == "auto"
-
-
-@pytest.mark.parametrize("spacing", [None, 0.003])
-def test_the_hull_is_that_of_the_reconstruction(run, monkeypatch, spacing):
-    settings_of(run, spacing=spacing)
-    monkeypatch.undo()
-    found = retrace_module._hull_surface(load_fitted(run))
-    folder = reconstruct(run, method="hull", output=run / "hull")
-    np.testing.assert_allclose(
-        read_mesh(folder / "mesh.ply").bounds, found.bounds, rtol=0, atol=1e-6
-    )
-
-
 # Tracing.
 
 
@@ -373,15 +281,15 @@ def traceable(run):
     """Settings, what is traced off, and where."""
     fitted = load_fitted(run)
     poses = poses_of(store_of(fitted), "val", fitted.module.renderer)
-    retrace = Retrace(SPHERE, np.zeros(len(fitted.module.renderer.frequency)), 1.0)
-    return fitted.settings, retrace, poses
+    rows = len(fitted.module.renderer.frequency)
+    return fitted.settings, Traced(SPHERE, np.zeros((2, rows)), np.ones(rows)), poses
 
 
 def test_traced_echoes_are_those_that_were_measured(traceable, echoes):
-    settings, retrace, poses = traceable
+    settings, surface, poses = traceable
     store = EnsembleStore.open(echoes)
     measured = np.stack([store.read_pose(int(number)) for number in poses.numbers])
-    traced = trace_poses(settings, retrace, poses, progress=QUIET)
+    traced = trace_poses(settings, surface, poses, progress=QUIET)
     assert traced.shape == measured.shape
     reference = store.attributes["reference"]
     error = np.abs(compress(traced, reference) - compress(measured, reference)).mean()
@@ -398,27 +306,27 @@ def test_traced_echoes_are_those_that_were_measured(traceable, echoes):
     ],
 )
 def test_noise_engine_and_rays_of_the_experiment_are_left_out(traceable, section, values):
-    settings, retrace, poses = traceable
+    settings, surface, poses = traceable
     changed = getattr(settings, section).model_copy(update=values)
     other = settings.model_copy(update={section: changed})
     assert other != settings
     some = poses.only(torch.tensor([0]))
     np.testing.assert_array_equal(
-        trace_poses(other, retrace, some, progress=QUIET),
-        trace_poses(settings, retrace, some, progress=QUIET),
+        trace_poses(other, surface, some, progress=QUIET),
+        trace_poses(settings, surface, some, progress=QUIET),
     )
 
 
-def test_the_gain_is_laid_on_its_own_frequency(traceable):
-    settings, retrace, poses = traceable
+def test_the_gain_applies_to_its_own_ear_and_frequency(traceable):
+    settings, surface, poses = traceable
     some = poses.only(torch.tensor([0]))
-    plain = trace_poses(settings, retrace, some, progress=QUIET)
-    gain = np.zeros_like(retrace.gain_db)
-    gain[3], gain[-1] = 20, -20
+    plain = trace_poses(settings, surface, some, progress=QUIET)
+    gain = np.zeros_like(surface.gain_db)
+    gain[0, 3], gain[1, -1] = 20, -20
     expected = plain.copy()
-    expected[..., 3] *= 10
-    expected[..., -1] /= 10
-    tuned = Retrace(SPHERE, gain, retrace.share)
+    expected[:, 0, :, 3] *= 10
+    expected[:, 1, :, -1] /= 10
+    tuned = Traced(SPHERE, gain, surface.weight)
     np.testing.assert_allclose(
         trace_poses(settings, tuned, some, progress=QUIET), expected, rtol=1e-12
     )
@@ -428,7 +336,7 @@ def test_the_gain_is_laid_on_its_own_frequency(traceable):
 
 
 def test_what_was_never_learned_is_not_there(run):
-    assert load_retrace(run) is None
+    assert load_traced(run) is None
 
 
 def of_another_fit(path):
@@ -441,9 +349,9 @@ def test_what_belongs_to_another_fit_is_left_alone(run, believe):
     believe(run, 1.0)
     of_another_fit(run)
     kept = (run / NAME).read_bytes()
-    assert load_retrace(run) is None
+    assert load_traced(run) is None
     arrays_and_numbers(run)
-    assert json.loads((run / "metrics.json").read_text())["prediction"]["traced_share"] == 0
+    assert json.loads((run / "metrics.json").read_text())["prediction"]["traced_weight"] == 0
     assert (run / NAME).read_bytes() == kept
 
 
@@ -463,7 +371,7 @@ DAMAGED = {
     # Renamed, it is another tensor's.
     **{
         f"no {name}": lambda data, name=name: data.replace(name.encode(), name.upper().encode())
-        for name in ("vertices", "faces", "gain_db", "share")
+        for name in ("vertices", "faces", "gain_db", "weight")
     },
 }
 
@@ -471,8 +379,8 @@ DAMAGED = {
 @pytest.mark.parametrize("how", DAMAGED)
 def test_a_damaged_file_is_told_in_one_line_with_a_way_out(run, learned, how):
     (run / NAME).write_bytes(DAMAGED[how](learned))
-    with pytest.raises(InputError, match=r"retrace\.safetensors: damaged \(.*fit") as caught:
-        load_retrace(run)
+    with pytest.raises(InputError, match=r"traced\.safetensors: damaged \(.*fit") as caught:
+        load_traced(run)
     assert "\n" not in str(caught.value)
 
 
@@ -481,9 +389,9 @@ def test_a_damaged_file_is_told_in_one_line_with_a_way_out(run, learned, how):
     [
         ("vertices", float("nan")),
         ("gain_db", float("inf")),
-        ("share", -0.1),
-        ("share", 1.1),
-        ("share", float("nan")),
+        ("weight", -0.1),
+        ("weight", 1.1),
+        ("weight", float("nan")),
         ("faces", -1),
         ("faces", 1_000_000),
     ],
@@ -493,8 +401,8 @@ def test_what_cannot_be_is_damage(run, learned, name, value):
     tensors[name].view(-1)[:1] = value
     digest = hashlib.sha256((run / "model.safetensors").read_bytes()).hexdigest()
     (run / NAME).write_bytes(safetensors.torch.save(tensors, {"model": digest}))
-    with pytest.raises(InputError, match=r"retrace\.safetensors: damaged \(.*fit"):
-        load_retrace(run)
+    with pytest.raises(InputError, match=r"traced\.safetensors: damaged \(.*fit"):
+        load_traced(run)
 
 
 def test_a_damaged_file_is_told_before_a_folder_is_made(run, learned, tmp_path):
@@ -509,7 +417,7 @@ def test_nothing_is_predicted_with_a_damaged_file_until_it_is_made_anew(run, lea
     with pytest.raises(InputError, match="damaged"):
         predict(run, accelerator="cpu")
     assert not (run / "metrics.json").exists()
-    assert learn(run) == 1
+    assert learn(run).mean() > 0.9
     assert (run / NAME).read_bytes() == learned
 
 
@@ -529,7 +437,7 @@ def parts(path, poses):
     """What the field renders and what is traced, as a blend takes them."""
     fitted = load_fitted(path)
     rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
-    traced = trace_poses(fitted.settings, load_retrace(path), poses, progress=QUIET)
+    traced = trace_poses(fitted.settings, load_traced(path), poses, progress=QUIET)
     return rendered, traced, fitted.module.reference
 
 
@@ -541,10 +449,11 @@ def test_a_prediction_is_traced_as_far_as_it_is_believed(run, believe, share):
     poses = poses_of(store_of(fitted), "test", fitted.module.renderer)
     rendered, traced, reference = parts(run, poses)
     assert arrays["predicted"].dtype == np.float32
-    expected = traced if share == 1 else blend(rendered, traced, share, reference)
+    level = mix(compress(rendered, reference), compress(traced, reference), share)
+    expected = reference * (10 ** (level / 20) - 1)
     tolerance = {"rtol": 1e-6, "atol": 1e-6 * reference}
     np.testing.assert_allclose(arrays["predicted"], expected, **tolerance)
-    assert numbers["traced_share"] == share
+    assert numbers["traced_weight"] == pytest.approx(share)
     measured = compress(arrays["measured"], reference)
     for key, magnitude in (("mae_db", arrays["predicted"]), ("rendered_mae_db", rendered)):
         error = np.abs(compress(magnitude, reference) - measured)
@@ -566,7 +475,7 @@ def test_a_prediction_without_belief_is_the_rendering(run, believe):
         unbelieved, same = arrays_and_numbers(run)
     np.testing.assert_array_equal(unbelieved["predicted"], rendered)
     assert same == numbers
-    assert numbers["traced_share"] == 0
+    assert numbers["traced_weight"] == 0
     assert numbers["rendered_mae_db"] == numbers["mae_db"]
     assert numbers["rendered_mae_db_active"] == numbers["mae_db_active"]
 
@@ -582,7 +491,7 @@ def test_poses_of_ones_own_are_traced_off_the_run_without_store_or_scene(
     arrays, numbers = arrays_and_numbers(run, poses_csv=tmp_path / "poses.csv")
     assert numbers is None
     fitted = load_fitted(run)
-    simulator = Simulator.from_settings(Scene(load_retrace(run).mesh), fitted.settings)
+    simulator = Simulator.from_settings(Scene(load_traced(run).mesh), fitted.settings)
     mine = np.stack(
         [
             simulator.spectrogram(position.astype(float), rotation.astype(float), seed=0)
