@@ -9,10 +9,10 @@ then many others rule out all places at its range.
 
 Each onset without an origin looks for the places at its range that the fewest others rule out, and
 these, n of them, get a blame of 1/n. An onset is an outlier if its blame reaches the number of
-ears, as if it alone contradicted a whole pose. The most blamed ones, down to half of the greatest blame,
-are removed, and so on until none is left. An onset whose places are all ruled out by more than a
-few is an outlier itself. Gross outliers go first, at a coarse look at places: fewer are then left
-to confuse a fine one.
+ears, as if it alone contradicted a whole pose. The most blamed ones, down to half of the greatest
+blame, are removed, and so on until none is left. An onset whose places are all ruled out by more
+than a few is an outlier itself. Gross outliers go first, at a coarse look at places: fewer are then
+left to confuse a fine one.
 """
 
 from __future__ import annotations
