@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: MIT
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from sononerf.geometry import hull as hull_module
+from sononerf.echoes import free_space as hull_module
+from sononerf.echoes.free_space import EchoHull
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.geometry.hull import EchoHull
 
 AHEAD = np.array([1.0, 0.0, 0.0])
 
@@ -209,3 +211,30 @@ def test_a_pose_hears_from_half_way_between_emitter_and_ears():
     # The first head's ears have their middle at (-10, 3, 5) mm.
     expected = [[-0.003, 0.0015, -0.0025], [2.0, 2.0, 3.0]]
     np.testing.assert_allclose(hull.sources, expected, rtol=0, atol=1e-15)
+
+
+def test_an_outlier_tells_nothing():
+    hull = by_chance()
+    points = points_around(200)
+    weight = np.ones_like(hull.first)
+    weight[3] = 0.0
+    found, pose = dataclasses.replace(hull, weight=weight).clearance(points)
+    assert not (pose == 3).any()
+    others = np.delete(np.arange(12), 3)
+    alone = EchoHull(
+        *(each[others] for each in (hull.emitters, hull.receivers, hull.first)), -AHEAD
+    )
+    np.testing.assert_allclose(found, alone.clearance(points)[0])
+    assert (hull.clearance(points)[1] == 3).any()
+
+
+def test_where_many_are_outliers_some_of_the_others_may_be():
+    """One in twenty of those that are found: the place counts that the second pose leaves least."""
+    hull = by_chance(60)
+    weight = np.ones_like(hull.first)
+    weight[:25] = 0.0
+    points = points_around(50)
+    robust = dataclasses.replace(hull, weight=weight)
+    assert (hull.undetected, robust.undetected) == (0, 1)
+    left = np.sort(robust.behind(points).min(axis=2), axis=1)
+    np.testing.assert_allclose(robust.clearance(points)[0], left[:, 1])
