@@ -23,6 +23,9 @@ Length = Annotated[float, Field(gt=0, le=0.5)]
 """An edge or a straight part, in m."""
 Radius = Annotated[float, Field(gt=0, le=0.2)]
 """In m. A mesh grows with its square, so that it has a bound."""
+Wire = Annotated[float, Field(ge=2.2e-3, le=0.02)]
+"""Radius of a wire or rod in m. From 2.2 mm on it has more than 12 sides, so that they meet at less
+than 30 degrees and are heard as one round surface."""
 
 
 def ball(centre: ArrayLike, radius: float) -> trimesh.Trimesh:

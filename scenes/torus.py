@@ -25,10 +25,15 @@ def torus(
             f"scene.options.minor_radius: found {minor_radius:g}; must lie below major_radius, "
             f"{major_radius:g}"
         )
-    mesh = trimesh.creation.torus(
+    mesh = ring(major_radius, minor_radius)
+    return Scene(placed(mesh, yaw, pitch, roll), MATERIALS[material])
+
+
+def ring(major_radius: float, minor_radius: float) -> trimesh.Trimesh:
+    """Build the surface of a torus about the z axis, of two radii (m)."""
+    return trimesh.creation.torus(
         major_radius,
         minor_radius,
         major_sections=sections(2.0 * math.pi * (major_radius + minor_radius)),
         minor_sections=sections(2.0 * math.pi * minor_radius),
     )
-    return Scene(placed(mesh, yaw, pitch, roll), MATERIALS[material])

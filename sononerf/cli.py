@@ -319,8 +319,9 @@ def reconstruct(
         str | None, typer.Option(help="Level of the surface: auto, or a number.")
     ] = None,
     output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
+    accelerator: OnWhat = Accelerator.auto,
 ) -> None:
-    """Read mesh, volume and projections out of a fitted field."""
+    """Read mesh, volume and projections out of a fitted field, and refine the mesh."""
     import math
     from typing import Literal
 
@@ -337,7 +338,14 @@ def reconstruct(
     from sononerf.experiment.reconstruct import reconstruct as reconstruct_run
     from sononerf.progress import Progress
 
-    folder = reconstruct_run(run, spacing=spacing, level=number, output=output, progress=Progress())
+    folder = reconstruct_run(
+        run,
+        spacing=spacing,
+        level=number,
+        output=output,
+        accelerator=accelerator.value,
+        progress=Progress(),
+    )
     _print(f"wrote {folder}")
 
 

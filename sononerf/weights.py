@@ -49,6 +49,11 @@ def save_weights(folder: Path, state: dict[str, Tensor], description: dict[str, 
     storage.commit_json(folder / DESCRIPTION_NAME, described)
 
 
+def model_checksum(folder: Path) -> str:
+    """Return the SHA-256 of the field that a run's folder holds, as its description says."""
+    return str(storage.read_json(folder / DESCRIPTION_NAME)["sha256"])
+
+
 def load_weights(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read a fitted field's weights, on the CPU, and their description; runs no code.
 

@@ -121,7 +121,7 @@ def test_every_promised_file_is_there(smoke):
         "metrics.json",
         "model.safetensors",
         "model.json",
-        "retrace.safetensors",
+        "traced.safetensors",
         "checkpoints/last.ckpt",
         "prediction/spectrograms.npz",
         *(f"prediction/pose_{number:04d}.png" for number in (52, 53, 54)),
@@ -177,7 +177,7 @@ def test_the_numbers_are_those_of_schema_one(smoke):
     both = ("mae_db", "mean_predictor_mae_db", "noise_floor_mae_db")
     assert metrics["prediction"].keys() == {
         *("split", "poses", "log_spectral_distance_db", "psnr_db", "ssim", "pearson"),
-        *("rendered_mae_db", "rendered_mae_db_active", "traced_share"),
+        *("rendered_mae_db", "rendered_mae_db_active", "traced_weight"),
         *both,
         *(f"{name}_active" for name in both),
     }
@@ -195,7 +195,7 @@ def test_the_numbers_are_those_of_schema_one(smoke):
     }
     assert metrics["cost"]["steps"] == 120
     finite_or_null(metrics)
-    assert 0 <= metrics["prediction"]["traced_share"] <= 1
+    assert 0 <= metrics["prediction"]["traced_weight"] <= 1
 
 
 def test_it_learns(smoke):
@@ -596,12 +596,12 @@ def test_a_damaged_surface_to_trace_echoes_off(smoke, clean):
     Path("run").mkdir()
     for file in ("model.safetensors", "model.json"):
         shutil.copy(smoke.run / file, "run")
-    data = (smoke.run / "retrace.safetensors").read_bytes()
-    (clean / "run" / "retrace.safetensors").write_bytes(data[: len(data) // 2])
+    data = (smoke.run / "traced.safetensors").read_bytes()
+    (clean / "run" / "traced.safetensors").write_bytes(data[: len(data) // 2])
     Path("mine.csv").write_text("x,y,z,yaw,pitch,roll\n-0.4,0,0,0,0,0\n")
     message = refused(3, "predict", "run", "--poses", "mine.csv", "--output", "out")
     assert len(message.splitlines()) == 1
-    assert "run/retrace.safetensors: damaged" in message
+    assert "run/traced.safetensors: damaged" in message
     assert "sononerf fit" in message
     assert not Path("out/spectrograms.npz").exists()
 

@@ -3,6 +3,7 @@
 """Measure what sononerf costs and how well it does.
 
     python tools/benchmark.py simulate [--scene ua] [--rays 300000] [--poses 400]
+    python tools/benchmark.py cost configs/three_spheres.yaml [--poses 20]
     python tools/benchmark.py noise [--scene ua] [--poses 20]
     python tools/benchmark.py physics
     python tools/benchmark.py exact [--scene three_spheres] [--engines hybrid rays] [--poses 8]
@@ -13,14 +14,17 @@
     python tools/benchmark.py paper [--scene three_spheres] [--minutes 60] [--steps N]
     python tools/benchmark.py variants [--scene three_spheres] [--epochs 10]
     python tools/benchmark.py scale [--counts 100 400 1600] [--axes poses slices size places]
+    python tools/benchmark.py surfaces [--only NAME ...] [--seeds 0 1 2] [--exact STORE]
     python tools/benchmark.py step [--accelerator cpu] [--compare OLD.json]
     python tools/benchmark.py fit [--scene three_spheres] [--error 0.45] [--compare OLD.json]
     python tools/benchmark.py reconstruct RUN [RUN ...] [--spacings 0.002 0.001]
     python tools/benchmark.py prey [--placements 20] [--others 5] [--conditions NAME ...]
 
 ``simulate``: seconds per pose, against those that embreex alone needs for the same rays, those for
-visibility included, and the greatest memory. ``noise``: by how much two simulations differ that
-have other rays, 16 times as many, or twice as many; with the reported decibels, on active cells.
+visibility included, and the greatest memory. ``cost``: CPU seconds per pose of a configuration, the
+low band of all its poses included; set OMP_NUM_THREADS=1 first. ``noise``: by how much two
+simulations differ that have other rays, 16 times as many, or twice as many; with the reported
+decibels, on active cells.
 ``physics``: both engines against exact solutions. ``exact``: engines against exact multiple
 scattering of spheres, by band, and what they put before the first echo. ``wave``: bem against exact
 spheres, then the others against bem on a leaf and a beaker; some ten minutes. ``dechirp``: where
@@ -39,7 +43,9 @@ or steps. ``variants``: the paper's settings with one thing after the other as i
 has it. ``scale``: what simulation, a step, reading out and memory come to with ever more poses,
 range slices, room and places. ``prey``: whether leaves with a dragonfly at places from seeds are
 told from the empty leaf, and how far off it is looked for, with fewer and more calls, without ears,
-in noise and amid clutter; about two minutes for each case on two cores. All six leave runs, a table
+in noise and amid clutter; about two minutes for each case on two cores. ``surfaces``: how good the
+surfaces of all kinds of scenes are, some under changed conditions; one line of JSON for each run.
+What is ``scaled`` is measured in the unscaled world's metres. All seven leave runs, a table
 as JSON and logs in a folder (``--output``), share ensembles (``--data``), go on where they were
 interrupted, and lay KEY=VALUE over the settings (``--set``).
 """
@@ -54,6 +60,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # the parts of this command, and the tests' exact solutions
 
+from tools.benchmarks.cost import cost  # noqa: E402
 from tools.benchmarks.exact import exact  # noqa: E402
 from tools.benchmarks.fit import fit  # noqa: E402
 from tools.benchmarks.paper import paper  # noqa: E402
@@ -66,6 +73,7 @@ from tools.benchmarks.scale import scale  # noqa: E402
 from tools.benchmarks.shapes import shapes  # noqa: E402
 from tools.benchmarks.simulator import noise, simulate  # noqa: E402
 from tools.benchmarks.step import step  # noqa: E402
+from tools.benchmarks.surfaces import CASES, surfaces  # noqa: E402
 from tools.benchmarks.variants import variants  # noqa: E402
 from tools.benchmarks.wave import wave  # noqa: E402
 
@@ -74,6 +82,9 @@ OTHER_HELP = "places of prey under every other condition (5)"
 CONDITIONS_HELP = "fewer or more calls, no ears, noise (signal to noise in dB), clutter; all"
 SECONDS_HELP = "fits that take longer are marked in the table (60)"
 ERROR_HELP = "over all cells of held-out poses, dB (0.45)"
+ONLY_HELP = "rows of the table; all, but exact only with --exact"
+SEEDS_HELP = "of the fits of three_spheres, ua and leaf; of all others the first alone (0 1 2)"
+EXACT_HELP = "ensemble of exact echoes of three_spheres, 100 calls, analysed up to 80 kHz"
 SPACINGS_HELP = "voxel sizes in metres; by default the run's own"
 SET_HELP = "laid over the settings of every run"
 
@@ -91,6 +102,10 @@ def main() -> None:
             command.add_argument("--bounces", type=int, default=3)
         if run is simulate:
             command.add_argument("--rays", type=int, default=300_000)
+    command = commands.add_parser(cost.__name__, help=(cost.__doc__ or "").strip())
+    command.set_defaults(run=cost)
+    command.add_argument("config", type=Path)
+    command.add_argument("--poses", type=int, default=20, help="that are traced (20)")
     command = commands.add_parser(exact.__name__, help=(exact.__doc__ or "").strip())
     command.set_defaults(run=exact)
     command.add_argument("--scene", default="three_spheres")
@@ -101,7 +116,7 @@ def main() -> None:
     names = ("spheres", "leaf", "beaker")
     command.add_argument("--bodies", nargs="+", choices=names, help="those three")
     command.add_argument("--poses", type=int, default=8)
-    for series in (shapes, poses, paper, variants, scale, prey, step, fit, reconstruct):
+    for series in (shapes, poses, paper, variants, scale, prey, surfaces, step, fit, reconstruct):
         command = commands.add_parser(series.__name__, help=(series.__doc__ or "").split("\n")[0])
         command.set_defaults(run=series)
         if series is shapes:
@@ -112,6 +127,11 @@ def main() -> None:
             command.add_argument("--others", type=int, default=5, help=OTHER_HELP)
             names = [condition.name for condition in CONDITIONS]
             command.add_argument("--conditions", nargs="+", choices=names, help=CONDITIONS_HELP)
+        if series is surfaces:
+            names = [case.name for case in CASES]
+            command.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=ONLY_HELP)
+            command.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help=SEEDS_HELP)
+            command.add_argument("--exact", type=Path, metavar="STORE", help=EXACT_HELP)
         if series is step:
             command.add_argument("--accelerator", choices=("auto", "cpu", "gpu"), default="auto")
         if series in (step, fit, reconstruct):
@@ -134,7 +154,7 @@ def main() -> None:
             command.add_argument("--steps", type=int, help="of the paper's fit; none are timed")
         elif series is variants:
             command.add_argument("--epochs", type=int, default=10, help="of each fit (10)")
-        elif series not in (scale, step, fit, reconstruct):
+        elif series not in (scale, surfaces, step, fit, reconstruct):
             command.add_argument("--seconds", type=float, default=60.0, help=SECONDS_HELP)
         command.add_argument("--output", type=Path, help="folder of runs and table")
         if series is reconstruct:

@@ -285,13 +285,13 @@ def _look_up(ears: Ears, table: int, directions: NDArray[np.float64]) -> NDArray
     row, upward = _place(ears.elevation, np.arctan2(z, np.hypot(x, y)))
     width = len(ears.azimuth)
     corner = row * width + column
-    corners = corner[:, None] + np.array([0, 1, width, width + 1])
+    corners = corner[:, None] + np.array([0, 1, width, width + 1], dtype=np.int32)
     low = 1 - upward
     weights = np.zeros(corners.shape, dtype=np.float32)
     weights[:, 0], weights[:, 1] = low * (1 - across), low * across
     weights[:, 2], weights[:, 3] = upward * (1 - across), upward * across
     # One pass over the rows, where four gathers would write four tables first.
-    ends = np.arange(0, 4 * len(directions) + 1, 4)
+    ends = np.arange(0, 4 * len(directions) + 1, 4, dtype=np.int32)
     values = ears._by_direction[table]
     pick = csr_array((weights.ravel(), corners.ravel(), ends), shape=(len(directions), len(values)))
     gain: NDArray[np.float32] = pick @ values
@@ -300,10 +300,10 @@ def _look_up(ears: Ears, table: int, directions: NDArray[np.float64]) -> NDArray
 
 def _place(
     nodes: NDArray[np.float64], values: NDArray[np.float32]
-) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """Index of the node below, and the fraction of the way to the next."""
     per_step = np.float32((len(nodes) - 1) / (nodes[-1] - nodes[0]))
     steps = (values - np.float32(nodes[0])) * per_step
     steps = np.clip(steps, np.float32(0.0), np.float32(len(nodes) - 1))
-    index = np.minimum(steps.astype(np.int64), len(nodes) - 2)
+    index = np.minimum(steps.astype(np.int32), np.int32(len(nodes) - 2))
     return index, steps - index.astype(np.float32)

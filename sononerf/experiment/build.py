@@ -17,20 +17,16 @@ from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import Settings, faults_of
 from sononerf.data.datamodule import EchoDataModule
-from sononerf.data.first_echo import asked_poses, first_echoes
-from sononerf.data.region import WITNESS_GAIN, EchoEvidence, echo_power, echo_reach
 from sononerf.data.store import EnsembleStore
-from sononerf.errors import InputError, NumericalError, SettingsError
+from sononerf.echoes.consistency import weighted
+from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.onsets import Onsets, PointEcho, find_onsets
+from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
+from sononerf.errors import InputError, SettingsError
 from sononerf.field.field import Field
-from sononerf.geometry.hull import EchoHull
-from sononerf.geometry.late_echo import corrected
 from sononerf.module import ACTIVE_DB, EchoModule
 from sononerf.renderer.renderer import Acquisition, Possible, Renderer
 from sononerf.simulation.simulator import DEFAULT_SPEED, DEFAULT_TEMPERATURE
-
-MARGIN_OF_SOUND = 0.15
-"""Of its size: so far around the region of the sound, on each side, the origins of first echoes are
-sought."""
 
 
 def _tensor(values: NDArray[np.floating]) -> Tensor:
@@ -70,40 +66,38 @@ def acquisition(settings: Settings) -> Acquisition:
     )
 
 
-def echo_hull(settings: Settings, store: EnsembleStore) -> EchoHull:
-    """Return the space that the first echoes of the asked poses leave, late ones corrected."""
-    known = acquisition(settings)
-    first = first_echoes(
-        store,
-        echo_power(settings.call, settings.spectrogram),
-        known.speed_of_sound / known.sampling_rate / 2,
-    )
-    if known.lag is not None:
-        first = first - float(known.lag.max())  # rows of a sweep may hear it that much too far off
-    asked = asked_poses(store)
-    positions = np.asarray(store.positions, dtype=np.float64)[asked]
-    rotations = np.asarray(store.rotations, dtype=np.float64)[asked]
+def point_echo(settings: Settings) -> PointEcho:
+    """Return what the analysis makes of the echo of one point."""
+    return PointEcho.of(settings.call, settings.spectrogram, _speed(settings))
+
+
+def echo_hull(settings: Settings, store: EnsembleStore, heard: Onsets | None = None) -> EchoHull:
+    """Return the space that the onsets of the asked poses leave, outliers of weight zero.
+
+    Parameters
+    ----------
+    settings : Settings
+        The experiment.
+    store : EnsembleStore
+        Its echoes.
+    heard : Onsets or None
+        What is detected in them; detected anew where None.
+    """
+    known, echo = acquisition(settings), point_echo(settings)
+    heard = heard or find_onsets(store, echo)
+    # Rows of a sweep may hear it that much too far off.
+    late = 0.0 if known.lag is None else float(known.lag.max())
+    positions = np.asarray(store.positions, dtype=np.float64)[heard.poses]
+    rotations = np.asarray(store.rotations, dtype=np.float64)[heard.poses]
     ears = known.ear_positions.double().numpy()
     hull = EchoHull(
         emitters=positions + rotations @ known.emitter.double().numpy(),
         receivers=positions[:, None] + np.einsum("pij,ej->pei", rotations, ears),
-        first=first,
+        first=heard.first - late,
         axes=rotations[:, :, 0],
         within=_beam_cosine(known),
     )
-    try:
-        # Without the hull: late echoes would make it too small.
-        lower, upper = _evidence(settings, store, None).box()
-    except NumericalError:
-        return hull  # whoever needs a region will say why there is none
-    margin = MARGIN_OF_SOUND * (upper - lower)
-    return corrected(hull, lower - margin, upper + margin)
-
-
-def _evidence(settings: Settings, store: EnsembleStore, hull: EchoHull | None) -> EchoEvidence:
-    ears = synthetic_ears(settings.ears, frequency_axis(settings.spectrogram))
-    reach = echo_reach(settings.call, settings.spectrogram, _speed(settings))
-    return EchoEvidence(store, ears, reach=reach, hull=hull, most=200)
+    return weighted(hull, echo.resolution)
 
 
 def _beam_cosine(known: Acquisition) -> float:
@@ -119,7 +113,10 @@ def _beam_cosine(known: Acquisition) -> float:
 
 
 def echo_region(
-    settings: Settings, store: EnsembleStore, hull: EchoHull | None = None
+    settings: Settings,
+    store: EnsembleStore,
+    hull: EchoHull | None = None,
+    heard: Onsets | None = None,
 ) -> tuple[Tensor, Possible]:
     """Return the box that is fitted, from the settings or the echoes, and what is possible in it.
 
@@ -130,7 +127,9 @@ def echo_region(
     store : EnsembleStore
         Its echoes.
     hull : EchoHull or None
-        What the first echoes leave; found anew where None.
+        What the onsets leave; found anew where None.
+    heard : Onsets or None
+        What is detected in the echoes; detected anew where None.
 
     Returns
     -------
@@ -139,16 +138,20 @@ def echo_region(
     possible : callable
         Which places the echoes leave possible, given how far a place speaks for its surroundings.
     """
-    hull = hull or echo_hull(settings, store)
-    evidence = _evidence(settings, store, hull)
+    echo = point_echo(settings)
+    heard = heard or find_onsets(store, echo)
+    hull = hull or echo_hull(settings, store, heard)
+    ears = synthetic_ears(settings.ears, frequency_axis(settings.spectrogram))
+    rotations = np.asarray(store.rotations, dtype=np.float64)[heard.poses]
+    found = EchoRegion(heard, hull, ears, rotations, echo.resolution)
     set_region = settings.region
     if set_region.lower is not None and set_region.upper is not None:
         box = np.asarray((set_region.lower, set_region.upper))
     else:
-        box = evidence.box()
+        box = found.box()
 
     def possible(places: Tensor, tolerance: float) -> Tensor:
-        left = evidence.left(places.double().cpu().numpy(), tolerance)
+        left = found.possible(places.double().cpu().numpy(), tolerance)
         if not left.any():
             left[:] = True  # the box is right by the user's word
         return torch.as_tensor(left, device=places.device)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What follows a fit: surface, share of the traced echoes, prediction, numbers; in this order."""
+"""What follows a fit: surface, weight of its echoes, prediction, numbers; in this order."""
 
 from __future__ import annotations
 
@@ -7,28 +7,27 @@ from pathlib import Path
 from typing import Any
 
 from sononerf.errors import NumericalError
-from sononerf.experiment.borne_out import NAME as RETRACE_NAME
 from sononerf.experiment.fitted import load_fitted
 from sononerf.experiment.predict import predict
 from sononerf.experiment.reconstruct import evaluate, reconstruct
-from sononerf.experiment.retrace import learn_retrace
 from sononerf.experiment.run_folder import RunFolder
+from sononerf.experiment.traced import NAME as TRACED_NAME
+from sononerf.experiment.traced import learn_traced
 from sononerf.progress import Progress
 
 
 def is_finished(path: Path) -> bool:
     """Tell whether a run has all that follows its fit."""
-    # The baselines are what is written last, but another mesh takes the numbers of its geometry
-    # away; runs of before there were traced echoes lack these.
+    # The baselines are written last. Another mesh removes the numbers of its geometry.
     has_numbers = {"geometry", "baseline"} <= RunFolder(path).read_metrics().keys()
-    files = path / RETRACE_NAME, path / "reconstruction" / "mesh.ply"
+    files = path / TRACED_NAME, path / "reconstruction" / "mesh.ply"
     return has_numbers and all(file.is_file() for file in files)
 
 
 def finish(
     path: Path, *, accelerator: str = "auto", progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Reconstruct, learn how far traced echoes are believed, predict held-out poses, evaluate.
+    """Reconstruct, find the weight of the surface's echoes, predict held-out poses, evaluate.
 
     Parameters
     ----------
@@ -53,9 +52,8 @@ def finish(
     no_surface: NumericalError | None = None
     options = load_fitted(path).settings
     try:
-        # By the field alone; what its poses bear out is found next.
-        reconstruct(path, method=options.reconstruction.method, progress=progress)
-        learn_retrace(path, accelerator=accelerator, progress=progress)
+        reconstruct(path, accelerator=accelerator, progress=progress)
+        learn_traced(path, accelerator=accelerator, progress=progress)
     except NumericalError as error:
         no_surface = error
     if options.poses.heldout:

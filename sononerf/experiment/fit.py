@@ -27,6 +27,8 @@ from sononerf.checkpoint_io import DurableCheckpointIO
 from sononerf.config import Settings
 from sononerf.data.datamodule import EchoDataModule
 from sononerf.data.store import EnsembleStore
+from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.onsets import find_onsets
 from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.experiment.build import (
     check_plugins,
@@ -35,6 +37,7 @@ from sononerf.experiment.build import (
     echo_region,
     field_and_renderer,
     module_for,
+    point_echo,
 )
 from sononerf.experiment.run_folder import RunFolder
 from sononerf.experiment.simulate import (
@@ -43,7 +46,6 @@ from sononerf.experiment.simulate import (
     open_ensemble,
     store_path,
 )
-from sononerf.geometry.hull import EchoHull
 from sononerf.module import EchoModule
 from sononerf.progress import Progress
 from sononerf.scene import load_scene
@@ -205,8 +207,9 @@ def _fit(
 ) -> None:
     quiet_lightning()
     keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
-    hull = echo_hull(settings, store)
-    region, possible = echo_region(settings, store, hull)
+    heard = find_onsets(store, point_echo(settings))
+    hull = echo_hull(settings, store, heard)
+    region, possible = echo_region(settings, store, hull, heard)
     corners = (1000 * region).round().int().tolist()
     progress.say(f"region {corners[0]} to {corners[1]} mm")
     field, renderer = field_and_renderer(settings, region)

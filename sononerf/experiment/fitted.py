@@ -17,11 +17,11 @@ from torch.utils.data import DataLoader
 from sononerf.config import Settings, validate_settings
 from sononerf.data.range_slices import PoseReader, WholePoses
 from sononerf.data.store import EnsembleStore
+from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.experiment.build import field_and_renderer, module_for
 from sononerf.experiment.fit import quiet_lightning, require_accelerator
 from sononerf.experiment.simulate import default_store, open_ensemble
-from sononerf.geometry.hull import EchoHull
 from sononerf.module import EchoModule
 from sononerf.progress import Progress
 from sononerf.renderer.renderer import Renderer

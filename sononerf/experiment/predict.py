@@ -16,7 +16,6 @@ from sononerf.acoustics.spectrogram import compress
 from sononerf.data.range_slices import WholePoses
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError
-from sononerf.experiment.borne_out import NAME as RETRACE_NAME
 from sononerf.experiment.fitted import (
     Fitted,
     Split,
@@ -25,12 +24,13 @@ from sononerf.experiment.fitted import (
     render_poses,
     store_of,
 )
-from sononerf.experiment.retrace import load_retrace, trace_poses
 from sononerf.experiment.run_folder import RunFolder, results_folder
+from sononerf.experiment.traced import NAME as TRACED_NAME
+from sononerf.experiment.traced import load_traced, trace_poses
 from sononerf.geometry.poses import Poses, read_pose_csv
 from sononerf.progress import Progress
+from sononerf.reconstruction.mixture import mix
 from sononerf.reconstruction.prediction import mae_db, prediction_metrics
-from sononerf.reconstruction.retrace import blend
 from sononerf.render.spectrogram import spectrogram_png
 from sononerf.renderer.renderer import Renderer
 
@@ -85,20 +85,22 @@ def predict(
     if own is not None:
         _check_poses(own, poses_csv, fitted, progress)
     store = None if own is not None else store_of(fitted)
-    retrace = load_retrace(path)
-    told = (run.read_metrics().get("prediction") or {}).get("traced_share", 0)
-    if retrace is None and told > 0:
+    surface = load_traced(path)
+    known = (run.read_metrics().get("prediction") or {}).get("traced_weight", 0)
+    if surface is None and known > 0:
         progress.say(
-            f"{path / RETRACE_NAME} is missing: what follows is rendered from the field alone, "
-            f"not the run's own prediction, {told:.0%} of which is traced off its mesh"
+            f"{path / TRACED_NAME} is missing: the prediction is rendered from the field alone; "
+            f"the run's own also has echoes traced off its surface (weight {known:.2f})"
         )
     poses = _poses_to_render(store, own, split, renderer)
     with results_folder(folder):
         rendered = render_poses(fitted, poses, accelerator=accelerator, progress=progress)
         magnitude, reference = rendered, fitted.module.reference
-        if retrace is not None and retrace.share > 0:
-            traced = trace_poses(fitted.settings, retrace, poses, progress=progress)
-            magnitude = blend(rendered, traced, retrace.share, reference).astype(np.float32)
+        if surface is not None and surface.weight.any():
+            traced = trace_poses(fitted.settings, surface, poses, progress=progress)
+            both = compress(rendered, reference), compress(traced, reference)
+            level = mix(*both, surface.weight)
+            magnitude = (reference * (10 ** (level / 20) - 1)).astype(np.float32)
         axes = {
             "range_m": renderer.range.double().numpy(),
             "frequency_hz": renderer.frequency.double().numpy(),
@@ -123,7 +125,7 @@ def predict(
                 **figures,
                 "rendered_mae_db": mae_db(measured, alone),
                 "rendered_mae_db_active": mae_db(measured, alone, active=True),
-                "traced_share": 0.0 if retrace is None else retrace.share,
+                "traced_weight": 0.0 if surface is None else float(surface.weight.mean()),
             },
         )
     return folder

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -16,11 +17,11 @@ from numpy.typing import NDArray
 from sononerf import storage
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, NumericalError, SonoNerfError
-from sononerf.experiment.borne_out import borne_out
 from sononerf.experiment.build import acquisition
 from sononerf.experiment.fitted import Fitted, load_fitted, store_of
 from sononerf.experiment.run_folder import RunFolder, results_folder
-from sononerf.progress import Progress
+from sononerf.experiment.surface import refine_surface
+from sononerf.progress import Progress, Task
 from sononerf.reconstruction.baseline import backprojection, best_level_surface
 from sononerf.reconstruction.confidence import poses_that_saw
 from sononerf.reconstruction.mesh import MeshFormat, mesh_bytes
@@ -33,6 +34,7 @@ from sononerf.reconstruction.voxels import voxel_fit
 from sononerf.render.mesh import confidence_png, mesh_png, side_by_side_png
 from sononerf.render.projection import mip_pngs
 from sononerf.scene import Scene, load_scene
+from sononerf.surface.refine import Refined
 
 OPEN = {
     "sheet": "the surface is a sheet: {0.thin_share:.0%} of it has its other side right behind it",
@@ -53,9 +55,13 @@ def reconstruct(
     level: float | Literal["auto"] | None = None,
     method: Method | None = None,
     output: Path | None = None,
+    accelerator: str = "auto",
     progress: Progress | None = None,
 ) -> Path:
     """Write mesh, volume, projections and a view.
+
+    The surface is read out of the field and, unless the settings or a level of the caller's say
+    otherwise, refined against the echoes that the field was fitted to.
 
     Parameters
     ----------
@@ -66,10 +72,11 @@ def reconstruct(
     level : float, "auto" or None
         Level of the surface; the settings' where None.
     method : {"auto", "oriented", "hull", "isosurface"} or None
-        How the surface is found; where None the settings', and where these say ``auto`` what bore
-        out the run's validation poses, see :func:`sononerf.experiment.retrace.learn_retrace`.
+        How the surface is read out; the settings' where None.
     output : Path or None
         Folder of the results; ``RUN/reconstruction`` where None.
+    accelerator : {"auto", "cpu", "gpu"}
+        What the surface is refined on.
     progress : Progress or None
         Where to show it.
 
@@ -85,24 +92,27 @@ def reconstruct(
     if level is None:
         level = options.level
     if method is None:
-        # A level of one's own is one of the indicator; the hull knows depths alone.
-        free = (options.method, level) == ("auto", "auto")
-        method = borne_out(path) if free else options.method
+        method = options.method
+    automatic = method == "auto" and level == "auto"
+    refines = options.refine and automatic
     with results_folder(folder):
-        with progress.task("reconstructing", 1000) as task, torch.inference_mode():
-            found = read_out(
-                fitted.module.field,
-                hull=fitted.hull,
-                spacing=spacing or options.spacing,
-                level=level,
-                method=method,
-                directions=options.directions,
-                smoothing=options.smoothing if method == "isosurface" else 0.0,
-                progress=lambda done, total: task.advance(1000 * done // total - task.done),
-            )
+        starts = _read_out(
+            fitted,
+            methods=("auto", "hull") if automatic else (method,),
+            several=refines,
+            spacing=spacing or options.spacing,
+            level=level,
+            progress=progress,
+        )
         if folder.resolve() == (path / "reconstruction").resolve():
             RunFolder(path).drop_metrics("geometry")  # of the mesh that is replaced
-        _write(folder, found, true_mesh(fitted))
+        found, refined = starts[0], None
+        if refines:
+            meshes = [start.mesh for start in starts]
+            refined = _refined(path, fitted, meshes, accelerator, progress)
+        if refined is not None:
+            found = replace(starts[refined.start], mesh=refined.mesh)
+        _write(folder, found, refined, true_mesh(fitted))
     if found.openness is not None and found.openness.kind in OPEN:
         progress.say(OPEN[found.openness.kind].format(found.openness))
     if output is None:
@@ -112,8 +122,77 @@ def reconstruct(
     return folder
 
 
-def _write(folder: Path, found: Reconstruction, truth: trimesh.Trimesh | None) -> None:
+def _read_out(
+    fitted: Fitted,
+    *,
+    methods: Sequence[Method],
+    several: bool,
+    spacing: float | None,
+    level: float | Literal["auto"],
+    progress: Progress,
+) -> list[Reconstruction]:
+    """Read surfaces out of the field by some methods: all of them, or the first that gives one.
+
+    Raises
+    ------
+    NumericalError
+        If none gives a surface.
+    """
+    options = fitted.settings.reconstruction
+    found: list[Reconstruction] = []
+    error: NumericalError | None = None
+    for method in methods:
+        if found and not several:
+            break
+        try:
+            with progress.task("reconstructing", 1000) as task, torch.inference_mode():
+
+                def shown(done: int, total: int, task: Task = task) -> None:
+                    task.advance(1000 * done // total - task.done)
+
+                one = read_out(
+                    fitted.module.field,
+                    hull=fitted.hull,
+                    spacing=spacing,
+                    level=level,
+                    method=method,
+                    directions=options.directions,
+                    smoothing=options.smoothing if method == "isosurface" else 0.0,
+                    progress=shown,
+                )
+            found.append(one)
+        except NumericalError as raised:
+            error = error or raised
+    if error is not None and not found:
+        raise error
+    return found
+
+
+def _refined(
+    path: Path,
+    fitted: Fitted,
+    starts: Sequence[trimesh.Trimesh],
+    accelerator: str,
+    progress: Progress,
+) -> Refined | None:
+    """Return the refined surface; None where the run's echoes are not there."""
+    try:
+        store_of(fitted)
+    except InputError as error:
+        progress.say(f"the surface is not refined: {error}")
+        return None
+    return refine_surface(path, fitted, starts, accelerator=accelerator, progress=progress)
+
+
+def _write(
+    folder: Path,
+    found: Reconstruction,
+    refined: Refined | None,
+    truth: trimesh.Trimesh | None,
+) -> None:
     seen = None if found.glints is None else poses_that_saw(found.mesh, found.glints)
+    if refined is not None:
+        seen = refined.support.round().astype(np.int32)
     for kind in FORMATS:
         data = mesh_bytes(found.mesh, kind, confidence=seen)
         storage.commit_bytes(folder / f"mesh.{kind}", data)
@@ -131,6 +210,8 @@ def _write(folder: Path, found: Reconstruction, truth: trimesh.Trimesh | None) -
             "level": found.level,
             "spacing_m": found.volume.spacing,
             "surface": None if found.openness is None else found.openness.kind,
+            "refined": refined is not None and refined.kept,
+            "validation_error_db": None if refined is None else refined.error_db,
         },
     )
 

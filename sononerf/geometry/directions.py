@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 # Turning by the golden section of a circle never lets two neighbouring rings line up.
 GOLDEN_TURN = (math.sqrt(5.0) - 1.0) / 2.0
+PATCHES = (64, 128)  # of a cap, over its area and around its axis
 
 
 def fibonacci_sphere(count: int) -> NDArray[np.float64]:
@@ -146,9 +147,43 @@ class CapSpiral:
         # 1 - cos(half_angle), written so that a narrow cap keeps its digits
         return 2.0 * math.sin(self.half_angle / 2.0) ** 2
 
-    def directions(self) -> NDArray[np.float64]:
-        """Return the unit vectors (D, 3), from the axis outwards."""
-        return self._at(*self._lattice(np.arange(self.count, dtype=np.float64)))
+    def directions(self, index: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
+        """Return the unit vectors (D, 3), from the axis outwards; all, or those of an index."""
+        chosen = np.arange(self.count) if index is None else index
+        return self._at(*self._lattice(chosen.astype(np.float64)))
+
+    def reaching(
+        self, towards: NDArray[np.float64], half_angle: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        """Return the indices, ascending, of all directions that lie in any of some cones.
+
+        Others that lie near a cone are among them: whole patches of the cap are left out or not.
+
+        Parameters
+        ----------
+        towards : (B, 3) float64
+            Axes of the cones, unit vectors.
+        half_angle : (B,) float64, rad
+            Of the cones.
+        """
+        rows, columns = PATCHES
+        edge, turn = np.arange(rows + 1) / rows, (np.arange(columns) + 0.5) / columns
+        share = 0.5 * (edge[:-1] + edge[1:])
+        middle = self._at(*(part.ravel() for part in np.meshgrid(share, turn, indexing="ij")))
+        # From the middle of a patch its corners are farthest; those of one row are alike.
+        aside = 0.5 / columns
+        radius = np.zeros(rows)
+        for ends in (edge[:-1], edge[1:]):
+            corner = self._at(ends, np.full(rows, aside))
+            apart = np.linalg.norm(corner - self._at(share, np.zeros(rows)), axis=1)
+            radius = np.maximum(radius, 2.0 * np.arcsin(np.minimum(0.5 * apart, 1.0)))
+        reach = np.cos(np.minimum(half_angle + 1.1 * radius[:, None], math.pi)) - 1e-9
+        near = (middle @ towards.T).reshape(rows, columns, -1) >= reach[:, None]
+        index = np.arange(self.count, dtype=np.float64)
+        at_share, at_turn = self._lattice(index)
+        row = np.minimum((at_share * rows).astype(np.int64), rows - 1)
+        column = np.minimum((np.mod(at_turn, 1.0) * columns).astype(np.int64), columns - 1)
+        return np.flatnonzero(near.any(axis=2).ravel()[row * columns + column])
 
     def neighbourhood(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
         """Return directions' indices together with those of their four neighbours, sorted."""

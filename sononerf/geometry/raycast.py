@@ -269,3 +269,32 @@ class RayCaster:
         scaled = points - self._middle
         scaled *= 1.0 / self._size
         return scaled
+
+
+class Occlusion:
+    """Whether anything of a mesh stands between points; quicker to build than a ray caster.
+
+    Parameters
+    ----------
+    vertices : (V, 3) float64, m
+        At least one triangle's.
+    faces : (T, 3) int64
+        Triangles.
+    """
+
+    def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+        lower, upper = vertices.min(axis=0), vertices.max(axis=0)
+        self._middle = (lower + upper) / 2.0
+        self._scale = 1.0 / float(np.linalg.norm(upper - lower))
+        scaled = (vertices - self._middle) * self._scale
+        self._engine: _Engine = (
+            _VtkEngine(scaled, faces) if EmbreeScene is None else _EmbreeEngine(scaled, faces)
+        )
+
+    def blocked(
+        self, points: NDArray[np.float64], targets: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """Whether the straight way from points to targets (N, 3), m, meets a triangle (N,)."""
+        return self._engine.blocked(
+            (points - self._middle) * self._scale, (targets - points) * self._scale
+        )

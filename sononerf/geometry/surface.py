@@ -12,6 +12,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 CREASE = math.radians(30.0)
+TIGHTER = 0.95  # radius of balls around halves, over that around the whole, that is worth it
 
 
 def corner_normals(mesh: trimesh.Trimesh, *, crease: float = CREASE) -> NDArray[np.float64]:
@@ -123,3 +124,59 @@ def _smooth_corners(mesh: trimesh.Trimesh, crease: float) -> NDArray[np.int32]:
     links = coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(size, size))
     labels: NDArray[np.int32] = connected_components(links, directed=False)[1]
     return labels
+
+
+def bodies(mesh: trimesh.Trimesh) -> NDArray[np.int64]:
+    """Return which connected part of the mesh each triangle belongs to (T,)."""
+    count = len(mesh.faces)
+    pairs = np.asarray(mesh.face_adjacency, dtype=np.int64).reshape(-1, 2)
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    label: NDArray[np.int64] = connected_components(graph, directed=False)[1].astype(np.int64)
+    return label
+
+
+def enclosing_balls(
+    corners: NDArray[np.float64], label: NDArray[np.int64], count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return balls that hold all triangles: one for each body, and more where that is tighter.
+
+    Parameters
+    ----------
+    corners : (T, 3, 3) float64, m
+        Of the triangles.
+    label : (T,) int64
+        Which body they belong to.
+    count : int
+        At most so many balls, one or more.
+
+    Returns
+    -------
+    centres : (B, 3) float64, m
+        Of the balls.
+    radii : (B,) float64, m
+        Of the balls.
+    """
+    middles = corners.mean(axis=1)
+
+    def ball(group: NDArray[np.int64]) -> tuple[NDArray[np.float64], float, NDArray[np.int64]]:
+        points = corners[group].reshape(-1, 3)
+        centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        return centre, float(np.linalg.norm(points - centre, axis=1).max()), group
+
+    bodies = np.unique(label)
+    alone = [np.flatnonzero(label == body) for body in bodies] if len(bodies) <= count else []
+    open_ = [ball(group) for group in alone or [np.arange(len(corners))]]
+    done: list[tuple[NDArray[np.float64], float, NDArray[np.int64]]] = []
+    while open_ and len(open_) + len(done) < count:
+        whole = open_.pop(int(np.argmax([radius for _, radius, _ in open_])))
+        group = whole[2]
+        axis = int(np.ptp(middles[group], axis=0).argmax())
+        group = group[np.argsort(middles[group, axis], kind="stable")]
+        halves = [ball(half) for half in np.array_split(group, 2) if len(half)]
+        # Halves of a sphere fill balls that are larger than that of the sphere.
+        if max(radius for _, radius, _ in halves) < TIGHTER * whole[1]:
+            open_ += halves
+        else:
+            done.append(whole)
+    found = open_ + done
+    return np.stack([centre for centre, _, _ in found]), np.array([r for _, r, _ in found])

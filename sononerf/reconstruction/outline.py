@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError
-from sononerf.geometry.hull import EchoHull
 from sononerf.reconstruction.glints import Glints
 from sononerf.reconstruction.isosurface import isosurface
 from sononerf.reconstruction.volume import Volume, grid_over

@@ -15,9 +15,9 @@ from scipy.ndimage import uniform_filter
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
-from sononerf.geometry.hull import EchoHull
 from sononerf.geometry.raycast import RayCaster
 from sononerf.reconstruction.glints import Glints, find_glints, trust
 from sononerf.reconstruction.isosurface import automatic_level, isosurface

@@ -35,13 +35,13 @@ class Arrival:
     def __init__(self, scene: Scene) -> None:
         corners = np.asarray(scene.mesh.vertices, dtype=np.float64)[np.asarray(scene.mesh.faces)]
         corners = corners.reshape(-1, 3)
-        middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
-        self.radius = float(np.linalg.norm(corners - middle, axis=1).max())
+        self._middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
+        self.radius = float(np.linalg.norm(corners - self._middle, axis=1).max())
         vertices, faces = trimesh.remesh.subdivide_to_size(
             scene.mesh.vertices, scene.mesh.faces, FINE * self.radius, max_iter=20
         )
         used = np.asarray(vertices, dtype=np.float64)[np.unique(faces)]
-        self._points: NDArray[np.float64] = np.unique(used, axis=0)
+        self._points: NDArray[np.float64] = np.unique(used, axis=0) - self._middle
 
     def shortest(
         self, emitters: NDArray[np.float64], ears: NDArray[np.float64]
@@ -56,11 +56,14 @@ class Arrival:
             World frame.
         """
         found = np.zeros(ears.shape[:2])
-        for pose, (emitter, places) in enumerate(zip(emitters, ears, strict=True)):
-            out = np.linalg.norm(self._points - emitter, axis=1)
-            for ear, place in enumerate(places):
-                back = np.linalg.norm(self._points - place, axis=1)
-                found[pose, ear] = (out + back).min()
+        square = np.einsum("nd,nd->n", self._points, self._points)
+        for pose, heads in enumerate(np.concatenate([emitters[:, None], ears], axis=1)):
+            heads = heads - self._middle
+            # Products suffice: coordinates count from the middle of the scene.
+            way = square - 2.0 * heads @ self._points.T
+            way += np.einsum("hd,hd->h", heads, heads)[:, None]
+            np.sqrt(np.maximum(way, 0.0, out=way), out=way)
+            found[pose] = (way[:1] + way[1:]).min(axis=1)
         return found
 
 

@@ -55,7 +55,7 @@ class Footprint:
         return Footprint(*(part.take(chosen, axis=-1) for part in parts))
 
     def detour(
-        self, towards: Real, rise: Real, distance: Real, solid_angle: float
+        self, towards: Real, rise: Real, distance: Real, solid_angle: float | NDArray[np.float64]
     ) -> tuple[Real, Real, Real]:
         r"""How much longer a path is than the mirror's nearby, and how it varies over a ray's cell.
 
@@ -71,7 +71,7 @@ class Footprint:
             Their cosine to the outward normal.
         distance : (H,) float32, m
             From the hits to the listener.
-        solid_angle : float, sr
+        solid_angle : float or (H,) float64, sr
             Of the cell, taken as a square.
 
         Returns
@@ -103,7 +103,7 @@ class Footprint:
         slope = g1 * g1 + g2 * g2
         detour = 0.5 * (a * slope + b * (h11 * g1 * g1 + h22 * g2 * g2 + 2.0 * h12 * g1 * g2))
         # Over a square of side 1, u has the variance 1/12, u²/2 1/720 and u v 1/144.
-        angle = np.float32(solid_angle)
+        angle = np.asarray(solid_angle, dtype=np.float32)
         variance = slope * (angle / 12.0) + (h11 * h11 + h22 * h22) * (angle * angle / 720.0)
         variance += h12 * h12 * (angle * angle / 144.0)
         return np.maximum(detour, 0.0), np.sqrt(variance), stiffness

@@ -6,15 +6,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.acoustics.ears import Ears, beam_gain, ear_gain
-from sononerf.simulation.impulse_response import Synthesis, air_loss, deposit, synthesise
+from sononerf.simulation.impulse_response import Bins, Synthesis, air_loss, deposit, synthesise
 
 MOST_WAITING = 300_000  # echoes; laying them into bins goes over all bins, so it is done seldom
+
+
+class Listener(Protocol):
+    """What takes the echoes of points one by one; see :meth:`Sound.add`."""
+
+    def add(
+        self, ear: int, delay: NDArray[Any], spread: NDArray[Any], strength: NDArray[Any]
+    ) -> None:
+        """Take echoes of one ear."""
 
 
 class Sound:
@@ -29,13 +38,13 @@ class Sound:
 
     Attributes
     ----------
-    bins : (E, B, F) float64
-        Filled by :meth:`settle`.
+    bins : list of Bins
+        Of each ear, filled by :meth:`settle`.
     """
 
     def __init__(self, synthesis: Synthesis, ears: int) -> None:
         self._synthesis = synthesis
-        self.bins = np.stack([synthesis.silence() for _ in range(ears)])
+        self.bins = [synthesis.silence() for _ in range(ears)]
         self._waiting: list[list[tuple[NDArray[Any], ...]]] = [[] for _ in range(ears)]
         self._heard = False
 
@@ -53,12 +62,11 @@ class Sound:
         """Whether any echo was added."""
         return self._heard
 
-    def settle(self, ear: int) -> NDArray[np.float64]:
-        """Lay what waits into an ear's bins (B, F), and return them."""
+    def settle(self, ear: int) -> Bins:
+        """Lay what waits into an ear's bins, and return them."""
         if self._waiting[ear]:
             delay, spread, strength = (
-                np.concatenate(parts, dtype=np.float64)
-                for parts in zip(*self._waiting[ear], strict=True)
+                np.concatenate(parts) for parts in zip(*self._waiting[ear], strict=True)
             )
             self._waiting[ear].clear()
             deposit(self._synthesis, self.bins[ear], delay, spread, strength)
@@ -87,9 +95,9 @@ class Hearing:
     speed_of_sound: float
 
     @cached_property
-    def _air(self) -> NDArray[np.float64]:
+    def _air(self) -> NDArray[np.float32]:
         decay = self.absorption * (math.log(10.0) / 20.0) * self.speed_of_sound
-        return air_loss(self.synthesis, decay)
+        return air_loss(self.synthesis, decay).astype(np.float32)
 
     def places(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64]
@@ -118,7 +126,7 @@ class Hearing:
 
     def add(
         self,
-        sound: Sound,
+        sound: Listener,
         ear: int,
         points: NDArray[np.float64],
         *,
@@ -127,6 +135,7 @@ class Hearing:
         level: NDArray[np.floating[Any]],
         position: NDArray[np.float64],
         rotation: NDArray[np.float64],
+        shaded: tuple[Listener, NDArray[np.int64], NDArray[np.complex64]] | None = None,
     ) -> None:
         r"""Add what one ear hears of points.
 
@@ -152,6 +161,9 @@ class Hearing:
             Of the head.
         rotation : (3, 3) float64
             Head to world.
+        shaded : tuple, optional
+            A second sound, indices (M,) of points that are partly hidden, and what passes of them
+            (M, F). The second sound takes the imaginary part, to be heard a quarter turn later.
         """
         place = position + rotation @ self.ears.positions[ear]
         towards = points - place
@@ -160,8 +172,13 @@ class Hearing:
         gain = self.gain(ear, towards, rotation)
         gain *= level
         gain /= (self.speed_of_sound * distance).astype(np.float32)[:, None]
-        delay = (length + distance) / self.speed_of_sound
-        sound.add(ear, delay, spread / self.speed_of_sound, gain)
+        delay, spread = (length + distance) / self.speed_of_sound, spread / self.speed_of_sound
+        if shaded is not None:
+            turned, dim, passed = shaded
+            part = gain.take(dim, axis=0)
+            turned.add(ear, delay.take(dim), spread.take(dim), part * passed.imag)
+            gain[dim] = part * passed.real
+        sound.add(ear, delay, spread, gain)
 
     def echo(
         self, sound: Sound, basis: NDArray[np.complex128] | None = None

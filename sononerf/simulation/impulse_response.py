@@ -9,6 +9,10 @@ An echo that stands for a patch of surface does not come all at once. It is laid
 as its arrival times are spread, as a texture seen from afar is read from a coarser image [1]_: so
 patches that are too large for the shortest wavelengths fall silent there instead of adding noise.
 
+Most of a record is silent. Only the stretch of bins that holds echoes is filtered: as if the record
+were a half or a quarter as long, with every second or fourth frequency of the filters. This is the
+same where the filters have faded out before the shorter record begins anew.
+
 References
 ----------
 .. [1] L. Williams, "Pyramidal parametrics", SIGGRAPH 1983.
@@ -18,6 +22,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import accumulate
+from typing import Any
 
 import numpy as np
 import scipy.fft
@@ -39,6 +45,8 @@ IMAGES = 2
 OVERSAMPLING = 4
 LEVELS = 10  # of bins, each twice as wide as the one before; the last smooths away even 10 kHz
 GUARD = 512  # samples behind the last frame, for what filters put before and after an echo
+RING = 384  # samples; what filters put farther from an echo is some 100 dB down
+SHORTEST = 4  # the part of a record that is filtered is no less than one over this
 # Laying an echo between two bins of width 1 and reading them as triangles spreads it by 1/6 twice.
 LEVEL_VARIANCE = 1.0 / 3.0
 
@@ -55,6 +63,8 @@ class Synthesis:
         Spectrum that each node stands for.
     basis : (K, F) complex128
         The same times ``j f`` in Hz, for what surfaces send back.
+    odd_hats : (K, F) complex128
+        As ``hats``, for strengths that are odd functions of frequency, as imaginary parts are.
     sampling_rate : float, Hz
         Of the echo.
     samples : int
@@ -66,6 +76,7 @@ class Synthesis:
     nodes: NDArray[np.float64]
     hats: NDArray[np.complex128]
     basis: NDArray[np.complex128]
+    odd_hats: NDArray[np.complex128]
     sampling_rate: float
     samples: int
     length: int
@@ -80,15 +91,32 @@ class Synthesis:
         """Of the filters (K,), Hz."""
         return np.fft.rfftfreq(self.length, 1.0 / self.sampling_rate).astype(np.float64)
 
-    def silence(self) -> NDArray[np.float64]:
-        """Return empty bins (B, F)."""
-        return np.zeros((sum(self.sizes), len(self.nodes)))
+    def silence(self, dtype: Any = np.float32) -> Bins:
+        """Return empty bins; single precision adds errors that are 120 dB down."""
+        return Bins(np.zeros((sum(self.sizes), len(self.nodes)), dtype=dtype))
+
+
+@dataclass(eq=False)
+class Bins:
+    """Time bins that echoes are laid into.
+
+    Attributes
+    ----------
+    values : (B, F) float
+        All levels, one after the other.
+    first, last : float, samples
+        All echoes lie between these two; the last is below the first where there is none.
+    """
+
+    values: NDArray[Any]
+    first: float = math.inf
+    last: float = -math.inf
 
 
 def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     """Lay out nodes and filters for an analysis.
 
-    Between nodes strengths are interpolated by raised cosines (:func:`_between`). They are even
+    Between nodes strengths are interpolated by raised cosines (:func:`between`). They are even
     about zero frequency, as gains are, and stay what they are above the highest node; there the
     echo falls smoothly to zero within a third of that frequency. The factor ``j f`` that every
     reflection has is part of the filters: a flat reflection is then a short derivative pulse and
@@ -114,18 +142,21 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     unit = 2 ** (LEVELS - 1)
     length = unit * int(scipy.fft.next_fast_len(math.ceil((samples + GUARD) / unit), real=True))
     frequency = np.fft.rfftfreq(length, 1.0 / rate)
-    hats = _between(np.minimum(frequency, top), nodes)
+    even, odd = between(np.minimum(frequency, top), nodes)
     end = min(top * 4.0 / 3.0, rate / 2.0)
     fall = np.clip((frequency - top) / (end - top), 0.0, 1.0)
     # Laying an echo between two of the finest bins damps it by this much, on average over where
     # it falls.
     damping = np.sinc(frequency / (OVERSAMPLING * rate)) ** 2
     shape = 0.5 * (1.0 + np.cos(np.pi * fall)) / damping
-    hats = (hats * shape[:, None]).astype(np.complex128)
-    return Synthesis(nodes, hats, hats * (1j * frequency)[:, None], rate, samples, length)
+    hats, odd_hats = ((part * shape[:, None]).astype(np.complex128) for part in (even, odd))
+    basis = hats * (1j * frequency)[:, None]
+    return Synthesis(nodes, hats, basis, odd_hats, rate, samples, length)
 
 
-def _between(frequency: NDArray[np.float64], nodes: NDArray[np.float64]) -> NDArray[np.float64]:
+def between(
+    frequency: NDArray[np.float64], nodes: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     r"""Return the weight (K, F) of each node in a value at each frequency.
 
     The interpolation is Nyquist's raised cosine, with :math:`x` the distance in node spacings and
@@ -136,7 +167,8 @@ def _between(frequency: NDArray[np.float64], nodes: NDArray[np.float64]) -> NDAr
     In time it is a window that keeps what comes within :math:`1 / (2 \Delta f)` of an echo and
     removes the rest. Straight lines between the nodes would repeat each echo there every
     :math:`1 / \Delta f`, before it too. The nodes lie at odd multiples of half the spacing, so the
-    values are continued as an even function about zero and about the upper end.
+    values are continued as an even function about the upper end, and as an even or an odd one about
+    zero. An odd one continued as an even one would jump at zero, and ring on as one over time.
 
     Parameters
     ----------
@@ -147,28 +179,32 @@ def _between(frequency: NDArray[np.float64], nodes: NDArray[np.float64]) -> NDAr
 
     Returns
     -------
-    weight : (K, F) float64
+    even : (K, F) float64
         They sum to one for each frequency, within 1e-6.
+    odd : (K, F) float64
+        For values that are odd about zero.
     """
     spacing = 2.0 * nodes[0]
     period = 2.0 * len(nodes) * spacing
-    weight = np.zeros((len(frequency), len(nodes)))
+    even, odd = np.zeros((2, len(frequency), len(nodes)))
     for image in range(-IMAGES, IMAGES + 1):
         for side in (1.0, -1.0):
             x = (frequency[:, None] - image * period - side * nodes) / spacing
             below = 1.0 - np.square(2.0 * ROLL_OFF * x)
             pole = np.abs(below) < 1e-9
             roll = np.cos(np.pi * ROLL_OFF * x) / np.where(pole, 1.0, below)
-            weight += np.sinc(x) * np.where(pole, np.pi / 4.0, roll)
-    return weight
+            weight = np.sinc(x) * np.where(pole, np.pi / 4.0, roll)
+            even += weight
+            odd += side * (-1.0) ** image * weight
+    return even, odd
 
 
 def deposit(
     synthesis: Synthesis,
-    bins: NDArray[np.float64],
+    bins: Bins,
     delay: NDArray[np.float64],
     spread: NDArray[np.float64],
-    strength: NDArray[np.float64],
+    strength: NDArray[np.floating[Any]],
 ) -> None:
     """Lay echoes into time bins, each between the two nearest of the two levels it lies between.
 
@@ -176,13 +212,13 @@ def deposit(
     ----------
     synthesis : Synthesis
         The bins.
-    bins : (B, F) float64
+    bins : Bins
         To these the echoes are added, in place.
     delay : (N,) float64, s
         From the emission; echoes too late for the last frame are left out.
     spread : (N,) float64, s
         Standard deviation of the arrival times of what an echo stands for.
-    strength : (N, F) float64
+    strength : (N, F) float
         Per node.
     """
     rate = synthesis.sampling_rate * OVERSAMPLING
@@ -191,26 +227,38 @@ def deposit(
     heard = place < last
     if not heard.all():
         place, spread, strength = place[heard], spread[heard], strength[heard]
+    if len(place) == 0:
+        return
+    earliest, latest = float(place.min()), float(place.max())
+    bins.first = min(bins.first, earliest / OVERSAMPLING)
+    bins.last = max(bins.last, latest / OVERSAMPLING)
     # In units of the finest bin; level l spreads by LEVEL_VARIANCE * 4**l, level 0 not at all.
     variance = np.square(spread * rate) / LEVEL_VARIANCE
     level = np.clip((np.frexp(variance)[1] - 1) // 2, 0, LEVELS - 2)
     floor = np.ldexp(1.0, 2 * level)
     below = np.where(level > 0, floor, 0.0)
     share = np.clip((variance - below) / (4.0 * floor - below), 0.0, 1.0)
-    start = np.concatenate([[0], np.cumsum(synthesis.sizes)])
+    # Of each level, the bins from the earliest to behind the latest echo, one after the other.
+    low = np.array([int(math.ldexp(earliest, -step)) for step in range(LEVELS)])
+    count = [int(math.ldexp(latest, -step)) + 2 - low[step] for step in range(LEVELS)]
+    start = np.array([0, *accumulate(count)])
     rows = np.zeros((len(place), 4), dtype=np.int32)
-    weights = np.zeros((len(place), 4))
+    weights = np.zeros((len(place), 4), dtype=bins.values.dtype)
     for step, part in ((0, 1.0 - share), (1, share)):
         at = np.ldexp(place, -(level + step))
         index = at.astype(np.int32)
-        rows[:, 2 * step] = start[level + step] + index
+        rows[:, 2 * step] = (start[:-1] - low)[level + step] + index
         rows[:, 2 * step + 1] = rows[:, 2 * step] + 1
         late = (at - index) * part
         weights[:, 2 * step] = part - late
         weights[:, 2 * step + 1] = late
     ends = np.arange(0, 4 * len(place) + 1, 4, dtype=np.int32)
-    lay = csc_array((weights.ravel(), rows.ravel(), ends), shape=(len(bins), len(place)))
-    bins += lay @ strength
+    lay = csc_array((weights.ravel(), rows.ravel(), ends), shape=(start[-1], len(place)))
+    laid = lay @ strength.astype(bins.values.dtype, copy=False)
+    for to, at_level, rows_of, begin in zip(
+        accumulate(synthesis.sizes, initial=0), low, count, start, strict=False
+    ):
+        bins.values[to + at_level : to + at_level + rows_of] += laid[begin : begin + rows_of]
 
 
 def air_loss(synthesis: Synthesis, decay: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -223,8 +271,8 @@ def air_loss(synthesis: Synthesis, decay: NDArray[np.float64]) -> NDArray[np.flo
 
 def synthesise(
     synthesis: Synthesis,
-    bins: NDArray[np.float64],
-    air: NDArray[np.float64],
+    bins: Bins,
+    air: NDArray[np.floating[Any]],
     basis: NDArray[np.complex128],
 ) -> NDArray[np.float64]:
     """Weaken each node's bins by the air, filter them with its part of the spectrum, add up.
@@ -233,9 +281,9 @@ def synthesise(
     ----------
     synthesis : Synthesis
         The filters.
-    bins : (B, F) float64
+    bins : Bins
         From :func:`deposit`.
-    air : (B, F) float64
+    air : (B, F) float
         From :func:`air_loss`.
     basis : (K, F) complex128
         The synthesis' ``basis``, or its ``hats``.
@@ -245,17 +293,24 @@ def synthesise(
     echo : (S,) float64
         Pressure for a call that is one sample of height 1, at the sampling rate.
     """
-    kept = synthesis.length // 2 + 1
-    spectrum = np.zeros((kept, len(synthesis.nodes)), dtype=np.complex128)
-    frequency = np.arange(kept) * (synthesis.sampling_rate / synthesis.length)
+    echo = np.zeros(synthesis.samples)
+    if bins.last < bins.first:
+        return echo
+    begin, part = _stretch(synthesis, bins)
+    length, basis = synthesis.length // part, basis[::part]
+    kept = int(np.flatnonzero(basis.any(axis=1)).max(initial=0)) + 1
+    basis = basis[:kept]
+    spectrum = np.zeros(basis.shape, dtype=np.complex128)
+    frequency = np.arange(kept) * (synthesis.sampling_rate / length)
     first = 0
-    for level, size in enumerate(synthesis.sizes):
-        part = bins[first : first + size]
-        weakened = part * air[first : first + size] if part.any() else None
-        first += size
-        if weakened is None:
+    for level, whole_size in enumerate(synthesis.sizes):
+        size = whole_size // part
+        start = first + (OVERSAMPLING * begin >> level)
+        first += whole_size
+        laid = bins.values[start : start + size]
+        if not laid.any():
             continue
-        half = scipy.fft.rfft(weakened, axis=0)
+        half = scipy.fft.rfft(laid * air[start : start + size], axis=0, overwrite_x=True)
         if level == 0:
             spectrum += half[:kept]
             continue
@@ -270,6 +325,26 @@ def synthesise(
         # What the filters make up for happens in the finest bins alone.
         triangle *= np.sinc(frequency / (OVERSAMPLING * synthesis.sampling_rate)) ** 2
         spectrum += whole * triangle[:, None]
-    spectrum = (spectrum * basis).sum(axis=1)
-    echo: NDArray[np.float64] = scipy.fft.irfft(spectrum, n=synthesis.length)
-    return echo[: synthesis.samples]
+    sound = scipy.fft.irfft(np.einsum("kf,kf->k", spectrum, basis), n=length)
+    end = min(begin + length, synthesis.samples)
+    echo[begin:end] = sound[: end - begin]
+    return echo
+
+
+def _stretch(synthesis: Synthesis, bins: Bins) -> tuple[int, int]:
+    """Return the first sample of the record that is filtered, and one over its length.
+
+    It begins at a bin of the coarsest level, and what the filters add around echoes fits in.
+    """
+    unit = 2 ** (LEVELS - 1) // OVERSAMPLING
+    earliest = unit * math.floor((bins.first - RING) / unit)
+    part = SHORTEST
+    while part > 1:
+        length = synthesis.length // part
+        begin = min(earliest, synthesis.length - length)
+        # Behind the last echo there may be one more bin of the coarsest level.
+        fits = begin >= 0 and bins.last + unit + RING <= begin + length
+        if fits and length % unit == 0:
+            return begin, part
+        part //= 2
+    return 0, 1

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from sononerf.simulation.footprint import Footprint, Real, across, dots, land
 from sononerf.simulation.reflection import keep_outside, mirror
 
 SPLIT = 2  # along each side of a divided cell
+GATHERED = 8192  # hits; so many are taken together, for numpy's calls cost as much as some hundred
 CHUNK = 49_152  # rays; fewer and calls add up, more and they leave the processor's cache
 
 Beyond = Callable[[Hits, NDArray[np.float64]], tuple[Hits, NDArray[np.float64]]]
@@ -30,7 +32,7 @@ class Bounce:
     ----------
     number : int
         n, the first hit being 1.
-    solid_angle : float, sr
+    solid_angle : float or (H,) float64, sr
         What each ray stands for.
     ray : (H,) int64
         Which of the emitted rays.
@@ -55,7 +57,7 @@ class Bounce:
     """
 
     number: int
-    solid_angle: float
+    solid_angle: float | NDArray[np.float64]
     ray: NDArray[np.int64]
     emitted: NDArray[np.float64]
     incoming: NDArray[np.float64]
@@ -96,7 +98,7 @@ class Bounce:
         """Return the chosen hits."""
         return Bounce(
             self.number,
-            self.solid_angle,
+            angle if isinstance(angle := self.solid_angle, float) else angle.take(chosen),
             self.ray.take(chosen),
             self.emitted.take(chosen, axis=0),
             self.incoming.take(chosen, axis=0),
@@ -108,6 +110,42 @@ class Bounce:
             self.triangles.take(chosen, axis=0),
             self.hidden,
         )
+
+
+def gathered(bounces: Iterable[Bounce]) -> Iterator[Bounce]:
+    """Yield the same hits in fewer parts; none of them is empty.
+
+    What was the index of a ray is none any more.
+    """
+    waiting: dict[tuple[int, bool], list[Bounce]] = {}
+    for bounce in bounces:
+        if len(bounce.ray) == 0:
+            continue
+        alike = waiting.setdefault((bounce.number, bounce.hidden), [])
+        alike.append(bounce)
+        if sum(len(part.ray) for part in alike) >= GATHERED:
+            yield _joined(alike)
+            alike.clear()
+    for alike in waiting.values():
+        if alike:
+            yield _joined(alike)
+
+
+def _joined(bounces: list[Bounce]) -> Bounce:
+    if len(bounces) == 1:
+        return bounces[0]
+
+    def of_hits(name: str) -> NDArray[Any]:
+        return np.concatenate([getattr(bounce, name) for bounce in bounces])
+
+    def of_footprints(name: str) -> Real:
+        return np.concatenate([getattr(bounce.footprint, name) for bounce in bounces], axis=-1)
+
+    angles = [np.broadcast_to(bounce.solid_angle, len(bounce.ray)) for bounce in bounces]
+    names = ("ray", "emitted", "incoming", "points", "flat", "mirrored", "length", "triangles")
+    joined: dict[str, Any] = {name: of_hits(name) for name in names}
+    footprint = Footprint(**{of.name: of_footprints(of.name) for of in fields(Footprint)})
+    return replace(bounces[0], solid_angle=np.concatenate(angles), footprint=footprint, **joined)
 
 
 def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -237,6 +275,7 @@ def echo_paths(
     extra: int,
     judge: Callable[[Bounce], tuple[NDArray[np.bool_], NDArray[np.float64]]],
     beyond: Beyond | None = None,
+    index: NDArray[np.int64] | None = None,
 ) -> Iterator[Bounce]:
     """Follow the rays of a cap, with more of them where a few would be noise.
 
@@ -262,16 +301,19 @@ def echo_paths(
         be wrong for the size of its cell, in any unit, zero where it is small enough.
     beyond : callable, optional
         See :func:`trace`.
+    index : (N,) int64, optional
+        Of the first rays, those that may hit anything; all where not given.
 
     Yields
     ------
     bounce : Bounce
         Audible hits of cells that are left as they are.
     """
-    directions, parts = cap.directions(), 1
+    rays = np.arange(cap.count) if index is None else index
+    directions, parts, count = cap.directions(rays), 1, cap.count
     cells: Cells | None = None
     while True:
-        weight = np.zeros(len(directions))
+        weight = np.zeros(count)
         found: list[Bounce] = []
         solid_angle = cap.solid_angle / parts
         for start in range(0, len(directions), CHUNK):
@@ -279,7 +321,7 @@ def echo_paths(
             for bounce in trace(
                 caster, emitter, chunk, bounces, solid_angle=solid_angle, beyond=beyond
             ):
-                bounce = replace(bounce, ray=bounce.ray + start)
+                bounce = replace(bounce, ray=rays.take(bounce.ray + start))
                 if extra < SPLIT**2:
                     found.append(bounce)  # none can be divided any more
                     continue
@@ -303,5 +345,6 @@ def echo_paths(
         if len(chosen) == 0:
             return
         cells = (cap.cells(chosen) if cells is None else cells[chosen]).divided(SPLIT)
-        directions, parts = cap.towards(cells), cells.parts
-        extra -= len(directions)
+        directions, parts, count = cap.towards(cells), cells.parts, cells.middles.shape[1]
+        rays = np.arange(count)
+        extra -= count

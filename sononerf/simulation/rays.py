@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from sononerf.geometry.directions import CapSpiral
 from sononerf.geometry.raycast import Hits
+from sononerf.geometry.surface import bodies, enclosing_balls
 from sononerf.scene import Scene
 from sononerf.simulation.diffraction import Diffraction
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.footprint import Real
-from sononerf.simulation.hearing import Hearing, Sound
-from sononerf.simulation.paths import Bounce, aim, echo_paths
+from sononerf.simulation.hearing import Hearing, Listener
+from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
 from sononerf.simulation.reflection import coarse_gain, unfaded
 from sononerf.simulation.shadows import LEAST, Outlines, Shadow, behind
 
@@ -37,6 +38,7 @@ REACHED = 1.0  # sides; how far from the middle of a cell a mirror point may be 
 # A bundle wider than this may hold a mirror point of the next bounce that its ray does not show.
 WIDE = 5e-4  # m
 EXPLORE = 0.1  # of what such a bundle may bring, against what one with a mirror point brings
+BALLS = 32  # that hold the scene between them; rays that miss all of them are not traced
 EARS_APART = 0.03  # m; up to this what holds for the middle between the ears holds for each
 
 
@@ -104,6 +106,8 @@ class Rays(Engine):
         vertices = np.asarray(scene.mesh.vertices, dtype=np.float64)
         self._centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
         self._radius = float(np.linalg.norm(vertices - self._centre, axis=1).max())
+        corners = vertices[np.asarray(scene.mesh.faces)]
+        self._balls = enclosing_balls(corners, bodies(scene.mesh), BALLS)
         self._farthest = max(
             math.inf if of_part.material.lobe_width else SILENT / float(of_part.fade.min())
             for of_part in self.reflections
@@ -115,6 +119,9 @@ class Rays(Engine):
         self._hats = synthesis.hats if band is None else synthesis.hats * band[:, None]
         factor = gain if any_smooth else 1j * synthesis.frequency
         self._basis = self._hats * factor[:, None]
+        # What a shadow turns is an imaginary part, and so an odd function of frequency.
+        odd_hats = synthesis.odd_hats if band is None else synthesis.odd_hats * band[:, None]
+        self._turned_basis = odd_hats * (1j * factor)[:, None]
         # Beside smooth surfaces lobed ones go through the same filters: their level is theirs.
         _, gain = unfaded(synthesis.nodes, speed_of_sound=hearing.speed_of_sound)
         self._lobed_level = synthesis.nodes / np.abs(gain) if any_smooth else 1.0
@@ -135,11 +142,11 @@ class Rays(Engine):
         shadows = self._shadows(position, rotation)
         lit = self._paths(position, rotation, (first, second), self.bounces)
         hidden = self._hidden(position, rotation, (first, second), shadows[0])
-        for bounce in chain(lit, hidden):
+        for bounce in chain(gathered(lit), gathered(hidden)):
             self._hear(sound, turned, bounce, position, rotation, shadows)
         echo = self.hearing.echo(sound, self._basis)
         if turned.heard:
-            echo += self.hearing.echo(turned, 1j * self._basis)
+            echo += self.hearing.echo(turned, self._turned_basis)
         if self._diffracts:
             if self._diffraction is None:
                 self._diffraction = Diffraction(self.scene, self.caster, self.reflections)
@@ -148,6 +155,20 @@ class Rays(Engine):
             )
             echo += self.hearing.echo(edges, self._hats)
         return echo
+
+    def later(
+        self,
+        sound: Listener,
+        position: NDArray[np.float64],
+        rotation: NDArray[np.float64],
+        *,
+        seed: int,
+    ) -> None:
+        """Tell a listener what is heard after the first bounce; edges are left out."""
+        first, second, _ = np.random.default_rng(seed).random(3)
+        for bounce in self._paths(position, rotation, (first, second), self.bounces):
+            if bounce.number > 1:
+                self._hear(sound, sound, bounce, position, rotation, [])
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_diffraction": None, "_outlines": None}
@@ -213,7 +234,20 @@ class Rays(Engine):
                 np.maximum(doubt, more, out=doubt)
             return audible, doubt
 
-        return echo_paths(self.caster, emitter, cap, bounces=bounces, extra=extra, judge=judge)
+        index = self._reaching(cap, emitter)
+        return echo_paths(
+            self.caster, emitter, cap, bounces=bounces, extra=extra, judge=judge, index=index
+        )
+
+    def _reaching(self, cap: CapSpiral, emitter: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return which rays of a cap may hit the scene."""
+        centres, radii = self._balls
+        ways = centres - emitter
+        distance = np.linalg.norm(ways, axis=1)
+        # The caster's single precision is far finer than this margin.
+        sine = radii * 1.001 / np.maximum(distance, 1e-300)
+        half_angle = np.where(sine < 1.0, np.arcsin(np.minimum(sine, 1.0)), math.pi)
+        return cap.reaching(ways / np.maximum(distance, 1e-300)[:, None], half_angle)
 
     def _hidden(
         self,
@@ -245,9 +279,11 @@ class Rays(Engine):
         def beyond(hits: Hits, directions: NDArray[np.float64]) -> tuple[Hits, NDArray[np.float64]]:
             return behind(self.caster, outlines, hits, directions)
 
+        index = self._reaching(cap, emitter)
         for bounce in echo_paths(
-            self.caster, emitter, cap, bounces=1, extra=extra, judge=judge, beyond=beyond
-        ):
+            self.caster, emitter, cap, bounces=1, extra=extra, judge=judge, beyond=beyond,
+            index=index,
+        ):  # fmt: skip
             yield replace(bounce, hidden=True)
 
     def _judge(
@@ -262,7 +298,7 @@ class Rays(Engine):
         facing = rise * distance > -EARS_APART
         audible = facing & (detour < 1.25 * self._farthest)
         k = np.float32(2.0 * math.pi * RESOLVED_FREQUENCY / self.hearing.speed_of_sound)
-        side = math.sqrt(bounce.solid_angle)
+        side = np.sqrt(bounce.solid_angle)
         # Counted in turns of the ray at the emitter, the mirror point is this far from the cell.
         off = np.sqrt(2.0 * detour / np.maximum(stiffness, np.float32(1e-12))) - REACHED * side
         least = 0.5 * stiffness * np.square(np.maximum(off, 0.0))
@@ -282,18 +318,17 @@ class Rays(Engine):
 
     def _hear(
         self,
-        sound: Sound,
-        turned: Sound,
+        sound: Listener,
+        turned: Listener,
         bounce: Bounce,
         position: NDArray[np.float64],
         rotation: NDArray[np.float64],
         shadows: list[Shadow],
     ) -> None:
+        soft = bounce.number == 1
         heard_by = [
-            self._heard(bounce, place, *((shadows[0], shadow) if bounce.number == 1 else ()))
-            for place, shadow in zip(
-                self.hearing.places(position, rotation)[1], shadows[1:], strict=True
-            )
+            self._heard(bounce, place, *((shadows[0], shadows[1 + ear]) if soft else ()))
+            for ear, place in enumerate(self.hearing.places(position, rotation)[1])
         ]
         anyone = np.zeros(len(bounce.ray), dtype=bool)
         for heard, _, _, _ in heard_by:
@@ -304,24 +339,17 @@ class Rays(Engine):
         place_of = np.cumsum(anyone) - 1
         for ear, (heard, gain, spread, shaded) in enumerate(heard_by):
             gain *= level.take(place_of.take(heard), axis=0)
-            every = np.arange(len(heard))
-            parts = [(sound, every, gain)]
-            if shaded is not None:
-                dim, passed = shaded
-                parts.append((turned, dim, (gain[dim] * passed.imag).astype(np.float32)))
-                gain[dim] *= passed.real
-            for into, which, strength in parts:
-                some = heard.take(which)
-                self.hearing.add(
-                    into,
-                    ear,
-                    bounce.points.take(some, axis=0),
-                    length=bounce.length.take(some),
-                    spread=spread.take(which),
-                    level=strength,
-                    position=position,
-                    rotation=rotation,
-                )
+            self.hearing.add(
+                sound,
+                ear,
+                bounce.points.take(heard, axis=0),
+                length=bounce.length.take(heard),
+                spread=spread,
+                level=gain,
+                position=position,
+                rotation=rotation,
+                shaded=None if shaded is None else (turned, *shaded),
+            )
 
     def _heard(
         self,
@@ -333,7 +361,7 @@ class Rays(Engine):
         NDArray[np.int64],
         NDArray[np.floating[Any]],
         Real,
-        tuple[NDArray[np.int64], NDArray[np.complex128]] | None,
+        tuple[NDArray[np.int64], NDArray[np.complex64]] | None,
     ]:
         """Which hits an ear hears (N,), by what gain (N, F), and their paths' spread (N,), m.
 
@@ -353,7 +381,7 @@ class Rays(Engine):
         seen, shaded = self._shaded(bounce, near, seen, lit, shadow)
         near = near[np.flatnonzero(seen)]
         gain = self._gain(bounce, near, towards.take(near, axis=0), detour.take(near))
-        bend = stiffness.take(near) * np.float32(bounce.solid_angle)
+        bend = (stiffness * np.asarray(bounce.solid_angle, dtype=np.float32)).take(near)
         coarse = bend * self._wavenumber[-1] > FINE
         coarse = np.flatnonzero(coarse & self._smooth[self._part(bounce.triangles[near, -1])])
         gain[coarse] *= coarse_gain(np.multiply.outer(bend.take(coarse), self._wavenumber))
@@ -366,7 +394,7 @@ class Rays(Engine):
         seen: NDArray[np.bool_],
         lit: Shadow | None,
         shadow: Shadow | None,
-    ) -> tuple[NDArray[np.bool_], tuple[NDArray[np.int64], NDArray[np.complex128]] | None]:
+    ) -> tuple[NDArray[np.bool_], tuple[NDArray[np.int64], NDArray[np.complex64]] | None]:
         """Which hits pass obstacles, and what passes of those near an outline."""
         points, triangle = bounce.points.take(near, axis=0), bounce.triangles[near, -1]
         whole = np.broadcast_to(~np.bool_(bounce.hidden), near.shape)
@@ -376,7 +404,7 @@ class Rays(Engine):
         passes = np.ones(len(near), dtype=bool)
         for leg, free in legs:
             if leg is None:
-                row, table = np.full(len(near), -1), np.ones((1, 1), dtype=np.complex128)
+                row, table = np.full(len(near), -1), np.ones((1, 1), dtype=np.complex64)
             else:
                 row, table = leg.passed(points, triangle)
             rows.append((row, table))
@@ -386,7 +414,7 @@ class Rays(Engine):
         if not dim.any():
             return passes, None
         chosen = np.flatnonzero(dim)
-        passed = np.ones((len(chosen), len(self._wavenumber)), dtype=np.complex128)
+        passed = np.ones((len(chosen), len(self._wavenumber)), dtype=np.complex64)
         for row, table in rows:
             of = row[chosen]
             some = np.flatnonzero(of >= 0)

@@ -10,12 +10,10 @@ from typing import Any
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from sononerf.geometry.raycast import Hits, RayCaster
-from sononerf.geometry.surface import CREASE, corner_normals, weight_gradients
+from sononerf.geometry.surface import CREASE, bodies, corner_normals, weight_gradients
 from sononerf.simulation.impulse_response import NODE_SPACING
 
 RESOLVED_FREQUENCY = 80e3
@@ -66,9 +64,8 @@ class Outlines:
         _, first, count = np.unique(used, axis=0, return_index=True, return_counts=True)
         rim = first[count == 1]
         owner = np.asarray(mesh.edges_face, dtype=np.int64)[rim]
-        graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(faces),) * 2)
-        parts, label = connected_components(graph, directed=False)
-        self.body: NDArray[np.int64] = label.astype(np.int64)
+        self.body: NDArray[np.int64] = bodies(mesh)
+        parts = int(self.body.max()) + 1
         is_open = np.zeros(parts, dtype=bool)
         is_open[self.body[owner]] = True
         self.closed: NDArray[np.bool_] = ~is_open[self.body]
@@ -230,7 +227,7 @@ class Shadow:
         self._shape = 2 * half.astype(np.int64) + 1
         self._low = 0.5 * (lower + upper) - (half + 0.5) * self._cell
         self._rows = np.full(int(self._shape.prod()), UNKNOWN, dtype=np.int32)
-        self._table = np.zeros((0, len(wavenumber)), dtype=np.complex128)
+        self._table = np.zeros((0, len(wavenumber)), dtype=np.complex64)
         self._pieces = self._cut() if outlines.several else None
         if self._pieces is not None:
             towards = self._pieces.middle - place
@@ -288,7 +285,7 @@ class Shadow:
 
     def passed(
         self, points: NDArray[np.float64], triangle: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int32], NDArray[np.complex128]]:
+    ) -> tuple[NDArray[np.int32], NDArray[np.complex64]]:
         """Return the row (N,) of each point in a table (C, F) of what passes; -1: no outline near.
 
         Parameters
@@ -388,7 +385,7 @@ class Shadow:
             return table
 
         lit = self._caster.visible(points[used] - self._cell * way[used], self._place)
-        found = lit[:, None] + lay(swept) @ self._turns
+        found = lit[:, None] + _product(lay(swept), self._turns)
         curve = pieces.curve[piece]
         if curve.any():
             # How far the way is in the shadow, as an angle by which sound bends.
@@ -399,11 +396,17 @@ class Shadow:
             weight = length / reduced * curve * np.clip(1.0 + bent * grazing / LIT, 0.0, 1.0)
             bent = np.minimum(bent, SHADED / grazing) * curve
             for factor in self._creep:
-                found += lay(weight) @ factor
+                found += _product(lay(weight), factor)
                 weight = weight * bent
         rows[used] = len(self._table) + np.arange(len(used))
-        self._table = np.concatenate([self._table, found])
+        self._table = np.concatenate([self._table, found.astype(np.complex64)])
         return rows
+
+
+def _product(real: NDArray[np.float64], factor: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Multiply a real matrix by a complex one, without making the real one complex."""
+    product: NDArray[np.complex128] = (real @ factor.view(np.float64)).view(np.complex128)
+    return product
 
 
 def behind(

@@ -29,7 +29,7 @@ from sononerf.simulation.spheres import Spheres
 
 logger = logging.getLogger("sononerf")
 
-VERSION = 3  # to be raised when the same settings give other echoes: stores are told apart by it
+VERSION = 4  # to be raised when the same settings give other echoes: stores are told apart by it
 LOWEST_OVER_PRESSURE = 4e-4  # Hz/Pa, of ISO 9613-1
 DEFAULT_SPEED = 343.0  # m/s
 DEFAULT_TEMPERATURE = 20.0  # °C, for absorption where only the speed is fixed

@@ -45,7 +45,7 @@ CONTROL = 100
 """Points of the surface at which the gains of beam and ears are looked up."""
 ORDER = 3
 """Degree of the polynomial over position that is fitted to these gains. 5 gave the same echoes."""
-BLOCK = 32
+BLOCK = 64
 """Poses that are solved for together. It is fixed, so that the rounding of a pose's result does not
 depend on the other poses."""
 LEAD = 2.5
@@ -185,14 +185,14 @@ class Sources(Solved):
         for start in range(0, len(poses), BLOCK):
             some = poses[np.arange(start, start + BLOCK).clip(max=len(poses) - 1)]
             incident = _arriving(system.points, system.normals, some.emitters, wavenumber)
-            incident *= (some.beam(control) @ points).T
+            incident *= (some.beam(control) @ points).T.astype(np.float32)
             strength = system.solve(incident)
             squares.append(np.square(system.error(incident, strength)))
             count = min(BLOCK, len(poses) - start)
             for ear in range(ears):
                 wave = _waves(some.ears[:, ear], system.places, wavenumber)
-                wave *= some.gain(ear, control) @ sources
-                heard[start : start + count, ear] = (wave * strength.T).sum(axis=1)[:count]
+                wave *= (some.gain(ear, control) @ sources).astype(np.float32)
+                heard[start : start + count, ear] = np.einsum("pm,mp->p", wave, strength)[:count]
         self.error[frequency] = math.sqrt(float(np.mean(squares)))
         return heard
 
@@ -211,30 +211,33 @@ class _System:
         self.chosen = np.r_[: self._asked, len(points) - CHECKS : len(points)]
         self.points, self.normals = points[self.chosen], normals[self.chosen]
         matrix = _slopes(self.points, self.normals, self.places, wavenumber)
-        used, self._checks = np.asfortranarray(matrix[: self._asked]), matrix[self._asked :]
-        self._adjoint = used.conj().T
+        self._checks = matrix[self._asked :]
+        self._adjoint = np.ascontiguousarray(matrix[: self._asked].T).conj()
+        # The squares of the equations need double precision, their solutions do not.
+        used = np.asfortranarray(matrix[: self._asked], dtype=np.complex128)
         normal = scipy.linalg.blas.zherk(1.0, used, trans=2, lower=1)
         diagonal = np.einsum("ii->i", normal)
         diagonal += REGULARISATION * float(diagonal.real.mean())
         try:
-            self._factor = scipy.linalg.cho_factor(
+            factor, _ = scipy.linalg.cho_factor(
                 normal, lower=True, overwrite_a=True, check_finite=False
             )
+            self._factor = factor.astype(np.complex64)
         except scipy.linalg.LinAlgError as error:
             raise NumericalError(
                 f"the equivalent sources at {frequency / 1e3:.3g} kHz cannot be solved for; "
                 "set simulation.engine=rays"
             ) from error
 
-    def solve(self, incident: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def solve(self, incident: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Return the sources' strengths (M, P) for normal slopes of pressure (N, P)."""
         wanted = self._adjoint @ -incident[: self._asked]
-        strength: NDArray[np.complex128] = scipy.linalg.cho_solve(
-            self._factor, wanted, check_finite=False
+        strength: NDArray[np.complex64] = scipy.linalg.cho_solve(
+            (self._factor, True), wanted, overwrite_b=True, check_finite=False
         )
         return strength
 
-    def error(self, incident: NDArray[np.complex128], strength: NDArray[np.complex128]) -> float:
+    def error(self, incident: NDArray[np.complex64], strength: NDArray[np.complex64]) -> float:
         """Return what is left of the normal slope at the points that were left out, relative."""
         arriving = incident[self._asked :]
         left = self._checks @ strength + arriving
@@ -262,28 +265,40 @@ def _slopes(
     normals: NDArray[np.float64],
     places: NDArray[np.float64],
     wavenumber: complex,
-) -> NDArray[np.complex128]:
+) -> NDArray[np.complex64]:
     r"""Return :math:`\partial_n e^{-j k r} / 4 \pi r` at points (N, 3) for sources (M, 3)."""
     square = _squares(points, places)
     distance = np.sqrt(square)
     across = np.einsum("nd,nd->n", points, normals)[:, None] - normals @ places.T
-    phase = -wavenumber.real * distance
-    size = np.exp(wavenumber.imag * distance) * across / (4.0 * math.pi * square * distance)
-    slope = np.zeros(distance.shape, dtype=np.complex128)
-    slope.real, slope.imag = size * np.cos(phase), size * np.sin(phase)
-    slope *= -1j * wavenumber * distance - 1.0
+    square *= distance
+    across /= square
+    slope = _turned(distance, wavenumber)
+    slope *= (-1j * wavenumber * distance - 1.0).astype(np.complex64)
+    slope *= across.astype(np.float32)
     return slope
 
 
 def _waves(
     points: NDArray[np.float64], places: NDArray[np.float64], wavenumber: complex
-) -> NDArray[np.complex128]:
+) -> NDArray[np.complex64]:
     r"""Return :math:`e^{-j k r} / 4 \pi r` at points (N, 3) for sources (M, 3)."""
     distance = np.sqrt(_squares(points, places))
-    size = np.exp(wavenumber.imag * distance) / (4.0 * math.pi * distance)
-    wave = np.zeros(distance.shape, dtype=np.complex128)
-    phase = -wavenumber.real * distance
-    wave.real, wave.imag = size * np.cos(phase), size * np.sin(phase)
+    wave = _turned(distance, wavenumber)
+    wave /= distance.astype(np.float32)
+    return wave
+
+
+def _turned(distance: NDArray[np.float64], wavenumber: complex) -> NDArray[np.complex64]:
+    r"""Return :math:`e^{-j k r} / 4 \pi` at distances (N, M); phases keep their full precision."""
+    turns = distance * (wavenumber.real / (2.0 * math.pi))
+    turns -= np.rint(turns)
+    phase = turns.astype(np.float32)
+    phase *= np.float32(-2.0 * math.pi)
+    size = np.exp((wavenumber.imag * distance).astype(np.float32))
+    size *= np.float32(0.25 / math.pi)
+    wave = np.zeros(distance.shape, dtype=np.complex64)
+    np.multiply(size, np.cos(phase), out=wave.real)
+    np.multiply(size, np.sin(phase), out=wave.imag)
     return wave
 
 
@@ -300,6 +315,6 @@ def _arriving(
     normals: NDArray[np.float64],
     emitters: NDArray[np.float64],
     wavenumber: complex,
-) -> NDArray[np.complex128]:
+) -> NDArray[np.complex64]:
     r"""Return :math:`\partial_n e^{-j k r} / r` at points (N, 3) for emitters (P, 3)."""
-    return 4.0 * math.pi * _slopes(points, normals, emitters, wavenumber)
+    return np.float32(4.0 * math.pi) * _slopes(points, normals, emitters, wavenumber)

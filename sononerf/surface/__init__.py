@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The one surface that explains the echoes: evidence, occupancy, and what follows from it."""
+"""The surface that explains the echoes: evidence, occupancy where it starts, and refinement."""

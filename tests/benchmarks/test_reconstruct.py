@@ -33,7 +33,6 @@ def asked(monkeypatch):
     )
     monkeypatch.setattr(module, "read_out", read_out)
     monkeypatch.setattr(module, "load_fitted", lambda run: fitted)
-    monkeypatch.setattr(module, "borne_out", lambda run: "hull")
     monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
     return given
 
@@ -53,8 +52,8 @@ def test_the_median_of_five(asked, tmp_path):
     (row,) = found["rows"]
     # Of 1, 2, 3, 4 and 5 s; 1,200 voxels.
     assert (row["reconstruct_s"], row["voxels"], row["voxels_per_s"]) == (3.0, 1200, 400.0)
-    assert (row["name"], row["method"]) == ("a, 2 mm", "hull")
-    assert text.splitlines()[1].split() == ["a,", "2", "mm", "hull", "1,200", "3.00", "400"]
+    assert (row["name"], row["method"]) == ("a, 2 mm", "auto")
+    assert text.splitlines()[1].split() == ["a,", "2", "mm", "auto", "1,200", "3.00", "400"]
 
 
 def test_a_run_with_a_voxel_size_of_its_own_is_read_by_that(asked, tmp_path, monkeypatch):

@@ -23,6 +23,7 @@ TINY = {
     "renderer": {"options": {"prune_every": 3, "points": 30, "start": 50, "prune_below": 0.3}},
     "fit": {"epochs": 3, "steps_per_epoch": 4, "batch_poses": 2, "batch_frequencies": 2},
     "preview": {"voxels": 8},
+    "reconstruction": {"refine": False},
 }
 
 

@@ -11,14 +11,12 @@ import pytest
 import torch
 
 from sononerf import plugins
-from sononerf.acoustics.ears import synthetic_ears
 from sononerf.acoustics.reception import effective_window
-from sononerf.acoustics.spectrogram import frequency_axis
-from sononerf.data import first_echo
-from sononerf.data.first_echo import asked_poses
-from sononerf.data.region import OUTSIDE, EchoEvidence, echo_reach
 from sononerf.data.store import EnsembleStore
-from sononerf.errors import InputError, NumericalError, SettingsError
+from sononerf.echoes import onsets
+from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.onsets import Onsets, asked_poses, find_onsets
+from sononerf.errors import InputError, SettingsError
 from sononerf.experiment import build
 from sononerf.experiment.build import (
     acquisition,
@@ -28,13 +26,13 @@ from sononerf.experiment.build import (
     echo_region,
     field_and_renderer,
     module_for,
+    point_echo,
 )
 from sononerf.experiment.simulate import simulate
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.field.hash import HashField
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.geometry.hull import EchoHull
 from sononerf.renderer.profile import ProfileRenderer
 from sononerf.renderer.shell import ShellRenderer
 
@@ -120,10 +118,6 @@ def test_slices_without_an_active_cell_are_silent(tiny):
     assert int(stream[0].rows) == 5
 
 
-def nothing_left(*given, **options):
-    raise NumericalError("no pose received an echo")
-
-
 def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeypatch):
     known = dataclasses.replace(
         acquisition(tiny()),
@@ -138,9 +132,10 @@ def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeyp
         indices=lambda split: {"train": np.array([1, 2])}[split],
     )
     heard = np.array([[0.4, 0.41], [-np.inf, 0.39]])
+    found = Onsets(np.array([1, 2]), np.ones(3), np.ones((2, 2, 3)), np.ones((2, 2, 3)), heard)
     asked = []
-    monkeypatch.setattr(build, "first_echoes", lambda *given: asked.append(given) or heard)
-    monkeypatch.setattr(build, "EchoEvidence", nothing_left)
+    monkeypatch.setattr(build, "find_onsets", lambda *given: asked.append(given) or found)
+    monkeypatch.setattr(build, "weighted", lambda hull, resolution: hull)
     hull = echo_hull(tiny(), store)
     expected = [[1.0, 2.002, 2.99], [0.002, 0.0, -0.01]]
     np.testing.assert_allclose(hull.emitters, expected, rtol=0, atol=1e-7)
@@ -154,8 +149,8 @@ def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeyp
     np.testing.assert_array_equal(hull.axes, [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     (given,) = asked
     assert given[0] is store
-    np.testing.assert_allclose(given[1], np.hamming(64) ** 2, rtol=1e-12)
-    assert given[2] == pytest.approx(343.0 / 2 / 1e6)
+    np.testing.assert_allclose(given[1].window, np.hamming(64) ** 2, rtol=1e-12)
+    assert given[1].spacing == pytest.approx(343.0 / 2 / 1e6)
     for values in (hull.emitters, hull.receivers, hull.first, hull.axes):
         assert values.dtype == np.float64
     # A row of a sweep may hear an echo too far off, so all are taken to be that much nearer.
@@ -165,21 +160,13 @@ def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeyp
     np.testing.assert_allclose(echo_hull(tiny(), store).first, heard - 0.004, rtol=0, atol=1e-9)
 
 
-def test_the_hull_leaves_late_first_echoes_out(tiny, echoes, monkeypatch):
-    """Their origins are sought around all sound, whatever the first echoes themselves leave."""
+def test_the_hull_is_weighted_by_the_range_resolution(tiny, echoes, monkeypatch):
     asked = []
-    monkeypatch.setattr(build, "corrected", lambda *given: asked.append(given) or "the others")
-    store = EnsembleStore.open(echoes)
-    settings = tiny(region={"lower": (-0.001,) * 3, "upper": (0.001,) * 3})
-    assert echo_hull(settings, store) == "the others"
-    ((hull, lower, upper),) = asked
+    monkeypatch.setattr(build, "weighted", lambda *given: asked.append(given) or "the others")
+    assert echo_hull(tiny(), EnsembleStore.open(echoes)) == "the others"
+    ((hull, resolution),) = asked
     assert hull.first.shape == (8, 2)
-    ears = synthetic_ears(settings.ears, frequency_axis(settings.spectrogram))
-    reach = echo_reach(settings.call, settings.spectrogram, 343.0)
-    box = EchoEvidence(store, ears, reach=reach).box()
-    size = box[1] - box[0]
-    np.testing.assert_allclose(lower, box[0] - 0.15 * size, rtol=1e-9)
-    np.testing.assert_allclose(upper, box[1] + 0.15 * size, rtol=1e-9)
+    assert resolution == point_echo(tiny()).resolution == pytest.approx(0.0058, abs=1e-4)
 
 
 def test_the_hull_of_a_sphere_holds_it_and_little_more(tiny, echoes):
@@ -187,10 +174,9 @@ def test_the_hull_of_a_sphere_holds_it_and_little_more(tiny, echoes):
     hull = echo_hull(tiny(), EnsembleStore.open(echoes))
     assert hull.first.shape == (8, 2)
     front = hull.clearance(0.02 * hull.sources / np.linalg.norm(hull.sources, axis=1)[:, None])[0]
-    # Beam and ears lengthen an echo, so it rises a little earlier, which is the safe side; places
-    # of a fit's lattice are allowed half a millimetre for it.
+    # Beam and ears lengthen an echo, so it rises a little earlier, which is the safe side.
     assert (front > -0.0001).all()
-    assert (front < OUTSIDE[1]).all()
+    assert (front < 0.1 * point_echo(tiny()).resolution).all()
     assert (hull.clearance(0.0199 * fibonacci_sphere(200))[0] > 0).all()
     assert (hull.clearance(0.021 * hull.sources / 0.4)[0] < 0).all()
 
@@ -290,7 +276,7 @@ def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):
 
 
 def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
-    """The noise of both lies above the zero of the reported decibels, 3 and 23 dB."""
+    """The noise of all lies above the zero of the reported decibels, 3, 23 and 33 dB."""
     poses = {"count": 24, "validation": 0, "heldout": 0}
 
     def heard(name, **noise):
@@ -299,53 +285,27 @@ def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
         return echo_region(settings, store)[0], echo_hull(settings, store)
 
     box, _ = heard("plain")
-    found, hull = heard("faint", snr_db=40)
-    torch.testing.assert_close(found, box, rtol=0, atol=0.006)
-    # First echoes of a sphere: its front, or a little before, never behind.
-    late = hull.first.mean(axis=1) - (np.linalg.norm(hull.sources, axis=1) - 0.02)
-    assert late.max() < 0.001
-    assert np.median(late) > -0.002
-    # Where an echo may lie under the noise, what is heard first tells nothing.
-    found, hull = heard("loud", snr_db=20)
-    late = hull.first - (np.linalg.norm(hull.sources, axis=1) - 0.02)[:, None]
-    assert np.isfinite(late).mean() < 0.5
-    assert late.max() < 0.002
-    assert (found[0] < box[0] + 0.006).all()
-    assert (found[1] > box[1] - 0.006).all()
-    assert (found[1] - found[0] < 2.5 * (box[1] - box[0])).all()
-
-
-def test_the_region_is_told_how_long_an_echo_is(tiny, echoes, monkeypatch):
-    told = []
-
-    class Asked(build.EchoEvidence):
-        def __init__(self, *given, reach, **options):
-            told.append(reach)
-            super().__init__(*given, reach=reach, **options)
-
-    monkeypatch.setattr(build, "EchoEvidence", Asked)
-    store = EnsembleStore.open(echoes)
-    for settings in (tiny(), tiny(call={"kind": "linear", "duration": 1e-3})):
-        echo_region(settings, store)
-    impulse, other, sweep, *_ = told  # the late first echoes are sought first
-    assert impulse == other == pytest.approx(31.5e-6 * 343 / 2)
-    assert sweep > 3 * impulse
+    for snr_db, error in ((40, 0.001), (20, 0.002), (10, 0.003)):
+        found, hull = heard(f"at {snr_db} dB", snr_db=snr_db)
+        torch.testing.assert_close(found, box, rtol=0, atol=0.010)
+        both = hull.first[(hull.weight > 0).all(axis=1)].mean(axis=1)
+        late = both - (np.linalg.norm(hull.sources, axis=1) - 0.02)[(hull.weight > 0).all(axis=1)]
+        assert len(late) > 20
+        assert np.abs(late).max() < error
 
 
 def test_of_many_poses_hull_and_region_ask_the_same_ones(tiny, echoes, monkeypatch):
-    """First echoes of some poses told to others would leave no place."""
     store = EnsembleStore.open(echoes)
     whole = echo_region(tiny(), store)[0]
-    monkeypatch.setattr(first_echo, "MOST_POSES", 6)
+    monkeypatch.setattr(onsets, "MOST_POSES", 6)
     asked = asked_poses(store)
-    hull = echo_hull(tiny(), store)
+    heard = find_onsets(store, point_echo(tiny()))
+    hull = echo_hull(tiny(), store, heard)
     assert hull.first.shape == (6, 2)
     assert len(asked) < len(store.indices("train"))
+    np.testing.assert_array_equal(heard.poses, asked)
     np.testing.assert_allclose(hull.axes, store.rotations[asked][:, :, 0])
-    evidence = build._evidence(tiny(), store, hull)
-    np.testing.assert_allclose(evidence.sources, hull.sources, atol=1e-6)
-    np.testing.assert_allclose(evidence.nearest, hull.first.min(axis=1))
-    few = echo_region(tiny(), store, hull)[0]
+    few = echo_region(tiny(), store, hull, heard)[0]
     assert (few[0] <= whole[0] + 0.002).all()
     assert (few[1] >= whole[1] - 0.002).all()
 
@@ -359,7 +319,7 @@ def test_what_is_possible_is_what_the_hull_leaves(tiny, echoes):
     found = given[1](places, 0.002)
     assert torch.equal(own[1](places, 0.002), found)
     clearance = hull.clearance(places.double().numpy())[0]
-    # Three tenths of how far a place speaks for its surroundings, and half a millimetre.
+    # A quarter of how far a place speaks for its surroundings, and an onset's error.
     assert clearance[found.numpy()].min() >= -0.0011
     assert (clearance < -0.0011).any()
     # The middle of the sphere is where nobody hears anything come from, and the front is.

@@ -10,10 +10,9 @@ import trimesh
 
 from sononerf.errors import NumericalError
 from sononerf.experiment import finish as finish_module
-from sononerf.experiment.borne_out import NAME
 from sononerf.experiment.finish import finish, is_finished
-from sononerf.experiment.retrace import learn_retrace
 from sononerf.experiment.run_folder import RunFolder
+from sononerf.experiment.traced import NAME, learn_traced
 from sononerf.progress import Progress
 from sononerf.weights import load_weights, save_weights
 
@@ -42,7 +41,7 @@ def run(fitted_run, tmp_path):
 def steps(monkeypatch):
     """Let every step say its name and nothing more."""
     called = []
-    for name in ("learn_retrace", "predict"):
+    for name in ("learn_traced", "predict"):
         monkeypatch.setattr(
             finish_module,
             name,
@@ -59,19 +58,7 @@ def steps(monkeypatch):
 
 def test_traces_are_learned_off_the_mesh_before_anything_is_predicted(run, steps):
     finish(run, accelerator="cpu")
-    assert steps == ["reconstruct", ("learn_retrace", "cpu"), ("predict", "cpu"), "evaluate"]
-
-
-@pytest.mark.parametrize("method", ["auto", "hull", "isosurface"])
-def test_what_poses_bore_out_before_is_found_out_anew(run, steps, monkeypatch, method):
-    """The surface is first drawn as the settings say, not as an earlier end of the run did."""
-    state, description = load_weights(run)
-    description["settings"]["reconstruction"]["method"] = method
-    save_weights(run, state, description)
-    asked = []
-    monkeypatch.setattr(finish_module, "reconstruct", lambda path, **given: asked.append(given))
-    finish(run)
-    assert [given["method"] for given in asked] == [method]
+    assert steps == ["reconstruct", ("learn_traced", "cpu"), ("predict", "cpu"), "evaluate"]
 
 
 def test_nothing_is_predicted_where_nothing_is_held_out(run, steps):
@@ -79,10 +66,10 @@ def test_nothing_is_predicted_where_nothing_is_held_out(run, steps):
     description["settings"]["poses"]["heldout"] = 0
     save_weights(run, state, description)
     finish(run)
-    assert steps == ["reconstruct", ("learn_retrace", "auto"), "evaluate"]
+    assert steps == ["reconstruct", ("learn_traced", "auto"), "evaluate"]
 
 
-@pytest.mark.parametrize("name", ["reconstruct", "learn_retrace"])
+@pytest.mark.parametrize("name", ["reconstruct", "learn_traced"])
 def test_a_field_without_a_surface_predicts_before_it_is_told(run, steps, monkeypatch, name):
     def silent(path, **options):
         raise NumericalError("the field is silent everywhere")
@@ -100,10 +87,10 @@ def test_a_surface_that_cannot_be_traced_is_told_and_no_fault(run, steps, monkey
         (path / "reconstruction" / "mesh.ply").write_bytes(mesh.export(file_type="ply"))
 
     monkeypatch.setattr(finish_module, "reconstruct", speck)
-    monkeypatch.setattr(finish_module, "learn_retrace", learn_retrace)
+    monkeypatch.setattr(finish_module, "learn_traced", learn_traced)
     progress = Heard()
     finish(run, accelerator="cpu", progress=progress)
-    assert any(text.startswith("no echoes are traced off the mesh: ") for text in progress.said)
+    assert any(text.startswith("no echoes are traced off the surface: ") for text in progress.said)
     assert steps == [("predict", "cpu"), "evaluate"]
 
 

@@ -180,11 +180,11 @@ def test_that_tracing_is_missing_is_told(run, no_pictures, monkeypatch):
     RunFolder(run).write_metrics("prediction", None)
     predict(run, accelerator="cpu")
     assert told == []
-    RunFolder(run).write_metrics("prediction", {"traced_share": 0.3})
+    RunFolder(run).write_metrics("prediction", {"traced_weight": 0.3})
     predict(run, accelerator="cpu")
     assert len(told) == 1
-    assert f"{run / 'retrace.safetensors'} is missing" in told[0]
-    assert "30%" in told[0]
+    assert f"{run / 'traced.safetensors'} is missing" in told[0]
+    assert "0.30" in told[0]
 
 
 def test_the_same_field_predicts_the_same_bits_wherever_it_lies(run, fitted, tmp_path, no_pictures):

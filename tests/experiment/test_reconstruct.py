@@ -165,21 +165,6 @@ def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, mo
     assert trimesh.load_mesh(folder / "mesh.ply").is_watertight == (kind != "one-sided")
 
 
-@pytest.mark.parametrize(("told", "found"), [("auto", "hull"), ("oriented", "oriented")])
-def test_what_poses_bore_out_is_drawn_unless_the_settings_say_how(
-    run, no_projections, monkeypatch, told, found
-):
-    description = json.loads((run / "model.json").read_text())
-    description["settings"]["reconstruction"]["method"] = told
-    (run / "model.json").write_text(json.dumps(description))
-    assert read_out(reconstruct(run))["method"] == "oriented"
-    monkeypatch.setattr(reconstruct_module, "borne_out", lambda path: "hull")
-    assert read_out(reconstruct(run))["method"] == found
-    assert read_out(reconstruct(run, method="isosurface"))["method"] == "isosurface"
-    # A level is one of the indicator; 0.4 m deep in a hull there is nothing.
-    assert read_out(reconstruct(run, level=0.4))["method"] == "oriented"
-
-
 def test_a_level_above_everything_has_no_surface(run):
     with pytest.raises(NumericalError):
         reconstruct(run, level=1e9)
@@ -261,3 +246,22 @@ def test_a_damaged_mesh_is_told(run, content, no_projections):
     (run / "reconstruction" / "mesh.ply").write_bytes(content)
     with pytest.raises(InputError, match=r"mesh\.ply: .*reconstruct again"):
         evaluate(run)
+
+
+def test_the_hull_of_first_echoes_is_the_surface_where_the_field_has_none(
+    run, no_projections, monkeypatch
+):
+    real, asked = reconstruct_module.read_out, []
+
+    def only_the_hull(field, *, method, **options):
+        asked.append(method)
+        if method != "hull":
+            raise NumericalError("no surface: the indicator is empty")
+        return real(field, method=method, **options)
+
+    monkeypatch.setattr(reconstruct_module, "read_out", only_the_hull)
+    folder = reconstruct(run)
+    assert asked == ["auto", "hull"]
+    assert read_out(folder)["method"] == "hull"
+    with pytest.raises(NumericalError, match="the indicator is empty"):
+        reconstruct(run, method="oriented")

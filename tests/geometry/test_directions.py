@@ -161,3 +161,25 @@ def test_faults_are_refused(arguments, match):
     good = {"count": 5, "axis": (0.0, 0.0, 1.0), "half_angle": 1.0, "offset": (0.5, 0.0)}
     with pytest.raises(ValueError, match=match):
         fibonacci_cap(**{**good, **arguments})
+
+
+@pytest.mark.parametrize("half_angle", [0.05, 0.8, math.pi])
+@pytest.mark.parametrize("offset", [(0.5, 0.0), (0.01, 0.99)])
+def test_no_direction_within_a_cone_is_left_out(half_angle, offset):
+    generator = np.random.default_rng(1)
+    cap = CapSpiral(20_000, (1.0, 2.0, -0.5), half_angle, offset, random_rotation(generator))
+    directions = cap.directions()
+    for width in (1e-4, 0.03, 0.4):
+        towards = directions[generator.integers(0, len(directions), 4)]
+        index = cap.reaching(towards, np.full(4, width * half_angle))
+        inside = (directions @ towards.T >= math.cos(width * half_angle)).any(axis=1)
+        assert np.isin(np.flatnonzero(inside), index).all()
+        np.testing.assert_array_equal(cap.directions(index), directions[index])
+        if width < 0.1:
+            assert len(index) < 0.1 * len(directions)
+    assert len(cap.reaching(directions[:1], np.array([math.pi]))) == len(directions)
+
+
+def random_rotation(generator):
+    turned, _ = np.linalg.qr(generator.normal(size=(3, 3)))
+    return turned

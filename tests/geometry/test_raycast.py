@@ -186,3 +186,15 @@ def test_without_embree_the_answers_are_the_same(monkeypatch):
     seen = slow.visible(a.points, target, normals=flat)
     np.testing.assert_array_equal(seen, fast.visible(a.points, target, normals=flat))
     assert 0 < seen.sum() < len(seen)
+
+
+def test_occlusion_agrees_with_the_ray_caster():
+    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
+    points = np.random.default_rng(0).uniform(-0.06, 0.06, (500, 3))
+    points = points[np.linalg.norm(points, axis=1) > 0.021]
+    target = np.broadcast_to([0.3, 0.0, 0.0], points.shape)
+    blocked = raycast.Occlusion(np.array(ball.vertices), np.array(ball.faces)).blocked(
+        points, target
+    )
+    assert 0 < blocked.sum() < len(points)
+    np.testing.assert_array_equal(~blocked, RayCaster(ball).visible(points, target))

@@ -3,7 +3,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.geometry.surface import corner_normals, total_curvature, weight_gradients
+from sononerf.geometry.surface import (
+    bodies,
+    corner_normals,
+    enclosing_balls,
+    total_curvature,
+    weight_gradients,
+)
 
 
 @pytest.mark.parametrize("subdivisions", [1, 3])
@@ -86,3 +92,34 @@ def test_a_triangle_without_area_has_no_gradients_and_no_curvature():
         np.testing.assert_array_equal(gradient[1], 0.0)
     assert np.isfinite(curvature(mesh)).all()
     assert curvature(mesh)[1] == 0.0
+
+
+def spheres_in_a_row(count):
+    parts = [trimesh.creation.icosphere(subdivisions=2, radius=0.5) for _ in range(count)]
+    for number, part in enumerate(parts):
+        part.apply_translation([float(number), 0.0, 0.0])
+    return trimesh.util.concatenate(parts)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 32])
+def test_balls_hold_every_corner(count):
+    for mesh in (spheres_in_a_row(3), trimesh.creation.box((0.01, 1.0, 2.0)).subdivide()):
+        centres, radii = enclosing_balls(mesh.triangles, bodies(mesh), count)
+        assert len(radii) <= count
+        away = np.linalg.norm(np.asarray(mesh.vertices)[:, None] - centres, axis=2)
+        assert (away <= radii * (1 + 1e-12)).any(axis=1).all()
+
+
+def test_a_ball_is_no_larger_than_its_body():
+    mesh = spheres_in_a_row(3)
+    assert len(np.unique(bodies(mesh))) == 3
+    centres, radii = enclosing_balls(mesh.triangles, bodies(mesh), 32)
+    np.testing.assert_allclose(radii, 0.5, rtol=1e-6)
+    np.testing.assert_allclose(np.sort(centres[:, 0]), [0.0, 1.0, 2.0], atol=1e-6)
+
+
+def test_a_plate_is_held_by_many_small_balls():
+    mesh = trimesh.creation.box((0.01, 1.0, 1.0)).subdivide().subdivide().subdivide()
+    _, radii = enclosing_balls(mesh.triangles, bodies(mesh), 32)
+    assert len(radii) > 8
+    assert radii.max() < 0.4

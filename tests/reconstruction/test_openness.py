@@ -6,9 +6,9 @@ import pytest
 import torch
 import trimesh
 
+from sononerf.echoes.free_space import EchoHull
 from sononerf.field.fourier import FourierField
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.geometry.hull import EchoHull
 from sononerf.reconstruction import openness, read_out
 from sononerf.reconstruction.openness import (
     FACING,

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from sononerf.echoes.free_space import EchoHull
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.geometry.hull import EchoHull
 from sononerf.reconstruction import outline as outline_module
 from sononerf.reconstruction.glints import Glints
 from sononerf.reconstruction.outline import clearance_volume, outline

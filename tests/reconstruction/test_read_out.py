@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 import torch
 
+from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field, sphere_directions
 from sononerf.field.grid import GridField
-from sononerf.geometry.hull import EchoHull
 from sononerf.reconstruction import read_out
 from sononerf.reconstruction.glints import Glints
 from sononerf.reconstruction.read_out import reconstruct

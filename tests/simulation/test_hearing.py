@@ -92,3 +92,23 @@ def test_air_takes_its_decibels_over_the_whole_path():
 def test_silence_is_silent():
     assert hearing().echo(hearing().silence()).shape == (2, SYNTHESIS.samples)
     assert not hearing().echo(hearing().silence()).any()
+
+
+def test_what_is_partly_hidden_is_split_into_two_sounds():
+    head, passed = hearing(), np.full((1, len(NODES)), 0.6 - 0.3j, dtype=np.complex64)
+    sound, turned = head.silence(), head.silence()
+    head.add(
+        sound,
+        0,
+        POINT[None].repeat(2, axis=0),
+        length=np.array([0.25, 0.25]),
+        spread=np.zeros(2),
+        level=np.ones((2, 1)),
+        position=POSITION,
+        rotation=ROTATION,
+        shaded=(turned, np.array([1]), passed),
+    )
+    whole = echo_of(head, 0)
+    scale = 1e-5 * np.abs(whole).max()
+    np.testing.assert_allclose(head.echo(sound), 1.6 * whole, atol=scale)
+    np.testing.assert_allclose(head.echo(turned), -0.3 * whole, atol=scale)

@@ -7,7 +7,7 @@ import trimesh
 
 from sononerf.geometry.directions import CapSpiral, fibonacci_cap
 from sononerf.geometry.raycast import RayCaster
-from sononerf.simulation.paths import SPLIT, aim, echo_paths, trace
+from sononerf.simulation.paths import SPLIT, aim, echo_paths, gathered, trace
 from tests.simulation.listening import ball, box, wall
 
 PARTS = SPLIT**2
@@ -391,3 +391,43 @@ def test_the_chosen_hits_are_the_chosen_hits():
     for name in ("shift", "square", "bend", "curving", "onward", "sink", "tube"):
         whole = getattr(bounce.footprint, name)
         np.testing.assert_array_equal(getattr(few.footprint, name), whole[..., chosen])
+
+
+def test_hits_that_are_gathered_are_the_same_hits():
+    caster, cap = corner(), CapSpiral(4000, (1.0, 1.0, 0.0), 0.5, (0.5, 0.0))
+
+    def paths():
+        return echo_paths(caster, ORIGIN, cap, bounces=3, extra=4000, judge=doubtful(0.7))
+
+    apart, together = list(paths()), list(gathered(paths()))
+    assert len(together) < len(apart)
+    assert all(len(bounce.ray) for bounce in together)
+    assert {bounce.number for bounce in together} == {1, 2}
+    for number in (1, 2):
+        totals = []
+        for bounces in (apart, together):
+            rows = []
+            for bounce in bounces:
+                if bounce.number == number and len(bounce.ray):
+                    angle = np.broadcast_to(bounce.solid_angle, len(bounce.ray))
+                    towards = np.broadcast_to([0.0, 1.0, 0.0], bounce.points.shape)
+                    felt = bounce.detour(towards, np.ones(len(bounce.ray)))
+                    rows.append(np.column_stack([bounce.points, bounce.length, angle, *felt]))
+            found = np.concatenate(rows)
+            totals.append(found[np.lexsort(found.T)])
+        np.testing.assert_array_equal(*totals)
+
+
+def test_rays_that_are_left_out_change_nothing_where_they_miss():
+    caster, cap = corner(), CapSpiral(4000, (1.0, 0.0, 0.0), 2.5, (0.5, 0.0))
+    hits = caster.first_hit(np.zeros((4000, 3)) + ORIGIN, cap.directions()).ray
+    assert len(hits) < 3900
+    whole, some = (
+        list(
+            echo_paths(caster, ORIGIN, cap, bounces=3, extra=4000, judge=doubtful(0.7), index=index)
+        )
+        for index in (None, hits)
+    )
+    for one, other in zip(whole, some, strict=True):
+        np.testing.assert_array_equal(one.ray, other.ray)
+        np.testing.assert_array_equal(one.points, other.points)

@@ -8,10 +8,12 @@ import trimesh
 
 from sononerf.acoustics.ears import synthetic_ears
 from sononerf.config import EarSettings
+from sononerf.geometry.directions import CapSpiral
 from sononerf.geometry.poses import look_at, rotation_from_euler
 from sononerf.material import RIGID, Material
 from sononerf.scene import Scene, load_scene
 from sononerf.simulation.hearing import Hearing
+from sononerf.simulation.paths import aim
 from tests.simulation.exact import SPEED, rigid_sphere
 from tests.simulation.listening import (
     NODES,
@@ -406,3 +408,18 @@ def test_only_smooth_surfaces_are_made_good_for_coarse_cells(lobe_width, correct
     material = replace(PLAIN, lobe_width=lobe_width)
     echoes(rays(ball(0.03), material, rays=300), [0.3, 0.0, 0.0])
     assert (sum(asked) > 0) == corrected
+
+
+@pytest.mark.parametrize("distance", [0.2, 0.04, 0.0])
+def test_no_ray_that_hits_is_left_out(distance):
+    parts = [ball(0.02, (0.0, 0.0, 0.0), 3), ball(0.015, (0.0, 0.05, 0.01), 3)]
+    engine = rays(trimesh.util.concatenate(parts), RIGID)
+    emitter = np.array([-0.02 - distance, 0.01, 0.005])
+    axis, half_angle = aim(emitter, engine._centre, engine._radius)
+    cap = CapSpiral(20_000, axis, half_angle, (0.3, 0.7))
+    origins = np.broadcast_to(emitter, (cap.count, 3))
+    hits = engine.caster.first_hit(origins, cap.directions()).ray
+    index = engine._reaching(cap, emitter)
+    assert np.isin(hits, index).all()
+    if distance == 0.2:
+        assert len(index) < 0.7 * cap.count

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from sononerf import __version__, storage
-from sononerf.config import load_settings
+from sononerf.config import Settings, load_settings
 from sononerf.errors import SonoNerfError
 from sononerf.experiment.run_folder import RunFolder
 from sononerf.experiment.simulate import default_store, echo_hash
@@ -71,6 +71,7 @@ def run_experiment(
     *,
     config: Path = CONFIG,
     enough: str | None = None,
+    store: Path | None = None,
 ) -> dict[str, Any]:
     """Run an experiment as a user would, in a process of its own.
 
@@ -87,6 +88,8 @@ def run_experiment(
     enough : str or None
         The section of ``metrics.json`` that is asked for: a command that wrote it has not failed,
         whatever came after, as where a short fit holds no surface yet.
+    store : Path or None
+        The ensemble, where it is not one of those in ``data``.
 
     Returns
     -------
@@ -109,8 +112,7 @@ def run_experiment(
         metrics = run.read_metrics()
         if "baseline" in metrics:  # what is written last
             return metrics
-    scene = load_scene(chosen.scene.name, chosen.scene.options)
-    store = data / default_store(chosen, echo_hash(chosen, scene)).name
+    store = store or data / ensemble_name(chosen)
     log = folder.with_name(f"{folder.name}.log")
     storage.make_folder(folder.parent)
     command = [sys.executable, "-m", "sononerf.cli", "fit", str(config), *settings]
@@ -131,6 +133,12 @@ def run_experiment(
         last = next((line for line in reversed(lines) if line.strip()), "nothing was said")
         raise RuntimeError(f"exit code {code}: {last.strip()}")
     return run.read_metrics()
+
+
+def ensemble_name(settings: Settings) -> str:
+    """Return the name of the folder that holds the ensemble of these settings."""
+    scene = load_scene(settings.scene.name, settings.scene.options)
+    return default_store(settings, echo_hash(settings, scene)).name
 
 
 @contextmanager
@@ -243,9 +251,9 @@ def table(rows: Sequence[Row]) -> str:
     columns = [column for column in COLUMNS if any(column.key in row for row in rows)]
     found = summary(rows)
     lines = [[column.title for column in columns]]
-    lines += [[_shown(column, row) for column in columns] for row in rows]
+    lines += [[shown(column, row) for column in columns] for row in rows]
     for name in ("median", "worst"):
-        lines.append([_shown(column, found[name], "") for column in columns])
+        lines.append([shown(column, found[name], "") for column in columns])
         lines[-1][0] = name
     text = aligned(lines)
     for number, row in enumerate(rows, start=1):
@@ -267,7 +275,8 @@ def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
     ]
 
 
-def _shown(column: Column, row: Mapping[str, Any], absent: str = "-") -> str:
+def shown(column: Column, row: Mapping[str, Any], absent: str = "-") -> str:
+    """Return a row's value as its column shows it."""
     value = row.get(column.key)
     if value is None:
         return absent

@@ -12,7 +12,6 @@ from pathlib import Path
 import torch
 
 from sononerf import storage
-from sononerf.experiment.borne_out import borne_out
 from sononerf.experiment.fitted import load_fitted
 from sononerf.reconstruction.read_out import reconstruct as read_out
 from tools.benchmarks.experiment import Row, aligned, ending
@@ -42,8 +41,7 @@ def reconstruct(arguments: argparse.Namespace) -> str:
 def _timed(run: Path, spacing: float) -> Row:
     fitted = load_fitted(run)
     options = fitted.settings.reconstruction
-    free = (options.method, options.level) == ("auto", "auto")
-    method = borne_out(run) if free else options.method
+    method = options.method
     seconds = []
     for _ in range(REPEATS):
         began = time.perf_counter()

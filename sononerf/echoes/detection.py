@@ -1,0 +1,177 @@
+# SPDX-License-Identifier: MIT
+r"""Echoes against noise: an ordered-statistic detector with a constant false-alarm rate.
+
+Two things that are no echoes are heard in front of the first one. *Noise* lies at all ranges of a
+pose alike. *Precursors* come with an echo and rise and fall with it: the rising flank of the
+analysis window, and in recordings the sidelobes of pulse compression. The level of both is taken
+from the data as an ordered statistic, as in OS-CFAR [1]_, for an echo that lies among the reference
+cells does not move it:
+
+.. math::
+
+    N_i &= \operatorname{quantile}_q \, P_i(r) \quad\text{over all ranges } r
+
+    S(l) &= \operatorname{quantile}_q \, P_i(r_i - l) / P_i(r_i) \quad\text{over poses and ears } i
+
+with :math:`P_i(r)` the power of one ear at one pose, averaged over frequency, and :math:`r_i` the
+range of its loudest slice. A slice holds an echo where
+
+.. math:: P_i(r) > T \max\big(N_i, \max_{l \ge g} P_i(r + l) \, S(l)\big)
+
+with :math:`r + l` the local maxima behind it.
+
+The guard :math:`g` keeps an echo from its own flank: it is the first lag with :math:`T S(g) < 1`.
+
+The average over frequency has :math:`K` independent values, so that noise power is
+gamma-distributed of shape :math:`K`, and with a false-alarm rate :math:`p` per slice
+
+.. math:: T = G_K^{-1}(1 - p) \, / \, G_K^{-1}(q) .
+
+References
+----------
+.. [1] H. Rohling, "Radar CFAR thresholding in clutter and multiple target situations", IEEE
+   Transactions on Aerospace and Electronic Systems 19(4):608-621, 1983.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaincinv
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+FALSE_ALARMS = 1e-6
+"""Probability that a range slice of noise alone is taken for an echo, no unit. An ensemble of 400
+poses has some ten thousand independent slices per ear, and one false onset hides a place."""
+RANK = 0.1
+"""Which quantile is the level of noise and precursors, no unit. Echoes may fill nine tenths of the
+range axis, and nine tenths of the poses may have other echoes in front of their loudest."""
+ONSET = 0.1
+"""Fraction of an echo's power at which its range is read, no unit. So early in the rise a second
+echo that follows within the window has not begun."""
+
+
+def threshold_factor(looks: float) -> float:
+    """Return the threshold over the quantile of noise power.
+
+    Parameters
+    ----------
+    looks : float
+        How many independent values each power is the average of.
+
+    Examples
+    --------
+    >>> round(threshold_factor(1.0))  # ln(1e-6) / ln(0.9)
+    131
+    """
+    low, high = gammaincinv(looks, [RANK, 1.0 - FALSE_ALARMS])
+    return float(high / low)
+
+
+class Levels(NamedTuple):
+    """What an echo must exceed."""
+
+    noise: Array  # (..., 1) power of noise alone
+    total: Array  # (..., R) of noise, precursors, and what the first slice cuts
+
+
+def threshold_levels(power: Array, looks: float) -> Levels:
+    """Return the thresholds of noise, and of noise and precursors.
+
+    Parameters
+    ----------
+    power : (..., R) float
+        Power averaged over frequency: of all poses and ears that are compared, over range.
+    looks : float
+        How many independent values each is the average of.
+    """
+    factor = threshold_factor(looks)
+    noise = factor * np.quantile(power, RANK, axis=-1, keepdims=True)
+    total = np.broadcast_to(noise, power.shape).copy()
+    precursors = factor * _precursors(power.reshape(-1, power.shape[-1]))
+    own = precursors >= 1.0
+    guard = int(own.argmin()) if not own.all() else len(own)
+    tops = np.where(_is_top(power), power, 0.0)
+    for lag, ratio in enumerate(precursors[guard:], start=guard + 1):
+        if ratio > 0.0:
+            np.maximum(total[..., :-lag], tops[..., lag:] * ratio, out=total[..., :-lag])
+    ahead = power[..., :1]
+    return Levels(noise, np.where(ahead > total[..., :1], np.maximum(total, factor * ahead), total))
+
+
+def _is_top(power: Array) -> Mask:
+    """Tell which slices are louder than those beside them, (..., R); the last may be one."""
+    top = np.zeros(power.shape, dtype=bool)
+    top[..., 1:-1] = (power[..., 1:-1] >= power[..., :-2]) & (power[..., 1:-1] > power[..., 2:])
+    top[..., -1] = power[..., -1] > power[..., -2]
+    return top
+
+
+def _precursors(power: Array) -> Array:
+    """Return the level in front of the loudest slice over its own, from one slice on, (L,)."""
+    top = power.argmax(axis=1)
+    known = power[np.arange(len(top)), top] > 0.0
+    power, top = power[known], top[known]
+    ratios = []
+    for lag in range(1, power.shape[1]):
+        reach = np.flatnonzero(top >= lag)
+        if len(reach) * RANK < 1.0:  # too few to be ranked
+            break
+        at = top[reach]
+        ratios.append(np.quantile(power[reach, at - lag] / power[reach, at], RANK))
+    return np.asarray(ratios)
+
+
+def onsets(power: Array, levels: Levels, window: Array, fineness: float) -> Array:
+    """Return where the first echo of each row is, in slices from the first one, (N,).
+
+    The range is read where the power has risen to a tenth of the echo's, or to the threshold of
+    noise where that is more, and moved by what a point echo needs from there to its middle.
+
+    Parameters
+    ----------
+    power : (N, R) float
+        Power over range.
+    levels : Levels
+        What an echo exceeds.
+    window : (W,) float
+        Power of a point echo over range.
+    fineness : float
+        Spacing of its values in slices.
+
+    Returns
+    -------
+    onset : (N,) float
+        Minus infinity where nothing was heard, or where the first slice cuts an echo that the
+        first whole one does not exceed by the threshold factor.
+    """
+    rising, middle = _flank(window)
+    found = np.full(len(power), -np.inf)
+    inner = (_is_top(power) & (power > levels.total))[:, 1:-1]
+    for row in np.flatnonzero(inner.any(axis=1)):
+        top = int(inner[row].argmax()) + 1
+        echo = power[row, : top + 1] / power[row, top]
+        fraction = max(ONSET, float(levels.noise[row, 0]) / power[row, top])
+        before = np.flatnonzero(echo[:top] < fraction)
+        if len(before):  # else it began before the first slice
+            rise = middle - _crossing(rising, fraction)
+            found[row] = _crossing(echo[int(before[-1]) :], fraction) + before[-1] + rise * fineness
+    return found
+
+
+def _flank(window: Array) -> tuple[Array, float]:
+    """Return the rise of a point echo up to its middle, from zero to one, and where that is."""
+    tops = np.flatnonzero(window == window.max())
+    rising = window[: tops[0] + 1] / window.max()
+    return np.concatenate(([0.0], rising)), float(tops.mean()) + 1.0
+
+
+def _crossing(rising: Array, fraction: float) -> float:
+    """Return where decibels last rise through a fraction of one, between values."""
+    before = int(np.flatnonzero(rising < fraction)[-1])
+    low, high = np.log10(np.maximum(rising[before : before + 2], 1e-30))
+    return before + float((np.log10(fraction) - low) / (high - low))

@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: MIT
+"""The range of the first echo at each ear of each pose, and which slices hold an echo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf.acoustics.call import covered
+from sononerf.acoustics.reception import effective_window
+from sononerf.acoustics.spectrogram import frequency_axis
+from sononerf.config import CallSettings, SpectrogramSettings
+from sononerf.data.store import EnsembleStore
+from sononerf.echoes.detection import Levels, onsets, threshold_levels
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+MOST_POSES = 1000
+"""How many training poses are asked, evenly over all, so that memory is bounded. More of them add
+less to the free space than an onset can be read to."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointEcho:
+    """What the analysis makes of the echo of one point.
+
+    Attributes
+    ----------
+    window : (W,) float
+        Its power over range, averaged over the frequencies that the call has.
+    spacing : float, m
+        Between these values.
+    looks : float
+        How many independent values there are among the frequencies.
+    """
+
+    window: Array
+    spacing: float
+    looks: float
+
+    @classmethod
+    def of(
+        cls, call: CallSettings, analysis: SpectrogramSettings, speed_of_sound: float
+    ) -> PointEcho:
+        """Return the echo of a call (m/s) in an analysis."""
+        rows = effective_window(call, analysis)
+        frequency = frequency_axis(analysis)
+        swept = covered(call, frequency)
+        heard = rows[swept] if swept.any() else rows[:1]
+        taper = np.hamming(analysis.window)
+        bandwidth = analysis.sampling_rate * (taper**2).sum() / taper.sum() ** 2
+        band = len(frequency) * analysis.sampling_rate / analysis.fft
+        return cls(
+            window=(heard**2).mean(axis=0),
+            spacing=speed_of_sound / 2.0 / analysis.sampling_rate,
+            looks=max(band / bandwidth, 1.0),
+        )
+
+    @property
+    def resolution(self) -> float:
+        """Width in range over which its magnitude is above half of its greatest, m."""
+        wide = np.flatnonzero(self.window >= 0.25 * self.window.max())
+        return float(wide[-1] - wide[0] + 1) * self.spacing
+
+
+@dataclass(frozen=True, eq=False)
+class Onsets:
+    """What the asked poses heard.
+
+    Attributes
+    ----------
+    poses : (P,) int
+        Their numbers in the store, ascending.
+    range : (R,) float, m
+        Of the slices.
+    power : (P, E, R) float
+        Averaged over frequency.
+    heard : (P, E, R) bool
+        Which slices hold an echo.
+    first : (P, E) float, m
+        Range of the first echo; minus infinity where there is none, or where it is cut.
+    """
+
+    poses: NDArray[np.int64]
+    range: Array
+    power: Array
+    heard: Mask
+    first: Array
+
+
+def asked_poses(store: EnsembleStore) -> NDArray[np.int64]:
+    """Return the numbers of the training poses that are asked, ascending."""
+    train = np.asarray(store.indices("train"))
+    chosen = np.linspace(0, len(train) - 1, min(MOST_POSES, len(train))).round().astype(int)
+    return np.asarray(train[chosen])
+
+
+def find_onsets(store: EnsembleStore, echo: PointEcho) -> Onsets:
+    """Detect the echoes of a sealed ensemble's asked poses.
+
+    Parameters
+    ----------
+    store : EnsembleStore
+        The ensemble.
+    echo : PointEcho
+        What the analysis makes of one point.
+    """
+    poses = asked_poses(store)
+    axis = np.asarray(store.range, dtype=np.float64)
+    power = np.stack(
+        [np.square(store.read_pose(int(i)), dtype=np.float64).mean(axis=-1) for i in poses]
+    )
+    levels = threshold_levels(power, echo.looks)
+    step = float(axis[1] - axis[0])
+    fineness = echo.spacing / step
+    found = [
+        onsets(power[:, ear], Levels(*(each[:, ear] for each in levels)), echo.window, fineness)
+        for ear in range(power.shape[1])
+    ]
+    first = axis[0] + step * np.stack(found, axis=1)
+    return Onsets(poses, axis, power, power > levels.total, first)

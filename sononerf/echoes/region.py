@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: MIT
+"""Where something can be: which places the echoes leave, and the box around what explains them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial.distance import cdist
+
+from sononerf.acoustics.ears import Ears
+from sononerf.echoes.consistency import ACCURACY
+from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.onsets import Onsets
+from sononerf.errors import NumericalError
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+WITNESS_GAIN = 0.1
+"""A pose is a witness of the places towards which its gain is at least this fraction of the best,
+no unit: 20 dB, beyond which an echo is easily below the threshold."""
+AGREEMENT = 0.6
+"""A place is taken where the power from its range is at least this fraction of the best place's, no
+unit. Above a half, for of two places that share an echo neither has more than that by chance."""
+UNEXPLAINED = 0.02
+"""Fraction of the power that may stay without a place, no unit. Bounces among the parts of a body
+arrive late and have no place of their own; they hold about as much."""
+NOTHING = (
+    "no pose received an echo that another one confirms; check scene, poses and range limits, or "
+    "set region.lower and region.upper"
+)
+
+# Sizes of the search: poses asked for their power, looks from coarse to fine, cells along the
+# longest side in each of them, passes over the power, and places looked at in one go.
+POSES, LOOKS, COARSE, ROUNDS, CHUNK = 200, 4, 28, 4, 2048
+ENOUGH = 2  # poses: one alone does not tell where on its ellipsoid an echo comes from
+
+
+class EchoRegion:
+    """What the asked poses say about places.
+
+    Parameters
+    ----------
+    heard : Onsets
+        Power, detected echoes and onsets.
+    hull : EchoHull
+        What the onsets leave; of the same poses.
+    ears : Ears
+        Gains of emitter and ears.
+    rotations : (P, 3, 3) float
+        Head to world.
+    resolution : float, m
+        Range resolution.
+
+    Raises
+    ------
+    NumericalError
+        If no pose heard anything.
+    """
+
+    def __init__(
+        self, heard: Onsets, hull: EchoHull, ears: Ears, rotations: Array, resolution: float
+    ) -> None:
+        if not np.isfinite(hull.trusted).any():
+            raise NumericalError(NOTHING)
+        self.hull, self.resolution, self.range = hull, resolution, heard.range
+        self.step = float(heard.range[1] - heard.range[0])
+        count = len(heard.poses)
+        asked = np.linspace(0, count - 1, min(POSES, count)).astype(int)
+        self.heard = heard.heard[asked].any(axis=1)  # (P, R)
+        total = heard.power[asked].sum(axis=1) * self.heard
+        self.power = total / total.sum(axis=1, keepdims=True).clip(1e-300)
+        self.first = hull.trusted[asked].max(axis=1)
+        self.sources, self.rotations = hull.sources[asked], rotations[asked]
+        gain = (ears.beam[None] * ears.ears).max(axis=(0, 1))  # (L, A)
+        self.witness_gain = gain >= WITNESS_GAIN * gain.max()
+
+    def possible(self, points: Array, tolerance: float) -> Mask:
+        """Return the places that no pose rules out and that some poses heard, (N,).
+
+        Parameters
+        ----------
+        points : (N, 3) float, m
+            Places, world frame.
+        tolerance : float, m
+            How far a place speaks for its surroundings.
+        """
+        return self._inside(points, tolerance / 4) & self._energy(points, tolerance)[1]
+
+    def _inside(self, points: Array, tolerance: float) -> Mask:
+        clearance = self.hull.clearance(points)[0]
+        return np.asarray(clearance >= -(tolerance + ACCURACY * self.resolution))
+
+    def _energy(
+        self, points: Array, tolerance: float, power: Array | None = None
+    ) -> tuple[Array, Mask]:
+        """Return the mean power from each place's range, and where enough poses hear any, (N,)."""
+        size = 2 * int(np.ceil(tolerance / self.step)) + 1
+        heard = ndimage.maximum_filter1d(self.heard, size, axis=1, mode="constant")
+        wanted = self.power if power is None else power
+        loud = ndimage.maximum_filter1d(wanted, size, axis=1, mode="constant")
+        pose = np.arange(len(self.sources))[:, None]
+        energy, sounding = [], []
+        for start in range(0, len(points), CHUNK):
+            distance, row, within = self._rows(points[start : start + CHUNK])
+            witness = self._witnesses(points[start : start + CHUNK], distance)
+            meets = witness & within
+            sounding.append((meets & heard[pose, row]).sum(axis=0))
+            energy.append((meets * loud[pose, row]).sum(axis=0) / witness.sum(axis=0).clip(1))
+        return np.concatenate(energy), np.concatenate(sounding) >= ENOUGH
+
+    def _rows(self, points: Array) -> tuple[Array, NDArray[np.int64], Mask]:
+        """Return each pose's distance to each place, and the slice it falls in, (P, N)."""
+        distance = cdist(self.sources, points).clip(1e-9)
+        row = np.round((distance - self.range[0]) / self.step).astype(np.int64)
+        within = (row >= 0) & (row < len(self.range))
+        return distance, row.clip(0, len(self.range) - 1), within
+
+    def _witnesses(self, points: Array, distance: Array) -> Mask:
+        local = [
+            np.einsum("pi,ni->pn", self.rotations[:, :, axis], points)
+            - (self.rotations[:, :, axis] * self.sources).sum(1)[:, None]
+            for axis in range(3)
+        ]
+        rows, columns = self.witness_gain.shape
+        azimuth = np.arctan2(local[1], local[0])
+        elevation = np.arcsin((local[2] / distance).clip(-1, 1))
+        row = np.round((elevation / np.pi + 0.5) * (rows - 1)).astype(np.int64)
+        column = np.round((azimuth / (2 * np.pi) + 0.5) * (columns - 1)).astype(np.int64)
+        return np.asarray(self.witness_gain[row, column])
+
+    def box(self) -> Array:
+        """Return the box around all that explains the echoes, (2, 3) m, with a margin.
+
+        The margin is two range resolutions.
+
+        Raises
+        ------
+        NumericalError
+            If the echoes of no two poses meet anywhere.
+        """
+        # A flight along a line or on one side still hears so far ahead, and to the sides.
+        looks = np.array([[3, 0, 0], [3, 2, 0], [3, -2, 0], [3, 0, 2], [3, 0, -2]])  # 34 degrees
+        looks = looks / np.linalg.norm(looks, axis=1, keepdims=True)
+        last = self.range[self.heard.shape[1] - 1 - self.heard[:, ::-1].argmax(axis=1)]
+        ahead = [self.sources + self.rotations @ look * last[:, None] for look in looks]
+        ends = np.concatenate((self.sources, *ahead))
+        lower, upper = ends.min(axis=0), ends.max(axis=0)
+        for _ in range(LOOKS):  # coarse to fine
+            spacing = float((upper - lower).max()) / COARSE
+            axes = [
+                np.arange(a + spacing / 2, b + spacing / 2, spacing)
+                for a, b in zip(lower, upper, strict=True)
+            ]
+            points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+            kept = points[self.needed(points, spacing * np.sqrt(3) / 2)]
+            if not len(kept):
+                raise NumericalError(NOTHING)
+            lower, upper = kept.min(axis=0) - spacing / 2, kept.max(axis=0) + spacing / 2
+        margin = 2.0 * self.resolution
+        return np.stack((lower - margin, upper + margin))
+
+    def needed(self, points: Array, tolerance: float) -> Mask:
+        """Return the places that explain the echoes, the best focused first, (N,).
+
+        Places out in the open lie at the range of some echo of many poses, but the echoes do not
+        agree there. So the places where they agree best are taken, what they explain is taken out,
+        and the rest is looked at anew, until little is left. Last come the origins of onsets that
+        have none yet, however faint their echoes are.
+        """
+        keep = np.zeros(len(points), dtype=bool)
+        inside = self._inside(points, tolerance)
+        covered = np.zeros_like(self.heard)
+        for _ in range(ROUNDS):
+            energy, enough = self._energy(points, tolerance, np.where(covered, 0.0, self.power))
+            energy = np.where(inside & enough, energy, 0.0)
+            taken = keep | (energy >= AGREEMENT * energy.max()) if energy.max() > 0 else keep
+            if int(taken.sum()) == int(keep.sum()):
+                break
+            keep, covered = taken, self._covered(points[taken], tolerance)
+            if self.power[~covered].sum() <= UNEXPLAINED * self.power.sum():
+                break
+        return self._with_origins(points, tolerance, keep, covered, inside)
+
+    def _with_origins(
+        self, points: Array, tolerance: float, keep: Mask, covered: Mask, inside: Mask
+    ) -> Mask:
+        known = np.isfinite(self.first)
+        row = np.round((np.where(known, self.first, 0.0) - self.range[0]) / self.step)
+        row = row.astype(int).clip(0, len(self.range) - 1)
+        pose = np.arange(len(row))
+        while True:
+            asks = np.flatnonzero(known & ~covered[pose, row])
+            if len(asks) <= max(ENOUGH, UNEXPLAINED * known.sum()):
+                return keep
+            agree = np.where(inside & ~keep, self._shared(points, tolerance, asks), 0)
+            if agree.max() <= ENOUGH:
+                return keep
+            keep = keep | (agree >= AGREEMENT * agree.max())
+            covered = self._covered(points[keep], tolerance)
+
+    def _shared(self, points: Array, tolerance: float, asks: NDArray[np.intp]) -> Array:
+        """Return how many of some onsets can have come from each place, (N,)."""
+        parts = []
+        for start in range(0, len(points), CHUNK):
+            distance = cdist(self.sources, points[start : start + CHUNK]).clip(1e-9)
+            witness = self._witnesses(points[start : start + CHUNK], distance)[asks]
+            near = np.abs(distance[asks] - self.first[asks, None]) <= tolerance + self.step
+            parts.append((witness & near).sum(axis=0))
+        return np.concatenate(parts)
+
+    def _covered(self, points: Array, tolerance: float) -> Mask:
+        """Return which slices of each pose the places explain, (P, R)."""
+        covered = np.zeros_like(self.heard)
+        for start in range(0, len(points), CHUNK):
+            _, row, within = self._rows(points[start : start + CHUNK])
+            pose = np.broadcast_to(np.arange(len(row))[:, None], row.shape)
+            covered[pose[within], row[within]] = True
+        reach = int(np.ceil((tolerance + self.resolution) / self.step))
+        covered = ndimage.maximum_filter1d(covered, 2 * reach + 1, axis=1, mode="constant")
+        return np.asarray(covered)

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: MIT
+import numpy as np
+import pytest
+
+from sononerf.echoes.detection import RANK, onsets, threshold_factor, threshold_levels
+
+SLICES = 400
+WINDOW = np.hamming(33) ** 2
+
+
+def echo(middle, power=1.0, half=16.0):
+    """Power of a point echo, its window's middle at a slice."""
+    offset = (np.arange(SLICES) - middle) / half
+    window = 0.54 + 0.46 * np.cos(np.pi * offset)
+    return power * np.where(np.abs(offset) <= 1, window, 0.0) ** 2
+
+
+def found_in(power, looks=4.0):
+    power = np.asarray(power)
+    return onsets(power, threshold_levels(power, looks), WINDOW, 1.0)
+
+
+def noise(shape, looks, seed=0):
+    return np.random.default_rng(seed).gamma(looks, 1.0 / looks, size=shape)
+
+
+@pytest.mark.parametrize("looks", [1.0, 2.1, 4.3, 20.0])
+def test_the_factor_is_that_of_gamma_distributed_power(looks, monkeypatch):
+    monkeypatch.setattr("sononerf.echoes.detection.FALSE_ALARMS", 1e-3)
+    power = noise(2_000_000, looks)
+    threshold = threshold_factor(looks) * np.quantile(power, RANK)
+    assert (power > threshold).mean() == pytest.approx(1e-3, rel=0.1)
+
+
+def test_noise_alone_is_no_echo():
+    power = noise((100, SLICES), 4.0)
+    assert np.isfinite(found_in(power)).sum() <= 1
+    assert (power > threshold_levels(power, 4.0).total).mean() < 1e-4
+
+
+def test_echoes_are_found_between_slices_and_in_noise():
+    middles = 150 + np.linspace(0, 50, 40)
+    plain = np.stack([echo(m) for m in middles])
+    np.testing.assert_allclose(found_in(plain), middles, atol=0.1)
+    loud = found_in(plain + noise(plain.shape, 4.0) * 1e-3)
+    np.testing.assert_allclose(loud, middles, atol=1.0)
+    # 17 dB: the threshold, not a tenth of the echo, is where its rise is read.
+    faint = found_in(plain + noise(plain.shape, 4.0) * 0.02)
+    assert np.isfinite(faint).all()
+    assert (np.abs(faint - middles) < 8).all()  # a quarter of the window
+    # Under noise there is none to be found, and none is invented.
+    assert not np.isfinite(found_in(plain * 0.5 + noise(plain.shape, 4.0))).any()
+
+
+def test_a_second_echo_does_not_move_the_first():
+    first = 150 + np.linspace(0, 1, 10)
+    for behind, power in ((10, 1.0), (20, 10.0), (60, 1000.0)):
+        rows = [echo(m) + echo(m + behind, power) for m in first] + [echo(200.0)] * 5
+        np.testing.assert_allclose(found_in(rows)[:10], first, atol=0.6)  # of 32 slices
+
+
+def test_a_precursor_that_all_echoes_have_is_no_echo():
+    """As sidelobes of pulse compression are: 25 dB below each echo, 60 slices before it."""
+    middles = np.linspace(150, 250, 50)
+    level = 10 ** (-2.5) * noise((50,), 4.0)
+    rows = [echo(m) + echo(m - 60, p) for m, p in zip(middles, level, strict=True)]
+    np.testing.assert_allclose(found_in(rows), middles, atol=0.1)
+    # An echo that some have there, and others elsewhere, is one.
+    real = [echo(m) + echo(m - 40 - i, 1e-3) for i, m in enumerate(middles)]
+    np.testing.assert_allclose(found_in(real), middles - 40 - np.arange(50), atol=0.1)
+
+
+def test_a_cut_echo_leaves_the_first_unknown():
+    cut, behind = echo(4.0), echo(200.0)
+    assert found_in([cut + behind])[0] == -np.inf
+    # Unless what is cut is faint beside it.
+    assert found_in([1e-3 * cut + behind])[0] == pytest.approx(200.0, abs=0.1)
+
+
+def test_silence_has_no_onset():
+    assert not np.isfinite(found_in(np.zeros((3, SLICES)))).any()
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e9])
+def test_the_level_of_all_does_not_matter(scale):
+    rows = np.stack([echo(m) for m in np.linspace(100, 300, 30)]) + 1e-3 * noise((30, SLICES), 4.0)
+    np.testing.assert_allclose(found_in(scale * rows), found_in(rows), rtol=1e-9)

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: MIT
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sononerf.acoustics.reception import effective_window
+from sononerf.acoustics.spectrogram import frequency_axis
+from sononerf.config import CallSettings, SpectrogramSettings
+from sononerf.echoes import onsets
+from sononerf.echoes.onsets import PointEcho, asked_poses, find_onsets
+
+STEP = 0.0007
+RANGE = 0.2 + STEP * np.arange(300)
+ECHO = PointEcho.of(CallSettings(), SpectrogramSettings(), 343.0)
+
+
+def echo(middle, power=1.0):
+    """Power over range of one echo of a Hamming window of 64 samples."""
+    offset = (RANGE - middle) / (31.5 * 343.0 / 2e6)
+    window = 0.54 + 0.46 * np.cos(np.pi * offset)
+    return power * np.where(np.abs(offset) <= 1, window, 0.0) ** 2
+
+
+def store_of(poses, train=None):
+    """A store of powers (E, R); three frequencies, of which the mean power is looked at."""
+    gain = np.array([1.0, 0.3, 2.0])
+    gain /= np.sqrt(np.mean(gain**2))
+    train = np.arange(len(poses)) if train is None else np.asarray(train)
+    return SimpleNamespace(
+        range=RANGE,
+        indices=lambda split: {"train": train}[split],
+        read_pose=lambda i: np.sqrt(np.asarray(poses[i]))[..., None].astype(np.float32) * gain,
+    )
+
+
+def test_each_ear_has_its_own_onset():
+    at = 0.27 + np.linspace(0, STEP, 12)
+    heard = find_onsets(store_of([[echo(r), echo(r + 0.0123, 0.01)] for r in at]), ECHO)
+    assert heard.power.shape == heard.heard.shape == (12, 2, 300)
+    np.testing.assert_allclose(heard.first, np.stack((at, at + 0.0123), axis=1), atol=1e-4)
+    # An echo is detected in the slices around its middle, and nowhere else.
+    lit = RANGE[heard.heard[0, 0]]
+    assert 0.002 < np.ptp(lit) < 0.011
+    assert lit[0] < at[0] < lit[-1]
+
+
+def test_what_is_not_heard_is_unknown():
+    silence = np.zeros(len(RANGE))
+    heard = find_onsets(store_of([[silence, echo(0.3)], [silence, silence]]), ECHO)
+    np.testing.assert_allclose(heard.first, [[-np.inf, 0.3], [-np.inf] * 2], atol=1e-4)
+    assert not heard.heard[1].any()
+
+
+def test_only_training_poses_are_asked():
+    poses = {1: [echo(0.3)] * 2, 4: [echo(0.35)] * 2}
+    heard = find_onsets(store_of(poses, train=[1, 4]), ECHO)
+    assert heard.poses.tolist() == [1, 4]
+    np.testing.assert_allclose(heard.first[:, 0], [0.3, 0.35], atol=1e-4)
+
+
+@pytest.mark.parametrize(("count", "asked"), [(7, 7), (25, 12)])
+def test_of_many_poses_some_are_asked_evenly(monkeypatch, count, asked):
+    monkeypatch.setattr(onsets, "MOST_POSES", 12)
+    train = 3 * np.arange(count)  # others lie between
+    found = asked_poses(store_of(range(count), train=train))
+    assert len(found) == asked
+    assert set(found) <= set(train)
+    assert (found[0], found[-1]) == (train[0], train[-1])
+    assert np.diff(found).max() - np.diff(found).min() <= 3
+
+
+def test_a_point_echo_is_told_by_window_and_band():
+    assert ECHO.spacing == pytest.approx(343.0 / 2e6)
+    np.testing.assert_allclose(ECHO.window, np.hamming(64) ** 2, rtol=1e-12)
+    # A Hamming window is above half of its height for 0.53 of its length.
+    assert ECHO.resolution == pytest.approx(0.53 * 64 * ECHO.spacing, rel=0.05)
+    # Its noise bandwidth is 1.36 over its length, 21 kHz of a band of 92.
+    assert ECHO.looks == pytest.approx(92 / 21.5, rel=0.05)
+    narrow = SpectrogramSettings(frequency_min=40e3, frequency_max=45e3)
+    assert PointEcho.of(CallSettings(), narrow, 343.0).looks == 1.0
+
+
+def test_the_echo_of_a_sweep_is_that_of_the_rows_it_sounds_in():
+    call, analysis = CallSettings(kind="linear", frequency_end=40e3), SpectrogramSettings()
+    rows = effective_window(call, analysis)[frequency_axis(analysis) >= 40e3]
+    found = PointEcho.of(call, analysis, 343.0)
+    np.testing.assert_allclose(found.window, (rows**2).mean(axis=0), rtol=1e-12)
+    assert found.resolution > ECHO.resolution
+
+
+def test_lengths_go_with_the_speed_of_sound():
+    slow, fast = (PointEcho.of(CallSettings(), SpectrogramSettings(), c) for c in (343.0, 1029.0))
+    assert fast.resolution == pytest.approx(3 * slow.resolution)
+    assert fast.looks == slow.looks

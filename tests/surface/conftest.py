@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+"""A sphere, a head that hears it, and a few poses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from sononerf.config import validate_settings
+from sononerf.geometry.poses import sphere_poses
+from sononerf.scene import Scene
+from sononerf.simulation.simulator import Simulator
+from sononerf.surface.echo_data import Echoes, optics_of
+
+RADIUS = 0.012
+POSES = 18
+
+
+def given(**changes):
+    wanted = {
+        "scene": {"name": "sphere"},
+        "simulation": {"engine": "rays", "rays": 20_000, "bounces": 1},
+        "spectrogram": {"range_min": 0.2, "range_max": 0.4},
+        **changes,
+    }
+    return validate_settings(wanted, "test")
+
+
+@pytest.fixture(scope="session")
+def settings():
+    return given()
+
+
+@pytest.fixture(scope="session")
+def ball():
+    return trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
+
+
+@pytest.fixture(scope="session")
+def optics(settings, ball):
+    return optics_of(settings, Scene(ball))
+
+
+@pytest.fixture(scope="session")
+def poses():
+    return sphere_poses(POSES, radius=0.3, aim_jitter=0.1, generator=np.random.default_rng(0))
+
+
+@pytest.fixture(scope="session")
+def simulated():
+    """Spectrograms (P, E, R, F) of a mesh, by the simulator."""
+
+    def simulate(mesh, settings, poses):
+        simulator = Simulator.from_settings(Scene(mesh), settings)
+        pairs = zip(poses.positions, poses.rotations, strict=True)
+        return np.stack([simulator.spectrogram(at, turn, seed=0) for at, turn in pairs])
+
+    return simulate
+
+
+@pytest.fixture(scope="session")
+def echoes(settings, ball, poses, simulated):
+    fine = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS)
+    heard = simulated(fine, settings, poses)
+    numbers = np.arange(POSES)
+    return Echoes(poses.positions, poses.rotations, numbers[:-3], numbers[-3:], lambda i: heard[i])
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

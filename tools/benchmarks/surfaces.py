@@ -1,0 +1,279 @@
+# SPDX-License-Identifier: MIT
+"""How good the surfaces are: the scenes, changed conditions and seeds of the table of results."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import trimesh
+
+from sononerf import storage
+from sononerf.config import load_settings
+from sononerf.reconstruction.metrics import geometry_metrics
+from sononerf.reconstruction.truth import TrueSurface
+from sononerf.scene import load_scene
+from tools.benchmarks.experiment import (
+    CONFIG,
+    STOPPED,
+    Column,
+    Row,
+    aligned,
+    ending,
+    ensemble_name,
+    origin,
+    row_of,
+    run_experiment,
+    shown,
+)
+from tools.benchmarks.scaled import UNSCALED, scaled_settings, scaled_store
+
+FACTOR = 3.0
+"""By how much the world of the case ``scaled`` is larger."""
+SPHERES = "scene.name=three_spheres"
+PROCEDURAL = range(100, 120)
+"""Seeds of shapes on which nothing was settled."""
+NEW = ("beaker", "cone", "rings", "tower", "blob", "stool", "helix")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One row of the table.
+
+    Attributes
+    ----------
+    name : str
+        Of the row, and of its folder up to the seed.
+    settings : tuple of str
+        ``KEY=VALUE``, laid over the defaults.
+    repeated : bool
+        Whether it is fitted with every seed, and not with the first alone.
+    """
+
+    name: str
+    settings: tuple[str, ...]
+    repeated: bool = False
+
+
+CASES = (
+    *(
+        Case(name, (f"scene.name={name}",), repeated=True)
+        for name in ("three_spheres", "ua", "leaf")
+    ),
+    *(
+        Case(f"procedural-{n}", ("scene.name=procedural", f"scene.options.seed={n}"))
+        for n in PROCEDURAL
+    ),
+    Case("25-calls", (SPHERES, "poses.count=25")),
+    Case("three-times-as-large", (SPHERES, "scene.options.radius=0.045")),
+    Case("unscaled", (SPHERES, *UNSCALED)),
+    Case("scaled", (SPHERES, *UNSCALED)),
+    Case("kirchhoff", (SPHERES, "simulation.engine=kirchhoff")),
+    Case("noisy-rays", (SPHERES, "simulation.engine=rays", "noise.snr_db=20")),
+    Case("exact", (SPHERES, "poses.count=100", "spectrogram.frequency_max=80e3")),
+    *(Case(name, (f"scene.name={name}",)) for name in NEW),
+)
+
+
+def surfaces(arguments: argparse.Namespace) -> str:
+    """Fit scenes, changed conditions and seeds; one line of JSON for each."""
+    output = arguments.output or Path("runs") / "surfaces"
+    file = output / "surfaces.jsonl"
+    lines = _Lines(file)
+    for case, seed in chosen_cases(arguments.only, arguments.seeds, arguments.exact is not None):
+        experiment = _Experiment(case, seed, output, arguments)
+        if lines.done(experiment.head):
+            continue
+        with ending(output):
+            lines.add(experiment.row())
+    return f"{table(lines.rows())}\nwrote {file}"
+
+
+def chosen_cases(
+    only: Sequence[str] | None, seeds: Sequence[int], exact: bool
+) -> Iterator[tuple[Case, int]]:
+    """Yield cases and the seeds of their fits; the exact echoes only where they are given."""
+    for case in CASES:
+        if case.name in only if only else exact or case.name != "exact":
+            if case.name == "exact" and not exact:
+                raise SystemExit("error: exact: give the ensemble with --exact STORE")
+            for seed in seeds if case.repeated else seeds[:1]:
+                yield case, seed
+
+
+class _Lines:
+    """The table on disk; of lines with the same head the last one counts."""
+
+    def __init__(self, file: Path) -> None:
+        self.file = file
+
+    def rows(self) -> list[Row]:
+        if not self.file.is_file():
+            return []
+        rows: dict[tuple[str, int], Row] = {}
+        for line in self.file.read_text(encoding="utf-8").splitlines():
+            try:
+                row = json.loads(line)
+            except ValueError:
+                continue  # a crash tore it
+            rows[row["name"], row["seed"]] = row
+        return list(rows.values())
+
+    def done(self, head: Row) -> bool:
+        """Whether there is a row of these settings; what failed is tried again."""
+        return any(
+            "failed" not in row and all(row.get(key) == head[key] for key in head)
+            for row in self.rows()
+        )
+
+    def add(self, row: Row) -> None:
+        line = storage.to_json(row)
+        storage.make_folder(self.file.parent)
+        storage.append_line(self.file, line)
+        print(line, file=sys.stderr, flush=True)
+
+
+class _Experiment:
+    """One case with one seed."""
+
+    def __init__(self, case: Case, seed: int, output: Path, arguments: argparse.Namespace) -> None:
+        self.case, self.exact = case, arguments.exact
+        self.data = arguments.data or output / "data"
+        self.folder = output / f"{case.name}-{seed}"
+        plain = [*case.settings, *arguments.set]
+        self.unscaled = plain
+        if case.name == "scaled":
+            plain = [*plain, *scaled_settings(load_settings(CONFIG, plain), FACTOR)]
+        self.settings = [*plain, f"fit.seed={seed}"]
+        self.head: Row = {"name": case.name, "seed": seed, "settings": self.settings}
+
+    def row(self) -> Row:
+        """Run it, unless it has been run, and return its line."""
+        try:
+            metrics = run_experiment(
+                self.folder, self.data, self.settings, enough="prediction", store=self._store()
+            )
+        except RuntimeError as error:
+            return {**self.head, **origin(), "failed": str(error)}
+        row = {**self.head, **origin(), **measured(metrics)}
+        if not metrics.get("geometry"):
+            return {**row, "failed": "no surface"}
+        return {**row, **self._unscaled_geometry()} if self.case.name == "scaled" else row
+
+    def _store(self) -> Path | None:
+        if self.case.name == "exact":
+            return Path(self.exact)
+        if self.case.name != "scaled":
+            return None
+        settings = load_settings(CONFIG, self.settings)
+        source = self.data / ensemble_name(load_settings(CONFIG, self.unscaled))
+        target = self.data / ensemble_name(settings)
+        _simulate(source, self.unscaled)
+        scaled_store(source, target, settings, FACTOR)
+        return target
+
+    def _unscaled_geometry(self) -> Row:
+        """Compare what was found with the truth, both made as small as the unscaled world."""
+        settings = load_settings(CONFIG, self.settings)
+        true = load_scene(settings.scene.name, settings.scene.options).mesh.copy()
+        found = trimesh.load_mesh(self.folder / "reconstruction" / "mesh.ply")
+        for mesh in (true, found):
+            mesh.apply_scale(1.0 / FACTOR)
+        geometry = geometry_metrics(found, TrueSurface(true))
+        row = measured({"geometry": geometry})
+        return {key: value for key, value in row.items() if value is not None}
+
+
+def _simulate(store: Path, settings: Sequence[str]) -> None:
+    """Have an ensemble simulated, unless it is there."""
+    command = [sys.executable, "-m", "sononerf.cli", "simulate", str(CONFIG), *settings]
+    code = subprocess.run(
+        [*command, "--output", str(store)], stdout=sys.stderr, check=False
+    ).returncode
+    if code in STOPPED:
+        raise KeyboardInterrupt
+    if code:
+        raise RuntimeError(f"exit code {code}: the unscaled world was not simulated")
+
+
+def measured(metrics: Mapping[str, Any]) -> Row:
+    """Return what a line tells of one run; None for what it does not have.
+
+    ``seconds`` are those of all but the simulation, ``rendered_mae_db_active`` is the error of the
+    field's own rendering on active cells, ``heldout_mae_db_active`` that of all that predicts.
+    """
+    cost, prediction = (metrics.get(name) or {} for name in ("cost", "prediction"))
+    spent = [
+        value
+        for key, value in cost.items()
+        if key.endswith("_s") and key != "simulate_s" and value is not None
+    ]
+    row = row_of(metrics)
+    return {
+        **{key: row[key] for key in ("chamfer_m", "fscore_1mm", "fscore_2mm", "fscore_5mm")},
+        **{key: row[key] for key in ("thickness_bias_m", "parts", "parts_true")},
+        "heldout_mae_db_active": row["heldout_mae_db_active"],
+        "heldout_mae_db": prediction.get("mae_db"),
+        "rendered_mae_db_active": prediction.get("rendered_mae_db_active"),
+        "seconds": sum(spent) if spent else None,
+        "simulate_s": cost.get("simulate_s"),
+    }
+
+
+def _low(value: float) -> float:
+    return -value
+
+
+COLUMNS = (
+    Column("name", "name"),
+    Column("seed", "seed"),
+    Column("chamfer_m", "Chamfer/mm", ".3f", 1e3, badness=float),
+    *(Column(f"fscore_{mm}mm", f"F {mm}mm", ".2f", badness=_low) for mm in (1, 2, 5)),
+    Column("parts", "parts"),
+    Column("parts_true", "true"),
+    Column("rendered_mae_db_active", "rendered/dB", ".2f", badness=float),
+    Column("heldout_mae_db_active", "all/dB", ".2f", badness=float),
+    Column("seconds", "seconds", ".0f", badness=float),
+)
+GROUPS = {"procedural": [f"procedural-{seed}" for seed in PROCEDURAL], "new scenes": list(NEW)}
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Return rows as lines of text, and medians and worst values of those that belong together.
+
+    Parameters
+    ----------
+    rows : sequence of dict
+        As :func:`surfaces` writes them.
+
+    Returns
+    -------
+    text : str
+        A worst value of one column may be of another run than that of the next.
+    """
+    order = {case.name: number for number, case in enumerate(CASES)}
+    listed = sorted(rows, key=lambda row: (order.get(row["name"], len(order)), row["seed"]))
+    lines = [[column.title for column in COLUMNS]]
+    lines += [[shown(column, row) for column in COLUMNS] for row in listed]
+    for title, names in GROUPS.items():
+        group = [row for row in listed if row["name"] in names]
+        median: Row = {"name": f"{title}, median"}
+        worst: Row = {"name": f"{title}, worst"}
+        for column in COLUMNS:
+            values = [row[column.key] for row in group if row.get(column.key) is not None]
+            if column.badness is not None and values:
+                median[column.key] = statistics.median(values)
+                worst[column.key] = max(values, key=column.badness)
+        if group:
+            lines += [[shown(column, row, "") for column in COLUMNS] for row in (median, worst)]
+    text = aligned(lines)
+    for number, row in enumerate(listed, start=1):
+        text[number] += f"  failed: {row['failed']}" if "failed" in row else ""
+    return "\n".join(text)
