@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: MIT
+"""A cubic lattice: values of points spread onto it, and read off it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+Array = NDArray[np.float64]
+Grid = NDArray[np.float32]
+MARGIN = 3
+"""Voxels around the box, so that a surface at its edge is closed by air."""
+
+
+@dataclass(frozen=True, eq=False)
+class Lattice:
+    """Places of voxels.
+
+    Attributes
+    ----------
+    origin : (3,) float, m
+        Centre of the first voxel.
+    spacing : float, m
+        Between centres.
+    shape : tuple of int
+        Voxels along x, y and z.
+    """
+
+    origin: Array
+    spacing: float
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def over(cls, lower: Array, upper: Array, spacing: float) -> Lattice:
+        """Return a lattice over a box and a margin around it."""
+        x, y, z = (int(np.ceil(n - 1e-9)) + 1 + 2 * MARGIN for n in (upper - lower) / spacing)
+        return cls(np.asarray(lower, dtype=np.float64) - MARGIN * spacing, spacing, (x, y, z))
+
+    def coordinates(self, points: Array) -> Array:
+        """Return where points lie, in voxels from the first."""
+        return (points - self.origin) / self.spacing
+
+    def points(self) -> Array:
+        """Return the centres of all voxels, (N, 3) m."""
+        return self.origin + self.spacing * np.argwhere(np.ones(self.shape, dtype=bool))
+
+    def spread(self, points: Array, values: Array, deviation: float = 0.0) -> Grid:
+        """Add values (N,) of points onto the voxels around them, and blur by so many voxels."""
+        place = self.coordinates(points)
+        base = np.floor(place).astype(np.intp)
+        fraction = place - base
+        within = ((base >= 0) & (base < np.asarray(self.shape) - 1)).all(axis=1)
+        base, fraction, values = base[within], fraction[within], values[within]
+        total = np.zeros(int(np.prod(self.shape)))
+        for corner in np.ndindex(2, 2, 2):
+            part = np.prod(np.where(corner, fraction, 1 - fraction), axis=1)
+            flat = np.ravel_multi_index(tuple((base + np.asarray(corner)).T), self.shape)
+            total += np.bincount(flat, values * part, total.size)
+        grid = total.reshape(self.shape).astype(np.float32)
+        if deviation:
+            grid = gaussian_filter(grid, deviation, mode="constant")
+        return np.asarray(grid, dtype=np.float32)
+
+    def read(self, grid: NDArray[np.floating], points: Array) -> Array:
+        """Read a grid at points, linearly between voxels, (N,)."""
+        read: Array = map_coordinates(
+            grid, self.coordinates(points).T, order=1, mode="nearest", output=np.float64
+        )
+        return read
