@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sononerf import storage
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, NumericalError, SonoNerfError
-from sononerf.experiment.build import acquisition
+from sononerf.experiment.build import acquisition, point_echo
 from sononerf.experiment.fitted import Fitted, load_fitted, store_of
 from sononerf.experiment.run_folder import RunFolder, results_folder
 from sononerf.experiment.surface import refine_surface
@@ -34,6 +34,7 @@ from sononerf.reconstruction.voxels import voxel_fit
 from sononerf.render.mesh import confidence_png, mesh_png, side_by_side_png
 from sononerf.render.projection import mip_pngs
 from sononerf.scene import Scene, load_scene
+from sononerf.surface.occupancy import Gathered
 from sononerf.surface.refine import Refined
 
 OPEN = {
@@ -42,7 +43,7 @@ OPEN = {
     "is left out",
 }
 """What is said of surfaces that are no body's skin."""
-Method = Literal["auto", "oriented", "hull", "isosurface"]
+Method = Literal["auto", "open", "filled", "oriented", "hull", "isosurface"]
 FORMATS: tuple[MeshFormat, ...] = ("ply", "stl", "glb")
 BASELINE_VOXELS = 64
 """Along the region's longest side; finer than the window's length in any scene of ours."""
@@ -71,7 +72,7 @@ def reconstruct(
         Voxel size; the settings' where None.
     level : float, "auto" or None
         Level of the surface; the settings' where None.
-    method : {"auto", "oriented", "hull", "isosurface"} or None
+    method : {"auto", "open", "filled", "oriented", "hull", "isosurface"} or None
         How the surface is read out; the settings' where None.
     output : Path or None
         Folder of the results; ``RUN/reconstruction`` where None.
@@ -98,7 +99,7 @@ def reconstruct(
     with results_folder(folder):
         starts = _read_out(
             fitted,
-            methods=("auto", "hull") if automatic else (method,),
+            methods=("auto", "hull", "open", "filled") if automatic else (method,),
             several=refines,
             spacing=spacing or options.spacing,
             level=level,
@@ -139,6 +140,8 @@ def _read_out(
         If none gives a surface.
     """
     options = fitted.settings.reconstruction
+    resolution = point_echo(fitted.settings).resolution
+    gathered: Gathered | None = None
     found: list[Reconstruction] = []
     error: NumericalError | None = None
     for method in methods:
@@ -158,8 +161,11 @@ def _read_out(
                     method=method,
                     directions=options.directions,
                     smoothing=options.smoothing if method == "isosurface" else 0.0,
+                    resolution=resolution,
+                    gathered=gathered,
                     progress=shown,
                 )
+            gathered = one.gathered or gathered
             found.append(one)
         except NumericalError as raised:
             error = error or raised
@@ -190,7 +196,9 @@ def _write(
     refined: Refined | None,
     truth: trimesh.Trimesh | None,
 ) -> None:
-    seen = None if found.glints is None else poses_that_saw(found.mesh, found.glints)
+    seen = found.support
+    if found.glints is not None:
+        seen = poses_that_saw(found.mesh, found.glints)
     if refined is not None:
         seen = refined.support.round().astype(np.int32)
     for kind in FORMATS:

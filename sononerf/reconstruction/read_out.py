@@ -30,6 +30,7 @@ from sononerf.reconstruction.openness import (
 from sononerf.reconstruction.oriented import oriented_surface
 from sononerf.reconstruction.outline import clearance_volume, outline
 from sononerf.reconstruction.volume import Volume, grid_over, volume_from_function
+from sononerf.surface.occupancy import Gathered, estimate_occupancy, gather_evidence
 
 Array = NDArray[np.float64]
 FAINTEST = 1e-7
@@ -55,6 +56,9 @@ OUTLINE = 0.5
 """What all points of the outline weigh, beside the glints."""
 
 
+Method = Literal["open", "filled", "oriented", "hull", "isosurface"]
+
+
 @dataclass(frozen=True)
 class Reconstruction:
     """What a field was read out to; glints and openness where it was heard from known poses."""
@@ -62,9 +66,11 @@ class Reconstruction:
     mesh: trimesh.Trimesh
     volume: Volume
     level: float
-    method: Literal["oriented", "hull", "isosurface"]
+    method: Method
     glints: Glints | None = None
     openness: Openness | None = None
+    gathered: Gathered | None = None
+    support: NDArray[np.int32] | None = None
 
 
 def reconstruct(
@@ -73,9 +79,11 @@ def reconstruct(
     hull: EchoHull | None = None,
     spacing: float | None = None,
     level: float | Literal["auto"] = "auto",
-    method: Literal["auto", "oriented", "hull", "isosurface"] = "auto",
+    method: Method | Literal["auto"] = "auto",
     directions: int = 100,
     smoothing: float = 0.0,
+    resolution: float | None = None,
+    gathered: Gathered | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Reconstruction:
     """Read volume and surface out of a field.
@@ -92,15 +100,21 @@ def reconstruct(
         Voxel size; half of the field's own resolution where None.
     level : float or "auto"
         Value of the volume, or of the oriented indicator, on the surface; of the hull the depth, m.
-    method : {"auto", "oriented", "hull", "isosurface"}
+    method : {"auto", "open", "filled", "oriented", "hull", "isosurface"}
         ``auto`` is the oriented surface where the field knows directions, or the hull where it was
         heard from. ``hull`` is what the first echoes leave, whatever the field says: exact for a
-        body without hollows.
+        body without hollows. ``open`` and ``filled`` are the surface of the occupancy, see
+        :mod:`sononerf.surface.occupancy`, with hollows opened by the winding number or not; both
+        need a hull and the resolution.
     directions : int
         Size of the spherical lattice that is summed over where the field has no lobes.
     smoothing : float, m
         Side of a box over which the volume is averaged before an iso-surface is drawn in it, an
         odd number of voxels; the published code of the paper takes 9 of 5 mm.
+    resolution : float or None, m
+        Range resolution of the analysis.
+    gathered : Gathered or None
+        The evidence of an earlier call with the same field, hull and spacing.
     progress : callable, optional
         Called with the voxels done and the voxels in all.
 
@@ -127,8 +141,8 @@ def reconstruct(
     if method == "auto":
         heard = field.knows_directions or hull is not None
         method = "oriented" if heard else "isosurface"
-    if method == "hull" and hull is None:
-        raise SettingsError("method hull: it is not known where the field was heard from")
+    if method in ("hull", "open", "filled") and hull is None:
+        raise SettingsError(f"method {method}: it is not known where the field was heard from")
     volume = volume_from_function(
         _loudness(field, directions, method), lower, upper, step, chunk=CHUNK, progress=progress
     )
@@ -136,6 +150,18 @@ def reconstruct(
         raise NumericalError("no surface: the field is silent everywhere")
     if method != "isosurface":
         places, energy, axis = _places(field, lower, upper, directions)
+        if method in ("open", "filled"):
+            assert hull is not None
+            if gathered is None:
+                wide = resolution or 1.5 * field.resolution
+                gathered = gather_evidence(field, places, hull, lower, upper, step, wide)
+            body = estimate_occupancy(gathered, opening=method == "open")
+            openness = judge_openness(body.mesh, hull.sources)
+            mesh = body.mesh
+            support: NDArray[np.int32] | None = body.support
+            if openness.kind == "one-sided":
+                mesh, support = without_unseen(mesh, openness), None
+            return Reconstruction(mesh, volume, 0.0, method, None, openness, gathered, support)
         if hull is not None:
             sources = torch.as_tensor(hull.sources, dtype=places.dtype, device=places.device)
             glints = find_glints(field, places, sources)
@@ -165,9 +191,7 @@ def _numbers(values: Tensor) -> Array:
     return np.asarray(values.double().cpu().numpy())
 
 
-def _loudness(
-    field: Field, directions: int, method: Literal["oriented", "hull", "isosurface"]
-) -> Callable[[Array], Array]:
+def _loudness(field: Field, directions: int, method: Method) -> Callable[[Array], Array]:
     def loudness(points: Array) -> Array:
         places = torch.as_tensor(points, dtype=field.region.dtype, device=field.region.device)
         inside = field.inside(places)

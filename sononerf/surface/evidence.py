@@ -22,10 +22,10 @@ from torch import Tensor
 from sononerf.field.field import Field
 
 Array = NDArray[np.float64]
-SHARED = 1.3
-"""Standard deviation, in range resolutions, of the Gaussian over which the sound is averaged. On
-three spheres half of it triples the bias of the points, and twice of it adds a third to their
-error."""
+SHARED = 1.6
+"""Standard deviation, in range resolutions, of the Gaussian over which the sound is averaged. With
+1.3 the points of nineteen touching spheres lie 0.9 mm too far out, with 2.0 0.3 mm; but with 2.0
+two spheres that stand close are joined."""
 FAINTEST = 1e-4
 """Fraction of a pose's greatest power below which sound is left out."""
 COMPRESSION = 0.25
@@ -112,20 +112,17 @@ def locate_sound(
             which = index.cpu().numpy()
             near = kernel[which][:, which]
             sound = power[loud].double().cpu().numpy()
-            found.append((*_moved(where[which], range_, sound, near, source, resolution), _all(pose)))
+            located = _moved(where[which], range_, sound, near, source, resolution)
+            found.append((*located, np.full(len(located[0]), pose, dtype=np.intp)))
         if progress is not None:
             progress(pose + 1, len(sources))
     if not found:
         return Evidence(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.intp))
     points, normals, power_ = (np.concatenate([f[k] for f in found]) for k in range(3))
-    pose_ = np.concatenate([np.full(len(f[0]), f[3][0]) for f in found])
+    pose_ = np.concatenate([f[3] for f in found])
     usual = float(np.median([f[2].max() for f in found]))
     weight = np.minimum(power_ / usual, 1.0) ** COMPRESSION
     return Evidence(points, normals, weight, pose_)
-
-
-def _all(pose: int) -> NDArray[np.intp]:
-    return np.array([pose], dtype=np.intp)
 
 
 def _neighbours(places: Array, deviation: float) -> sparse.csr_matrix:
@@ -158,4 +155,5 @@ def _moved(
     total = np.bincount(member, power)
     points = np.column_stack([np.bincount(member, power * p) for p in points.T]) / total[:, None]
     towards = source - points
-    return points, towards / np.linalg.norm(towards, axis=1, keepdims=True), total
+    normals: Array = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    return points, normals, np.asarray(total, dtype=np.float64)

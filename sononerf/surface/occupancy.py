@@ -55,7 +55,10 @@ closer than their blur would cancel."""
 UNHEARD = 0.03
 """A part of which the evidence per area is this fraction of the best part's is left out."""
 BENDING = 1.0  # of a voxel beside evidence at its point; sets the unit of all weights
+_NEGLIGIBLE = 1e-3  # weight of a point that is left out of the planes, to save time
 _SMEAR = 1.0  # voxels, of a point's plane
+_LEAST = 30  # voxels of the smallest surface
+_CONTRADICTED = 4.0  # range resolutions by which every place lies in front of an onset
 _LOCAL = 3.0  # voxels over which the density of points is measured
 _CHUNK = 100_000
 
@@ -101,19 +104,50 @@ class Occupancy:
         return np.asarray(near & (self.hull.clearance(points)[0] >= -tolerance))
 
 
-def estimate_occupancy(
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """All evidence, on one lattice; a surface of it is found by :func:`estimate_occupancy`.
+
+    Attributes
+    ----------
+    evidence : Evidence
+        The oriented points.
+    believed : (G,) float
+        Their weights, from 0 to 1.
+    points : (G, 3) float, m
+        Where they stand on the lattice: moved outward where the body is thin.
+    lattice : Lattice
+        The voxels.
+    thin : (X, Y, Z) float
+        How far the body is thin, from 0 to 1.
+    bound : (X, Y, Z) float, voxels
+        What the signed distance must not lie below.
+    hull : EchoHull
+        The free space.
+    resolution : float, m
+        Range resolution.
+    """
+
+    evidence: Evidence
+    believed: Array
+    points: Array
+    lattice: Lattice
+    thin: Grid
+    bound: Grid
+    hull: EchoHull
+    resolution: float
+
+
+def gather_evidence(
     field: Field,
     places: torch.Tensor,
     hull: EchoHull,
     lower: Array,
     upper: Array,
     spacing: float,
-    *,
     resolution: float,
-    opening: bool = True,
-    evidence: Evidence | None = None,
-) -> Occupancy:
-    """Return where the body is.
+) -> Gathered:
+    """Return what the field and the onsets tell about a region.
 
     Parameters
     ----------
@@ -129,43 +163,68 @@ def estimate_occupancy(
         Of the voxels.
     resolution : float, m
         Range resolution of the analysis.
-    opening : bool
-        Whether the winding number opens hollows and gaps that the onsets leave closed.
-    evidence : Evidence, optional
-        The field's sound, where it is known already.
 
     Raises
     ------
     NumericalError
         If nothing was heard.
     """
-    if evidence is None:
-        evidence = locate_sound(field, places, hull.sources, resolution=resolution)
+    evidence = locate_sound(field, places, hull.sources, resolution=resolution)
     evidence = evidence.where(evidence.weight > QUIET)
+    if not len(evidence.points) and not np.isfinite(hull.trusted).any():
+        raise NumericalError("no surface: no pose heard an echo from inside the region")
     lattice = Lattice.over(lower, upper, spacing)
     believed = evidence.weight * reliability(evidence, hull, resolution)
     thin = _thinness(lattice, evidence, believed)
     move = THICKER * lattice.read(thin, evidence.points).clip(0, 1)
     points = evidence.points + spacing * move[:, None] * evidence.normals
-    weight, target = _planes(lattice, points, evidence.normals, believed)
-    clearance = clearance_grid(hull, lattice)
-    if not len(points) and not (np.isfinite(clearance) & (clearance > 0)).any():
-        raise NumericalError("no surface: no pose heard an echo from inside the region")
-    farthest = np.float32(max(lattice.shape))
-    bound = (-clearance / spacing).clip(-farthest, farthest) - np.float32(THICKER) * thin
-    bound = _walled(bound.astype(np.float32))
-    empty = np.zeros_like(bound)
+    farthest = max(lattice.shape)
+    bound = (-clearance_grid(hull, lattice) / spacing).clip(-farthest, farthest)
+    bound = _walled((bound - THICKER * thin).astype(np.float32))
+    return Gathered(evidence, believed, points, lattice, thin, bound, hull, resolution)
+
+
+def estimate_occupancy(known: Gathered, *, opening: bool = True) -> Occupancy:
+    """Return where the body is.
+
+    Parameters
+    ----------
+    known : Gathered
+        The evidence.
+    opening : bool
+        Whether the winding number opens hollows and gaps that the onsets leave closed. Without
+        it the onsets outweigh the field's sound over shorter gaps, too.
+
+    Raises
+    ------
+    NumericalError
+        If the onsets contradict one another: no place is left by nearly all of them.
+    """
+    lattice, evidence, points = known.lattice, known.evidence, known.points
+    spacing, thin = lattice.spacing, known.thin
+    told = known.believed > _NEGLIGIBLE
+    weight, target = _planes(lattice, points[told], evidence.normals[told], known.believed[told])
+    empty = np.zeros_like(known.bound)
     if opening and len(points):
-        backs = -_winding(lattice, points, evidence) - BACKS[0]
+        backs = -_winding(lattice, points, evidence) - np.float32(BACKS[0])
         empty = np.float32(OPENING) * (backs / np.float32(BACKS[1])).clip(0, 1)
-    span = SPAN["open" if opening else "filled"] * resolution / spacing
-    distance = signed_distance(weight, target, bound, span**-4, empty, BENDING)
-    distance = _cleaned(_walled(distance), lattice, points, evidence.normals, believed)
+    if not (known.bound < _CONTRADICTED * known.resolution / spacing).any():
+        raise NumericalError(
+            "no surface: the first echoes leave no room for a body; check poses and speed of sound"
+        )
+    span = SPAN["open" if opening else "filled"] * known.resolution / spacing
+    distance = signed_distance(weight, target, known.bound, span**-4, empty, BENDING)
+    if not (distance < 0).any():
+        # What was heard is thinner than a voxel: the most likely places are taken, however little.
+        inner = distance[(slice(MARGIN, -MARGIN),) * 3]
+        most = np.partition(inner.ravel(), min(_LEAST, inner.size - 1))[: _LEAST + 1].max()
+        distance = distance - most - np.float32(0.5)
+    distance = _cleaned(_walled(distance), lattice, points, evidence.normals, known.believed)
     mesh = _surface(distance, lattice)
     back = THICKER * spacing * lattice.read(thin, np.asarray(mesh.vertices)).clip(0, 1)
     mesh.vertices = mesh.vertices - back[:, None] * mesh.vertex_normals
-    support = poses_that_heard(mesh, evidence, resolution)
-    return Occupancy(mesh, support, spacing * distance, lattice, evidence, hull)
+    support = poses_that_heard(mesh, evidence, known.resolution)
+    return Occupancy(mesh, support, spacing * distance, lattice, evidence, known.hull)
 
 
 def _thinness(lattice: Lattice, evidence: Evidence, weight: Array) -> Grid:
@@ -177,9 +236,7 @@ def _thinness(lattice: Lattice, evidence: Evidence, weight: Array) -> Grid:
     if not len(evidence.points):
         return np.zeros(lattice.shape, np.float32)
     total = lattice.spread(evidence.points, weight, 1.5)
-    blurred = [
-        lattice.spread(evidence.points, weight * along, 1.5) for along in evidence.normals.T
-    ]
+    blurred = [lattice.spread(evidence.points, weight * along, 1.5) for along in evidence.normals.T]
 
     def agreement(shift: float) -> Array:
         where = evidence.points + shift * lattice.spacing * evidence.normals
@@ -197,9 +254,7 @@ def _thinness(lattice: Lattice, evidence: Evidence, weight: Array) -> Grid:
     return np.asarray(thin / np.maximum(wide, 1e-3 * wide.max() + 1e-30), dtype=np.float32)
 
 
-def _planes(
-    lattice: Lattice, points: Array, normals: Array, weight: Array
-) -> tuple[Grid, Grid]:
+def _planes(lattice: Lattice, points: Array, normals: Array, weight: Array) -> tuple[Grid, Grid]:
     """Return how far voxels near points are known, 0 to 1, and their distance to the planes."""
     size = int(np.prod(lattice.shape))
     total, moment = np.zeros(size), np.zeros(size)
@@ -263,12 +318,9 @@ def _cleaned(
 
 
 def _surface(distance: Grid, lattice: Lattice) -> trimesh.Trimesh:
-    if not (distance < 0).any():
-        raise NumericalError(
-            "no surface: what was heard leaves no room for a body; check poses and speed of sound"
-        )
     # A voxel on the surface itself would be wrapped in triangles without area.
-    off = np.where(np.abs(distance) < 1e-3, np.where(distance < 0, -1e-3, 1e-3), distance)
+    near = np.abs(distance) < 1e-3
+    off = np.where(near, np.where(distance < 0, -1e-3, 1e-3), distance)
     vertices, faces, _, _ = marching_cubes(
         off.astype(np.float32), 0.0, gradient_direction="ascent", allow_degenerate=False
     )

@@ -52,6 +52,9 @@ def winding_number(flux: Sequence[Grid]) -> Grid:
         total = total + wave * fft.rfftn(flux[axis], s=size)
     square[0, 0, 0] = 1.0  # the mean is set below
     found = fft.irfftn(1j * total / square, s=size)
-    far = [found.take((n + s) // 2, axis).mean() for axis, (n, s) in enumerate(zip(shape, size))]
+    far = [
+        found.take((inner + whole) // 2, axis).mean()
+        for axis, (inner, whole) in enumerate(zip(shape, size, strict=True))
+    ]
     x, y, z = shape
     return np.asarray(found[:x, :y, :z] - np.mean(far), dtype=np.float32)

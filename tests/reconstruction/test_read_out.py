@@ -370,3 +370,23 @@ def test_a_spacing_larger_than_the_region_is_said_to_be_so():
     field = GridField(region, torch.tensor([20e3, 40e3]), spacing=0.01, levels=1)
     with pytest.raises(SettingsError, match="larger than the region"):
         reconstruct(field, spacing=2.0)
+
+
+@pytest.mark.parametrize("method", ["open", "filled"])
+def test_the_surface_of_the_occupancy_is_the_sphere_and_says_who_heard_it(method):
+    found = reconstruct(sounding(0.012), hull=hull_of_the_sphere(), method=method, resolution=0.005)
+    assert found.method == method
+    assert np.abs(radii(found.mesh) - RADIUS).mean() < 0.8e-3
+    assert found.mesh.is_watertight
+    assert found.support is not None
+    assert len(found.support) == len(found.mesh.vertices)
+    again = reconstruct(
+        sounding(0.012), hull=hull_of_the_sphere(), method=method, gathered=found.gathered
+    )
+    np.testing.assert_array_equal(again.mesh.vertices, found.mesh.vertices)
+
+
+@pytest.mark.parametrize("method", ["open", "filled"])
+def test_an_occupancy_needs_to_know_where_the_field_was_heard_from(method):
+    with pytest.raises(SettingsError, match=f"method {method}: it is not known where"):
+        reconstruct(sounding(RADIUS), method=method)
