@@ -77,8 +77,9 @@ class ProfileRenderer(Renderer):
         0 never does.
     prune_below : float
         Places weaker than this part of the strongest in their surroundings are dropped.
-    surroundings : float, m
-        How far "surroundings" reaches.
+    surroundings : float
+        How far "surroundings" reaches, range resolutions: some of them, so that a part has its own
+        strongest place, and not a fraction of one, where all of a blur would stay.
     """
 
     lattice: Tensor
@@ -104,12 +105,12 @@ class ProfileRenderer(Renderer):
         start: Annotated[int, Option(ge=1)] = 12_000,
         prune_every: Annotated[int, Option(ge=0)] = 100,
         prune_below: Annotated[float, Option(ge=0, lt=1)] = 1e-6,
-        surroundings: Annotated[float, Option(gt=0)] = 0.03,
+        surroundings: Annotated[float, Option(gt=0)] = 5.0,
     ) -> None:
         super().__init__(region, acquisition)
         self.points, self.uniform, self.start = points, uniform, start
         self.prune_every, self.prune_below = prune_every, prune_below
-        self.surroundings = surroundings
+        self.surroundings = surroundings * _resolution(acquisition)
         self.occlusion = occlusion
         self._turned = False
         self._summed = (torch.zeros(0), -1, False)  # phased, as of when, and what it said
@@ -428,6 +429,14 @@ class ProfileRenderer(Renderer):
         if self.lag is not None:
             middle = middle + look_up(self.lag.index_select(1, bins), head).mT / self.bin
         return known, way, middle
+
+
+def _resolution(acquisition: Acquisition) -> float:
+    """Return the width in range over which a point echo is above half of its magnitude, m."""
+    power = acquisition.window.double().square().mean(dim=0)
+    wide = (power >= 0.25 * power.max()).nonzero()[:, 0]
+    samples = int(wide[-1] - wide[0]) + 1
+    return samples * acquisition.speed_of_sound / acquisition.sampling_rate / 2
 
 
 def _length(vectors: Tensor) -> Tensor:

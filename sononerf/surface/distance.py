@@ -59,8 +59,8 @@ def signed_distance(
     """
     if min(weight.shape) >= 2 * COARSEST:
         coarse = _halved(weight)
-        aim = _halved(np.asarray(weight * target, dtype=np.float32)) / np.maximum(coarse, 1e-9)
-        aim = np.asarray(aim, dtype=np.float32)
+        moment = _halved(np.asarray(weight * target, dtype=np.float32))
+        aim: Grid = (moment / np.maximum(coarse, 1e-9)).astype(np.float32)
         # Values stay in fine voxels, so a Laplacian on twice the spacing is four times as small.
         first = signed_distance(coarse, aim, _halved(bound), pull, _halved(empty), bending / 16)
         distance = ndimage.zoom(first, 2, order=1, mode="nearest", grid_mode=True)

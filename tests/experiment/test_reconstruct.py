@@ -261,7 +261,7 @@ def test_the_hull_of_first_echoes_is_the_surface_where_the_field_has_none(
 
     monkeypatch.setattr(reconstruct_module, "read_out", only_the_hull)
     folder = reconstruct(run)
-    assert asked == ["auto", "hull", "open", "filled"]
+    assert asked == ["auto", "hull"]
     assert read_out(folder)["method"] == "hull"
     with pytest.raises(NumericalError, match="the indicator is empty"):
         reconstruct(run, method="oriented")
