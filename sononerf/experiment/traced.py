@@ -29,8 +29,8 @@ from sononerf.weights import model_checksum
 
 NAME = "traced.safetensors"
 RAYS = 100_000
-"""Per pose. Off the true three spheres they differ from 300,000 by 0.1 dB over active cells, 30,000 by
-0.2 dB."""
+"""Per pose. Off the true three spheres they differ from 300,000 by 0.1 dB over active cells, and
+30,000 by 0.2 dB."""
 GAIN_POSES = 12
 """Number of training poses that give the gain."""
 
