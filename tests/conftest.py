@@ -9,7 +9,11 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
+
+# Other test processes run beside this one; so that commands started by tests take one core too.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import torch  # it reads the variable
 
 TESTS = Path(__file__).resolve().parent
 PLUGIN = TESTS / "plugin"

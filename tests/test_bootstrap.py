@@ -168,7 +168,7 @@ def test_exit_codes_and_arguments_pass_through(bootstrap, checkout, code):
     stamp = checkout / ".venv" / ".sononerf-stamp"
     stamp.write_text(bootstrap.fingerprint(checkout))
     (checkout / "pytest.py").write_text(
-        "import sys\nprint(sys.argv[1:])\nsys.exit(int(sys.argv[1]))"
+        "import sys\nprint(sys.argv[-2:])\nsys.exit(int(sys.argv[-2]))"
     )
     done = subprocess.run(
         [sys.executable, script, "test", str(code), "-k"],

@@ -24,6 +24,8 @@ ROOT = Path(__file__).resolve().parent.parent
 OLDEST_PYTHON = (3, 11)
 TORCH = "torch==2.13.0"
 COMMANDS = ("demo", "test", "check")
+PYTEST = ("-m", "pytest", "-n", "auto", "--maxprocesses", "4", "--dist", "loadfile")
+"""The tests run one file per process, on at most four cores: each process takes 0.7 GiB."""
 DEMO_CONFIG = "configs/three_spheres.yaml"
 UNFINISHED = "unfinished"
 
@@ -131,7 +133,7 @@ def command_line(command: str, python: Path, root: Path, arguments: list[str]) -
         output = ["--output", str(next_run(root))]
         return [str(python), "-m", "sononerf.cli", "fit", DEMO_CONFIG, *output, *arguments]
     if command == "test":
-        return [str(python), "-m", "pytest", *arguments]
+        return [str(python), *PYTEST, *arguments]
     return ["bash", str(root / "tools" / "check"), *arguments]
 
 

@@ -20,6 +20,7 @@ range of its loudest slice. A slice holds an echo where
 
 with :math:`r + l` the local maxima behind it.
 
+The threshold of noise is at least 80 dB below the loudest power of the ensemble.
 The guard :math:`g` keeps an echo from its own flank: it is the first lag with :math:`T S(g) < 1`.
 
 The average over frequency has :math:`K` independent values, so that noise power is
@@ -53,6 +54,10 @@ range axis, and nine tenths of the poses may have other echoes in front of their
 ONSET = 0.1
 """Fraction of an echo's power at which its range is read, no unit. So early in the rise a second
 echo that follows within the window has not begun."""
+
+DYNAMIC_RANGE = 1e-8
+"""Least threshold over the loudest power of all poses, no unit: 80 dB, what 14 bits record. Without
+noise even the rounding of a simulator would be detected."""
 
 
 def threshold_factor(looks: float) -> float:
@@ -91,6 +96,7 @@ def threshold_levels(power: Array, looks: float) -> Levels:
     """
     factor = threshold_factor(looks)
     noise = factor * np.quantile(power, RANK, axis=-1, keepdims=True)
+    noise = np.maximum(noise, DYNAMIC_RANGE * power.max(initial=0.0))
     total = np.broadcast_to(noise, power.shape).copy()
     precursors = factor * _precursors(power.reshape(-1, power.shape[-1]))
     own = precursors >= 1.0

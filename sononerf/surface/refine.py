@@ -31,7 +31,9 @@ SIMULATED = 96
 """Training poses for which a surface is simulated; each is drawn about three times."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
 TOLERATED = 1.15
-"""Error over the least one up to which a later stage's surface is preferred."""
+"""Errors of validation poses that differ by less than this factor differ by chance. A later stage
+is preferred up to it, and a refined surface is kept only if the start's error is larger by it. On a
+procedural shape with 200 calls 5 % less error came with twice the distance from the truth."""
 ASKED = 16
 """At most so many validation poses are asked about each stage's surface."""
 
@@ -310,7 +312,7 @@ class Refinement:
         good = max(TOLERATED * min(errors), 1e-12)
         # The latest that is as good as any: traced errors of fine stages differ by chance.
         best = max(n for n, error in enumerate(errors) if error <= good or n == 0)
-        best = best if errors[best] < errors[0] else 0
+        best = best if TOLERATED * errors[best] < errors[0] else 0
         mesh = self.candidates[best]
         support = poses_that_hear(mesh, self.echoes, self.optics).double().cpu().numpy()
         if best:

@@ -85,3 +85,14 @@ def test_silence_has_no_onset():
 def test_the_level_of_all_does_not_matter(scale):
     rows = np.stack([echo(m) for m in np.linspace(100, 300, 30)]) + 1e-3 * noise((30, SLICES), 4.0)
     np.testing.assert_allclose(found_in(scale * rows), found_in(rows), rtol=1e-9)
+
+
+def test_what_no_recording_could_hold_is_no_echo():
+    """A simulator without noise has residues far below its echoes."""
+    middles = 200 + 5.0 * np.arange(20)
+    rows = np.stack([echo(m) for m in middles])
+    rows[3] += echo(40.0, 1e-9)
+    np.testing.assert_allclose(found_in(rows), middles, atol=0.1)
+    # 77 dB below the loudest an echo is one, before faint poses too.
+    rows[0] = echo(100.0, 2e-7)
+    assert found_in(rows)[0] == pytest.approx(100.0, abs=1.0)

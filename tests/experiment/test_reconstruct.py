@@ -101,9 +101,9 @@ def test_every_file_is_there_and_readable(run):
 
 
 def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
-    coarse = reconstruct(run, spacing=0.016, output=tmp_path / "coarse")
+    coarse = reconstruct(run, spacing=0.012, output=tmp_path / "coarse")
     fine = reconstruct(run, spacing=0.007, output=tmp_path / "fine")
-    assert read_out(coarse)["spacing_m"] == pytest.approx(0.016)
+    assert read_out(coarse)["spacing_m"] == pytest.approx(0.012)
     assert read_out(fine)["spacing_m"] == pytest.approx(0.007)
     level = read_out(fine)["level"]
     other = reconstruct(run, spacing=0.007, level=level / 2, output=tmp_path / "low")
@@ -156,7 +156,7 @@ def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, mo
         return plain(mesh, sources)
 
     monkeypatch.setattr(read_out_module, "judge_openness", judge)
-    folder = reconstruct(run, spacing=0.016)
+    folder = reconstruct(run, spacing=0.012)
     np.testing.assert_allclose(asked[0], load_fitted(run).hull.sources)
     assert len(asked) == 1
     kind = read_out(folder)["surface"]
@@ -186,12 +186,12 @@ def test_another_mesh_takes_the_numbers_of_the_last_one_away(
     run, tmp_path, few_samples, no_projections
 ):
     first = evaluate(run)
-    reconstruct(run, spacing=0.016, output=tmp_path / "aside")
+    reconstruct(run, spacing=0.012, output=tmp_path / "aside")
     with pytest.raises(NumericalError):
         reconstruct(run, level=1e9)
     assert json.loads((run / "metrics.json").read_text()) == first
     for output in (None, run / "reconstruction"):
-        reconstruct(run, spacing=0.016, output=output)
+        reconstruct(run, spacing=0.012, output=output)
         left = json.loads((run / "metrics.json").read_text())
         assert left.keys() == first.keys() - {"geometry"}
         assert left["baseline"] == first["baseline"]  # which know no mesh
@@ -242,7 +242,7 @@ def test_amid_surroundings_the_target_is_judged_alone_too(
 
 @pytest.mark.parametrize("content", [b"", b"ply\nnonsense", b"\x00" * 100])
 def test_a_damaged_mesh_is_told(run, content, no_projections):
-    reconstruct(run, spacing=0.016)
+    reconstruct(run, spacing=0.012)
     (run / "reconstruction" / "mesh.ply").write_bytes(content)
     with pytest.raises(InputError, match=r"mesh\.ply: .*reconstruct again"):
         evaluate(run)
