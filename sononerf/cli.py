@@ -40,6 +40,16 @@ class Accelerator(StrEnum):
     gpu = "gpu"
 
 
+class SurfaceMethod(StrEnum):
+    """How a surface is read out."""
+
+    auto = "auto"
+    open = "open"
+    filled = "filled"
+    hull = "hull"
+    isosurface = "isosurface"
+
+
 class Split(StrEnum):
     """Poses of an ensemble."""
 
@@ -315,8 +325,21 @@ def predict(
 def reconstruct(
     run: Run,
     spacing: Annotated[float | None, typer.Option(help="Voxel size in metres.")] = None,
+    method: Annotated[
+        SurfaceMethod | None,
+        typer.Option(
+            help="How the surface is read out. open, filled, hull: from field and first echoes; "
+            "open opens hollows and gaps, filled leaves them closed, hull takes the first echoes "
+            "alone. isosurface: where the field has one value. auto: the best of the first three, "
+            "refined. A method other than auto is not refined."
+        ),
+    ] = None,
     level: Annotated[
-        str | None, typer.Option(help="Level of the surface: auto, or a number.")
+        str | None,
+        typer.Option(
+            help="Level of an iso-surface: auto, or a number. With a number the surface is an "
+            "iso-surface and is not refined."
+        ),
     ] = None,
     output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
     accelerator: OnWhat = Accelerator.auto,
@@ -342,6 +365,7 @@ def reconstruct(
         run,
         spacing=spacing,
         level=number,
+        method=None if method is None else method.value,
         output=output,
         accelerator=accelerator.value,
         progress=Progress(),

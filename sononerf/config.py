@@ -277,11 +277,20 @@ class ReconstructionSettings(_Section):
     """The read-out of the finished field."""
 
     spacing: Spacing | None = None  # from the field's own resolution where it is not set
-    level: Annotated[float, Field(ge=0)] | Literal["auto"] = "auto"
-    method: Literal["auto", "open", "filled", "oriented", "hull", "isosurface"] = "auto"
+    level: Annotated[float, Field(ge=0)] | Literal["auto"] = "auto"  # of an iso-surface
+    method: Literal["auto", "open", "filled", "hull", "isosurface"] = "auto"
     refine: bool = True  # fit the surface to the echoes by physical optics
     directions: Annotated[int, Field(ge=6)] = 100
     smoothing: Annotated[float, Field(ge=0, le=1)] = 0.0  # side of a box over the volume, m
+
+    @model_validator(mode="after")
+    def _level_is_of_an_isosurface(self) -> ReconstructionSettings:
+        if self.level != "auto" and self.method not in ("auto", "isosurface"):
+            raise ValueError(
+                f"level is of the method isosurface, not of {self.method}; set method, or leave "
+                "it out"
+            )
+        return self
 
     @model_validator(mode="after")
     def _smooths_what_is_cut(self) -> ReconstructionSettings:

@@ -282,6 +282,10 @@ def test_reconstruct_with_spacing_and_level(at_home, tmp_path):
     assert f"wrote {tmp_path / 'coarse'}" in done("reconstruct", "runs/smoke", *options).err
     said = json.loads((tmp_path / "coarse" / "read_out.json").read_text())
     assert (said["spacing_m"], said["level"]) == (pytest.approx(0.012), pytest.approx(0.4))
+    assert said["method"] == "isosurface"
+    done("reconstruct", "runs/smoke", "--method", "hull", "--output", tmp_path / "hull")
+    said = json.loads((tmp_path / "hull" / "read_out.json").read_text())
+    assert (said["method"], said["level"], said["refined"]) == ("hull", None, False)
     assert tree(at_home.run) == before
 
 
@@ -637,9 +641,10 @@ def test_tables_of_poses_that_are_none(smoke, clean, content, words):
         ("--spacing", "0"),
         ("--spacing", "nan"),
         ("--spacing", "wide"),
+        ("--method", "oriented"),
     ],
 )
-def test_wrong_numbers_for_the_read_out(smoke, clean, options):
+def test_wrong_options_of_the_read_out(smoke, clean, options):
     assert options[0] in refused(2, "reconstruct", smoke.run, *options, "--output", "out")
     assert tree(clean) == {}
 
@@ -653,6 +658,12 @@ def test_a_run_has_a_page(at_home, tmp_path):
         assert "# smoke" in page
         assert ("As in the paper" in page) == bool(extra)
     assert tree(at_home.run) == before
+
+
+def test_only_an_isosurface_has_a_level(smoke, clean):
+    options = ("--method", "filled", "--level", "0.4", "--output", "out")
+    assert "method filled has no level" in refused(2, "reconstruct", smoke.run, *options)
+    assert tree(clean) == {}
 
 
 def test_a_surface_that_is_not_there(smoke, clean):

@@ -103,6 +103,10 @@ def test_settings_do_not_change(write):
         ("scene.name=", ["scene.name: found None"]),
         ("reconstruction.level=high", ["reconstruction.level: found 'high'"]),
         (
+            "reconstruction.method=oriented",
+            ["reconstruction.method: found 'oriented'", "'hull' or 'isosurface'"],
+        ),
+        (
             "reconstruction.spacing=2",
             ["reconstruction.spacing: found 2", "less than or equal to 0.1"],
         ),
@@ -280,6 +284,17 @@ def test_another_scene_does_not_inherit_the_options_of_the_files_scene(tmp_path)
 def test_poses_of_an_arrangement_say_what_it_needs_and_nothing_else(write, poses, said):
     (line,) = faults(write(SCENE + f"poses: {poses if poses[0] == '{' else '{' + poses + '}'}\n"))
     assert f": poses: {said}" in line
+
+
+@pytest.mark.parametrize("method", ["open", "filled", "hull"])
+def test_only_an_isosurface_has_a_level(write, method):
+    (line,) = faults(write(SCENE + f"reconstruction: {{level: 0.4, method: {method}}}\n"))
+    assert f": reconstruction: level is of the method isosurface, not of {method}" in line
+    for other in ("auto", "isosurface"):
+        settings = load_settings(
+            write(SCENE + f"reconstruction: {{level: 0.4, method: {other}}}\n")
+        )
+        assert settings.reconstruction.level == 0.4
 
 
 def test_only_an_isosurface_is_smoothed(write):

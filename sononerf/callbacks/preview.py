@@ -13,9 +13,10 @@ from sononerf import storage
 from sononerf.callbacks.epoch import EpochCallback
 from sononerf.errors import NumericalError
 from sononerf.module import EchoModule
+from sononerf.reconstruction.isosurface import automatic_level, isosurface
 from sononerf.reconstruction.mesh import mesh_bytes
 from sononerf.reconstruction.projection import maximum_intensity_projections
-from sononerf.reconstruction.read_out import reconstruct
+from sononerf.reconstruction.read_out import energy_volume
 from sononerf.render.figure import png_from_pixels
 from sononerf.render.projection import mip_image
 
@@ -53,22 +54,20 @@ class PreviewCallback(EpochCallback):
         module.eval()
         try:
             with torch.inference_mode():
-                seen = reconstruct(
-                    module.field,
-                    spacing=max(extent / self.voxels, module.field.resolution / 2),
-                    directions=self.directions,
-                )
+                spacing = max(extent / self.voxels, module.field.resolution / 2)
+                volume = energy_volume(module.field, spacing, self.directions)
+                mesh = isosurface(volume, automatic_level(volume))
         except NumericalError as error:
             # An early field may hold no surface yet; that is news, not a fault.
             storage.commit_json(target / "metrics.json", {**numbers, "no_surface": str(error)})
             return
         finally:
             module.train(was_training)
-        storage.commit_bytes(target / "mesh.ply", mesh_bytes(seen.mesh, "ply"))
+        storage.commit_bytes(target / "mesh.ply", mesh_bytes(mesh, "ply"))
         # Bare pixels: axes and labels would cost more than the rest of the epoch's look.
         pictures = {
             axis: mip_image(projection)
-            for axis, projection in maximum_intensity_projections(seen.volume).items()
+            for axis, projection in maximum_intensity_projections(volume).items()
         }
         for axis, pixels in pictures.items():
             storage.commit_bytes(target / f"mip_{axis}.png", png_from_pixels(pixels))

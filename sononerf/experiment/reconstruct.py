@@ -23,10 +23,9 @@ from sononerf.experiment.run_folder import RunFolder, results_folder
 from sononerf.experiment.surface import refine_surface
 from sononerf.progress import Progress, Task
 from sononerf.reconstruction.baseline import backprojection, best_level_surface
-from sononerf.reconstruction.confidence import poses_that_saw
 from sononerf.reconstruction.mesh import MeshFormat, mesh_bytes
 from sononerf.reconstruction.metrics import geometry_metrics, target_metrics
-from sononerf.reconstruction.read_out import Reconstruction
+from sononerf.reconstruction.read_out import Method, Reconstruction
 from sononerf.reconstruction.read_out import reconstruct as read_out
 from sononerf.reconstruction.truth import TrueSurface
 from sononerf.reconstruction.volume import Volume, vti_bytes
@@ -42,8 +41,11 @@ OPEN = {
     "one-sided": "the surface is open: what no pose can have heard, {0.unseen_share:.0%} of it, "
     "is left out",
 }
-"""What is said of surfaces that are no body's skin."""
-Method = Literal["auto", "open", "filled", "oriented", "hull", "isosurface"]
+"""What is said of surfaces that do not enclose a body."""
+REFINED: tuple[Method, ...] = ("open", "filled", "hull")
+"""Start surfaces: the one that explains the validation poses best is refined."""
+UNREFINED: tuple[Method, ...] = ("filled", "hull")
+"""Without refinement the first of these that gives a surface is taken."""
 FORMATS: tuple[MeshFormat, ...] = ("ply", "stl", "glb")
 BASELINE_VOXELS = 64
 """Along the region's longest side; finer than the window's length in any scene of ours."""
@@ -54,15 +56,15 @@ def reconstruct(
     *,
     spacing: float | None = None,
     level: float | Literal["auto"] | None = None,
-    method: Method | None = None,
+    method: Method | Literal["auto"] | None = None,
     output: Path | None = None,
     accelerator: str = "auto",
     progress: Progress | None = None,
 ) -> Path:
     """Write mesh, volume, projections and a view.
 
-    The surface is read out of the field and, unless the settings or a level of the caller's say
-    otherwise, refined against the echoes that the field was fitted to.
+    The surface is read out of the field and refined against the echoes that the field was fitted
+    to. It is not refined if a level or a method is given, or if the settings say so.
 
     Parameters
     ----------
@@ -71,8 +73,8 @@ def reconstruct(
     spacing : float or None, m
         Voxel size; the settings' where None.
     level : float, "auto" or None
-        Level of the surface; the settings' where None.
-    method : {"auto", "open", "filled", "oriented", "hull", "isosurface"} or None
+        A number asks for an iso-surface of this level; the settings' where None.
+    method : {"auto", "open", "filled", "hull", "isosurface"} or None
         How the surface is read out; the settings' where None.
     output : Path or None
         Folder of the results; ``RUN/reconstruction`` where None.
@@ -90,16 +92,24 @@ def reconstruct(
     fitted = load_fitted(path)
     folder = output or path / "reconstruction"
     options = fitted.settings.reconstruction
-    if level is None:
-        level = options.level
+    # What the caller gives replaces both settings.
     if method is None:
-        method = options.method
-    automatic = method == "auto" and level == "auto"
-    refines = options.refine and automatic
+        method = options.method if level in (None, "auto") else "isosurface"
+    if level is None:
+        level = options.level if method in ("auto", "isosurface") else "auto"
+    methods: tuple[Method, ...]
+    refines = False
+    if method != "auto":
+        methods = (method,)
+    elif level != "auto":
+        methods = ("isosurface",)
+    else:
+        refines = options.refine
+        methods = REFINED if refines else UNREFINED
     with results_folder(folder):
         starts = _read_out(
             fitted,
-            methods=("auto", "hull", "open", "filled") if automatic else (method,),
+            methods=methods,
             several=refines,
             spacing=spacing or options.spacing,
             level=level,
@@ -196,11 +206,7 @@ def _write(
     refined: Refined | None,
     truth: trimesh.Trimesh | None,
 ) -> None:
-    seen = found.support
-    if found.glints is not None:
-        seen = poses_that_saw(found.mesh, found.glints)
-    if refined is not None:
-        seen = refined.support.round().astype(np.int32)
+    seen = found.support if refined is None else refined.support.round().astype(np.int32)
     for kind in FORMATS:
         data = mesh_bytes(found.mesh, kind, confidence=seen)
         storage.commit_bytes(folder / f"mesh.{kind}", data)

@@ -273,8 +273,7 @@ def _figures(
 
 def _isosurface(fitted: Fitted, pictures: dict[str, bytes], progress: Progress) -> Iterator[str]:
     options = fitted.settings.reconstruction
-    # A level is one of the surface that the settings ask for.
-    level = options.level if options.method == "isosurface" else "auto"
+    level = options.level
     try:
         with progress.task("reading out", 1000) as task, torch.inference_mode():
             found = read_out(

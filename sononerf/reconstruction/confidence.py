@@ -1,77 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""How many poses bear out each place of a surface, and how that is coloured."""
+"""Colours for the number of poses that heard each place of a surface."""
 
 from __future__ import annotations
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
-from sononerf.reconstruction.glints import Glints
-
-# Cosine of the greatest angle between the normals of a vertex and a glint that speaks for it.
-ALIKE = 0.5
-# Vertices that are looked at together; their pairs and poses stay within some hundred megabytes.
-VERTICES_AT_ONCE = 4096
 # So many poses and more have the brightest colour.
 MANY_POSES = 100
 # Dark grey and bright yellow in OKLab; on the line between the two, equal steps look equal.
 FEW_COLOUR, MANY_COLOUR = (0.34, 0.0, -0.01), (0.93, -0.02, 0.15)
-
-
-def poses_that_saw(
-    mesh: trimesh.Trimesh, glints: Glints, *, reach: float = 0.01, tolerance: float = 0.003
-) -> NDArray[np.int32]:
-    """Count the poses that heard the surface around each vertex.
-
-    A pose counts where one of its glints lies within ``reach``, its normal is within 60 degrees of
-    the vertex's, and both lie on one smooth surface: along the mean of their normals they are
-    no farther apart than ``tolerance``.
-
-    Parameters
-    ----------
-    mesh : Trimesh
-        Metres; normals outward.
-    glints : Glints
-        Of all poses.
-    reach : float, m
-        How far around a vertex glints are asked.
-    tolerance : float, m
-        How far off the surface they may lie.
-
-    Returns
-    -------
-    poses : (V,) int32
-        Different poses; zero where none heard anything.
-
-    Raises
-    ------
-    ValueError
-        If reach or tolerance is not above zero.
-    """
-    if not (reach > 0 and tolerance > 0):
-        raise ValueError(f"reach {reach}, tolerance {tolerance}: expected both above 0 m")
-    counts = np.zeros(len(mesh.vertices), np.int32)
-    heard_by, pose = np.unique(glints.pose, return_inverse=True)
-    vertices, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
-    tree = cKDTree(glints.points)
-    # Neighbours together, so that few glints are near each lot.
-    order = cKDTree(vertices).indices
-    for start in range(0, len(order), VERTICES_AT_ONCE):
-        some = order[start : start + VERTICES_AT_ONCE]
-        pairs = cKDTree(vertices[some]).sparse_distance_matrix(tree, reach, output_type="ndarray")
-        i, j = pairs["i"], pairs["j"]
-        ours, theirs = normals[some[i]], glints.normals[j]
-        alike = np.einsum("ni,ni->n", ours, theirs) >= ALIKE
-        both = ours + theirs
-        between = glints.points[j] - vertices[some[i]]
-        off = np.abs(np.einsum("ni,ni->n", between, both))
-        level = off <= tolerance * np.linalg.norm(both, axis=1)
-        saw = np.zeros((len(some), len(heard_by)), bool)
-        saw[i[alike & level], pose[j[alike & level]]] = True
-        counts[some] = saw.sum(axis=1)
-    return counts
 
 
 def confidence_colours(poses: ArrayLike) -> NDArray[np.float64]:

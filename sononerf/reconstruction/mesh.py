@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Meshes read out of volumes and oriented points, and written as files."""
+"""Meshes read out of volumes, and written as files."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from sononerf.errors import NumericalError
 from sononerf.reconstruction.confidence import confidence_colours, linear_light
 from sononerf.reconstruction.isosurface import automatic_level, isosurface
-from sononerf.reconstruction.oriented import oriented_surface
 from sononerf.reconstruction.parts import clean_mesh, split_parts
 
 __all__ = [
@@ -20,7 +19,6 @@ __all__ = [
     "clean_mesh",
     "isosurface",
     "mesh_bytes",
-    "oriented_surface",
     "split_parts",
 ]
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: MIT
 """Whether a reconstructed surface is the skin of a body, or a sheet, or one side of something.
 
-Poisson's equation closes every surface. Where no pose could have heard the other side, what closes
-it is made up; where both sides are heard and hardly anything lies between them, it is a leaf.
+Every start surface is closed. Where no pose can have heard the other side, the part that closes it
+is a guess. Where both sides are heard and hardly anything lies between them, it is a sheet, such as
+a leaf.
 """
 
 from __future__ import annotations
@@ -17,19 +18,18 @@ from numpy.typing import NDArray
 from sononerf.geometry.raycast import RayCaster
 
 Array = NDArray[np.float64]
-LOOKS = 12
-"""So many poses at a time are asked whether they see a triangle, those that it faces best first."""
 FACING = 0.1
-"""Cosine from which on a triangle faces a pose."""
+"""Least cosine between a triangle's normal and the way to a pose that it faces."""
 UNSEEN_SHARE = 0.25
-"""A surface of which more than this cannot have been heard is open; less is closed by guess."""
-THIN = 0.004
-"""Thinner than this is a sheet, m: neither of its sides is known better than to a millimetre."""
+"""Fraction of the area: if more than this cannot have been heard, the surface is one-sided."""
+THIN = 0.7
+"""Range resolutions: a place is thin if its other side is nearer than this. The sides of a sheet
+share one echo, so neither is known to better than a fraction of the resolution."""
 THIN_SHARE = 0.75
-"""Of a sheet's surface so much is thin."""
-LIFT = 1e-4
-"""How far inside of a triangle the look for the other side begins, m."""
-CHUNK = 4096
+"""Fraction of the area: if more than this is thin, the surface is a sheet."""
+_LIFT = 1e-3  # of the root of a triangle's area: so far inside the search for the other side begins
+_POSES = 12  # tested at a time for whether they see a triangle, those that it faces best first
+_CHUNK = 4096  # triangles at a time, a bound of memory
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ class Openness:
     unseen : (T,) bool
         The triangles that no pose can have heard.
     unseen_share, thin_share : float
-        Shares of the area: that no pose can have heard; that has the other side close behind it.
+        Fractions of the area: that no pose can have heard; that has the other side close behind it.
     """
 
     unseen: NDArray[np.bool_]
@@ -56,7 +56,7 @@ class Openness:
         return "sheet" if self.thin_share > THIN_SHARE else "closed"
 
 
-def judge_openness(mesh: trimesh.Trimesh, sources: Array) -> Openness:
+def judge_openness(mesh: trimesh.Trimesh, sources: Array, *, resolution: float) -> Openness:
     """Tell a body's skin from an open surface.
 
     Parameters
@@ -65,6 +65,8 @@ def judge_openness(mesh: trimesh.Trimesh, sources: Array) -> Openness:
         A closed reconstruction, normals outward, m.
     sources : (P, 3) float, m
         Where it was heard from.
+    resolution : float, m
+        Range resolution of the analysis.
 
     Returns
     -------
@@ -75,29 +77,30 @@ def judge_openness(mesh: trimesh.Trimesh, sources: Array) -> Openness:
     areas = np.asarray(mesh.area_faces, dtype=np.float64)
     caster = RayCaster(mesh)
     unseen = ~_seen(caster, middles, normals, sources)
-    inward = caster.first_hit(middles - LIFT * normals, -normals)
-    thin = inward.ray[inward.distance < THIN]
+    lift = _LIFT * np.sqrt(areas)
+    inward = caster.first_hit(middles - lift[:, None] * normals, -normals)
+    thin = inward.ray[inward.distance + lift[inward.ray] < THIN * resolution]
     total = areas.sum()
     return Openness(unseen, float(areas[unseen].sum() / total), float(areas[thin].sum() / total))
 
 
 def _seen(caster: RayCaster, middles: Array, normals: Array, sources: Array) -> NDArray[np.bool_]:
     seen = np.zeros(len(middles), dtype=bool)
-    for start in range(0, len(middles), CHUNK):
-        some = slice(start, start + CHUNK)
+    for start in range(0, len(middles), _CHUNK):
+        some = slice(start, start + _CHUNK)
         ways = sources[None] - middles[some, None]
         ways /= np.linalg.norm(ways, axis=2, keepdims=True)
         facing = np.einsum("tpi,ti->tp", ways, normals[some])
         order = np.argsort(-facing, axis=1)
         left = np.arange(len(facing))
-        for first in range(0, len(sources), LOOKS):
-            best = order[left, first : first + LOOKS]
+        for first in range(0, len(sources), _POSES):
+            best = order[left, first : first + _POSES]
             row, column = np.nonzero(np.take_along_axis(facing[left], best, axis=1) > FACING)
             if not len(row):
                 break
             which = start + left[row]
-            asked = sources[best[row, column]]
-            seen[which[caster.visible(middles[which], asked, normals=normals[which])]] = True
+            tested = sources[best[row, column]]
+            seen[which[caster.visible(middles[which], tested, normals=normals[which])]] = True
             left = left[~seen[start + left]]
     return seen
 

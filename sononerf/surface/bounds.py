@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from sononerf.echoes.free_space import EchoHull
 from sononerf.surface.lattice import Lattice
 
-COARSER = 4  # the first look is so many voxels apart
+_COARSER = 4  # voxels between the places of the first look; only saves time
 
 
 def clearance_grid(hull: EchoHull, lattice: Lattice) -> NDArray[np.float64]:
@@ -29,7 +29,7 @@ def clearance_grid(hull: EchoHull, lattice: Lattice) -> NDArray[np.float64]:
         one. At most the diagonal of the lattice, where no pose says anything.
     """
     far = lattice.spacing * float(np.linalg.norm(lattice.shape))
-    coarse = [np.unique(np.append(np.arange(0, n, COARSER), n - 1)) for n in lattice.shape]
+    coarse = [np.unique(np.append(np.arange(0, n, _COARSER), n - 1)) for n in lattice.shape]
     corners = np.stack(np.meshgrid(*coarse, indexing="ij"), axis=-1).reshape(-1, 3)
     found = np.minimum(hull.clearance(lattice.origin + lattice.spacing * corners)[0], far)
     values = found.reshape([len(c) for c in coarse])
@@ -39,7 +39,7 @@ def clearance_grid(hull: EchoHull, lattice: Lattice) -> NDArray[np.float64]:
         part = (at - left).reshape([-1 if a == axis else 1 for a in range(3)])
         right = np.minimum(left + 1, len(picked) - 1)
         values = values.take(left, axis) * (1 - part) + values.take(right, axis) * part
-    near = np.abs(values) < COARSER * lattice.spacing
+    near = np.abs(values) < _COARSER * lattice.spacing
     places = lattice.origin + lattice.spacing * np.argwhere(near)
     values[near] = np.minimum(hull.clearance(places)[0], far)
     return np.asarray(values)

@@ -24,12 +24,9 @@ from scipy import ndimage
 
 from sononerf.surface.lattice import Grid
 
-ROBUST = 1.5
-"""Scale of Cauchy's loss, voxels: evidence that lies farther off the surface hardly counts."""
-OUTER, INNER = 4, 40
-"""Rounds of reweighting, and steps of conjugate gradients in each."""
-COARSEST = 12
-"""Least voxels along an axis of the coarsest grid."""
+_ROBUST = 1.5  # voxels, scale of Cauchy's loss: evidence farther off the surface hardly counts
+_OUTER, _INNER = 4, 40  # rounds of reweighting, steps of conjugate gradients in each
+_COARSEST = 12  # least voxels along an axis of the coarsest grid
 _ACCURACY = 1e-3  # of the residual's norm, where conjugate gradients stop
 
 
@@ -57,7 +54,7 @@ def signed_distance(
     -------
     distance : (X, Y, Z) float, voxels
     """
-    if min(weight.shape) >= 2 * COARSEST:
+    if min(weight.shape) >= 2 * _COARSEST:
         coarse = _halved(weight)
         moment = _halved(np.asarray(weight * target, dtype=np.float32))
         aim: Grid = (moment / np.maximum(coarse, 1e-9)).astype(np.float32)
@@ -67,8 +64,8 @@ def signed_distance(
         distance = distance[tuple(slice(n) for n in weight.shape)].astype(np.float32)
     else:
         distance = bound.copy()
-    for turn in range(OUTER):
-        robust = 1 / (1 + ((distance - target) / ROBUST) ** 2)
+    for turn in range(_OUTER):
+        robust = 1 / (1 + ((distance - target) / _ROBUST) ** 2)
         gap = distance - bound
         held = pull / np.maximum(np.abs(gap), 1.0) + (gap < 0)
         data, free = weight * robust, np.where(distance < 1.0, empty, 0.0)
@@ -77,7 +74,7 @@ def signed_distance(
             (data + held + free).astype(np.float32),
             (data * target + held * bound + free).astype(np.float32),
             bending,
-            INNER if turn else 2 * INNER,
+            _INNER if turn else 2 * _INNER,
         )
     return distance
 

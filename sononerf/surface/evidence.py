@@ -26,13 +26,11 @@ SHARED = 1.6
 """Standard deviation, in range resolutions, of the Gaussian over which the sound is averaged. With
 1.3 the points of nineteen touching spheres lie 0.9 mm too far out, with 2.0 0.3 mm; but with 2.0
 two spheres that stand close are joined."""
-FAINTEST = 1e-4
-"""Fraction of a pose's greatest power below which sound is left out."""
 COMPRESSION = 0.25
 """Exponent of the power that a point weighs: quiet parts must count beside loud ones."""
-BANDS = 5
-"""Frequencies, evenly spread, whose power is averaged."""
-CUTOFF = 2.5  # standard deviations after which the Gaussian is cut off
+_FAINTEST = 1e-4  # fraction of a pose's greatest power; quieter sound is left out, to save time
+_BANDS = 5  # frequencies, evenly spread, whose power is averaged
+_CUTOFF = 2.5  # standard deviations after which the Gaussian is cut off
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +89,7 @@ def locate_sound(
     evidence : Evidence
         Empty where nothing is heard.
     """
-    bands = torch.arange(BANDS, device=places.device) * (len(field.frequency) - 1) // (BANDS - 1)
+    bands = torch.arange(_BANDS, device=places.device) * (len(field.frequency) - 1) // (_BANDS - 1)
     where = places.double().cpu().numpy()
     kernel = _neighbours(where, SHARED * resolution)
     found: list[tuple[Array, Array, Array, NDArray[np.intp]]] = []
@@ -105,7 +103,7 @@ def locate_sound(
         # The power at the pose decides what is heard; without spreading it is what there is.
         power = response.abs().square().mean(-1)
         heard = power / distance[index] ** 4
-        loud = heard > FAINTEST * heard.max() if len(heard) else heard > 0
+        loud = heard > _FAINTEST * heard.max() if len(heard) else heard > 0
         if bool(loud.any()):
             index = index[loud]
             range_ = (distance[index] - lead[loud]).double().cpu().numpy()
@@ -128,7 +126,7 @@ def locate_sound(
 def _neighbours(places: Array, deviation: float) -> sparse.csr_matrix:
     """Return the Gaussian weights of places close to each other, (N, N)."""
     tree = cKDTree(places)
-    pairs = tree.sparse_distance_matrix(tree, CUTOFF * deviation, output_type="ndarray")
+    pairs = tree.sparse_distance_matrix(tree, _CUTOFF * deviation, output_type="ndarray")
     weight = np.exp(-0.5 * (pairs["v"] / deviation) ** 2)
     return sparse.csr_matrix((weight, (pairs["i"], pairs["j"])), shape=(len(places),) * 2)
 

@@ -25,8 +25,8 @@ FEW = 0.3
 """Power of agreeing points, over what is usual, that is little."""
 AT_ONSET = 0.7
 """Reliability of evidence at its pose's own onset."""
-WITNESSES = 4000  # points that are asked at most, a bound of time
-CHUNK = 4000
+_WITNESSES = 4000  # points that are asked at most, a bound of time
+_CHUNK = 4000  # points at a time, a bound of memory
 
 
 def reliability(evidence: Evidence, hull: EchoHull, resolution: float) -> Array:
@@ -46,10 +46,10 @@ def reliability(evidence: Evidence, hull: EchoHull, resolution: float) -> Array:
     by_others = _agreement(evidence, resolution)
     own = np.concatenate(
         [
-            hull.behind(evidence.points[i : i + CHUNK])[
-                np.arange(len(evidence.points[i : i + CHUNK])), evidence.pose[i : i + CHUNK]
+            hull.behind(evidence.points[i : i + _CHUNK])[
+                np.arange(len(evidence.points[i : i + _CHUNK])), evidence.pose[i : i + _CHUNK]
             ].min(axis=1)
-            for i in range(0, len(evidence.points), CHUNK)
+            for i in range(0, len(evidence.points), _CHUNK)
         ]
     )
     at_onset = AT_ONSET * np.exp(-0.5 * (own / (ALIGNED * resolution)) ** 2)
@@ -61,7 +61,7 @@ def _agreement(evidence: Evidence, resolution: float) -> Array:
     points, normals = evidence.points, evidence.normals
     count = len(points)
     # Evenly over all poses: points come pose by pose.
-    asked = np.unique(np.linspace(0, count - 1, min(count, WITNESSES)).astype(np.intp))
+    asked = np.unique(np.linspace(0, count - 1, min(count, _WITNESSES)).astype(np.intp))
     pairs = cKDTree(points).sparse_distance_matrix(
         cKDTree(points[asked]), REACH * resolution, output_type="ndarray"
     )

@@ -22,8 +22,7 @@ from scipy import fft
 
 from sononerf.surface.lattice import Grid
 
-AIR = 0.25
-"""Air on each side of the grid, part of its longest side: periodic images must stay apart."""
+_AIR = 0.25  # fraction of the longest side, empty on each side: periodic images must stay apart
 
 
 def winding_number(flux: Sequence[Grid]) -> Grid:
@@ -40,7 +39,7 @@ def winding_number(flux: Sequence[Grid]) -> Grid:
         Zero far away.
     """
     shape = flux[0].shape
-    air = 2 * round(AIR * max(shape))
+    air = 2 * round(_AIR * max(shape))
     size = [int(fft.next_fast_len(n + air, real=True)) for n in shape]
     square = np.zeros(1, np.float32)
     total = np.zeros(1, np.complex64)

@@ -91,7 +91,7 @@ def test_a_field_without_a_surface_is_news_and_no_fault(training, tmp_path, monk
     def none(*given, **options):
         raise NumericalError("no surface: the field is silent")
 
-    monkeypatch.setattr(preview_module, "reconstruct", none)
+    monkeypatch.setattr(preview_module, "energy_volume", none)
     modes = Modes()
     made = training(previews(tmp_path), modes)
     made.train()
@@ -109,7 +109,7 @@ def test_other_faults_are_not_hidden(training, tmp_path, monkeypatch):
     def broken(*given, **options):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(preview_module, "reconstruct", broken)
+    monkeypatch.setattr(preview_module, "energy_volume", broken)
     made = training(previews(tmp_path))
     with pytest.raises(ZeroDivisionError):
         made.train()

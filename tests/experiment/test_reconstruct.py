@@ -15,6 +15,7 @@ from PIL import Image
 
 from sononerf.errors import InputError, NumericalError
 from sononerf.experiment import reconstruct as reconstruct_module
+from sononerf.experiment.build import point_echo
 from sononerf.experiment.fit import fit
 from sononerf.experiment.fitted import load_fitted
 from sononerf.experiment.reconstruct import evaluate, reconstruct
@@ -102,12 +103,16 @@ def test_every_file_is_there_and_readable(run):
 
 def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
     coarse = reconstruct(run, spacing=0.012, output=tmp_path / "coarse")
-    fine = reconstruct(run, spacing=0.007, output=tmp_path / "fine")
+    assert read_out(coarse)["method"] in ("open", "filled", "hull")
+    assert read_out(coarse)["level"] is None
+    fine = reconstruct(run, spacing=0.007, method="isosurface", output=tmp_path / "fine")
     assert read_out(coarse)["spacing_m"] == pytest.approx(0.012)
     assert read_out(fine)["spacing_m"] == pytest.approx(0.007)
     level = read_out(fine)["level"]
     other = reconstruct(run, spacing=0.007, level=level / 2, output=tmp_path / "low")
     assert read_out(other)["level"] == pytest.approx(level / 2)
+    assert read_out(other)["method"] == "isosurface"
+    assert not read_out(other)["refined"]
     assert (fine / "mesh.ply").read_bytes() != (other / "mesh.ply").read_bytes()
     same = reconstruct(run, spacing=0.007, level=level, output=tmp_path / "same")
     assert (fine / "mesh.ply").read_bytes() == (same / "mesh.ply").read_bytes()
@@ -120,15 +125,20 @@ def judged(run, tmp_path, no_projections, monkeypatch):
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
     volume = Volume(np.zeros((2, 2, 2), np.float32), np.zeros(3), 0.01)
 
-    def make(openness):
-        found = Reconstruction(ball, volume, 1.0, "oriented", None, openness)
-        monkeypatch.setattr(reconstruct_module, "read_out", lambda *given, **options: found)
+    def make(openness, **given):
+        found = Reconstruction(ball, volume, None, "filled", openness)
+
+        def noted(*field, **options):
+            make.asked = options
+            return found
+
+        monkeypatch.setattr(reconstruct_module, "read_out", noted)
         monkeypatch.setattr(reconstruct_module, "side_by_side_png", lambda *meshes: b"")
         said = []
         progress = Progress(quiet=True)
         monkeypatch.setattr(progress, "say", said.append)
         name = "none" if openness is None else openness.kind
-        return reconstruct(run, output=tmp_path / name, progress=progress), said
+        return reconstruct(run, output=tmp_path / name, progress=progress, **given), said
 
     return make
 
@@ -151,9 +161,10 @@ def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, mo
     asked = []
     plain = read_out_module.judge_openness
 
-    def judge(mesh, sources):
+    def judge(mesh, sources, *, resolution):
         asked.append(sources)
-        return plain(mesh, sources)
+        assert resolution == point_echo(load_fitted(run).settings).resolution
+        return plain(mesh, sources, resolution=resolution)
 
     monkeypatch.setattr(read_out_module, "judge_openness", judge)
     folder = reconstruct(run, spacing=0.012)
@@ -163,6 +174,27 @@ def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, mo
     assert kind in ("closed", "sheet", "one-sided")
     # Only what was heard from one side is cut open.
     assert trimesh.load_mesh(folder / "mesh.ply").is_watertight == (kind != "one-sided")
+
+
+@pytest.mark.parametrize(
+    ("settings", "given", "expected"),
+    [
+        ({}, {}, "filled"),
+        ({"method": "open"}, {}, "open"),
+        ({"method": "open"}, {"method": "hull"}, "hull"),
+        ({"method": "open"}, {"level": 0.4}, "isosurface"),
+        ({"level": 0.4}, {}, "isosurface"),
+        ({"level": 0.4}, {"method": "hull"}, "hull"),
+        ({"level": 0.4}, {"level": "auto"}, "filled"),
+    ],
+)
+def test_what_the_caller_gives_replaces_the_settings(judged, run, settings, given, expected):
+    description = json.loads((run / "model.json").read_text())
+    description["settings"]["reconstruction"] |= settings
+    (run / "model.json").write_text(json.dumps(description))
+    judged(None, **given)
+    assert judged.asked["method"] == expected
+    assert judged.asked["level"] == (0.4 if expected == "isosurface" else "auto")
 
 
 def test_a_level_above_everything_has_no_surface(run):
@@ -256,12 +288,12 @@ def test_the_hull_of_first_echoes_is_the_surface_where_the_field_has_none(
     def only_the_hull(field, *, method, **options):
         asked.append(method)
         if method != "hull":
-            raise NumericalError("no surface: the indicator is empty")
+            raise NumericalError("no surface: the lattice is empty")
         return real(field, method=method, **options)
 
     monkeypatch.setattr(reconstruct_module, "read_out", only_the_hull)
     folder = reconstruct(run)
-    assert asked == ["auto", "hull"]
+    assert asked == ["filled", "hull"]
     assert read_out(folder)["method"] == "hull"
-    with pytest.raises(NumericalError, match="the indicator is empty"):
-        reconstruct(run, method="oriented")
+    with pytest.raises(NumericalError, match="the lattice is empty"):
+        reconstruct(run, method="open")

@@ -218,7 +218,11 @@ def test_a_damaged_comparison_is_told_before_the_long_work(finished, monkeypatch
 
 @pytest.mark.parametrize(
     ("method", "level", "said"),
-    [("isosurface", 2.5, "level as set: 2.5"), ("oriented", 2.5, "level by Otsu's rule")],
+    [
+        ("isosurface", 2.5, "level as set: 2.5"),
+        ("auto", 2.5, "level as set: 2.5"),
+        ("filled", "auto", "level by Otsu's rule"),
+    ],
 )
 def test_the_isosurface_is_drawn_as_the_settings_say(finished, monkeypatch, method, level, said):
     description = json.loads((finished / "model.json").read_text())
@@ -236,7 +240,7 @@ def test_the_isosurface_is_drawn_as_the_settings_say(finished, monkeypatch, meth
 
     monkeypatch.setattr(report_module, "read_out", read_out)
     assert said in report(finished, paper=True).read_text()
-    assert asked["level"] == (level if method == "isosurface" else "auto")
+    assert asked["level"] == level
     assert asked["method"] == "isosurface"
     assert (asked["spacing"], asked["directions"]) == (0.005, 12)
     assert asked["smoothing"] == own.get("smoothing", 0.0)

@@ -1,77 +1,7 @@
 # SPDX-License-Identifier: MIT
 import numpy as np
-import pytest
-import trimesh
 
-from sononerf.reconstruction import confidence
-from sononerf.reconstruction.confidence import (
-    MANY_POSES,
-    confidence_colours,
-    linear_light,
-    poses_that_saw,
-)
-from sononerf.reconstruction.glints import Glints
-
-RADIUS = 0.03
-
-
-@pytest.fixture(scope="module")
-def ball():
-    return trimesh.creation.icosphere(subdivisions=3, radius=RADIUS)
-
-
-def glints_at(points, normals, pose):
-    points, normals = np.atleast_2d(points).astype(float), np.atleast_2d(normals).astype(float)
-    return Glints(points, normals, np.ones(len(points)), np.asarray(pose, dtype=np.intp))
-
-
-def by_a_loop(mesh, glints, reach, tolerance):
-    counts = []
-    for vertex, normal in zip(mesh.vertices, mesh.vertex_normals, strict=True):
-        seen = set()
-        for point, other, pose in zip(glints.points, glints.normals, glints.pose, strict=True):
-            mean = (normal + other) / np.linalg.norm(normal + other)
-            near = np.linalg.norm(point - vertex) <= reach
-            if near and normal @ other >= 0.5 and abs((point - vertex) @ mean) <= tolerance:
-                seen.add(int(pose))
-        counts.append(len(seen))
-    return counts
-
-
-@pytest.mark.parametrize("at_once", [4096, 50])
-def test_it_counts_as_a_slow_loop_does(ball, monkeypatch, at_once):
-    monkeypatch.setattr(confidence, "VERTICES_AT_ONCE", at_once)
-    generator = np.random.default_rng(1)
-    normals = generator.normal(size=(300, 3))
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    points = normals * (RADIUS + generator.normal(0, 0.004, (300, 1)))
-    turned = normals + generator.normal(0, 0.5, (300, 3))
-    turned /= np.linalg.norm(turned, axis=1, keepdims=True)
-    glints = glints_at(points, turned, 7 * generator.integers(0, 12, 300))
-    expected = by_a_loop(ball, glints, 0.01, 0.003)
-    assert max(expected) > 5
-    np.testing.assert_array_equal(poses_that_saw(ball, glints), expected)
-
-
-def test_a_pose_counts_once_and_only_around_its_glints(ball):
-    top = [0, 0, RADIUS]
-    glints = glints_at([top, top, top], [[0, 0, 1]] * 3, [4, 4, 9])
-    counts = poses_that_saw(ball, glints)
-    near = np.linalg.norm(ball.vertices - top, axis=1) <= 0.01
-    assert (counts[near] == 2).all()
-    assert (counts[~near] == 0).all()
-
-
-def test_no_glints_bear_out_nothing(ball):
-    counts = poses_that_saw(ball, glints_at(np.zeros((0, 3)), np.zeros((0, 3)), []))
-    assert counts.shape == (len(ball.vertices),)
-    assert not counts.any()
-
-
-@pytest.mark.parametrize("wrong", [{"reach": 0.0}, {"tolerance": -1.0}])
-def test_wrong_distances_are_refused(ball, wrong):
-    with pytest.raises(ValueError, match="above 0"):
-        poses_that_saw(ball, glints_at([0, 0, 1], [0, 0, 1], [0]), **wrong)
+from sononerf.reconstruction.confidence import MANY_POSES, confidence_colours, linear_light
 
 
 def test_colours_brighten_evenly_from_grey_to_yellow():

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Closed surfaces, sheets, and what was heard from one side alone."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -12,15 +14,18 @@ from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.reconstruction import openness, read_out
 from sononerf.reconstruction.openness import (
     FACING,
-    LIFT,
     THIN,
     Openness,
-    judge_openness,
     without_unseen,
 )
 
-RADIUS, DISTANCE = 0.02, 0.4
+RADIUS, DISTANCE, RESOLUTION = 0.02, 0.4, 0.006
+THINNEST = THIN * RESOLUTION
 CAP = np.radians(30)
+
+
+def judge_openness(mesh, sources, resolution=RESOLUTION):
+    return openness.judge_openness(mesh, sources, resolution=resolution)
 
 
 def sphere():
@@ -122,7 +127,7 @@ def test_what_stands_in_the_way_hides_what_lies_behind():
     assert both.unseen[count:].all()
 
 
-@pytest.mark.parametrize("thickness", [0.0015, THIN - 2e-4])
+@pytest.mark.parametrize("thickness", [0.0015, THINNEST - 1e-5])
 def test_a_thin_plate_is_a_sheet(thickness):
     mesh = plate(thickness)
     found = judge_openness(mesh, all_around(300))
@@ -133,11 +138,22 @@ def test_a_thin_plate_is_a_sheet(thickness):
     assert found.unseen_share == 0.0
 
 
-@pytest.mark.parametrize("thickness", [THIN + LIFT + 1e-4, 0.01])
+@pytest.mark.parametrize("thickness", [THINNEST + 1e-5, 0.01])
 def test_a_thick_plate_is_closed(thickness):
     found = judge_openness(plate(thickness), all_around(300))
     assert found.kind == "closed"
     assert found.thin_share == 0.0
+
+
+def test_what_is_thin_follows_from_the_resolution_and_not_from_the_size_of_triangles():
+    mesh = plate(0.004)
+    assert judge_openness(mesh, all_around(), 0.006).kind == "sheet"
+    assert judge_openness(mesh, all_around(), 0.005).kind == "closed"
+    large = mesh.copy().apply_scale(10)
+    assert judge_openness(large, 10 * all_around(), 0.06).kind == "sheet"
+    fine = mesh.subdivide()
+    found = judge_openness(fine, all_around(), 0.006)
+    assert found.thin_share == pytest.approx(judge_openness(mesh, all_around(), 0.006).thin_share)
 
 
 def test_a_plate_that_was_heard_from_one_side_is_one_sided():
@@ -181,7 +197,7 @@ def test_a_pit_that_no_pose_looks_into_was_not():
 
 def test_pieces_of_the_work_change_nothing(monkeypatch):
     whole = judge_openness(sphere(), cap())
-    monkeypatch.setattr(openness, "CHUNK", 777)
+    monkeypatch.setattr(openness, "_CHUNK", 777)
     pieces = judge_openness(sphere(), cap())
     np.testing.assert_array_equal(pieces.unseen, whole.unseen)
 
@@ -212,27 +228,31 @@ def hull_over(sources):
 
 @pytest.fixture
 def read(monkeypatch):
-    """Read out a field whose surface is the sphere, whatever its glints are."""
+    """Read out a field whose occupancy is the sphere, whatever was heard."""
     region = torch.tensor([[-0.03] * 3, [0.03] * 3])
     torch.manual_seed(0)
     field = FourierField(region, torch.tensor([40e3, 60e3]), octaves=2, width=8)
 
-    def drawn(*given, **options):
-        return sphere(), None, 1.0
+    def body(gathered, belief):
+        mesh = sphere()
+        return SimpleNamespace(mesh=mesh, support=np.arange(len(mesh.vertices)))
 
-    monkeypatch.setattr(read_out, "_glint_surface", drawn)
-    monkeypatch.setattr(read_out, "oriented_surface", drawn)
+    monkeypatch.setattr(
+        read_out, "gather_evidence", lambda *given: SimpleNamespace(resolution=given[-1])
+    )
+    monkeypatch.setattr(read_out, "estimate_occupancy", body)
     monkeypatch.setattr(read_out, "isosurface", lambda *given: sphere())
-    monkeypatch.setattr(read_out, "find_glints", lambda *given: None)
 
-    def make(hull, method="oriented"):
-        return read_out.reconstruct(field, hull=hull, spacing=0.02, method=method, directions=2)
+    def make(hull, method="filled"):
+        return read_out.reconstruct(
+            field, hull=hull, spacing=0.02, method=method, directions=2, resolution=RESOLUTION
+        )
 
     return make
 
 
-def test_a_network_too_is_read_out_by_its_glints_where_poses_are_known(read):
-    assert read(hull_over(all_around()), method="auto").method == "oriented"
+def test_a_surface_is_of_the_occupancy_where_poses_are_known(read):
+    assert read(hull_over(all_around()), method="auto").method == "filled"
     assert read(None, method="auto").method == "isosurface"
 
 
@@ -249,6 +269,8 @@ def test_a_read_out_loses_what_no_pose_can_have_heard(read):
     assert len(found.openness.unseen) == 5120
     assert len(found.mesh.faces) == (~found.openness.unseen).sum() < 5120
     assert found.mesh.vertices[:, 0].min() > -0.6 * RADIUS
+    # Each vertex keeps its own number of poses.
+    np.testing.assert_array_equal(sphere().vertices[found.support], found.mesh.vertices)
 
 
 def test_a_hole_of_a_closed_surface_stays_closed(read):
@@ -258,8 +280,8 @@ def test_a_hole_of_a_closed_surface_stays_closed(read):
     assert found.mesh.is_watertight
 
 
-def test_without_poses_or_without_glints_no_one_judges(read):
-    assert read(None).openness is None
+def test_an_isosurface_is_not_judged(read):
+    assert read(None, method="auto").openness is None
     found = read(hull_over(cap()), method="isosurface")
     assert found.openness is None
     assert found.mesh.is_watertight

@@ -4,7 +4,7 @@ import pytest
 import trimesh
 
 from sononerf.errors import NumericalError
-from sononerf.reconstruction.parts import clean_mesh, split_parts, supported_parts
+from sononerf.reconstruction.parts import clean_mesh, split_parts
 
 
 def sphere(radius, x):
@@ -36,19 +36,3 @@ def test_wrong_input_is_refused():
         clean_mesh(trimesh.Trimesh())
     with pytest.raises(ValueError, match="min_area_fraction"):
         clean_mesh(sphere(1, 0), min_area_fraction=2.0)
-
-
-@pytest.mark.parametrize(
-    ("radius", "energy", "kept"), [(0.01, 0.02, True), (0.01, 0.005, False), (0.003, 1.0, False)]
-)
-def test_crumbs_and_hollows_go(radius, energy, kept):
-    large = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
-    hollow = trimesh.creation.icosphere(subdivisions=2, radius=0.015)
-    hollow.invert()
-    other = trimesh.creation.icosphere(subdivisions=2, radius=radius)
-    other.apply_translation([0.1, 0, 0])
-    points = np.vstack([large.vertices, other.vertices])
-    energies = np.repeat([1.0, energy], [len(large.vertices), len(other.vertices)])
-    mesh = trimesh.util.concatenate([large, hollow, other])
-    left = supported_parts(mesh, points, energies, reach=0.004, spacing=0.0025)
-    assert left.area == pytest.approx(large.area + kept * other.area)

@@ -76,7 +76,7 @@ def off_spheres(mesh):
 
 def test_two_spheres_are_two_although_the_onsets_leave_a_bridge(two):
     assert two.bound[two.lattice.shape[0] // 2].min() < -1  # a film between them
-    found = estimate_occupancy(two)
+    found = estimate_occupancy(two, "open")
     assert found.mesh.body_count == 2
     assert found.mesh.is_watertight
     assert found.mesh.volume == pytest.approx(2 * 4 / 3 * np.pi * RADIUS**3, rel=0.15)
@@ -84,13 +84,13 @@ def test_two_spheres_are_two_although_the_onsets_leave_a_bridge(two):
 
 
 def test_every_vertex_says_how_many_poses_heard_it(two):
-    found = estimate_occupancy(two)
+    found = estimate_occupancy(two, "open")
     assert found.support.shape == (len(found.mesh.vertices),)
     assert np.median(found.support) >= 3
 
 
 def test_something_may_be_on_the_body_and_not_beside_it(two):
-    found = estimate_occupancy(two)
+    found = estimate_occupancy(two, "open")
     places = np.array([[0.025, 0, 0], [0.025, 0, RADIUS], [0.0, 0, 0], [0.0, 0.025, 0.025]])
     assert found.possible(places, SPACING).tolist() == [True, True, False, False]
 
@@ -102,14 +102,14 @@ def test_a_flat_face_that_nobody_faces_lies_along_the_onsets():
     silent.audible = lambda positions, sources, code=None: torch.zeros(
         len(sources), len(positions), dtype=torch.bool
     )
-    found = estimate_occupancy(gathered(places, None, field=silent), opening=False)
+    found = estimate_occupancy(gathered(places, None, field=silent), "filled")
     assert found.mesh.body_count == 1
     assert found.mesh.volume == pytest.approx(box.volume, rel=0.25)
     assert (found.support == 0).all()
 
 
 def test_a_sheet_is_one_thin_solid_with_two_sides():
-    found = estimate_occupancy(gathered(*leaf()), opening=False)
+    found = estimate_occupancy(gathered(*leaf()), "filled")
     assert found.mesh.body_count == 1
     inner = np.abs(found.mesh.vertices[:, 0]) < 0.02
     inner &= np.abs(found.mesh.vertices[:, 1]) < 0.012
@@ -139,3 +139,30 @@ def test_onsets_that_leave_no_room_are_told():
     hull = EchoHull(sources, sources[:, None], np.full((40, 1), FAR + 0.1), -sources / FAR)
     with pytest.raises(NumericalError, match="no room for a body"):
         estimate_occupancy(gathered(places, normals, sources=sources, hull=hull))
+
+
+def test_the_onsets_alone_leave_the_bridge(two):
+    found = estimate_occupancy(two, "hull")
+    assert found.mesh.body_count == 1
+    assert found.mesh.is_watertight
+    # The mesh lies on the boundary of free space, neither thickened nor thinned.
+    assert np.abs(two.hull.clearance(found.mesh.vertices)[0]).mean() < SPACING / 20
+    assert found.mesh.volume > 1.3 * estimate_occupancy(two, "open").mesh.volume
+
+
+def test_the_onsets_alone_do_not_make_a_sheet_thicker():
+    known = gathered(*leaf())
+    assert known.thin.max() > 0.5
+    found = estimate_occupancy(known, "hull")
+    inner = np.abs(found.mesh.vertices[:, :2]).max(axis=1) < 0.01
+    assert np.abs(known.hull.clearance(found.mesh.vertices[inner])[0]).mean() < SPACING / 50
+
+
+def test_a_part_that_no_pose_hears_stays_in_the_hull_alone():
+    """Two spheres are seen by the onsets; the field sounds from one of them."""
+    middles = (-0.025, 0.0, 0.0), (0.025, 0.0, 0.0)
+    both, one = spheres(*middles), spheres(middles[0])
+    known = gathered(*one, hull=hull_of(both[0], around(600)), sources=around(600))
+    hull = estimate_occupancy(known, "hull")
+    assert hull.mesh.bounds[1, 0] == pytest.approx(0.025 + RADIUS, abs=SPACING)
+    assert (hull.support[hull.mesh.vertices[:, 0] > 0.025] == 0).all()
