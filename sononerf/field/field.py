@@ -37,8 +37,6 @@ class Field(nn.Module):
     cell: Tensor
     learning_rate: float = 1e-3
     """What Adam starts with where the settings name no rate."""
-    knows_directions: bool = False
-    """Whether lobes are explicit, so that the oriented read-out is the better one."""
     costly: bool = False
     """Whether a place asks for so many operations that any number of them is worth threads."""
 

@@ -115,7 +115,6 @@ class LobeField(Field):
     """
 
     learning_rate = 0.05
-    knows_directions = True
     curved: Tensor
 
     def __init__(self, region: Tensor, frequency: Tensor, rank: int) -> None:

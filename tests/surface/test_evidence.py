@@ -13,8 +13,6 @@ RADIUS, RESOLUTION = 0.02, 0.006
 class Ball(Field):
     """Lobes along the normals of a sphere around the origin; loudness by the side they are on."""
 
-    knows_directions = True
-
     def __init__(self, loudness=(1.0, 1.0), heard=True):
         super().__init__(torch.tensor([[-0.1] * 3, [0.1] * 3]).double(), FREQUENCY)
         self.loudness, self.heard = loudness, heard

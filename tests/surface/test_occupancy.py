@@ -16,8 +16,6 @@ LOWER, UPPER = np.array([-0.05, -0.03, -0.03]), np.array([0.05, 0.03, 0.03])
 class Bodies(Field):
     """Lobes along given normals at given places."""
 
-    knows_directions = True
-
     def __init__(self, places, normals):
         super().__init__(torch.tensor(np.stack([LOWER, UPPER])), torch.tensor([30e3, 60e3, 90e3]))
         self.places, self.normals = places, normals
