@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -225,7 +226,9 @@ def _write(
             "spacing_m": found.volume.spacing,
             "surface": None if found.openness is None else found.openness.kind,
             "refined": refined is not None and refined.kept,
-            "validation_error_db": None if refined is None else refined.error_db,
+            "validation_error_db": None
+            if refined is None or not math.isfinite(refined.error_db)
+            else refined.error_db,
         },
     )
 

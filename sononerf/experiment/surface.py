@@ -69,6 +69,7 @@ def refine_surface(
         starts,
         Echoes.of(store),
         optics,
+        hull=fitted.hull,
         simulate=partial(surface_simulator, settings, rays=RAYS),
         seed=settings.fit.seed,
     )

@@ -15,14 +15,16 @@ from sononerf.surface.correction import Correction
 from sononerf.surface.echo_data import Echoes
 from sononerf.surface.mesh_operators import MeshOperators, smoothing_passes, unit
 from sononerf.surface.objective import Level, measured, mismatch
+from sononerf.surface.onset_ranges import OnsetRanges
 from sononerf.surface.optics import Heard, Optics
 from sononerf.surface.traced import LaterBounces
 from sononerf.surface.visibility import listen
 
 POSES = 8
 """Per step."""
-RATE = 0.02
-"""Length of the first steps over the length of smoothing: how much the surface may tilt."""
+ONSETS = 3.0
+"""Weight of the misfit of onsets beside the mismatch, dB. Without it the edges of a box are cut
+off; with 30 the surface follows the errors of the onsets."""
 LAST = 0.2
 """That of the last ones, as part of the first; between them a cosine."""
 MOMENTUM = 0.8
@@ -50,10 +52,14 @@ class Descent:
         What was measured, what hears, and gains, which are brought up to date.
     smoothing : float, m
         Length over which steps are smoothed.
+    rate : float
+        Length of the first steps over the length of smoothing: how much the surface may tilt.
     later : LaterBounces or None
         To be added as power.
     correction : Correction or None
         Of the start, by the simulator.
+    onsets : OnsetRanges or None
+        Where the surface must begin.
     seed : int
         Of poses and rays.
     """
@@ -66,8 +72,10 @@ class Descent:
         level: Level,
         *,
         smoothing: float,
+        rate: float,
         later: LaterBounces | None = None,
         correction: Correction | None = None,
+        onsets: OnsetRanges | None = None,
         seed: int,
     ) -> None:
         self.echoes, self.optics, self.level, self.seed = echoes, optics, level, seed
@@ -86,7 +94,8 @@ class Descent:
         self.count = 0
         self._start = self._seen = self.vertices
         self._sight: Occlusion | None = None
-        self._later, self._correction = later, correction
+        self._later, self._correction, self._onsets = later, correction, onsets
+        self.rate = rate
 
     def mesh(self) -> trimesh.Trimesh:
         """Return the surface as it is now."""
@@ -118,7 +127,7 @@ class Descent:
         usual = self.operators.smoothed(self.square, 2.0 * self.strength).clamp_min(0.0)
         usual = usual / (1 - MEMORY**self.count)
         usual = torch.sqrt(usual + LOCAL * usual.mean()).clamp_min(1e-300)
-        rate = RATE * self.smoothing
+        rate = self.rate * self.smoothing
         rate *= LAST + (1 - LAST) * 0.5 * (1 + math.cos(math.pi * part))
         move = self.direction / (1 - MOMENTUM**self.count) / usual
         move = self.operators.smoothed(move, self.strength)
@@ -138,7 +147,8 @@ class Descent:
         """
         area = self.operators.areas(self.vertices)
         bending = self.operators.bending(self.vertices, unit(area), self.passes)
-        if self._sight is None or self.count % SIGHT == 0:
+        moved = self._seen is not self.vertices
+        if self._sight is None or (moved and self.count % SIGHT == 0):
             self._seen = self.vertices
             self._sight = Occlusion(self._seen.cpu().numpy(), self.faces)
         places = torch.as_tensor(self.echoes.positions[numbers]).to(self.vertices)
@@ -172,6 +182,8 @@ class Descent:
         assert to_areas is not None
         (through,) = torch.autograd.grad(self.operators.areas(moved), moved, to_areas.double())
         total = through + to_points.double()
+        if self._onsets is not None:
+            total = total + ONSETS * self._onsets.gradient(self.vertices, number)
         return (total * normals).sum(1, keepdim=True), float(errors.detach().mean())
 
     def state(self) -> dict[str, Tensor]:

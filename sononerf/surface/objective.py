@@ -58,6 +58,11 @@ class Level:
         self.steps = 0
         self.learns: Literal["none", "whole", "each"] = "each"
 
+    def reset(self) -> None:
+        """Forget everything that was learned."""
+        self.gain, self.error = torch.zeros_like(self.gain), torch.full_like(self.error, 4.0)
+        self.steps = 0
+
     def state(self) -> dict[str, Tensor]:
         """Return everything as plain tensors."""
         return {"gain": self.gain, "error": self.error, "steps": torch.tensor(self.steps)}

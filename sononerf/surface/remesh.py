@@ -22,8 +22,9 @@ RELAXING = 8
 """Steps of tangential relaxation; marching cubes leave slivers."""
 RELAXED = 0.7
 """Part of the way to the neighbours' mean in one of these steps."""
-LEAST = 60
-"""Vertices of the smallest piece that is kept."""
+LEAST = 1.5
+"""Side of the cube whose volume the smallest piece has that is kept, edges. Torn films leave crumbs
+below it."""
 LOST = 0.01
 """Part of the old surface that may be missing from the new one, unless it is blurred; a sheet that
 is thinner than a voxel would be lost."""
@@ -69,7 +70,7 @@ def remesh(mesh: trimesh.Trimesh, edge: float, blur: float = 0.0) -> trimesh.Tri
     if _volume(found) < 0.0:
         found.invert()
     pieces = found.split(only_watertight=False)
-    pieces = [piece for piece in pieces if len(piece.vertices) >= LEAST]
+    pieces = [piece for piece in pieces if abs(_volume(piece)) >= (LEAST * edge) ** 3]
     if not pieces:
         return None
     found = trimesh.util.concatenate(pieces) if len(pieces) > 1 else pieces[0]

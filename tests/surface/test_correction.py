@@ -52,7 +52,7 @@ def level(optics):
 
 def heard_of(sphere, echoes, optics, level):
     """What is rendered of the surface itself for the poses."""
-    work = Descent(sphere, echoes, optics, level, smoothing=optics.wavelength, seed=0)
+    work = Descent(sphere, echoes, optics, level, smoothing=optics.wavelength, rate=0.02, seed=0)
     return work.render(POSES)[0]
 
 
@@ -94,7 +94,14 @@ def test_a_simulator_of_another_level_moves_nothing(optics, sphere, simulator, e
         echoes.positions, echoes.rotations, echoes.training, echoes.validation, loud.__getitem__
     )
     work = Descent(
-        sphere, same, optics, level, smoothing=optics.wavelength, correction=correction, seed=0
+        sphere,
+        same,
+        optics,
+        level,
+        smoothing=optics.wavelength,
+        rate=0.02,
+        correction=correction,
+        seed=0,
     )
     assert work.step(0, 0.0) < 0.05
     assert float((work.vertices.norm(dim=1) - RADIUS).abs().mean()) < 1e-4

@@ -8,8 +8,10 @@ import trimesh
 
 from sononerf.surface.descent import Descent, poses_that_hear
 from sononerf.surface.objective import Level
+from sononerf.surface.onset_ranges import OnsetRanges
 from sononerf.surface.remesh import remesh
 from tests.surface.conftest import RADIUS
+from tests.surface.test_onset_ranges import heard as onsets_of
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +23,7 @@ def descent_on(mesh, echoes, optics):
     level = Level(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
     level.learns = "none"
     smoothing = 1.5 * optics.wavelength
-    return Descent(mesh, echoes, optics, level, smoothing=smoothing, seed=0)
+    return Descent(mesh, echoes, optics, level, smoothing=smoothing, rate=0.02, seed=0)
 
 
 def off(descent, heard):
@@ -63,3 +65,20 @@ def test_a_step_depends_on_the_state_alone(too_large, echoes, optics):
         work.step(number, 0.1)
         other.step(number, 0.1)
     assert torch.equal(work.vertices, other.vertices)
+
+
+def test_onsets_move_the_surface_to_where_it_must_begin(echoes, optics):
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    onsets = OnsetRanges(
+        onsets_of(trimesh.creation.icosphere(subdivisions=4, radius=RADIUS + 1e-3)), 0.006, seed=0
+    )
+    sizes = []
+    for known in (None, onsets):
+        level = Level(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
+        work = Descent(
+            ball, echoes, optics, level, smoothing=0.004, rate=0.02, onsets=known, seed=0
+        )
+        for number in range(5):
+            work.step(number, 0.0)
+        sizes.append(float(work.vertices.norm(dim=1).mean()))
+    assert sizes[1] > sizes[0] + 5e-5

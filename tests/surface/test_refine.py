@@ -10,12 +10,14 @@ import trimesh
 
 from sononerf.errors import InputError
 from sononerf.simulation.simulator import Simulator
+from sononerf.surface import comparison
 from sononerf.surface import refine as module
 from sononerf.surface.descent import Descent
 from sononerf.surface.echo_data import Echoes
 from sononerf.surface.objective import Level
 from sononerf.surface.optics import Optics
-from sononerf.surface.refine import Refinement, Stage, refine
+from sononerf.surface.refine import Refinement
+from sononerf.surface.stages import Stage
 from sononerf.surface.traced import quiet_scene
 from tests.surface.conftest import RADIUS
 
@@ -24,8 +26,11 @@ def unasked(mesh):
     raise AssertionError("no stage asks for the simulator")
 
 
-def refined(mesh, echoes, optics, *, simulate=unasked, stages=None, **given):
-    return refine([mesh], echoes, optics, simulate=simulate, stages=stages or SHORT, **given)
+def refined(mesh, echoes, optics, **given):
+    work = started(mesh, echoes, optics, **given)
+    while not work.done:
+        work.advance()
+    return work.result()
 
 
 def started(mesh, echoes, optics, *, simulate=unasked, stages=None):
@@ -33,14 +38,14 @@ def started(mesh, echoes, optics, *, simulate=unasked, stages=None):
 
 
 SHORT = (
-    Stage(smoothing=2.0, edge=0.8, blur=0.3, steps=8, beyond="trace"),
-    Stage(smoothing=1.2, edge=0.7, blur=0.0, steps=8, beyond="keep"),
+    Stage(smoothing=2.0, edge=0.8, blur=0.3, rate=0.02, steps=8, beyond="trace"),
+    Stage(smoothing=1.2, edge=0.7, blur=0.0, rate=0.02, steps=8, beyond="keep"),
 )
 
 
 @pytest.fixture(autouse=True)
 def few_rays(monkeypatch):
-    monkeypatch.setattr(module, "RAYS", 4000)
+    monkeypatch.setattr(comparison, "RAYS", 4000)
 
 
 @pytest.fixture(scope="module")
@@ -52,13 +57,12 @@ def bumpy():
 
 
 def test_a_bumpy_sphere_becomes_round(bumpy, echoes, optics):
-    seen = []
-    found = refined(bumpy, echoes, optics, seed=0, progress=lambda *a: seen.append(a[:2]))
+    found = refined(bumpy, echoes, optics)
     assert found.kept
-    assert seen[-1] == (16, 16)
     assert len(found.support) == len(found.mesh.vertices)
     assert found.gain.shape == (2, len(optics.frequencies))
-    assert [one["stage"] for one in found.history] == [0, 1]
+    assert [(one["stage"], one["sharp"]) for one in found.history][:2] == [(0, False), (0, True)]
+    assert [one["stage"] for one in found.history] == [0, 0, 1]
 
     def off(mesh):
         return np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).mean()
@@ -74,7 +78,7 @@ def test_a_surface_that_gets_worse_is_not_kept(echoes, optics, monkeypatch):
         return 1.0
 
     monkeypatch.setattr(Descent, "step", spoil)
-    found = refined(true, echoes, optics, seed=0)
+    found = refined(true, echoes, optics)
     assert not found.kept
     assert np.array_equal(found.mesh.vertices, true.vertices)
 
@@ -112,7 +116,7 @@ def test_a_surface_that_cannot_be_simulated_is_refined_all_the_same(
         raise InputError("the mesh is 1e-06 m large")
 
     simulated_stage["simulate"] = refuse
-    assert refined(bumpy, echoes, optics, seed=0, **simulated_stage).kept
+    assert refined(bumpy, echoes, optics, **simulated_stage).kept
 
 
 @pytest.mark.parametrize("corrected", [False, True])
@@ -123,7 +127,7 @@ def test_going_on_from_any_step_ends_the_same(bumpy, echoes, optics, simulated_s
     while not whole.done:
         states[whole.drawn] = {k: v.clone() for k, v in whole.state().items()}
         whole.advance()
-    for step in (5, 8, 12):
+    for step in (5, 8, 12, 16, 20):
         again = started(bumpy, echoes, optics, **given)
         again.load(states[step])
         while not again.done:
@@ -175,7 +179,9 @@ def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
         mesh = trimesh.Trimesh(bumpy.vertices * scale, bumpy.faces, process=False)
         made = module.remesh(mesh, 0.8 * heard.wavelength, 0.3 * heard.wavelength)
         level = Level(heard.ears, len(heard.frequencies), heard.get_buffer("wavenumber"))
-        work = Descent(made, world, heard, level, smoothing=1.5 * heard.wavelength, seed=0)
+        work = Descent(
+            made, world, heard, level, smoothing=1.5 * heard.wavelength, rate=0.02, seed=0
+        )
         for step in range(4):
             work.step(step, step / 4)
         return work.vertices / scale
@@ -183,3 +189,23 @@ def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
     one, three = moved(1.0, analysis), moved(factor, slow)
     assert one.shape == three.shape
     assert float((one - three).abs().max()) < 2e-3 * optics.wavelength
+
+
+def test_the_better_of_the_blurred_and_the_sharp_surface_goes_on(
+    bumpy, echoes, optics, monkeypatch
+):
+    for worse, sharp in ((False, True), (True, False)):
+        work = started(bumpy, echoes, optics)
+        monkeypatch.setattr(
+            work.comparison,
+            "objective",
+            lambda *a, work=work, worse=worse, **k: 9.0 if work.sharp == worse else 1.0,
+        )
+        ends = []
+        while work.stage == 0:
+            work.advance()
+            if work.step == 0:
+                ends.append(work._rival if work.stage == 0 else work.candidates[-1])
+        assert work.sharp is sharp
+        assert (ends[1] is ends[0]) is not sharp
+        assert len(work.candidates) == 2

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: MIT
+r"""How far the nearest point of a surface is from where each pose's first echo began.
+
+The nearest point of a body always answers, be it an edge or a corner that hardly reflects. So the
+least range over the surface must be the onset. Physical optics alone does not tell this: where a
+pose hears a quiet edge only, it can as well make the edge quieter by cutting it off.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sononerf.echoes.free_space import EchoHull
+
+USUAL = 0.1
+"""Error of an onset up to which the misfit is quadratic, range resolutions; beyond it is linear. It
+is the accuracy of the detector, :data:`sononerf.echoes.consistency.ACCURACY`."""
+_POSES = 64  # drawn per step, a bound of time; single poses are noisy, and eight hear too little
+
+
+class OnsetRanges:
+    """The onsets of the training poses, to compare surfaces with.
+
+    Parameters
+    ----------
+    hull : EchoHull
+        Onsets; those of weight zero take no part.
+    resolution : float, m
+        Range resolution of the analysis.
+    seed : int
+        Of the order in which poses are drawn.
+    """
+
+    def __init__(self, hull: EchoHull, resolution: float, seed: int) -> None:
+        self.scale, self.seed = USUAL * resolution, seed
+        known = np.isfinite(hull.trusted)
+        pose, ear = np.nonzero(known)
+        self._first = hull.trusted[known]
+        self._emitters, self._receivers = hull.emitters[pose], hull.receivers[pose, ear]
+
+    def __len__(self) -> int:
+        return len(self._first)
+
+    def misfit(self, vertices: Tensor) -> float:
+        """Mean Huber loss of the least range of vertices (V, 3), m; no unit; 0 without onsets."""
+        if not len(self):
+            return 0.0
+        lots = np.array_split(np.arange(len(self)), -(-len(self) // _POSES))
+        off = torch.cat([self._off(vertices, some)[0] for some in lots]).abs()
+        return float(torch.where(off < 1.0, 0.5 * off.square(), off - 0.5).mean())
+
+    def gradient(self, vertices: Tensor, number: int) -> Tensor:
+        """Gradient (V, 3), 1/m, of the misfit of a step's onsets; ``number`` is the step's."""
+        found = torch.zeros_like(vertices)
+        if not len(self):
+            return found
+        rng = np.random.default_rng([self.seed, number])
+        some = rng.choice(len(self), min(_POSES, len(self)), replace=False)
+        off, nearest, way = self._off(vertices, some)
+        slope = off.clamp(-1.0, 1.0)[:, None] * way / (self.scale * len(some))
+        return found.index_add_(0, nearest, slope)
+
+    def _off(self, vertices: Tensor, some: NDArray[np.intp]) -> tuple[Tensor, Tensor, Tensor]:
+        """Return misfit (N,), nearest vertex (N,) and the range's gradient there (N, 3)."""
+        emitters, receivers, first = (
+            torch.as_tensor(part[some]).to(vertices)
+            for part in (self._emitters, self._receivers, self._first)
+        )
+        ranges = (torch.cdist(vertices, emitters) + torch.cdist(vertices, receivers)) / 2
+        least, nearest = ranges.min(0)
+        out, back = vertices[nearest] - emitters, vertices[nearest] - receivers
+        way = out / out.norm(dim=1, keepdim=True) + back / back.norm(dim=1, keepdim=True)
+        return (least - first) / self.scale, nearest, way / 2
