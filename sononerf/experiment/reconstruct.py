@@ -26,7 +26,7 @@ from sononerf.progress import Progress, Task
 from sononerf.reconstruction.baseline import backprojection, best_level_surface
 from sononerf.reconstruction.mesh import MeshFormat, mesh_bytes
 from sononerf.reconstruction.metrics import geometry_metrics, target_metrics
-from sononerf.reconstruction.read_out import Method, Reconstruction
+from sononerf.reconstruction.read_out import Method, Reconstruction, judged
 from sononerf.reconstruction.read_out import reconstruct as read_out
 from sononerf.reconstruction.truth import TrueSurface
 from sononerf.reconstruction.volume import Volume, vti_bytes
@@ -34,7 +34,6 @@ from sononerf.reconstruction.voxels import voxel_fit
 from sononerf.render.mesh import confidence_png, mesh_png, side_by_side_png
 from sononerf.render.projection import mip_pngs
 from sononerf.scene import Scene, load_scene
-from sononerf.surface.occupancy import Gathered
 from sononerf.surface.refine import Refined
 
 OPEN = {
@@ -124,6 +123,7 @@ def reconstruct(
             refined = _refined(path, fitted, meshes, accelerator, progress)
         if refined is not None:
             found = replace(starts[refined.start], mesh=refined.mesh)
+        found = judged(found, None if refined is None else refined.support.round().astype(np.int32))
         _write(folder, found, refined, true_mesh(fitted))
     if found.openness is not None and found.openness.kind in OPEN:
         progress.say(OPEN[found.openness.kind].format(found.openness))
@@ -152,7 +152,6 @@ def _read_out(
     """
     options = fitted.settings.reconstruction
     resolution = point_echo(fitted.settings).resolution
-    gathered: Gathered | None = None
     found: list[Reconstruction] = []
     error: NumericalError | None = None
     for method in methods:
@@ -173,10 +172,10 @@ def _read_out(
                     directions=options.directions,
                     smoothing=options.smoothing if method == "isosurface" else 0.0,
                     resolution=resolution,
-                    gathered=gathered,
+                    earlier=found[-1] if found else None,
+                    judge=False,
                     progress=shown,
                 )
-            gathered = one.gathered or gathered
             found.append(one)
         except NumericalError as raised:
             error = error or raised
@@ -207,7 +206,7 @@ def _write(
     refined: Refined | None,
     truth: trimesh.Trimesh | None,
 ) -> None:
-    seen = found.support if refined is None else refined.support.round().astype(np.int32)
+    seen = found.support
     for kind in FORMATS:
         data = mesh_bytes(found.mesh, kind, confidence=seen)
         storage.commit_bytes(folder / f"mesh.{kind}", data)

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -21,6 +21,7 @@ from sononerf.reconstruction.isosurface import automatic_level, isosurface
 from sononerf.reconstruction.openness import Openness, judge_openness, without_unseen
 from sononerf.reconstruction.volume import Volume, grid_over, volume_from_function
 from sononerf.surface.occupancy import Gathered, estimate_occupancy, gather_evidence
+from sononerf.surface.support import poses_that_heard
 
 Array = NDArray[np.float64]
 _FAINTEST = (
@@ -74,7 +75,8 @@ def reconstruct(
     directions: int = 100,
     smoothing: float = 0.0,
     resolution: float | None = None,
-    gathered: Gathered | None = None,
+    earlier: Reconstruction | None = None,
+    judge: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Reconstruction:
     """Read volume and surface out of a field.
@@ -99,8 +101,11 @@ def reconstruct(
         odd number of voxels; the published code of the paper takes 9 of 5 mm.
     resolution : float or None, m
         Range resolution of the analysis; 1.5 of the field's resolution where None.
-    gathered : Gathered or None
-        The evidence of an earlier call with the same field, hull and spacing.
+    earlier : Reconstruction or None
+        Of a call with the same field, hull, spacing and directions; its volume and evidence serve
+        again, unless the method is ``isosurface``.
+    judge : bool
+        Whether :func:`judged` is applied.
     progress : callable, optional
         Called with the voxels done and the voxels in all.
 
@@ -128,21 +133,44 @@ def reconstruct(
         )
     chosen = _chosen(method, level, hull)
     values = _loudness(field, directions) if chosen == "isosurface" else _energy(field, directions)
-    volume = volume_from_function(values, lower, upper, step, chunk=_CHUNK, progress=progress)
+    if chosen == "isosurface" or earlier is None:
+        volume = volume_from_function(values, lower, upper, step, chunk=_CHUNK, progress=progress)
+    else:
+        volume = earlier.volume
     if chosen == "isosurface":
         return _isosurface(volume, level, smoothing)
     assert hull is not None
+    gathered = None if earlier is None else earlier.gathered
     if gathered is None:
         wide = resolution or 1.5 * field.resolution
         places = _places(field, lower, upper, directions)
         gathered = gather_evidence(field, places, hull, lower, upper, step, wide)
     body = estimate_occupancy(gathered, chosen)
-    openness = judge_openness(body.mesh, hull.sources, resolution=gathered.resolution)
-    mesh, support = body.mesh, body.support
+    found = Reconstruction(body.mesh, volume, None, chosen, gathered=gathered)
+    return judged(found) if judge else found
+
+
+def judged(found: Reconstruction, support: NDArray[np.int32] | None = None) -> Reconstruction:
+    """Return a reconstruction with its openness and support, without what no pose can have heard.
+
+    Parameters
+    ----------
+    found : Reconstruction
+        Of any method; an iso-surface is returned as it is.
+    support : (V,) int32, optional
+        How many poses heard each vertex; counted in the evidence where None.
+    """
+    known = found.gathered
+    if known is None:
+        return found
+    mesh = found.mesh
+    if support is None:
+        support = poses_that_heard(mesh, known.evidence, known.resolution)
+    openness = judge_openness(mesh, known.hull.sources, resolution=known.resolution)
     if openness.kind == "one-sided":
         used = np.unique(mesh.faces[~openness.unseen])
         mesh, support = without_unseen(mesh, openness), support[used]
-    return Reconstruction(mesh, volume, None, chosen, openness, gathered, support)
+    return replace(found, mesh=mesh, openness=openness, support=support)
 
 
 def _chosen(

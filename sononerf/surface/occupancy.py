@@ -36,7 +36,6 @@ from sononerf.surface.evidence import Evidence, locate_sound
 from sononerf.surface.evidence_grids import planes, thinness, winding_of
 from sononerf.surface.lattice import MARGIN, Grid, Lattice
 from sononerf.surface.reliability import reliability
-from sononerf.surface.support import poses_that_heard
 
 Array = NDArray[np.float64]
 Belief = Literal["open", "filled", "hull"]
@@ -73,8 +72,6 @@ class Occupancy:
     ----------
     mesh : Trimesh
         Closed, m, normals outward.
-    support : (V,) int32
-        How many poses heard the surface around each vertex.
     distance : (X, Y, Z) float, m
         Signed distance, positive outside.
     lattice : Lattice
@@ -86,7 +83,6 @@ class Occupancy:
     """
 
     mesh: trimesh.Trimesh
-    support: NDArray[np.int32]
     distance: Grid
     lattice: Lattice
     evidence: Evidence
@@ -224,8 +220,7 @@ def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> Occupancy:
     if belief != "hull":
         back = _THICKER * spacing * lattice.read(known.thin, np.asarray(mesh.vertices)).clip(0, 1)
         mesh.vertices = mesh.vertices - back[:, None] * mesh.vertex_normals
-    support = poses_that_heard(mesh, known.evidence, known.resolution)
-    return Occupancy(mesh, support, spacing * distance, lattice, known.evidence, known.hull)
+    return Occupancy(mesh, spacing * distance, lattice, known.evidence, known.hull)
 
 
 def _by_all_evidence(known: Gathered, belief: Literal["open", "filled"]) -> Grid:

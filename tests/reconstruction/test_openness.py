@@ -235,10 +235,14 @@ def read(monkeypatch):
 
     def body(gathered, belief):
         mesh = sphere()
-        return SimpleNamespace(mesh=mesh, support=np.arange(len(mesh.vertices)))
+        return SimpleNamespace(mesh=mesh)
 
+    def gathered(*given):
+        return SimpleNamespace(hull=given[2], resolution=given[-1], evidence=None)
+
+    monkeypatch.setattr(read_out, "gather_evidence", gathered)
     monkeypatch.setattr(
-        read_out, "gather_evidence", lambda *given: SimpleNamespace(resolution=given[-1])
+        read_out, "poses_that_heard", lambda mesh, *given: np.arange(len(mesh.vertices))
     )
     monkeypatch.setattr(read_out, "estimate_occupancy", body)
     monkeypatch.setattr(read_out, "isosurface", lambda *given: sphere())

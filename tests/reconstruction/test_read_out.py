@@ -108,10 +108,13 @@ def whole():
     return read(sounding(RADIUS))
 
 
-def test_one_gathering_serves_all_methods(whole):
-    gathered = read(sounding(RADIUS), method="hull").gathered
-    together = read(sounding(RADIUS), gathered=gathered)
-    assert together.gathered is gathered
+def test_volume_and_evidence_serve_all_methods(whole):
+    earlier = read(sounding(RADIUS), method="hull", judge=False)
+    together = read(sounding(RADIUS), earlier=earlier)
+    assert together.gathered is earlier.gathered
+    assert together.volume is earlier.volume
+    assert earlier.openness is None
+    assert together.openness.kind == "closed"
     np.testing.assert_array_equal(whole.mesh.vertices, together.mesh.vertices)
 
 
