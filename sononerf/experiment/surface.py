@@ -72,6 +72,8 @@ def refine_surface(
         hull=fitted.hull,
         simulate=partial(surface_simulator, settings, rays=RAYS),
         seed=settings.fit.seed,
+        # The level of a recording is that of its microphone and its amplifier.
+        calibrated=store.attributes.get("origin") == "simulated",
     )
     digest = hashlib.sha256(b"".join(mesh.vertices.tobytes() for mesh in starts))
     identity = f"{model_checksum(path)} {digest.hexdigest()}"

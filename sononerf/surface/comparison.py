@@ -44,12 +44,21 @@ class Comparison:
         Onsets of the training poses.
     seed : int
         Of the rays.
+    calibrated : bool
+        Whether the measured level is absolute. Where not, one gain per surface is found first.
     """
 
     def __init__(
-        self, echoes: Echoes, optics: Optics, onsets: OnsetRanges | None, seed: int
+        self,
+        echoes: Echoes,
+        optics: Optics,
+        onsets: OnsetRanges | None,
+        seed: int,
+        *,
+        calibrated: bool = True,
     ) -> None:
         self.echoes, self.optics, self.onsets, self.seed = echoes, optics, onsets, seed
+        self.calibrated = calibrated
         chosen = np.linspace(0, len(echoes.validation) - 1, min(ASKED, len(echoes.validation)))
         self.poses = echoes.validation[chosen.astype(np.int64)]
 
@@ -67,25 +76,37 @@ class Comparison:
         """
         gain = level.gain.exp().cpu().numpy()[:, None]
         positions, rotations = self.echoes.positions, self.echoes.rotations
-        errors, weights = [], []
         try:
             if smooth:
                 mesh, _ = finer(mesh, np.zeros(len(mesh.vertices)), self.optics.wavelength)
             tracer = Tracer(self.optics, mesh, rays=RAYS, seed=self.seed)
-            for pose in self.poses.tolist():
-                heard = self.echoes.magnitude(pose).numpy()
-                rendered = gain * tracer.spectrogram(positions[pose], rotations[pose])
-                errors.append(_difference(heard, rendered))
-                weights.append(math.sqrt(float(heard.max())))
+            rendered = [
+                gain * tracer.spectrogram(positions[pose], rotations[pose])
+                for pose in self.poses.tolist()
+            ]
         except SonoNerfError:
             return math.inf
+        heard = [self.echoes.magnitude(pose).numpy() for pose in self.poses.tolist()]
+        weights = [math.sqrt(float(one.max())) for one in heard]
         if not sum(weights) > 0:
             return math.inf
+        common = 1.0 if self.calibrated else _common_gain(heard, rendered)
+        errors = [_difference(a, common * b) for a, b in zip(heard, rendered, strict=True)]
         found = float(np.average(errors, weights=weights))
         if self.onsets is not None:
             vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
             found += ONSETS * self.onsets.misfit(vertices)
         return found
+
+
+def _common_gain(heard: list[NDArray[np.float32]], rendered: list[NDArray[np.float32]]) -> float:
+    """Median ratio of the loudest cells of each pose, and ear, that is both heard and rendered."""
+    ratios = [
+        a.max(axis=(1, 2)) / np.maximum(b.max(axis=(1, 2)), 1e-30)
+        for a, b in zip(heard, rendered, strict=True)
+        if b.any()
+    ]
+    return float(np.median(np.concatenate(ratios))) if ratios else 1.0
 
 
 def _difference(heard: NDArray[np.float32], rendered: NDArray[np.float32]) -> float:

@@ -119,7 +119,7 @@ class Refinement:
         self._descent: Descent | None = None
         self._later: LaterBounces | None = None
         self._source = 0  # the candidate whose later bounces are added
-        self.comparison = Comparison(echoes, optics, self.onsets, seed)
+        self.comparison = Comparison(echoes, optics, self.onsets, seed, calibrated=calibrated)
 
     @property
     def total(self) -> int:

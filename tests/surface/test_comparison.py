@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -54,3 +55,12 @@ def test_training_poses_take_no_part(echoes, optics, level):
 def test_what_cannot_be_traced_is_infinitely_bad(echoes, optics, level):
     flat = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False)
     assert Comparison(echoes, optics, None, seed=0).objective(flat, level, smooth=False) == math.inf
+
+
+def test_without_an_absolute_level_one_gain_is_found(echoes, optics, level):
+    louder = dataclasses.replace(echoes, read=lambda number: 8 * echoes.read(number))
+    wrong = Comparison(louder, optics, None, seed=0).objective(ball(RADIUS), level, smooth=True)
+    free = Comparison(louder, optics, None, seed=0, calibrated=False)
+    right = Comparison(echoes, optics, None, seed=0).objective(ball(RADIUS), level, smooth=True)
+    found = free.objective(ball(RADIUS), level, smooth=True)
+    assert found < right + 0.3 < wrong - 2.0
