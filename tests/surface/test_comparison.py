@@ -58,7 +58,7 @@ def test_what_cannot_be_traced_is_infinitely_bad(echoes, optics, level):
 
 
 def test_without_an_absolute_level_one_gain_is_found(echoes, optics, level):
-    louder = dataclasses.replace(echoes, read=lambda number: 8 * echoes.read(number))
+    louder = dataclasses.replace(echoes, read=lambda number: 8 * echoes.read(number), _kept={})
     wrong = Comparison(louder, optics, None, seed=0).objective(ball(RADIUS), level, smooth=True)
     free = Comparison(louder, optics, None, seed=0, calibrated=False)
     right = Comparison(echoes, optics, None, seed=0).objective(ball(RADIUS), level, smooth=True)
