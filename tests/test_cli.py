@@ -786,7 +786,7 @@ def test_sigterm_stops_a_fit_in_time_and_the_same_command_goes_on(clean, fit_alo
     asked = time.monotonic()
     process.send_signal(signal.SIGTERM)
     out, err = process.communicate(timeout=60)
-    assert time.monotonic() - asked < 10  # 5 s alone; other test processes run beside it
+    assert time.monotonic() - asked < 5
     assert (process.returncode, out) == (143, "")
     last = err.strip().splitlines()[-1]
     assert last.startswith("stopped at step ")

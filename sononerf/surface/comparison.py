@@ -45,7 +45,7 @@ class Comparison:
     seed : int
         Of the rays.
     calibrated : bool
-        Whether the measured level is absolute. Where not, one gain per surface is found first.
+        Whether the measured level is absolute. If it is not, each surface gets one gain first.
     """
 
     def __init__(
@@ -100,13 +100,10 @@ class Comparison:
 
 
 def _common_gain(heard: list[NDArray[np.float32]], rendered: list[NDArray[np.float32]]) -> float:
-    """Median ratio of the loudest cells of each pose, and ear, that is both heard and rendered."""
-    ratios = [
-        a.max(axis=(1, 2)) / np.maximum(b.max(axis=(1, 2)), 1e-30)
-        for a, b in zip(heard, rendered, strict=True)
-        if b.any()
-    ]
-    return float(np.median(np.concatenate(ratios))) if ratios else 1.0
+    """Median over poses and ears of the loudest heard over the loudest rendered magnitude."""
+    a, b = (np.stack(part).max(axis=(2, 3)) for part in (heard, rendered))
+    both = (a > 0) & (b > 0)
+    return float(np.median(a[both] / b[both])) if both.any() else 1.0
 
 
 def _difference(heard: NDArray[np.float32], rendered: NDArray[np.float32]) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-r"""Where the body is, for all that the onsets and the fitted field tell, and its surface.
+r"""Estimate where the body is from the onsets and the fitted field, and extract its surface.
 
 Three kinds of evidence meet in one signed distance, see :mod:`sononerf.surface.distance`:
 
@@ -8,7 +8,7 @@ Three kinds of evidence meet in one signed distance, see :mod:`sononerf.surface.
 - *free space*: what lies in front of an onset is empty, and with no other evidence the body reaches
   as far as the onsets let it;
 - *winding number*: where that of the oriented points is negative, mostly backs of surfaces are
-  seen. Such a place is outside, however far the onsets let a body reach (a hollow, a gap).
+  seen. Such a place is outside, even if the onsets allow a body there (a hollow, a gap).
 
 Few poses face a flat side, so the winding number may be wrong about it; and a field that is fitted
 badly is wrong everywhere. How much of this is believed is the ``Belief``; the caller chooses it by
@@ -87,19 +87,6 @@ class Occupancy:
     lattice: Lattice
     evidence: Evidence
     hull: EchoHull
-
-    def possible(self, points: Array, tolerance: float) -> NDArray[np.bool_]:
-        """Return whether something may be at places (N, 3), m.
-
-        Parameters
-        ----------
-        points : (N, 3) float, m
-            World frame.
-        tolerance : float, m
-            How far from it something may be.
-        """
-        near = self.lattice.read(self.distance, points) <= tolerance + self.lattice.spacing
-        return np.asarray(near & (self.hull.clearance(points)[0] >= -tolerance))
 
 
 @dataclass(frozen=True, eq=False)

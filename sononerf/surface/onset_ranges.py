@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
 r"""How far the nearest point of a surface is from where each pose's first echo began.
 
-The nearest point of a body always answers, be it an edge or a corner that hardly reflects. So the
-least range over the surface must be the onset. Physical optics alone does not tell this: where a
-pose hears a quiet edge only, it can as well make the edge quieter by cutting it off.
+The nearest point of a body always sends an echo, even if it is an edge or a corner. So the least
+range over the surface must be the onset. Physical optics alone does not ensure this: if a pose
+hears only a quiet edge, the descent can make the edge quieter by cutting it off.
+
+Up to the accuracy of the detector the misfit is quadratic, beyond it is linear (Huber's loss).
 """
 
 from __future__ import annotations
@@ -13,12 +15,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sononerf.echoes.consistency import ACCURACY
 from sononerf.echoes.free_space import EchoHull
 
-USUAL = 0.1
-"""Error of an onset up to which the misfit is quadratic, range resolutions; beyond it is linear. It
-is the accuracy of the detector, :data:`sononerf.echoes.consistency.ACCURACY`."""
-_POSES = 64  # drawn per step, a bound of time; single poses are noisy, and eight hear too little
+_POSES = 64  # drawn per step, to bound the time
 
 
 class OnsetRanges:
@@ -35,7 +35,7 @@ class OnsetRanges:
     """
 
     def __init__(self, hull: EchoHull, resolution: float, seed: int) -> None:
-        self.scale, self.seed = USUAL * resolution, seed
+        self.scale, self.seed = ACCURACY * resolution, seed
         known = np.isfinite(hull.trusted)
         pose, ear = np.nonzero(known)
         self._first = hull.trusted[known]

@@ -183,29 +183,6 @@ class Refinement:
         self.start = int(np.argmin(objectives))
         self.candidates, self.objectives = [self.candidates[self.start]], [min(objectives)]
 
-    def _on(
-        self,
-        mesh: trimesh.Trimesh,
-        level: Level,
-        smoothing: float,
-        rate: float,
-        later: LaterBounces | None = None,
-        correction: Correction | None = None,
-    ) -> Descent:
-        return Descent(
-            mesh,
-            self.echoes,
-            self.optics,
-            level,
-            smoothing=smoothing * self.optics.wavelength,
-            rate=rate,
-            later=later,
-            correction=correction,
-            # The simulator's correction is better than the onsets.
-            onsets=None if correction is not None else self.onsets,
-            seed=self.seed,
-        )
-
     def _descend(self, mesh: trimesh.Trimesh) -> Descent:
         stage = self.stages[self.stage]
         last = self.stage == len(self.stages) - 1
@@ -218,7 +195,19 @@ class Refinement:
         elif stage.beyond == "trace" or self._later is None:
             source = self.candidates[self._source]
             self._later = LaterBounces(self.optics, source, self.echoes, seed=self.seed)
-        return self._on(mesh, self.level, stage.smoothing, stage.rate, self._later, correction)
+        return Descent(
+            mesh,
+            self.echoes,
+            self.optics,
+            self.level,
+            smoothing=stage.smoothing * self.optics.wavelength,
+            rate=stage.rate,
+            later=self._later,
+            correction=correction,
+            # The simulator's correction is more exact than the onsets.
+            onsets=None if correction is not None else self.onsets,
+            seed=self.seed,
+        )
 
     def _correction(self, mesh: trimesh.Trimesh) -> Correction | None:
         """Return the correction on a surface; None where it cannot be simulated."""

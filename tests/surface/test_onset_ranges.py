@@ -6,8 +6,9 @@ import pytest
 import torch
 import trimesh
 
+from sononerf.echoes.consistency import ACCURACY
 from sononerf.echoes.free_space import EchoHull
-from sononerf.surface.onset_ranges import USUAL, OnsetRanges
+from sononerf.surface.onset_ranges import OnsetRanges
 
 RESOLUTION = 0.006
 
@@ -35,8 +36,8 @@ def box():
 def test_the_body_itself_has_no_misfit_and_a_smaller_one_has(box):
     onsets = OnsetRanges(heard(box), RESOLUTION, seed=0)
     assert onsets.misfit(vertices_of(box)) == pytest.approx(0.0, abs=1e-9)
-    off = 2.0 * USUAL * RESOLUTION
-    smaller = box.copy().apply_translation([0, 0, 0])
+    off = 2.0 * ACCURACY * RESOLUTION
+    smaller = box.copy()
     smaller.vertices *= 1 - off / 0.04
     assert 0.5 < onsets.misfit(vertices_of(smaller)) < 2.5
 
