@@ -47,6 +47,7 @@ class SurfaceMethod(StrEnum):
     open = "open"
     filled = "filled"
     hull = "hull"
+    sheet = "sheet"
     isosurface = "isosurface"
 
 
@@ -328,10 +329,10 @@ def reconstruct(
     method: Annotated[
         SurfaceMethod | None,
         typer.Option(
-            help="How the surface is read out. open, filled, hull: from field and first echoes; "
-            "open opens hollows and gaps, filled leaves them closed, hull takes the first echoes "
-            "alone. isosurface: where the field has one value. auto: the best of the first three, "
-            "refined. A method other than auto is not refined."
+            help="How the surface is read out. open, filled, hull, sheet: from field and first "
+            "echoes; open opens hollows and gaps, filled leaves them closed, hull takes the first "
+            "echoes alone, sheet is for a thin sheet. isosurface: where the field has one value. "
+            "auto: the best of the first four, refined. A method other than auto is not refined."
         ),
     ] = None,
     level: Annotated[

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
@@ -42,8 +42,9 @@ OPEN = {
     "is left out",
 }
 """What is said of surfaces that do not enclose a body."""
-REFINED: tuple[Method, ...] = ("open", "filled", "hull")
-"""Start surfaces: the one that explains the validation poses best is refined."""
+REFINED: tuple[Method, ...] = ("open", "filled", "hull", "sheet")
+"""Start surfaces: the one that explains the validation poses best is refined, see
+:class:`~sononerf.surface.refine.Refinement`."""
 UNREFINED: tuple[Method, ...] = ("filled", "hull")
 """Without refinement the first of these that gives a surface is taken."""
 FORMATS: tuple[MeshFormat, ...] = ("ply", "stl", "glb")
@@ -74,7 +75,7 @@ def reconstruct(
         Voxel size; the settings' where None.
     level : float, "auto" or None
         A number asks for an iso-surface of this level; the settings' where None.
-    method : {"auto", "open", "filled", "hull", "isosurface"} or None
+    method : {"auto", "open", "filled", "hull", "sheet", "isosurface"} or None
         How the surface is read out; the settings' where None.
     output : Path or None
         Folder of the results; ``RUN/reconstruction`` where None.
@@ -119,10 +120,11 @@ def reconstruct(
             RunFolder(path).drop_metrics("geometry")  # of the mesh that is replaced
         found, refined = starts[0], None
         if refines:
-            meshes = [start.mesh for start in starts]
+            meshes: dict[str, trimesh.Trimesh] = {start.method: start.mesh for start in starts}
             refined = _refined(path, fitted, meshes, accelerator, progress)
         if refined is not None:
-            found = replace(starts[refined.start], mesh=refined.mesh)
+            start = next(start for start in starts if start.method == refined.start)
+            found = replace(start, mesh=refined.mesh)
         found = judged(found, None if refined is None else refined.support.round().astype(np.int32))
         _write(folder, found, refined, true_mesh(fitted))
     if found.openness is not None and found.openness.kind in OPEN:
@@ -187,7 +189,7 @@ def _read_out(
 def _refined(
     path: Path,
     fitted: Fitted,
-    starts: Sequence[trimesh.Trimesh],
+    starts: Mapping[str, trimesh.Trimesh],
     accelerator: str,
     progress: Progress,
 ) -> Refined | None:

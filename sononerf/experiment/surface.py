@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 
@@ -34,7 +34,7 @@ RAYS = 20_000
 def refine_surface(
     path: Path,
     fitted: Fitted,
-    starts: Sequence[trimesh.Trimesh],
+    starts: Mapping[str, trimesh.Trimesh],
     *,
     accelerator: str = "auto",
     progress: Progress,
@@ -47,8 +47,8 @@ def refine_surface(
         The run's folder; the state is kept there until the refinement is done.
     fitted : Fitted
         The run.
-    starts : sequence of Trimesh
-        Surfaces to start from, m; the one that explains the validation poses best is refined.
+    starts : mapping of str to Trimesh
+        Surfaces to start from, m, by the method that they were read out by.
     accelerator : {"auto", "cpu", "gpu"}
         What to compute on.
     progress : Progress
@@ -64,7 +64,7 @@ def refine_surface(
     require_accelerator(accelerator)
     settings = fitted.settings
     store = store_of(fitted)
-    optics = optics_of(settings, quiet_scene(starts[0])).to(_device(accelerator))
+    optics = optics_of(settings, quiet_scene(next(iter(starts.values())))).to(_device(accelerator))
     work = Refinement(
         starts,
         Echoes.of(store),
@@ -75,7 +75,7 @@ def refine_surface(
         # The level of a recording is that of its microphone and its amplifier.
         calibrated=store.attributes.get("origin") == "simulated",
     )
-    digest = hashlib.sha256(b"".join(mesh.vertices.tobytes() for mesh in starts))
+    digest = hashlib.sha256(b"".join(mesh.vertices.tobytes() for mesh in starts.values()))
     identity = f"{model_checksum(path)} {digest.hexdigest()}"
     file = path / STATE
     _restore(file, work, identity)

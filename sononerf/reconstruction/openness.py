@@ -16,15 +16,13 @@ import trimesh
 from numpy.typing import NDArray
 
 from sononerf.geometry.raycast import RayCaster
+from sononerf.surface.sheet import THIN
 
 Array = NDArray[np.float64]
 FACING = 0.1
 """Least cosine between a triangle's normal and the way to a pose that it faces."""
 UNSEEN_SHARE = 0.25
 """Fraction of the area: if more than this cannot have been heard, the surface is one-sided."""
-THIN = 0.7
-"""Range resolutions: a place is thin if its other side is nearer than this. The sides of a sheet
-share one echo, so neither is known to better than a fraction of the resolution."""
 THIN_SHARE = 0.75
 """Fraction of the area: if more than this is thin, the surface is a sheet."""
 _LIFT = 1e-3  # of the root of a triangle's area: so far inside the search for the other side begins

@@ -21,6 +21,7 @@ from sononerf.reconstruction.isosurface import automatic_level, isosurface
 from sononerf.reconstruction.openness import Openness, judge_openness, without_unseen
 from sononerf.reconstruction.volume import Volume, grid_over, volume_from_function
 from sononerf.surface.occupancy import Gathered, estimate_occupancy, gather_evidence
+from sononerf.surface.sheet import fit_sheet
 from sononerf.surface.support import poses_that_heard
 
 Array = NDArray[np.float64]
@@ -29,9 +30,10 @@ _FAINTEST = (
 )
 _CHUNK = 16_384  # places at a time, a bound of memory
 
-Method = Literal["open", "filled", "hull", "isosurface"]
+Method = Literal["open", "filled", "hull", "sheet", "isosurface"]
 """How a surface is read out. The first three are the surface of the occupancy, see
-:mod:`sononerf.surface.occupancy`; ``isosurface`` is drawn in the volume of the field."""
+:mod:`sononerf.surface.occupancy`; ``sheet`` is one thin body, see :mod:`sononerf.surface.sheet`;
+``isosurface`` is drawn in the volume of the field."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class Reconstruction:
         The field's energy, or its loudness for an iso-surface.
     level : float or None
         Of the iso-surface, in the unit of the volume; None for other methods.
-    method : {"open", "filled", "hull", "isosurface"}
+    method : {"open", "filled", "hull", "sheet", "isosurface"}
         How the surface was read out.
     openness : Openness or None
         What kind of surface it is; None for an iso-surface.
@@ -92,7 +94,7 @@ def reconstruct(
         Voxel size; half of the field's own resolution where None.
     level : float or "auto"
         Value of the volume on the iso-surface; by Otsu's rule where "auto".
-    method : {"auto", "open", "filled", "hull", "isosurface"}
+    method : {"auto", "open", "filled", "hull", "sheet", "isosurface"}
         ``auto`` is ``isosurface`` where a level or no hull is given, else ``filled``.
     directions : int
         Size of the spherical lattice that is summed over where the field has no lobes.
@@ -119,8 +121,9 @@ def reconstruct(
         If the spacing is larger than the region, a level is given to a method that has none, or
         there is no hull for a method that needs it.
     NumericalError
-        If there is no surface: nothing was heard, the onsets contradict one another, or, for an
-        iso-surface, the field is silent everywhere or nowhere at the level.
+        If there is no surface: nothing was heard, the onsets contradict one another, the evidence
+        does not lie on one sheet, or, for an iso-surface, the field is silent everywhere or nowhere
+        at the level.
     ResourceError
         If the grid does not fit in memory.
     """
@@ -145,8 +148,8 @@ def reconstruct(
         wide = resolution or 1.5 * field.resolution
         places = _places(field, lower, upper, directions)
         gathered = gather_evidence(field, places, hull, lower, upper, step, wide)
-    body = estimate_occupancy(gathered, chosen)
-    found = Reconstruction(body.mesh, volume, None, chosen, gathered=gathered)
+    mesh = fit_sheet(gathered) if chosen == "sheet" else estimate_occupancy(gathered, chosen).mesh
+    found = Reconstruction(mesh, volume, None, chosen, gathered=gathered)
     return judged(found) if judge else found
 
 

@@ -166,9 +166,9 @@ class Rays(Engine):
     ) -> None:
         """Tell a listener what is heard after the first bounce; edges are left out."""
         first, second, _ = np.random.default_rng(seed).random(3)
-        for bounce in self._paths(position, rotation, (first, second), self.bounces):
-            if bounce.number > 1:
-                self._hear(sound, sound, bounce, position, rotation, [])
+        paths = self._paths(position, rotation, (first, second), self.bounces)
+        for bounce in gathered(bounce for bounce in paths if bounce.number > 1):
+            self._hear(sound, sound, bounce, position, rotation, [])
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_diffraction": None, "_outlines": None}

@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -32,7 +32,11 @@ SIMULATED = 96
 Simulate = Callable[[trimesh.Trimesh], Simulator]
 TOLERATED = 1.15
 """Objectives of validation poses that differ by less than this factor differ by chance. A later
-stage is preferred up to it."""
+stage, and a sheet, are preferred up to it."""
+Way = Literal["blurred", "sharp", "sheet"]
+"""How a surface goes through the stages: with the blur and the edges of each stage; without blur on
+fine triangles; or as a sheet, whose triangles stay as they are because a signed distance on voxels
+would tear it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,21 +51,21 @@ class Refined:
         What rendered magnitudes are multiplied by, learned on training poses.
     support : (V,) float64
         How many training poses see each vertex near the direction of a mirror.
-    start : int
-        Which of the starts was refined.
+    start : str
+        Name of the start that was refined.
     kept : bool
         True where the refined surface explains the validation poses better than the start.
     error_db : float
         Objective on validation poses, see :class:`~sononerf.surface.comparison.Comparison`.
     history : list of dict
-        Per stage: its number, whether it is sharp, the mismatch of its last step, and the objective
-        on validation poses after it.
+        Per stage: its number, its way, the mismatch of its last step, and the objective on
+        validation poses after it.
     """
 
     mesh: trimesh.Trimesh
     gain: NDArray[np.float64]
     support: NDArray[np.float64]
-    start: int
+    start: str
     kept: bool
     error_db: float
     history: list[dict[str, Any]]
@@ -72,8 +76,9 @@ class Refinement:
 
     Parameters
     ----------
-    meshes : sequence of Trimesh
-        Where to start, m; of several the one that explains the validation poses best.
+    meshes : mapping of str to Trimesh
+        Where to start, m; of several the one that explains the validation poses best. One that is
+        called ``sheet`` is a sheet: it takes part in the first stage beside the best of the others.
     echoes : Echoes
         What was measured.
     optics : Optics
@@ -93,7 +98,7 @@ class Refinement:
 
     def __init__(
         self,
-        meshes: Sequence[trimesh.Trimesh],
+        meshes: Mapping[str, trimesh.Trimesh],
         echoes: Echoes,
         optics: Optics,
         *,
@@ -109,13 +114,16 @@ class Refinement:
         like = optics.get_buffer("wavenumber")
         self.level = Level(optics.ears, len(optics.frequencies), like)
         self.onsets = None if hull is None else OnsetRanges(hull, optics.resolution, seed)
-        self.candidates = [_plain(mesh) for mesh in meshes]
+        self.starts = {name: _plain(mesh) for name, mesh in meshes.items()}
+        self.candidates: list[trimesh.Trimesh] = []
         self.objectives: list[float] = []
-        self.start: int | None = None
+        self.start: str | None = None
         self.stage, self.step, self.drawn = 0, 0, 0
-        self.sharp = False
+        ways: list[Way] = ["blurred", "sharp"] if set(meshes) - {"sheet"} else []
+        self.ways: list[Way] = [*ways, "sheet"] if "sheet" in meshes else ways
+        self.way = self.ways[0]
         self.history: list[dict[str, Any]] = []
-        self._rival: trimesh.Trimesh | None = None
+        self._rivals: list[trimesh.Trimesh] = []  # what the first stage made in each way
         self._descent: Descent | None = None
         self._later: LaterBounces | None = None
         self._source = 0  # the candidate whose later bounces are added
@@ -124,7 +132,8 @@ class Refinement:
     @property
     def total(self) -> int:
         """Number of steps of all stages."""
-        return self.stages[0].steps + sum(stage.steps for stage in self.stages)
+        repeated = (len(self.ways) - 1) * self.stages[0].steps
+        return repeated + sum(stage.steps for stage in self.stages)
 
     @property
     def done(self) -> bool:
@@ -137,12 +146,9 @@ class Refinement:
         if self.start is None:
             self._choose()
         if self._descent is None:
-            unit = self.optics.wavelength
-            edge, blur = (SHARP, 0.0) if self.sharp else (stage.edge, stage.blur)
-            made = remesh(self.candidates[-1], min(edge, stage.edge) * unit, blur * unit)
             if stage.beyond == "trace":
                 self._source = len(self.candidates) - 1
-            self._descent = self._descend(self.candidates[-1] if made is None else made)
+            self._descent = self._descend(self._prepared())
         mismatch = self._descent.step(self.drawn, self.step / stage.steps)
         self.step += 1
         self.drawn += 1
@@ -150,38 +156,62 @@ class Refinement:
             self._finish(mismatch)
         return mismatch
 
+    def _prepared(self) -> trimesh.Trimesh:
+        """Return the surface that a stage begins with."""
+        stage, unit = self.stages[self.stage], self.optics.wavelength
+        if self.way == "sheet":
+            return self.starts["sheet"] if self.stage == 0 else self.candidates[-1]
+        edge, blur = (SHARP, 0.0) if self.way == "sharp" else (stage.edge, stage.blur)
+        made = remesh(self.candidates[-1], min(edge, stage.edge) * unit, blur * unit)
+        return self.candidates[-1] if made is None else made
+
     def _finish(self, mismatch: float) -> None:
-        """End a stage; the first one is done twice."""
+        """End a stage; the first one is done in each way."""
         assert self._descent is not None
         mesh, self._descent, self.step = self._descent.mesh(), None, 0
         objective = self.comparison.objective(mesh, self.level, smooth=True)
         self.history.append(
             {
                 "stage": self.stage,
-                "sharp": self.sharp,
+                "way": self.way,
                 "mismatch_db": mismatch,
                 "objective_db": objective,
             }
         )
-        if self.stage == 0 and self._rival is None:
-            self._rival, self.sharp = mesh, True
-            self.level.reset()
-            return
         if self.stage == 0:
-            blurred = self.history[-2]["objective_db"]
-            if blurred <= objective:
-                mesh, objective, self.sharp = self._rival, blurred, False
+            self._rivals.append(mesh)
+            if len(self._rivals) < len(self.ways):
+                self.way = self.ways[len(self._rivals)]
+                self.level.reset()
+                return
+            mesh, objective = self._best_way()
         self.candidates.append(mesh)
         self.objectives.append(objective)
         self.stage += 1
 
+    def _best_way(self) -> tuple[trimesh.Trimesh, float]:
+        """Go on in the best way; return what the first stage made in it, and its objective."""
+        found = [one["objective_db"] for one in self.history]
+        best = int(np.argmin(found))
+        if self.ways[-1] == "sheet" and found[-1] <= TOLERATED * found[best]:
+            best = len(found) - 1
+            if self.start != "sheet":
+                self._begin({"sheet": self.starts["sheet"]})
+        self.way = self.ways[best]
+        return self._rivals[best], found[best]
+
     def _choose(self) -> None:
-        """Keep the start that explains the validation poses best."""
-        objectives = [
-            self.comparison.objective(mesh, self.level, smooth=False) for mesh in self.candidates
-        ]
-        self.start = int(np.argmin(objectives))
-        self.candidates, self.objectives = [self.candidates[self.start]], [min(objectives)]
+        """Begin with the start that explains the validation poses best."""
+        bodies = {name: mesh for name, mesh in self.starts.items() if name != "sheet"}
+        self._begin(bodies or self.starts)
+
+    def _begin(self, starts: dict[str, trimesh.Trimesh]) -> None:
+        objectives = {
+            name: self.comparison.objective(mesh, self.level, smooth=False)
+            for name, mesh in starts.items()
+        }
+        self.start = min(objectives, key=lambda name: objectives[name])
+        self.candidates, self.objectives = [starts[self.start]], [objectives[self.start]]
 
     def _descend(self, mesh: trimesh.Trimesh) -> Descent:
         stage = self.stages[self.stage]
@@ -223,21 +253,22 @@ class Refinement:
 
     def state(self) -> dict[str, Tensor]:
         """Return all that is needed to go on, as plain tensors."""
-        start = -1 if self.start is None else self.start
+        start = -1 if self.start is None else list(self.starts).index(self.start)
+        way = self.ways.index(self.way)
         found = {
-            "progress": torch.tensor(
-                [self.stage, self.step, self.drawn, start, int(self.sharp), self._source]
-            ),
+            "progress": torch.tensor([self.stage, self.step, self.drawn, start, way, self._source]),
             "objectives": torch.tensor(self.objectives, dtype=torch.float64),
             "history": torch.tensor(
-                [[float(part) for part in one.values()] for one in self.history],
+                [
+                    (one["stage"], self.ways.index(one["way"]), *list(one.values())[2:])
+                    for one in self.history
+                ],
                 dtype=torch.float64,
             ).reshape(-1, 4),
             **{f"level.{name}": part for name, part in self.level.state().items()},
         }
         meshes = {f"candidate.{number}": mesh for number, mesh in enumerate(self.candidates)}
-        if self._rival is not None:
-            meshes["rival"] = self._rival
+        meshes.update({f"rival.{number}": mesh for number, mesh in enumerate(self._rivals)})
         for name, mesh in meshes.items():
             found[f"{name}.vertices"] = torch.as_tensor(np.array(mesh.vertices))
             found[f"{name}.faces"] = torch.as_tensor(np.array(mesh.faces))
@@ -248,21 +279,23 @@ class Refinement:
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Go on from a state; meshes, echoes, optics, seed and stages must be the same."""
-        self.stage, self.step, self.drawn, start, sharp, self._source = (
+        self.stage, self.step, self.drawn, start, way, self._source = (
             int(part) for part in state["progress"]
         )
-        self.start, self.sharp = None if start < 0 else start, bool(sharp)
+        self.start = None if start < 0 else list(self.starts)[start]
+        self.way = self.ways[way]
         self.objectives = state["objectives"].tolist()
-        names = ("stage", "sharp", "mismatch_db", "objective_db")
-        kinds = (int, bool, float, float)
         self.history = [
-            {name: kind(part) for name, kind, part in zip(names, kinds, row, strict=True)}
-            for row in state["history"].tolist()
+            {
+                "stage": int(stage),
+                "way": self.ways[int(way)],
+                "mismatch_db": mismatch,
+                "objective_db": objective,
+            }
+            for stage, way, mismatch, objective in state["history"].tolist()
         ]
         self.level.load({name: state[f"level.{name}"] for name in self.level.state()})
-        count = sum(key.endswith(".vertices") and key.startswith("candidate.") for key in state)
-        self.candidates = [_mesh(state, f"candidate.{number}") for number in range(count)]
-        self._rival = _mesh(state, "rival") if "rival.vertices" in state else None
+        self.candidates, self._rivals = _meshes(state, "candidate"), _meshes(state, "rival")
         self._later, self._descent = None, None
         parts = {k.removeprefix("descent."): v for k, v in state.items() if k[:8] == "descent."}
         if parts:
@@ -282,14 +315,18 @@ class Refinement:
         if best:
             mesh, support = finer(mesh, support, self.optics.wavelength)
         gain = self.level.gain.exp().double().cpu().numpy()
-        start = self.start or 0
+        assert self.start is not None
         error = self.objectives[best]
-        return Refined(mesh, gain, support, start, best > 0, error, self.history)
+        return Refined(mesh, gain, support, self.start, best > 0, error, self.history)
 
 
-def _mesh(state: dict[str, Tensor], name: str) -> trimesh.Trimesh:
-    vertices, faces = (state[f"{name}.{part}"].numpy() for part in ("vertices", "faces"))
-    return trimesh.Trimesh(vertices, faces, process=False)
+def _meshes(state: dict[str, Tensor], name: str) -> list[trimesh.Trimesh]:
+    """Return the meshes ``name.0``, ``name.1`` and so on of a state."""
+    found: list[trimesh.Trimesh] = []
+    while f"{name}.{len(found)}.vertices" in state:
+        parts = (state[f"{name}.{len(found)}.{part}"].numpy() for part in ("vertices", "faces"))
+        found.append(trimesh.Trimesh(*parts, process=False))
+    return found
 
 
 def _plain(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

@@ -59,7 +59,9 @@ def run(fitted_run, tmp_path, monkeypatch):
 
 
 def refined(path, start=BUMPY, progress=QUIET):
-    return refine_surface(path, load_fitted(path), [start], accelerator="cpu", progress=progress)
+    return refine_surface(
+        path, load_fitted(path), {"filled": start}, accelerator="cpu", progress=progress
+    )
 
 
 def test_a_run_has_its_refined_surface(run, monkeypatch):
@@ -72,7 +74,9 @@ def test_a_run_has_its_refined_surface(run, monkeypatch):
 
     def noted(path, fitted, starts, *, accelerator, progress):
         asked.append(accelerator)
-        return refine_surface(path, fitted, [BUMPY], accelerator=accelerator, progress=progress)
+        return refine_surface(
+            path, fitted, {"filled": BUMPY}, accelerator=accelerator, progress=progress
+        )
 
     monkeypatch.setattr(reconstruct_module, "refine_surface", noted)
     monkeypatch.setattr(
@@ -95,7 +99,7 @@ def test_without_its_echoes_a_surface_is_not_refined(run, monkeypatch):
     (run / "model.json").write_text(description.replace(str(store), str(store) + "-gone"))
     heard = Heard()
     fitted = load_fitted(run)
-    assert reconstruct_module._refined(run, fitted, [BUMPY], "cpu", heard) is None
+    assert reconstruct_module._refined(run, fitted, {"filled": BUMPY}, "cpu", heard) is None
     (line,) = heard.said
     assert line.startswith("the surface is not refined: ")
     assert "is not there" in line
@@ -122,11 +126,11 @@ def test_an_interrupted_refinement_goes_on_to_the_same_surface(run, monkeypatch)
 
     monkeypatch.setattr(Refinement, "advance", stops)
     with pytest.raises(KeyboardInterrupt):
-        refine_surface(run, hasty, [BUMPY], accelerator="cpu", progress=QUIET)
+        refine_surface(run, hasty, {"filled": BUMPY}, accelerator="cpu", progress=QUIET)
     assert (run / STATE).is_file()
     more = []
     monkeypatch.setattr(Refinement, "advance", lambda self: more.append(self.drawn) or real(self))
-    again = refine_surface(run, hasty, [BUMPY], accelerator="cpu", progress=QUIET)
+    again = refine_surface(run, hasty, {"filled": BUMPY}, accelerator="cpu", progress=QUIET)
     assert more == [4, 5, 6, 7, 8]  # the first stage is done twice
     np.testing.assert_array_equal(again.mesh.vertices, whole.mesh.vertices)
     assert not (run / STATE).exists()
@@ -140,7 +144,7 @@ def test_a_state_that_does_not_fit_is_ignored(run, what):
     else:
         fitted = load_fitted(run)
         work = module.Refinement(
-            [BUMPY.copy().apply_scale(1.1)],
+            {"filled": BUMPY.copy().apply_scale(1.1)},
             module.Echoes.of(module.store_of(fitted)),
             module.optics_of(fitted.settings, module.quiet_scene(BUMPY)),
             simulate=lambda mesh: None,
@@ -154,4 +158,4 @@ def test_a_state_that_does_not_fit_is_ignored(run, what):
 def test_a_gpu_that_is_not_there_is_refused(run, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ResourceError, match="no GPU"):
-        refine_surface(run, load_fitted(run), [BUMPY], accelerator="gpu", progress=QUIET)
+        refine_surface(run, load_fitted(run), {"filled": BUMPY}, accelerator="gpu", progress=QUIET)

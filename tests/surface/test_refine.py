@@ -34,7 +34,9 @@ def refined(mesh, echoes, optics, **given):
 
 
 def started(mesh, echoes, optics, *, simulate=unasked, stages=None):
-    return Refinement([mesh], echoes, optics, simulate=simulate, seed=1, stages=stages or SHORT)
+    return Refinement(
+        {"body": mesh}, echoes, optics, simulate=simulate, seed=1, stages=stages or SHORT
+    )
 
 
 SHORT = (
@@ -61,7 +63,10 @@ def test_a_bumpy_sphere_becomes_round(bumpy, echoes, optics):
     assert found.kept
     assert len(found.support) == len(found.mesh.vertices)
     assert found.gain.shape == (2, len(optics.frequencies))
-    assert [(one["stage"], one["sharp"]) for one in found.history][:2] == [(0, False), (0, True)]
+    assert [(one["stage"], one["way"]) for one in found.history][:2] == [
+        (0, "blurred"),
+        (0, "sharp"),
+    ]
     assert [one["stage"] for one in found.history] == [0, 0, 1]
 
     def off(mesh):
@@ -85,15 +90,15 @@ def test_a_surface_that_gets_worse_is_not_kept(echoes, optics, monkeypatch):
 
 def test_of_two_starts_the_one_that_explains_more_is_refined(bumpy, echoes, optics):
     half = bumpy.copy().apply_scale(0.5)
-    for place, starts in ((0, [bumpy, half]), (1, [half, bumpy])):
+    for starts in ({"whole": bumpy, "half": half}, {"half": half, "whole": bumpy}):
         work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
         work.advance()
-        assert work.start == place
+        assert work.start == "whole"
         assert len(work.candidates) == 1
         np.testing.assert_array_equal(work.candidates[0].vertices, bumpy.vertices)
         again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
         again.load(work.state())
-        assert again.start == place
+        assert again.start == "whole"
 
 
 @pytest.fixture
@@ -194,18 +199,56 @@ def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
 def test_the_better_of_the_blurred_and_the_sharp_surface_goes_on(
     bumpy, echoes, optics, monkeypatch
 ):
-    for worse, sharp in ((False, True), (True, False)):
+    for worse, better in (("blurred", "sharp"), ("sharp", "blurred")):
         work = started(bumpy, echoes, optics)
         monkeypatch.setattr(
             work.comparison,
             "objective",
-            lambda *a, work=work, worse=worse, **k: 9.0 if work.sharp == worse else 1.0,
+            lambda *a, work=work, worse=worse, **k: 9.0 if work.way == worse else 1.0,
         )
         ends = []
         while work.stage == 0:
             work.advance()
             if work.step == 0:
-                ends.append(work._rival if work.stage == 0 else work.candidates[-1])
-        assert work.sharp is sharp
-        assert (ends[1] is ends[0]) is not sharp
+                ends.append(work._rivals[-1] if work.stage == 0 else work.candidates[-1])
+        assert work.way == better
+        assert (ends[1] is ends[0]) == (better == "blurred")
         assert len(work.candidates) == 2
+
+
+def slab(height):
+    """A thin plate, thinner than any voxel of the stages."""
+    plate = trimesh.creation.box((0.02, 0.02, height))
+    return plate.subdivide().subdivide().subdivide().subdivide()
+
+
+def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
+    bumpy, echoes, optics, monkeypatch
+):
+    thin = slab(2e-4)
+    for value, start in ((1.1, "sheet"), (2.0, "body")):
+        starts = {"body": bumpy, "sheet": thin}
+        work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        monkeypatch.setattr(
+            work.comparison,
+            "objective",
+            lambda *a, work=work, value=value, **k: value if work.way == "sheet" else 1.0,
+        )
+        while not work.done:
+            work.advance()
+        assert work.drawn == work.total
+        assert work.start == start
+        again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        again.load(work.state())
+        assert (again.start, again.way) == (start, work.way)
+        assert again.history == work.history
+        if start == "sheet":
+            assert all(len(mesh.faces) == len(thin.faces) for mesh in work.candidates)
+
+
+def test_a_sheet_alone_is_refined(echoes, optics):
+    work = Refinement({"sheet": slab(2e-4)}, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+    while not work.done:
+        work.advance()
+    assert work.result().start == "sheet"
+    assert {one["way"] for one in work.history} == {"sheet"}
