@@ -17,6 +17,7 @@ from sononerf.surface.mesh_operators import MeshOperators, smoothing_passes, uni
 from sononerf.surface.objective import Level, measured, mismatch
 from sononerf.surface.onset_ranges import OnsetRanges
 from sononerf.surface.optics import Heard, Optics
+from sononerf.surface.sides import APART, Sides
 from sononerf.surface.traced import LaterBounces
 from sononerf.surface.visibility import listen
 
@@ -60,6 +61,8 @@ class Descent:
         Of the start, by the simulator.
     onsets : OnsetRanges or None
         Where the surface must begin.
+    sheet : bool
+        Whether it is a sheet, whose sides are kept apart.
     seed : int
         Of poses and rays.
     """
@@ -76,6 +79,7 @@ class Descent:
         later: LaterBounces | None = None,
         correction: Correction | None = None,
         onsets: OnsetRanges | None = None,
+        sheet: bool = False,
         seed: int,
     ) -> None:
         self.echoes, self.optics, self.level, self.seed = echoes, optics, level, seed
@@ -96,6 +100,7 @@ class Descent:
         self._sight: Occlusion | None = None
         self._later, self._correction, self._onsets = later, correction, onsets
         self.rate = rate
+        self._sides = Sides(mesh, APART * optics.wavelength) if sheet else None
 
     def mesh(self) -> trimesh.Trimesh:
         """Return the surface as it is now."""
@@ -133,6 +138,8 @@ class Descent:
         move = self.operators.smoothed(move, self.strength)
         self.vertices = self.vertices - rate * move.clamp(-4.0, 4.0) * normals
         self.vertices = self.operators.relaxed(self.vertices, normals, TANGENT)
+        if self._sides is not None:
+            self.vertices = self._sides.apart(self.vertices, normals)
         return error
 
     def render(self, numbers: list[int]) -> tuple[Heard | None, Tensor, Tensor]:

@@ -236,6 +236,7 @@ class Refinement:
             correction=correction,
             # The simulator's correction is more exact than the onsets.
             onsets=None if correction is not None else self.onsets,
+            sheet=self.way == "sheet",
             seed=self.seed,
         )
 
