@@ -203,6 +203,8 @@ def _slab(frame: _Frame, z: Array, half: float) -> trimesh.Trimesh:
     layers = np.abs(np.arange(-3, 4)) - 1.0
     deepest = ndimage.gaussian_filter(frame.depth.max(axis=2), 0.7) / frame.step
     outside = np.maximum(layers[None, None], -deepest[:, :, None])
+    if not (outside < 0).any():
+        raise NumericalError("no surface: the onsets leave no room for a sheet")
     vertices, faces, _, _ = marching_cubes(
         outside.astype(np.float32), 0.0, gradient_direction="ascent", allow_degenerate=False
     )

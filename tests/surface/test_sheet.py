@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import trimesh
@@ -121,3 +123,15 @@ def test_a_sheet_of_which_only_the_rim_was_heard_is_refused(bent):
     sideways[:, 0] = 1.0
     with pytest.raises(NumericalError, match="sides of a sheet"):
         fit_sheet(gathered(points, sideways))
+
+
+def test_onsets_that_leave_no_room_are_refused(bent):
+    known = gathered(*bent)
+    outside = np.abs(known.bound) + np.float32(1.0)
+    with pytest.raises(NumericalError, match="no room"):
+        fit_sheet(dataclasses.replace(known, bound=outside))
+    # A few single voxels are less than the smoothing of the outline leaves.
+    few = outside + 3
+    few[8:40:8, 15, 6] = -0.01
+    with pytest.raises(NumericalError, match="no surface"):
+        fit_sheet(dataclasses.replace(known, bound=few))
