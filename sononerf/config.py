@@ -113,18 +113,28 @@ class SimulationSettings(_Section):
 
 
 class AirSettings(_Section):
-    """The medium; the speed of sound is 343 m/s unless a temperature is set."""
+    """The medium; the speed of sound is 343 m/s unless a temperature or the speed itself is set."""
 
+    speed_of_sound: Annotated[float, Field(ge=100, le=10_000)] | None = None  # m/s
     temperature_c: Annotated[float, Field(ge=-20, le=50)] | None = None
     relative_humidity: Annotated[float, Field(ge=0, le=1)] = 0.5
     pressure_pa: Annotated[float, Field(ge=20_000, le=200_000)] = 101_325.0
 
 
 class EarSettings(_Section):
-    """Synthetic emitter and ears in the head frame (x forward, y left, z up)."""
+    """Emitter and receivers in the head frame (x forward, y left, z up).
+
+    Two ears by default, at ``left`` and its mirror image. ``receivers`` gives other places, from
+    one on. The directivity is that of a synthetic ear, of a circular piston of ``piston_radius``
+    that looks ahead, the same in all directions, or measured: read from ``file``.
+    """
 
     emitter: Vector = (0.0, 0.0, -0.010)
     left: Vector = (-0.010, 0.010, 0.005)  # the right ear is its mirror image
+    receivers: Annotated[tuple[Vector, ...], Field(min_length=1, max_length=256)] | None = None
+    directivity: Literal["ear", "omnidirectional", "piston", "file"] = "ear"
+    piston_radius: Positive = 0.003
+    file: Path | None = None
     beam_radius: Annotated[float, Field(ge=0)] = 0.003
     azimuth_deg: Annotated[float, Field(ge=-90, le=90)] = 25.0
     elevation_deg: Annotated[float, Field(ge=-90, le=90)] = 10.0
@@ -302,10 +312,21 @@ class ReconstructionSettings(_Section):
         return self
 
 
-class Settings(_Section):
-    """One experiment, whole."""
+class EvaluationSettings(_Section):
+    """The true surface that a reconstruction is compared with; metrics alone use it.
 
-    scene: SceneSettings
+    Without ``truth`` it is the scene's own. A ``rigid`` registration turns and moves the result
+    onto it, a ``similarity`` scales it too.
+    """
+
+    truth: Path | None = None
+    registration: Literal["none", "rigid", "similarity"] = "none"
+
+
+class Settings(_Section):
+    """One experiment, whole. Echoes come from a scene or from ``data.store``."""
+
+    scene: SceneSettings | None = None
     poses: PoseSettings = PoseSettings()
     simulation: SimulationSettings = SimulationSettings()
     air: AirSettings = AirSettings()
@@ -321,6 +342,13 @@ class Settings(_Section):
     preview: PreviewSettings = PreviewSettings()
     prediction: PredictionSettings = PredictionSettings()
     reconstruction: ReconstructionSettings = ReconstructionSettings()
+    evaluation: EvaluationSettings = EvaluationSettings()
+
+    @model_validator(mode="after")
+    def _echoes_come_from_somewhere(self) -> Settings:
+        if self.scene is None and self.data.store is None:
+            raise ValueError("scene: missing; set scene.name, or data.store for recorded echoes")
+        return self
 
     @model_validator(mode="after")
     def _solved_frequencies_are_sampled(self) -> Settings:

@@ -6,6 +6,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.config import AirSettings
+
+DEFAULT_SPEED = 343.0  # m/s
+DEFAULT_TEMPERATURE = 20.0  # °C, for absorption where only the speed is fixed
+LOWEST_OVER_PRESSURE = 4e-4  # Hz/Pa, of ISO 9613-1
 REFERENCE_PRESSURE = 101_325.0  # Pa
 REFERENCE_TEMPERATURE = 293.15  # K
 TRIPLE_POINT = 273.16  # K
@@ -30,6 +35,26 @@ def speed_of_sound(temperature_c: float) -> float:
     343.2
     """
     return float(343.2 * np.sqrt((temperature_c + 273.15) / REFERENCE_TEMPERATURE))
+
+
+def speed_in(air: AirSettings) -> float:
+    """Return the speed of sound (m/s) that settings give: set, of the temperature, or 343."""
+    if air.speed_of_sound is not None:
+        return air.speed_of_sound
+    return DEFAULT_SPEED if air.temperature_c is None else speed_of_sound(air.temperature_c)
+
+
+def absorption_in(air: AirSettings, frequency: ArrayLike) -> NDArray[np.float64]:
+    """Return the absorption (F,), dB/m, of the air that settings describe, at (F,) Hz.
+
+    Below the lowest frequency of the standard it is that of the lowest frequency.
+    """
+    return air_absorption(
+        np.maximum(frequency, LOWEST_OVER_PRESSURE * air.pressure_pa),
+        temperature_c=DEFAULT_TEMPERATURE if air.temperature_c is None else air.temperature_c,
+        relative_humidity=air.relative_humidity,
+        pressure=air.pressure_pa,
+    )
 
 
 def air_absorption(

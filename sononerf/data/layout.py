@@ -16,7 +16,6 @@ from zarr.storage import LocalStore
 from sononerf import storage
 from sononerf.errors import InputError, NumericalError
 
-EARS = 2
 SPECTROGRAM = "spectrogram"
 CRC_BYTES = 4
 SPLITS = {"train": 0, "val": 1, "test": 2}
@@ -111,7 +110,7 @@ def checked_axes(**given: ArrayLike) -> dict[str, NDArray[Any]]:
     return axes
 
 
-def create_arrays(root: Path, axes: dict[str, NDArray[Any]]) -> None:
+def create_arrays(root: Path, axes: dict[str, NDArray[Any]], receivers: int) -> None:
     """Write the axes whole and declare the spectrogram, all before the group that shows them.
 
     Parameters
@@ -120,6 +119,8 @@ def create_arrays(root: Path, axes: dict[str, NDArray[Any]]) -> None:
         The ensemble's folder.
     axes : dict of array
         By the names of :data:`AXES`.
+    receivers : int
+        Number E of receivers, from 1 on.
 
     Raises
     ------
@@ -132,7 +133,7 @@ def create_arrays(root: Path, axes: dict[str, NDArray[Any]]) -> None:
             root, name, shape=values.shape, chunks=values.shape, dtype=dtype, dimensions=dimensions
         )
         array[...] = values
-    size = (EARS, len(axes["range"]), len(axes["frequency"]))
+    size = (receivers, len(axes["range"]), len(axes["frequency"]))
     _create(
         root,
         SPECTROGRAM,
@@ -218,6 +219,12 @@ def read_axes(root: Path, group: Any) -> tuple[dict[str, NDArray[Any]], Any]:
     poses = {len(axes[name]) for name in ("position", "rotation", "split")}
     if len(poses) > 1:
         raise InputError(f"{root}: position, rotation and split differ in length: {sorted(poses)}")
-    shape = (len(axes["position"]), EARS, len(axes["range"]), len(axes["frequency"]))
     dims = ("pose", "ear", "range", "frequency")
-    return axes, _open_array(root, SPECTROGRAM, group, "float32", dims, shape)
+    sizes = (len(axes["range"]), len(axes["frequency"]))
+    spectrogram = _open_array(root, SPECTROGRAM, group, "float32", dims, sizes)
+    if len(spectrogram) != len(axes["position"]):
+        raise InputError(
+            f"{root / SPECTROGRAM}: holds {len(spectrogram)} poses, expected "
+            f"{len(axes['position'])}"
+        )
+    return axes, spectrogram

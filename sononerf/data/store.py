@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The ensemble on disk: what both ears heard at every pose, each pose whole or not there."""
+"""The ensemble on disk: what the receivers heard at every pose, each pose whole or not there."""
 
 from __future__ import annotations
 
@@ -86,6 +86,7 @@ class EnsembleStore:
         range: ArrayLike,  # noqa: A002 - the axis is called so
         frequency: ArrayLike,
         attributes: dict[str, Any],
+        receivers: int = 2,
     ) -> EnsembleStore:
         """Make a store with its axes and poses whole, or open the same one for more poses.
 
@@ -107,6 +108,8 @@ class EnsembleStore:
             Frequencies of the bins.
         attributes : dict
             Plain data; ``echo_hash`` tells ensembles apart.
+        receivers : int
+            Number E of receivers.
 
         Raises
         ------
@@ -131,7 +134,7 @@ class EnsembleStore:
             _refuse_foreign(path)
             storage.make_folder(path)
             storage.clean_leftovers(path)
-            create_arrays(path, axes)
+            create_arrays(path, axes, receivers)
             write_group(path, plain)
         store = cls(path, mode="r+")
         if store.attributes.get("echo_hash") != plain.get("echo_hash"):
@@ -143,6 +146,11 @@ class EnsembleStore:
                 raise IncompatibleError(
                     f"{path}: its {name} differs; choose another folder, or --overwrite"
                 )
+        if store.receivers != receivers:
+            raise IncompatibleError(
+                f"{path}: holds {store.receivers} receivers, expected {receivers}; choose another "
+                "folder, or --overwrite"
+            )
         return store
 
     def __len__(self) -> int:
@@ -172,6 +180,11 @@ class EnsembleStore:
     def frequency(self) -> NDArray[np.float64]:
         """Frequencies of the bins, (F,), Hz."""
         return self._axes["frequency"].copy()
+
+    @property
+    def receivers(self) -> int:
+        """Number of receivers."""
+        return int(self._spectrogram.shape[1])
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -224,7 +237,7 @@ class EnsembleStore:
         if values.shape != self._spectrogram.shape[1:]:
             raise InputError(
                 f"{self.path}: pose {index} has shape {values.shape}, "
-                f"expected (ears, ranges, frequencies) {self._spectrogram.shape[1:]}"
+                f"expected (receivers, ranges, frequencies) {self._spectrogram.shape[1:]}"
             )
         if not np.isfinite(values).all():
             raise NumericalError(f"{self.path}: pose {index} holds NaN or infinite magnitudes")

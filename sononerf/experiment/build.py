@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sononerf import plugins
-from sononerf.acoustics.air import air_absorption, speed_of_sound
+from sononerf.acoustics.air import absorption_in, speed_in
 from sononerf.acoustics.ears import analysed_ears, synthetic_ears
 from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
@@ -26,31 +26,19 @@ from sononerf.errors import InputError, SettingsError
 from sononerf.field.field import Field
 from sononerf.module import ACTIVE_DB, EchoModule
 from sononerf.renderer.renderer import Acquisition, Possible, Renderer
-from sononerf.simulation.simulator import DEFAULT_SPEED, DEFAULT_TEMPERATURE
 
 
 def _tensor(values: NDArray[np.floating]) -> Tensor:
     return torch.as_tensor(np.asarray(values), dtype=torch.float32)
 
 
-def _speed(settings: Settings) -> float:
-    given = settings.air.temperature_c
-    return DEFAULT_SPEED if given is None else speed_of_sound(given)
-
-
 def acquisition(settings: Settings) -> Acquisition:
     """Return what a renderer has to know of how the spectra came to be."""
     air, analysis = settings.air, settings.spectrogram
-    temperature = air.temperature_c
-    speed = _speed(settings)
+    speed = speed_in(air)
     frequency = frequency_axis(analysis)
     ears, lag = analysed_ears(settings.ears, settings.call, analysis)
-    absorption = air_absorption(
-        frequency,
-        temperature_c=DEFAULT_TEMPERATURE if temperature is None else temperature,
-        relative_humidity=air.relative_humidity,
-        pressure=air.pressure_pa,
-    )
+    absorption = absorption_in(air, frequency)
     return Acquisition(
         frequency=_tensor(frequency),
         range=_tensor(range_axis(analysis, speed)),
@@ -68,7 +56,7 @@ def acquisition(settings: Settings) -> Acquisition:
 
 def point_echo(settings: Settings) -> PointEcho:
     """Return what the analysis makes of the echo of one point."""
-    return PointEcho.of(settings.call, settings.spectrogram, _speed(settings))
+    return PointEcho.of(settings.call, settings.spectrogram, speed_in(settings.air))
 
 
 def echo_hull(settings: Settings, store: EnsembleStore, heard: Onsets | None = None) -> EchoHull:

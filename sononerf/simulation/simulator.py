@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.acoustics.air import air_absorption, speed_of_sound
+from sononerf.acoustics.air import absorption_in, speed_in
 from sononerf.acoustics.ears import Ears, synthetic_ears
 from sononerf.acoustics.reception import WINDOW_BANDWIDTH, Reception
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
-from sononerf.config import AirSettings, Settings, SimulationSettings, SpectrogramSettings
+from sononerf.config import Settings, SimulationSettings, SpectrogramSettings
 from sononerf.scene import Scene
 from sononerf.simulation.arrival import silence_before
 from sononerf.simulation.boundary import Boundary
@@ -30,9 +30,6 @@ from sononerf.simulation.spheres import Spheres
 logger = logging.getLogger("sononerf")
 
 VERSION = 4  # to be raised when the same settings give other echoes: stores are told apart by it
-LOWEST_OVER_PRESSURE = 4e-4  # Hz/Pa, of ISO 9613-1
-DEFAULT_SPEED = 343.0  # m/s
-DEFAULT_TEMPERATURE = 20.0  # °C, for absorption where only the speed is fixed
 
 
 class Simulator:
@@ -73,12 +70,11 @@ class Simulator:
             If the settings' ranges hold no analysis frame.
         """
         air = settings.air
-        given = air.temperature_c
-        speed = DEFAULT_SPEED if given is None else speed_of_sound(given)
+        speed = speed_in(air)
         analysis = settings.spectrogram
         reception = Reception(settings.call, analysis, settings.noise, speed_of_sound=speed)
         synthesis = plan_synthesis(analysis, reception.samples)
-        gains, absorption = partial(synthetic_ears, settings.ears), partial(_absorption, air)
+        gains, absorption = partial(synthetic_ears, settings.ears), partial(absorption_in, air)
         hearing = Hearing(gains(synthesis.nodes), synthesis, absorption(synthesis.nodes), speed)
         wanted = settings.simulation
         engine: Engine
@@ -207,14 +203,3 @@ def solved_frequency(wanted: SimulationSettings, analysis: SpectrogramSettings) 
             *(wanted.frequency_max, whole, analysis.frequency_max),
         )
     return wanted.frequency_max
-
-
-def _absorption(air: AirSettings, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the air's absorption (K,), dB/m, at frequencies (K,), Hz."""
-    lowest = LOWEST_OVER_PRESSURE * air.pressure_pa  # below it there is next to none
-    return air_absorption(
-        np.maximum(frequency, lowest),
-        temperature_c=DEFAULT_TEMPERATURE if air.temperature_c is None else air.temperature_c,
-        relative_humidity=air.relative_humidity,
-        pressure=air.pressure_pa,
-    )
