@@ -51,6 +51,14 @@ class SurfaceMethod(StrEnum):
     isosurface = "isosurface"
 
 
+class Registration(StrEnum):
+    """How a mesh is laid over the true surface."""
+
+    none = "none"
+    rigid = "rigid"
+    similarity = "similarity"
+
+
 class Split(StrEnum):
     """Poses of an ensemble."""
 
@@ -375,12 +383,29 @@ def reconstruct(
 
 
 @app.command()
-def evaluate(run: Run, as_json: Json = False) -> None:
-    """Compare a run's mesh with the true scene, and show all its numbers."""
-    from sononerf.experiment.reconstruct import evaluate as evaluate_run
+def evaluate(
+    run: Run,
+    truth: Annotated[
+        Path | None, typer.Option(help="Mesh of the true surface; the scene's own by default.")
+    ] = None,
+    registration: Annotated[
+        Registration | None,
+        typer.Option(
+            help="Lays the mesh over the truth: none, rigid, or with one scale (similarity)."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare a run's mesh with the true surface, and show all its numbers."""
+    from sononerf.experiment.evaluate import evaluate as evaluate_run
     from sononerf.progress import Progress
 
-    metrics = evaluate_run(run, progress=Progress(quiet=as_json))
+    metrics = evaluate_run(
+        run,
+        truth=truth,
+        registration=None if registration is None else registration.value,
+        progress=Progress(quiet=as_json),
+    )
     if as_json:
         _print_json(metrics)
     else:

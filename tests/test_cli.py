@@ -27,8 +27,8 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sononerf import __version__, cli, storage
 from sononerf.callbacks import preview, spectrogram_images
+from sononerf.experiment import evaluate as evaluate_module
 from sononerf.experiment import finish as finish_module
-from sononerf.experiment import reconstruct as reconstruct_module
 from sononerf.reconstruction import baseline
 from sononerf.weights import load_weights, save_weights
 
@@ -90,9 +90,9 @@ def tree(folder):
 def quick():
     """Fewer samples of surfaces, and no previews: both have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        metrics = functools.partial(reconstruct_module.geometry_metrics, samples=3000)
-        patch.setattr(reconstruct_module, "geometry_metrics", metrics)
-        patch.setattr(reconstruct_module, "BASELINE_VOXELS", 24)
+        metrics = functools.partial(evaluate_module.geometry_metrics, samples=3000)
+        patch.setattr(evaluate_module, "geometry_metrics", metrics)
+        patch.setattr(evaluate_module, "BASELINE_VOXELS", 24)
         patch.setattr(baseline, "LEVEL_SAMPLES", 500)
         yield
 

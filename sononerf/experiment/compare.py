@@ -15,16 +15,16 @@ from sononerf.acoustics.spectrogram import compress
 from sononerf.data.range_slices import WholePoses
 from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.experiment.build import acquisition
-from sononerf.experiment.fitted import Fitted, load_fitted, render_poses
-from sononerf.experiment.reconstruct import true_mesh
+from sononerf.experiment.fitted import Fitted, all_poses, load_fitted, render_poses
 from sononerf.experiment.run_folder import differing_keys, results_folder
+from sononerf.experiment.truth import true_mesh
 from sononerf.geometry.poses import Poses
 from sononerf.progress import Progress
 from sononerf.reconstruction.baseline import backprojection
 from sononerf.reconstruction.compare import added_part, compare
 from sononerf.reconstruction.volume import Volume, vti_bytes
 from sononerf.render.difference import difference_pngs, overlay_png
-from sononerf.simulation.ensemble import TRAIN, ensemble_poses
+from sononerf.simulation.ensemble import TRAIN
 
 HEARING = ("air", "ears", "call", "spectrogram")
 """Sections in which two runs must not differ: else what differs is who listens."""
@@ -104,7 +104,7 @@ def compare_runs(
         poses = _common_poses(runs)
         one, other = (_heard(run, poses, reference, *box, accelerator, progress) for run in runs)
         found = compare(one, other)
-        surfaces = [true_mesh(run) for run in runs]
+        surfaces = [true_mesh(run.settings) for run in runs]
         truth = _added(*surfaces)
         names = first.resolve().name, second.resolve().name
         missing = -float(found.difference.values.min())
@@ -142,7 +142,7 @@ def _common_poses(runs: list[Fitted]) -> Poses:
     """Return the poses that either run was trained on, each once, evenly thinned out."""
     table = []
     for run in runs:
-        poses, split = ensemble_poses(run.settings)
+        poses, split = all_poses(run)
         rows = np.concatenate([poses.positions, poses.rotations.reshape(-1, 9)], axis=1)
         table.append(rows[split == TRAIN])
     _, index = np.unique(np.concatenate(table).round(9), axis=0, return_index=True)

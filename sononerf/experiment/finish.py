@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from sononerf.errors import NumericalError
-from sononerf.experiment.fitted import load_fitted
+from sononerf.experiment.evaluate import evaluate
+from sononerf.experiment.fitted import has_heldout, load_fitted
 from sononerf.experiment.predict import predict
-from sononerf.experiment.reconstruct import evaluate, reconstruct
+from sononerf.experiment.reconstruct import reconstruct
 from sononerf.experiment.run_folder import RunFolder
 from sononerf.experiment.traced import NAME as TRACED_NAME
 from sononerf.experiment.traced import learn_traced
@@ -50,13 +51,13 @@ def finish(
     """
     progress = progress or Progress(quiet=True)
     no_surface: NumericalError | None = None
-    options = load_fitted(path).settings
+    fitted = load_fitted(path)
     try:
         reconstruct(path, accelerator=accelerator, progress=progress)
         learn_traced(path, accelerator=accelerator, progress=progress)
     except NumericalError as error:
         no_surface = error
-    if options.poses.heldout:
+    if has_heldout(fitted):
         predict(path, accelerator=accelerator, progress=progress)
     if no_surface is not None:
         raise no_surface

@@ -46,9 +46,9 @@ from sononerf.experiment.simulate import (
     open_ensemble,
     store_path,
 )
+from sononerf.experiment.sources import with_store
 from sononerf.module import EchoModule
 from sononerf.progress import Progress
-from sononerf.scene import load_scene
 from sononerf.weights import save_weights
 
 WAIT_SECONDS = 0.5
@@ -94,7 +94,7 @@ def follows() -> bool:
 
 def _wait_for_store(settings: Settings) -> EnsembleStore:
     """Open the ensemble once the first process has sealed it."""
-    path = store_path(settings, load_scene(settings.scene.name, settings.scene.options), None)
+    path = store_path(settings, None, None)
     background = background_path(settings)
     while not all(_is_sealed(part) for part in (path, background) if part is not None):
         time.sleep(WAIT_SECONDS)
@@ -119,7 +119,7 @@ def fit(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> RunFolder:
-    """Simulate where needed, fit, and keep the fitted field.
+    """Simulate where needed, or open the store of ``data.store``; fit, and keep the fitted field.
 
     The same call goes on where an interrupted one stopped; a finished run is left as it is.
 
@@ -155,6 +155,7 @@ def fit(
     progress = progress or Progress(quiet=True)
     run = RunFolder(path)
     require_accelerator(accelerator)
+    settings = with_store(settings)
     check_plugins(settings)
     if follows():
         # The first process holds the lock, simulates and writes; the others only compute.

@@ -22,9 +22,11 @@ from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.experiment.build import field_and_renderer, module_for
 from sononerf.experiment.fit import quiet_lightning, require_accelerator
 from sononerf.experiment.simulate import default_store, open_ensemble
+from sononerf.geometry.poses import Poses
 from sononerf.module import EchoModule
 from sononerf.progress import Progress
 from sononerf.renderer.renderer import Renderer
+from sononerf.simulation.ensemble import ensemble_poses
 from sononerf.weights import DESCRIPTION_NAME, load_weights
 
 Split = Literal["train", "val", "test"]
@@ -105,14 +107,34 @@ def store_of(fitted: Fitted) -> EnsembleStore:
     settings = fitted.settings
     path = settings.data.store or default_store(settings, fitted.echo_hash)
     if not path.exists():
+        again = (
+            "import the recordings again"
+            if settings.scene is None
+            else "make it again with `sononerf simulate RUN/config.yaml`"
+        )
         raise InputError(
-            f"{path}: the ensemble of this run is not there; make it again with "
-            "`sononerf simulate RUN/config.yaml`, or predict poses of your own with --poses"
+            f"{path}: the ensemble of this run is not there; {again}, or predict poses of your "
+            "own with --poses"
         )
     store = open_ensemble(settings, path)
     if store.attributes.get("echo_hash") != fitted.echo_hash:
         raise IncompatibleError(f"{path}: holds other echoes than those of this run")
     return store
+
+
+def has_heldout(fitted: Fitted) -> bool:
+    """Tell whether poses were held out of the fit."""
+    if fitted.settings.scene is not None:
+        return fitted.settings.poses.heldout > 0
+    return len(store_of(fitted).indices("test")) > 0
+
+
+def all_poses(fitted: Fitted) -> tuple[Poses, NDArray[np.int8]]:
+    """Return the poses of a run's ensemble and what each is for (P,): 0 train, 1 val, 2 test."""
+    if fitted.settings.scene is not None:
+        return ensemble_poses(fitted.settings)
+    store = store_of(fitted)
+    return Poses(store.positions, store.rotations), store.split
 
 
 def poses_of(store: EnsembleStore, split: Split, renderer: Renderer) -> WholePoses:

@@ -5,35 +5,29 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 
 from sononerf import storage
-from sononerf.data.store import EnsembleStore
-from sononerf.errors import InputError, NumericalError, SonoNerfError
-from sononerf.experiment.build import acquisition, point_echo
+from sononerf.errors import InputError, NumericalError
+from sononerf.experiment.build import point_echo
 from sononerf.experiment.fitted import Fitted, load_fitted, store_of
 from sononerf.experiment.run_folder import RunFolder, results_folder
 from sononerf.experiment.surface import refine_surface
+from sononerf.experiment.truth import true_mesh
 from sononerf.progress import Progress, Task
-from sononerf.reconstruction.baseline import backprojection, best_level_surface
 from sononerf.reconstruction.mesh import MeshFormat, mesh_bytes
-from sononerf.reconstruction.metrics import geometry_metrics, target_metrics
 from sononerf.reconstruction.read_out import Method, Reconstruction, judged
 from sononerf.reconstruction.read_out import reconstruct as read_out
-from sononerf.reconstruction.truth import TrueSurface
-from sononerf.reconstruction.volume import Volume, vti_bytes
-from sononerf.reconstruction.voxels import voxel_fit
+from sononerf.reconstruction.volume import vti_bytes
 from sononerf.render.mesh import confidence_png, mesh_png, side_by_side_png
 from sononerf.render.projection import mip_pngs
-from sononerf.scene import Scene, load_scene
 from sononerf.surface.refine import Refined
 
 OPEN = {
@@ -48,8 +42,6 @@ REFINED: tuple[Method, ...] = ("open", "filled", "hull", "sheet")
 UNREFINED: tuple[Method, ...] = ("filled", "hull")
 """Without refinement the first of these that gives a surface is taken."""
 FORMATS: tuple[MeshFormat, ...] = ("ply", "stl", "glb")
-BASELINE_VOXELS = 64
-"""Along the region's longest side; finer than the window's length in any scene of ours."""
 
 
 def reconstruct(
@@ -126,7 +118,7 @@ def reconstruct(
             start = next(start for start in starts if start.method == refined.start)
             found = replace(start, mesh=refined.mesh)
         found = judged(found, None if refined is None else refined.support.round().astype(np.int32))
-        _write(folder, found, refined, true_mesh(fitted))
+        _write(folder, found, refined, true_mesh(fitted.settings))
     if found.openness is not None and found.openness.kind in OPEN:
         progress.say(OPEN[found.openness.kind].format(found.openness))
     if output is None:
@@ -234,63 +226,6 @@ def _write(
     )
 
 
-def true_scene(fitted: Fitted) -> Scene | None:
-    """Return the scene that a run is of; None where it is not installed here."""
-    try:
-        return load_scene(fitted.settings.scene.name, fitted.settings.scene.options)
-    except SonoNerfError:
-        return None
-
-
-def true_mesh(fitted: Fitted) -> trimesh.Trimesh | None:
-    """Return the scene's own surface; None where the scene is not installed here."""
-    scene = true_scene(fitted)
-    return None if scene is None else scene.mesh
-
-
-def evaluate(path: Path, *, progress: Progress | None = None) -> dict[str, Any]:
-    """Compare a reconstruction with the true scene, and the baselines likewise.
-
-    Parameters
-    ----------
-    path : Path
-        A run that was reconstructed.
-    progress : Progress or None
-        Where to show it.
-
-    Returns
-    -------
-    metrics : dict
-        All of ``metrics.json``.
-    """
-    progress = progress or Progress(quiet=True)
-    run = RunFolder(path)
-    fitted = load_fitted(path)
-    folder = path / "reconstruction"
-    if not (folder / "mesh.ply").is_file():
-        reconstruct(path, progress=progress)
-    scene = true_scene(fitted)
-    geometry: dict[str, Any] | None = None
-    baseline: dict[str, Any] = {"backprojection": None, "voxels": None}
-    if scene is not None:
-        with progress.task("evaluating", 3) as task:
-            mesh = read_mesh(folder / "mesh.ply")
-            level = storage.read_json(folder / "read_out.json")["level"]
-            true = TrueSurface(scene.mesh)
-            geometry = {**geometry_metrics(mesh, true), "level": level}
-            surroundings = scene.surface(background=True)
-            target = scene.surface(background=False)
-            if surroundings is not None and target is not None:
-                geometry["target"] = target_metrics(mesh, target, surroundings)
-            task.advance()
-            for name, volume in _baselines(fitted):
-                baseline[name] = _at_best_level(volume, true)
-                task.advance()
-    run.write_metrics("geometry", geometry)
-    run.write_metrics("baseline", baseline)
-    return run.read_metrics()
-
-
 def read_mesh(path: Path) -> trimesh.Trimesh:
     """Read a reconstructed surface back.
 
@@ -306,46 +241,3 @@ def read_mesh(path: Path) -> trimesh.Trimesh:
     if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
         raise InputError(f"{path}: holds no surface; reconstruct again")
     return mesh
-
-
-def _baselines(fitted: Fitted) -> Iterator[tuple[str, Volume]]:
-    """Yield what needs no learning, read out on one grid: backprojection and voxel fit."""
-    store = store_of(fitted)
-    train = store.indices("train")
-    known = acquisition(fitted.settings)
-    lower, upper = (corner.double().numpy() for corner in fitted.module.field.region)
-    given = (
-        store.positions[train],
-        store.rotations[train],
-        store.range,
-        lower,
-        upper,
-        float((upper - lower).max()) / BASELINE_VOXELS,
-    )
-    emitter, ears = known.emitter.double().numpy(), known.ear_positions.double().numpy()
-    yield (
-        "backprojection",
-        backprojection(_heard(store, train), *given, emitter_offset=emitter, ear_offsets=ears),
-    )
-    fitted_voxels = voxel_fit(
-        _heard(store, train),
-        *given,
-        emitter_offset=emitter,
-        ear_offsets=ears,
-        # Of a sweep each row has a window of its own; where rows are added up, their mean.
-        window=known.window.double().square().mean(dim=0).numpy(),
-        window_step=known.speed_of_sound / known.sampling_rate / 2,
-    )
-    yield "voxels", fitted_voxels
-
-
-def _heard(store: EnsembleStore, indices: NDArray[np.int64]) -> Iterator[NDArray[np.float32]]:
-    return (store.read_pose(int(index)) for index in indices)
-
-
-def _at_best_level(volume: Volume, truth: TrueSurface) -> dict[str, Any] | None:
-    try:
-        mesh, level = best_level_surface(volume, truth)
-    except NumericalError:
-        return None
-    return {**geometry_metrics(mesh, truth), "level": level}

@@ -17,14 +17,13 @@ from sononerf import storage
 from sononerf.acoustics.spectrogram import compress
 from sononerf.config import dump_yaml
 from sononerf.errors import InputError, NumericalError
-from sononerf.experiment.fitted import Fitted, load_fitted
-from sononerf.experiment.reconstruct import true_mesh
+from sononerf.experiment.fitted import Fitted, all_poses, has_heldout, load_fitted
 from sononerf.experiment.run_folder import RunFolder, results_folder
+from sononerf.experiment.truth import true_mesh
 from sononerf.progress import Progress
 from sononerf.reconstruction.read_out import reconstruct as read_out
 from sononerf.render.mesh import mesh_png
 from sononerf.render.scene import scene_png
-from sononerf.simulation.ensemble import ensemble_poses
 
 PAGE = "report.md"
 Table = list[tuple[str, ...]]
@@ -69,7 +68,7 @@ def report(
     progress = progress or Progress(quiet=True)
     fitted = load_fitted(path)
     folder = output or path / "report"
-    heldout = fitted.settings.poses.heldout > 0
+    heldout = has_heldout(fitted)
     pictures: dict[str, bytes] = {}
     with results_folder(folder):
         parts = [f"# {path.resolve().name}"]
@@ -103,10 +102,12 @@ def _made(path: Path, fitted: Fitted) -> str:
     metrics = RunFolder(path).read_metrics()
     cost = metrics.get("cost") or {}
     settings = fitted.settings
-    said = [
-        f"Scene `{settings.scene.name}`, {settings.poses.count} poses for training; field "
-        f"`{settings.field.kind}` through renderer `{settings.renderer.kind}`"
-    ]
+    echoes = (
+        f"Recorded echoes of `{settings.data.store}`"
+        if settings.scene is None
+        else f"Scene `{settings.scene.name}`, {settings.poses.count} poses for training"
+    )
+    said = [f"{echoes}; field `{settings.field.kind}` through renderer `{settings.renderer.kind}`"]
     if cost.get("steps") is not None:
         said.append(f"{cost['steps']} steps")
     if cost.get("fit_s") is not None:
@@ -253,11 +254,11 @@ def _figures(
 ) -> Iterator[str]:
     yield "## As in the paper"
     yield "### Scene and poses (figures 4 to 6)"
-    mesh = true_mesh(fitted)
+    mesh = true_mesh(fitted.settings)
     if mesh is None:
-        yield f"Scene `{fitted.settings.scene.name}` is not installed here."
+        yield "The true surface is not known here: no scene or `evaluation.truth` can be read."
     else:
-        poses, split = ensemble_poses(fitted.settings)
+        poses, split = all_poses(fitted)
         looks = poses.rotations[:, :, 0]
         pictures["scene.png"] = scene_png(mesh, poses.positions, looks, split=split)
         yield "![scene](scene.png)"

@@ -18,8 +18,14 @@ from sononerf.errors import IncompatibleError, InputError
 from sononerf.weights import DESCRIPTION_NAME
 
 METRICS_SCHEMA = 1
-FREE_KEYS = ("data.store", "data.workers", "data.memory_bytes", "fit.checkpoint_seconds")
-"""What may change between two calls of one run: it moves no number."""
+FREE_KEYS = (
+    "data.store",
+    "data.workers",
+    "data.memory_bytes",
+    "evaluation",
+    "fit.checkpoint_seconds",
+)
+"""What may change between two calls of one run: it changes nothing that is fitted."""
 RECORDED = ("torch", "lightning", "numpy", "scipy", "trimesh", "embreex", "zarr")
 
 

@@ -17,6 +17,7 @@ from sononerf.acoustics.spectrogram import compress
 from sononerf.config import Settings
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, SonoNerfError
+from sononerf.experiment.simulate import scene_of
 from sononerf.render.echo import echo_png
 from sononerf.render.mesh import mesh_png
 from sononerf.render.scene import scene_png
@@ -210,7 +211,8 @@ def draw_ensemble(settings: Settings, store: EnsembleStore, folder: Path) -> lis
         If a picture cannot be written.
     """
     with _quietly():  # who simulated it has been warned
-        scene = load_scene(settings.scene.name, settings.scene.options, source=settings.source)
+        scene = scene_of(settings)
+    name = "" if settings.scene is None else settings.scene.name
     written = [folder / "scene.png"]
     forward = store.rotations[:, :, 0]
     storage.commit_bytes(
@@ -233,7 +235,7 @@ def draw_ensemble(settings: Settings, store: EnsembleStore, folder: Path) -> lis
         store.range,
         store.frequency,
         speed_of_sound=simulator.speed_of_sound,
-        title=f"{settings.scene.name}, pose {index}",
+        title=f"{name}, pose {index}",
     )
     storage.commit_bytes(written[1], picture)
     return written

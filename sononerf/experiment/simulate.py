@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from sononerf.config import Settings
 from sononerf.data.store import EnsembleStore
 from sononerf.data.subtracted import SubtractedStore
 from sononerf.errors import IncompatibleError, NumericalError, SettingsError
+from sononerf.experiment.sources import complete_store
 from sononerf.geometry.poses import Poses
 from sononerf.progress import Progress
 from sononerf.reconstruction.prediction import mae_db
@@ -46,7 +48,7 @@ def echo_hash(settings: Settings, scene: Scene) -> str:
     Poses count as what they are, not as how they were asked for: a changed table at the same
     place is another ensemble, the same table at another place is not.
     """
-    plain = settings.plain()
+    plain = _heard_settings(settings)
     digest = hashlib.sha256(f"simulator {VERSION}".encode())
     digest.update(json.dumps([plain[name] for name in HASHED_SECTIONS], sort_keys=True).encode())
     poses, split = ensemble_poses(settings)
@@ -62,15 +64,50 @@ def echo_hash(settings: Settings, scene: Scene) -> str:
     return digest.hexdigest()
 
 
-def store_path(settings: Settings, scene: Scene, output: Path | None) -> Path:
+def _heard_settings(settings: Settings) -> dict[str, Any]:
+    """Return the settings that the echoes depend on, without optional keys that do not apply."""
+    plain = settings.plain()
+    ears, air = plain["ears"], plain["air"]
+    if ears["directivity"] != "piston":
+        del ears["piston_radius"]
+    for section, key, default in (
+        (air, "speed_of_sound", None),
+        (ears, "receivers", None),
+        (ears, "file", None),
+        (ears, "directivity", "ear"),
+    ):
+        if section[key] == default:
+            del section[key]
+    return plain
+
+
+def scene_of(settings: Settings) -> Scene:
+    """Return the scene that settings name.
+
+    Raises
+    ------
+    SettingsError
+        If they name none: their echoes come from a store.
+    InputError
+        If the scene is unknown or broken.
+    """
+    if settings.scene is None:
+        raise SettingsError("scene: missing; set scene.name to simulate echoes")
+    return load_scene(settings.scene.name, settings.scene.options, source=settings.source)
+
+
+def store_path(settings: Settings, scene: Scene | None, output: Path | None) -> Path:
     """Return where the ensemble lies: as asked for, as set, or by its hash under ``data/``."""
     chosen = output or settings.data.store
-    return chosen or default_store(settings, echo_hash(settings, scene))
+    if chosen is not None:
+        return chosen
+    return default_store(settings, echo_hash(settings, scene or scene_of(settings)))
 
 
 def default_store(settings: Settings, echoes: str) -> Path:
     """Return where the ensemble of a hash lies when nobody says where."""
-    return Path("data") / f"{settings.scene.name}-{echoes[:12]}"
+    name = "recorded" if settings.scene is None else settings.scene.name
+    return Path("data") / f"{name}-{echoes[:12]}"
 
 
 def background_path(settings: Settings) -> Path | None:
@@ -86,11 +123,10 @@ def background_path(settings: Settings) -> Path | None:
 
 
 def _own_background(settings: Settings) -> tuple[Path, Scene]:
-    scene = load_scene(settings.scene.name, settings.scene.options, source=settings.source)
-    alone = scene.surroundings()
+    alone = scene_of(settings).surroundings()
     if alone is None:
         raise SettingsError(
-            f"data.background: the scene {settings.scene.name!r} marks no background; give the "
+            "data.background: the scene marks no background; give the "
             "ensemble of the surroundings alone, or leave it out"
         )
     path = default_store(settings, echo_hash(settings, alone))
@@ -106,7 +142,7 @@ def open_ensemble(settings: Settings, path: Path) -> EnsembleStore:
 def ensemble(
     settings: Settings, *, workers: int | None = None, progress: Progress | None = None
 ) -> EnsembleStore:
-    """Simulate what is missing, and take the surroundings off where that is asked for.
+    """Open or simulate the echoes, and take the surroundings off where that is asked for.
 
     As :func:`simulate`, whose errors it raises.
     """
@@ -114,7 +150,10 @@ def ensemble(
     background = background_path(settings)
     if background is not None and settings.data.background != "scene":
         EnsembleStore.open(background)
-    store = simulate(settings, workers=workers, progress=progress)
+    if settings.scene is None and settings.data.store is not None:
+        store = complete_store(settings.data.store)
+    else:
+        store = simulate(settings, workers=workers, progress=progress)
     if settings.data.background == "scene":
         alone = _own_background(settings)[1]
         simulate(settings, scene=alone, output=background, workers=workers, progress=progress)
@@ -165,14 +204,15 @@ def simulate(
     """
     progress = progress or Progress(quiet=True)
     if scene is None:
-        scene = load_scene(settings.scene.name, settings.scene.options, source=settings.source)
+        scene = scene_of(settings)
     path = store_path(settings, scene, output)
     wanted = echo_hash(settings, scene)
     if (path / "zarr.json").is_file():
         store = EnsembleStore.open(path)
         if store.attributes.get("echo_hash") != wanted:
             raise IncompatibleError(
-                f"{path}: holds echoes of other settings; choose another --output"
+                f"{path}: holds echoes of other settings; choose another --output, or leave the "
+                "scene out of the settings to take the echoes as they are"
             )
         if "reference" in store.attributes and not store.missing():
             return store
@@ -199,6 +239,7 @@ def simulate(
             split=split,
             range=simulator.range,
             frequency=simulator.frequency,
+            receivers=len(simulator.ears.positions),
             attributes=_attributes(settings, wanted, simulator),
         )
         _fill(store, simulator, poses, settings, workers, scheduler, progress)

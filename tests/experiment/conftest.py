@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import functools
+import shutil
 
 import pytest
 
 from sononerf.callbacks import spectrogram_images
 from sononerf.config import validate_settings
 from sononerf.experiment import build
+from sononerf.experiment import reconstruct as reconstruct_module
 from sononerf.experiment.fit import fit
 from sononerf.experiment.simulate import simulate
 
@@ -72,3 +74,29 @@ def fitted_run(tiny_settings, tmp_path_factory):
         patch.setattr(spectrogram_images.SpectrogramImages, "on_epoch", lambda *given: None)
         fit(tiny_settings(), path, accelerator="cpu", workers=1)
     return path
+
+
+@pytest.fixture(scope="session")
+def fitted(tiny_settings, tmp_path_factory):
+    """The tiny experiment with a longer fit; for reading alone."""
+    path = tmp_path_factory.mktemp("fitted") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(spectrogram_images.SpectrogramImages, "on_epoch", lambda *given: None)
+        fit(tiny_settings(fit={"epochs": 10}), path, accelerator="cpu", workers=1)
+    return path
+
+
+@pytest.fixture
+def run(fitted, tmp_path):
+    """A copy of a fitted run, to write into."""
+    path = tmp_path / "elsewhere"
+    path.mkdir()
+    for name in ("model.safetensors", "model.json"):
+        shutil.copy(fitted / name, path)
+    return path
+
+
+@pytest.fixture
+def no_projections(monkeypatch):
+    """Projections take most of a tiny read-out."""
+    monkeypatch.setattr(reconstruct_module, "mip_pngs", lambda volume: {})
