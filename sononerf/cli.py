@@ -59,6 +59,16 @@ class Registration(StrEnum):
     similarity = "similarity"
 
 
+class Exported(StrEnum):
+    """Part of a store or a run."""
+
+    auto = "auto"
+    echoes = "echoes"
+    prediction = "prediction"
+    volume = "volume"
+    points = "points"
+
+
 class Split(StrEnum):
     """Poses of an ensemble."""
 
@@ -410,6 +420,23 @@ def evaluate(
         _print_json(metrics)
     else:
         _summary(run, metrics)
+
+
+@app.command()
+def export(
+    source: Annotated[Path, typer.Argument(help="A store, or the folder of a run.")],
+    output: Annotated[Path, typer.Argument(help="File to write: .mat, .h5, .nc or .csv.")],
+    what: Annotated[
+        Exported,
+        typer.Option(
+            help="auto: echoes of a store; of a run, points for .csv and else the prediction."
+        ),
+    ] = Exported.auto,
+) -> None:
+    """Write echoes, predictions, volumes or surface points for other programs."""
+    from sononerf.experiment.export import export as export_part
+
+    _print(f"wrote {export_part(source, output, what=what.value)}")
 
 
 @app.command()

@@ -28,6 +28,8 @@ AXES: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
     "range": ("float64", ("range",), ()),
     "frequency": ("float64", ("frequency",), ()),
 }
+UNITS = {"position": "m", "range": "m", "frequency": "Hz"}
+"""Of the arrays; the others are plain numbers."""
 
 
 class DurableStore(LocalStore):
@@ -81,6 +83,7 @@ def _create(
         dimension_names=dimensions,
         config={"write_empty_chunks": True},
         overwrite=True,
+        attributes={"units": UNITS.get(name, "1")},
     )
 
 

@@ -33,7 +33,7 @@ def mesh_bytes(
     With a confidence PLY and GLB carry a colour per vertex: from dark grey, heard by no pose, to
     bright yellow, heard by a hundred or more, in steps even to the eye over the logarithm (see
     :func:`~sononerf.reconstruction.confidence.confidence_colours`). PLY also holds the numbers
-    themselves, as the vertices' property ``poses``. STL knows neither.
+    themselves, as the vertices' property ``poses``, and always their normals. STL knows neither.
 
     Parameters
     ----------
@@ -66,7 +66,8 @@ def mesh_bytes(
     bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, validate=False)
     if confidence is not None:
         _carry(bare, file_type, np.asarray(confidence))
-    return bytes(bare.export(file_type=file_type))
+    options = {"vertex_normal": True} if file_type == "ply" else {}
+    return bytes(bare.export(file_type=file_type, **options))
 
 
 def _carry(mesh: trimesh.Trimesh, file_type: MeshFormat, poses: NDArray[Any]) -> None:
