@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf import __version__, storage
+from sononerf.acoustics.ears import directivity_content
 from sononerf.acoustics.reception import warn_of_call
 from sononerf.acoustics.spectrogram import compress
 from sononerf.config import Settings
@@ -47,6 +48,8 @@ def echo_hash(settings: Settings, scene: Scene) -> str:
     place is another ensemble, the same table at another place is not.
     """
     plain = settings.plain()
+    # A measured directivity counts as what it is, not as where it lies.
+    plain["ears"]["file"] = directivity_content(settings.ears)
     digest = hashlib.sha256(f"simulator {VERSION}".encode())
     digest.update(json.dumps([plain[name] for name in HASHED_SECTIONS], sort_keys=True).encode())
     poses, split = ensemble_poses(settings)
@@ -200,6 +203,7 @@ def simulate(
             range=simulator.range,
             frequency=simulator.frequency,
             attributes=_attributes(settings, wanted, simulator),
+            receivers=len(simulator.ears.positions),
         )
         _fill(store, simulator, poses, settings, workers, scheduler, progress)
         store.seal()

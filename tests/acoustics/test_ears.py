@@ -4,7 +4,7 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 
 from sononerf.acoustics.call import call_waveform, sweep_delay
-from sononerf.acoustics.ears import Ears, analysed_ears, beam_gain, ear_gain, synthetic_ears
+from sononerf.acoustics.ears import Ears, analysed_ears, beam_gain, ear_gain, ear_tables
 from sononerf.acoustics.spectrogram import (
     echo_samples,
     frequency_axis,
@@ -19,7 +19,7 @@ FREQUENCY = np.array([10e3, 40e3, 60e3, 100e3])
 
 @pytest.fixture(scope="module")
 def ears():
-    return synthetic_ears(EarSettings(), FREQUENCY)
+    return ear_tables(EarSettings(), FREQUENCY)
 
 
 def direction(azimuth_deg, elevation_deg):
@@ -51,7 +51,7 @@ def test_left_ear_hears_best_on_its_axis(ears):
 
 
 def test_width_of_an_ear_at_50_kilohertz():
-    ears = synthetic_ears(EarSettings(azimuth_deg=0, elevation_deg=0, notch_depth=0), [50e3, 200e3])
+    ears = ear_tables(EarSettings(azimuth_deg=0, elevation_deg=0, notch_depth=0), [50e3, 200e3])
     gain = ear_gain(ears, 0, np.concatenate([direction(44, 0), direction(0, -44)]))
     expected = np.exp(-0.5 * (44 / 45) ** 2 * np.array([1.0, 4.0]))
     np.testing.assert_allclose(gain, np.stack([expected, expected]), rtol=1e-5)
@@ -62,7 +62,7 @@ def test_notch_rises_with_elevation(elevation_deg, notch):
     frequency = np.arange(20e3, 110e3, 500.0)
     deep, flat = (
         ear_gain(
-            synthetic_ears(EarSettings(notch_depth=d), frequency), 0, direction(0, elevation_deg)
+            ear_tables(EarSettings(notch_depth=d), frequency), 0, direction(0, elevation_deg)
         )
         for d in (0.8, 0.0)
     )
@@ -74,14 +74,14 @@ def test_notch_rises_with_elevation(elevation_deg, notch):
 def test_beam_has_the_pistons_null_where_the_book_says():
     # First null of a piston: ka sin(theta) = 3.8317.
     radius = 3.8317 * 343.0 / (2 * np.pi * 100e3) / np.sin(np.radians(40.0))
-    ears = synthetic_ears(EarSettings(beam_radius=radius), [100e3])
+    ears = ear_tables(EarSettings(beam_radius=radius), [100e3])
     gain = beam_gain(ears, np.concatenate([direction(0, 0), direction(40, 0), direction(0, 40)]))
     assert gain[0, 0] == pytest.approx(1.0, abs=1e-6)
     np.testing.assert_allclose(gain[1:, 0], 0.0, atol=1e-4)
 
 
 def test_no_radius_emits_alike_in_all_directions():
-    ears = synthetic_ears(EarSettings(beam_radius=0.0), FREQUENCY)
+    ears = ear_tables(EarSettings(beam_radius=0.0), FREQUENCY)
     np.testing.assert_array_equal(ears.beam, 1.0)
 
 
@@ -120,7 +120,7 @@ def test_analysed_ears_are_what_the_window_makes_of_an_echo():
     heard, lag = analysed_ears(head, CallSettings(), analysis)
     assert lag is None
     step = analysis.sampling_rate / analysis.fft
-    fine = synthetic_ears(head, np.arange(1, analysis.fft // 2 + 1) * step)
+    fine = ear_tables(head, np.arange(1, analysis.fft // 2 + 1) * step)
     row, column = 40, 95  # a little below and to the left of straight ahead
     gain = fine.ears[0, :, row, column].astype(float)
     spectrum = np.concatenate((gain[:1], gain))  # below the first bin as at it
@@ -151,7 +151,7 @@ def test_analysed_ears_are_what_a_sweeps_rows_hear(kind):
     waveform = call_waveform(call, analysis.sampling_rate)
     echo[2000 : 2000 + len(waveform)] = waveform
     frequency = np.fft.rfftfreq(len(echo), 1 / analysis.sampling_rate)
-    fine = synthetic_ears(head, np.maximum(frequency, 1.0) + 1e-6 * np.arange(len(frequency)))
+    fine = ear_tables(head, np.maximum(frequency, 1.0) + 1e-6 * np.arange(len(frequency)))
     row, column = 40, 95
     gain = fine.ears[0, :, row, column].astype(float)
     # The beam of no radius fades towards the back and sounds alike at all frequencies.
