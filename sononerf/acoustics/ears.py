@@ -73,7 +73,7 @@ class Ears:
     @property
     def alike(self) -> bool:
         """Whether all receivers share one table in memory."""
-        return self.ears.strides[0] == 0
+        return len(self.ears) == 1 or self.ears.strides[0] == 0
 
     @cached_property
     def _by_direction(self) -> NDArray[np.float32]:
@@ -180,7 +180,7 @@ def _places(
     if measured is not None and len(measured.gains) != 2:
         raise SettingsError(
             f"ears.receivers: missing; {settings.file} does not state the places of its "
-            f"{len(measured.gains)} receivers"
+            f"{len(measured.gains)} receiver{'s' * (len(measured.gains) > 1)}"
         )
     sides = [1.0, -1.0]
     return np.stack([left * (1.0, side, 1.0) for side in sides]), sides

@@ -67,10 +67,13 @@ def read_sofa(path: Path) -> Directivity:
 def _spectrum(file: h5py.File, path: Path) -> tuple[Array, Array]:
     """Return frequencies (F,) and magnitudes (M, R, F)."""
     if find(file, "Data.IR") is None:
-        pressure = numbers(file, "Data.Real") + 1j * numbers(file, "Data.Imag")
-        if "N" not in file:
-            raise InputError(f"{path}: holds no frequencies N")
-        frequency = numbers(file, "N").astype(np.float64).reshape(-1)
+        real, imaginary = numbers(file, "Data.Real"), numbers(file, "Data.Imag")
+        if real.shape != imaginary.shape:
+            raise InputError(
+                f"{path}: Data.Real and Data.Imag differ in shape: {real.shape}, {imaginary.shape}"
+            )
+        pressure = real + 1j * imaginary
+        frequency: Array = numbers(file, "N").astype(np.float64).reshape(-1)
     else:
         response = numbers(file, "Data.IR").astype(np.float64)
         rate = float(numbers(file, "Data.SamplingRate").reshape(-1)[0])
@@ -79,7 +82,7 @@ def _spectrum(file: h5py.File, path: Path) -> tuple[Array, Array]:
         # Twice as long: a squared magnitude changes twice as fast as its response is long.
         length = 2 * max(response.shape[-1], 1)
         pressure = np.fft.rfft(response, length, axis=-1)
-        frequency = np.fft.rfftfreq(length, 1.0 / rate)
+        frequency = np.arange(length // 2 + 1) * (rate / length)
     if pressure.ndim != 3 or pressure.shape[2] != len(frequency):
         raise InputError(
             f"{path}: the data have the shape {pressure.shape}, expected (measurements, "

@@ -29,6 +29,7 @@ BULGE = 1e-4
 """The sphere is deformed by this fraction before it is triangulated. So the diagonals of the
 cells of a regular grid do not depend on rounding or on the order of the directions."""
 SAME = 1e-6  # rad; directions nearer than this are one
+EDGE = 1e-9  # weight of a corner; below minus this a direction lies beyond the edge
 NEAR = 24  # triangles that are tried for a direction before all are
 CHUNK = 512
 
@@ -67,7 +68,7 @@ def interpolation(known: Array, wanted: Array) -> csr_array:
     source = np.concatenate([np.arange(len(points)), nearest])
     triangles = _hull(every)
     measured = (triangles < len(points)).all(axis=1) & (_radius(every, triangles) <= GAP * spacing)
-    found, weights = _locate(every, triangles, wanted)
+    found, weights = _locate(every, triangles, measured, wanted)
     off = 2.0 * np.arcsin(np.minimum(tree.query(wanted)[0] / 2.0, 1.0)) - spacing
     fade = np.where(measured[found], 1.0, np.clip(1.0 - off / FADE, 0.0, 1.0))
     rows = np.repeat(np.arange(len(wanted)), 3)
@@ -103,12 +104,17 @@ def _spacing(points: Array) -> float:
 
 
 def _locate(
-    points: Array, triangles: NDArray[np.int64], wanted: Array
+    points: Array, triangles: NDArray[np.int64], first: NDArray[np.bool_], wanted: Array
 ) -> tuple[NDArray[np.int64], Array]:
     """Return the triangle that each direction runs through, and the weights (N, 3) of its corners.
 
-    The triangles enclose the origin.
+    The triangles enclose the origin. On the edge of two of them, those that come ``first`` count.
     """
+
+    def best(inside: Array, of: NDArray[np.int64]) -> NDArray[np.int64]:
+        least = inside.min(axis=2)
+        return np.asarray(np.where(least > -EDGE, 1.0 + first[of], least).argmax(axis=1))
+
     inverse = np.linalg.inv(points[triangles].transpose(0, 2, 1))
     centres = points[triangles].sum(axis=1)
     centres /= np.linalg.norm(centres, axis=1, keepdims=True)
@@ -119,13 +125,13 @@ def _locate(
         part = slice(start, start + CHUNK)
         tried = near[part]
         inside = np.einsum("nkij,nj->nki", inverse[tried], wanted[part])
-        best = inside.min(axis=2).argmax(axis=1)
-        rows = np.arange(len(best))
-        found[part], weights[part] = tried[rows, best], inside[rows, best]
-    for missed in np.array_split(*_portions(np.flatnonzero(weights.min(axis=1) < -1e-9))):
+        chosen, rows = best(inside, tried), np.arange(len(tried))
+        found[part], weights[part] = tried[rows, chosen], inside[rows, chosen]
+    every = np.arange(len(triangles))[None]
+    for missed in np.array_split(*_portions(np.flatnonzero(weights.min(axis=1) < -EDGE))):
         inside = np.einsum("kij,nj->nki", inverse, wanted[missed])
-        best = inside.min(axis=2).argmax(axis=1)
-        found[missed], weights[missed] = best, inside[np.arange(len(best)), best]
+        chosen = best(inside, every)
+        found[missed], weights[missed] = chosen, inside[np.arange(len(chosen)), chosen]
     weights = weights.clip(0.0)
     return found, weights / weights.sum(axis=1, keepdims=True)
 

@@ -6,7 +6,7 @@ import pytest
 from sononerf.acoustics.directivity.matlab import read_mat
 from sononerf.errors import InputError
 
-from .patterns import (
+from tests.acoustics.directivity.patterns import (
     AZIMUTH,
     FREQUENCY,
     batslam_fields,
@@ -50,9 +50,7 @@ def test_complex_gains_count_by_their_magnitude(tmp_path, write):
 @VERSIONS
 def test_one_frequency_and_no_emission(tmp_path, write):
     _, left, right, _ = gridded()
-    fields = batslam_fields(
-        freq_vec=5e4, hrtf_left=left[..., 1:2], hrtf_right=right[..., 1:2]
-    )
+    fields = batslam_fields(freq_vec=5e4, hrtf_left=left[..., 1:2], hrtf_right=right[..., 1:2])
     del fields["bat_hrtf"]["hrtf_em"]
     found = read_mat(write(tmp_path / "a.mat", fields))
     np.testing.assert_allclose(found.gains[..., 0], pair().gains[..., 1])

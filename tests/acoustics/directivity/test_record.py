@@ -7,7 +7,7 @@ import pytest
 from sononerf.acoustics.directivity.record import unit_vectors
 from sononerf.errors import InputError
 
-from .patterns import FREQUENCY, pair
+from tests.acoustics.directivity.patterns import FREQUENCY, pair
 
 
 def test_unit_vectors_are_of_the_head_frame():
