@@ -51,7 +51,11 @@ class Directivity:
 
     def __post_init__(self) -> None:
         self._check_shapes()
-        named = {"frequencies": self.frequency, "directions": self.directions, "gains": self.gains}
+        named: dict[str, Array] = {
+            "frequencies": self.frequency,
+            "directions": self.directions,
+            "gains": self.gains,
+        }
         if self.beam is not None:
             named["emitter's gains"] = self.beam
         if self.places is not None:
@@ -65,15 +69,13 @@ class Directivity:
         if not np.allclose(length, 1.0, atol=1e-6):
             raise InputError(f"{self.source}: a direction is no unit vector")
         for name in ("gains", "emitter's gains"):
-            values = named.get(name)
-            if values is None:
-                continue
-            if (values < 0.0).any():
+            least, most = (named[name].min(), named[name].max()) if name in named else (0.0, 1.0)
+            if least < 0.0:
                 raise InputError(
-                    f"{self.source}: the {name} hold the negative value {values.min():.3g}; "
+                    f"{self.source}: the {name} hold the negative value {least:.3g}; "
                     "expected linear gains of 0 or more"
                 )
-            if not values.any():
+            if most == 0.0:
                 raise InputError(f"{self.source}: the {name} are all zero")
 
     def _check_shapes(self) -> None:

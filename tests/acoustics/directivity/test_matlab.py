@@ -5,7 +5,6 @@ import pytest
 
 from sononerf.acoustics.directivity.matlab import read_mat
 from sononerf.errors import InputError
-
 from tests.acoustics.directivity.patterns import (
     AZIMUTH,
     FREQUENCY,
@@ -81,7 +80,7 @@ def test_a_bad_file_is_one_line(tmp_path, write, fields, said):
 
 def test_objects_are_refused(tmp_path):
     fields = batslam_fields(hrtf_left=np.array([{"a": 1}, "text", 3.0], dtype=object))
-    with pytest.raises(InputError, match="hrtf_left holds .*expected an array of numbers"):
+    with pytest.raises(InputError, match=r"hrtf_left holds .*expected an array of numbers"):
         read_mat(write_v5(tmp_path / "a.mat", fields))
     path = write_v73(tmp_path / "b.mat", batslam_fields())
     with h5py.File(path, "r+") as file:

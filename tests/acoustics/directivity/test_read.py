@@ -1,6 +1,4 @@
 # SPDX-License-Identifier: MIT
-import os
-
 import numpy as np
 import pytest
 
@@ -65,4 +63,4 @@ def test_what_cannot_be_read(tmp_path):
     (tmp_path / "empty").touch()
     with pytest.raises(InputError, match="columns none"):
         read_directivity(tmp_path / "empty")
-    assert os.listdir(tmp_path) == ["empty"]
+    assert [path.name for path in tmp_path.iterdir()] == ["empty"]

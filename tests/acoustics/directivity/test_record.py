@@ -6,7 +6,6 @@ import pytest
 
 from sononerf.acoustics.directivity.record import unit_vectors
 from sononerf.errors import InputError
-
 from tests.acoustics.directivity.patterns import FREQUENCY, pair
 
 
