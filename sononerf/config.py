@@ -126,7 +126,9 @@ class EarSettings(_Section):
 
     Two ears by default, at ``left`` and its mirror image. ``receivers`` gives other places, from
     one on. The directivity is that of a synthetic ear, of a circular piston of ``piston_radius``
-    that looks ahead, the same in all directions, or measured: read from ``file``.
+    that looks ahead, the same in all directions, or measured: read from ``file``, with the
+    receivers' places and the emitter's beam where it has them. A synthetic ear looks to its own
+    side: ``azimuth_deg`` has the sign of its y, and is 0 where y is 0.
     """
 
     emitter: Vector = (0.0, 0.0, -0.010)
@@ -140,6 +142,17 @@ class EarSettings(_Section):
     elevation_deg: Annotated[float, Field(ge=-90, le=90)] = 10.0
     width_deg: Annotated[float, Field(ge=5, le=180)] = 45.0
     notch_depth: Annotated[float, Field(ge=0, lt=1)] = 0.8
+
+    @model_validator(mode="after")
+    def _file_is_of_its_directivity(self) -> EarSettings:
+        if self.directivity == "file" and self.file is None:
+            raise ValueError("the directivity file needs ears.file")
+        if self.directivity != "file" and self.file is not None:
+            raise ValueError(
+                f"file is of the directivity file, not of {self.directivity}; set directivity, or "
+                "leave it out"
+            )
+        return self
 
 
 class CallSettings(_Section):
@@ -348,6 +361,16 @@ class Settings(_Section):
     def _echoes_come_from_somewhere(self) -> Settings:
         if self.scene is None and self.data.store is None:
             raise ValueError("scene: missing; set scene.name, or data.store for recorded echoes")
+        return self
+
+    @model_validator(mode="after")
+    def _noise_is_of_each_receiver(self) -> Settings:
+        places, level = self.ears.receivers, self.noise.snr_db
+        if places is not None and len(places) != 2 and isinstance(level, tuple):
+            raise ValueError(
+                f"noise.snr_db: gives 2 levels for {len(places)} ears.receivers; give one level "
+                "for all"
+            )
         return self
 
     @model_validator(mode="after")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""The emitter's beam and the two ears as tables over direction and frequency.
+"""The emitter's beam and the receivers as tables over direction and frequency.
 
 Head frame: x forward, y left, z up. Azimuth counts from straight ahead, positive to the left;
-elevation is positive up. Ear 0 is the left one.
+elevation is positive up. Of two ears, ear 0 is the left one.
 """
 
 from __future__ import annotations
@@ -15,23 +15,21 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
-from scipy.special import j1
 
+from sononerf.acoustics import gains
 from sononerf.acoustics.call import call_waveform, sweep_delay
+from sononerf.acoustics.directivity.read import content_hash, read_directivity
+from sononerf.acoustics.directivity.record import Directivity, unit_vectors
 from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.config import CallSettings, EarSettings, SpectrogramSettings
+from sononerf.errors import SettingsError
 
-SPEED = 343.0  # m/s; the beam's width follows it so weakly that temperature is left out
 GRID_DEG = 2.0
-WIDTH_FREQUENCY = 50e3  # Hz, where an ear is as wide as its setting says
-NOTCH_MIDDLE = 60e3  # Hz, at elevation 0
-NOTCH_RISE = 30e3  # Hz, from elevation 0 to straight up
-NOTCH_WIDTH = 8e3  # Hz, standard deviation
 
 
 @dataclass(frozen=True, eq=False)
 class Ears:
-    """Real, non-negative gains of the beam and of each ear, and where they are.
+    """Real, non-negative gains of the beam and of each receiver, and where they are.
 
     Attributes
     ----------
@@ -44,11 +42,11 @@ class Ears:
     beam : (F, L, A) float32
         Gain of the emission.
     ears : (E, F, L, A) float32
-        Gain of each ear.
+        Gain of each receiver; all of them may share one table in memory.
     emitter : (3,) float64, m
         Head frame.
     positions : (E, 3) float64, m
-        Of the ears, head frame.
+        Of the receivers, head frame.
     """
 
     azimuth: NDArray[np.float64]
@@ -64,8 +62,18 @@ class Ears:
         if self.beam.shape != grid or self.ears.shape != (len(self.positions), *grid):
             raise ValueError(
                 f"beam {self.beam.shape} and ears {self.ears.shape} do not fit the grid {grid} "
-                f"of {len(self.positions)} ears"
+                f"of {len(self.positions)} receivers"
             )
+
+    @property
+    def directions(self) -> NDArray[np.float64]:
+        """Unit vectors of the grid, (L, A, 3)."""
+        return unit_vectors(self.azimuth, self.elevation[:, None])
+
+    @property
+    def alike(self) -> bool:
+        """Whether all receivers share one table in memory."""
+        return len(self.ears) == 1 or self.ears.strides[0] == 0
 
     @cached_property
     def _by_direction(self) -> NDArray[np.float32]:
@@ -75,20 +83,16 @@ class Ears:
         return np.ascontiguousarray(flat, dtype=np.float32)
 
 
-def synthetic_ears(settings: EarSettings, frequency: ArrayLike) -> Ears:
-    r"""Tables of a piston-like emitter and of two mirrored, bat-like ears.
-
-    The beam is that of a piston of radius ``a`` in a small head,
-    :math:`|2 J_1(ka \sin\theta) / (ka \sin\theta)| (1 + \cos\theta) / 2`; radius 0 emits alike in
-    all directions. An ear hears best towards its axis, as a Gaussian of the angle from it whose
-    width falls with the square root of frequency (``width_deg`` at 50 kHz); a spectral notch
-    rises from 30 kHz (straight down) over 60 kHz to 90 kHz (straight up), so that elevation can
-    be told from the spectrum.
+def ear_tables(settings: EarSettings, frequency: ArrayLike) -> Ears:
+    """Tables of the emitter and of the receivers that settings describe.
 
     Parameters
     ----------
     settings : EarSettings
-        Places, axes, widths.
+        Places and directivities; models are those of :mod:`sononerf.acoustics.gains`. Between
+        measured directions and frequencies gains are linear. Below the lowest and above the
+        highest measured frequency they are those at it; outside the measured directions they fade
+        to zero over 10 degrees.
     frequency : (F,) float, Hz
         Ascending.
 
@@ -96,40 +100,106 @@ def synthetic_ears(settings: EarSettings, frequency: ArrayLike) -> Ears:
     -------
     ears : Ears
         On a grid of 2 degrees.
+
+    Raises
+    ------
+    InputError
+        If the file of the directivity cannot be read.
+    SettingsError
+        If the receivers of settings and file do not fit.
     """
     f = np.asarray(frequency, dtype=np.float64)
+    measured = _measured(settings)
+    places, sides = _places(settings, measured)
+    azimuth, elevation, directions = _grid()
+    beam = None
+    if measured is not None:
+        tables, beam = _measured_tables(measured, f)
+    elif settings.directivity == "ear":
+        lobes = {side: gains.ear(directions, side, settings, f) for side in set(sides)}
+        tables = np.stack([lobes[side].astype(np.float32) for side in sides])
+    else:
+        radius = settings.piston_radius if settings.directivity == "piston" else 0.0
+        tables = gains.piston(directions, radius, f).astype(np.float32)[None]
+    if beam is None:
+        beam = gains.piston(directions, settings.beam_radius, f).astype(np.float32)
+    if len(tables) == 1:  # one table for all, however many they are
+        tables = np.broadcast_to(tables, (len(places), *tables.shape[1:]))
+    emitter = np.asarray(settings.emitter, dtype=np.float64)
+    return Ears(azimuth, elevation, f, beam, tables, emitter, places)
+
+
+def receiver_count(settings: EarSettings) -> int:
+    """Return how many receivers settings describe; raises as :func:`ear_tables`."""
+    return len(_places(settings, _measured(settings))[0])
+
+
+def directivity_content(settings: EarSettings) -> str | None:
+    """Return a hash of the directivity's file, None where there is none.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    return None if settings.file is None else content_hash(settings.file)
+
+
+@lru_cache(maxsize=1)
+def _grid() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return azimuths (A,), elevations (L,) and directions (L, A, 3) of the tables."""
     azimuth = np.radians(np.linspace(-180.0, 180.0, round(360.0 / GRID_DEG) + 1))
     elevation = np.radians(np.linspace(-90.0, 90.0, round(180.0 / GRID_DEG) + 1))
-    level = np.cos(elevation)[:, None]
-    directions = np.stack(
-        [
-            level * np.cos(azimuth),
-            level * np.sin(azimuth),
-            np.broadcast_to(np.sin(elevation)[:, None], (len(elevation), len(azimuth))),
-        ],
-        axis=-1,
-    )  # (L, A, 3)
-    notch_at = NOTCH_MIDDLE + NOTCH_RISE * elevation / (np.pi / 2.0)
-    off = (f[:, None] - notch_at) / NOTCH_WIDTH  # (F, L)
-    notch = 1.0 - settings.notch_depth * np.exp(-0.5 * off**2)
-    sides = (1.0, -1.0)
-    ears = [
-        _lobe(directions, side * settings.azimuth_deg, settings, f) * notch[:, :, None]
-        for side in sides
-    ]
+    return azimuth, elevation, unit_vectors(azimuth, elevation[:, None])
+
+
+@lru_cache(maxsize=4)
+def _grid_weights(measured: Directivity) -> csr_array:
+    return measured.weights(_grid()[2].reshape(-1, 3))
+
+
+def _measured(settings: EarSettings) -> Directivity | None:
+    return None if settings.file is None else read_directivity(settings.file)
+
+
+def _places(
+    settings: EarSettings, measured: Directivity | None
+) -> tuple[NDArray[np.float64], list[float]]:
+    """Return places (E, 3) of the receivers, and which way synthetic ears there look."""
     left = np.asarray(settings.left, dtype=np.float64)
-    return Ears(
-        azimuth,
-        elevation,
-        f,
-        _beam(directions, settings.beam_radius, f).astype(np.float32),
-        np.stack(ears).astype(np.float32),
-        np.asarray(settings.emitter, dtype=np.float64),
-        np.stack([left * (1.0, side, 1.0) for side in sides]),
-    )
+    if settings.receivers is not None:
+        places = np.asarray(settings.receivers, dtype=np.float64)
+        if measured is not None and len(measured.gains) not in (1, len(places)):
+            raise SettingsError(
+                f"ears.receivers: gives {len(places)} places, but {settings.file} holds "
+                f"{len(measured.gains)} receivers; give as many places, or leave them out"
+            )
+        return places, np.sign(places[:, 1]).tolist()
+    if measured is not None and measured.places is not None:
+        return measured.places, []
+    if measured is not None and len(measured.gains) != 2:
+        raise SettingsError(
+            f"ears.receivers: missing; {settings.file} does not state the places of its "
+            f"{len(measured.gains)} receiver{'s' * (len(measured.gains) > 1)}"
+        )
+    sides = [1.0, -1.0]
+    return np.stack([left * (1.0, side, 1.0) for side in sides]), sides
 
 
-@lru_cache(maxsize=4)  # a fit and its read-out ask nine times; no one may write to the arrays
+def _measured_tables(
+    measured: Directivity, frequency: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Return tables (E, F, L, A) and the beam (F, L, A) of a measured directivity."""
+    weights, shape = _grid_weights(measured), (len(frequency), *_grid()[2].shape[:2])
+
+    def table(values: NDArray[np.float64]) -> NDArray[np.float32]:
+        at_grid = weights @ measured.at(frequency, values)  # (L A, F)
+        return np.ascontiguousarray(at_grid.T, dtype=np.float32).reshape(shape)
+
+    ears = np.stack([table(gain) for gain in measured.gains])
+    return ears, None if measured.beam is None else table(measured.beam)
+
+
 def analysed_ears(
     settings: EarSettings, call: CallSettings, analysis: SpectrogramSettings
 ) -> tuple[Ears, NDArray[np.float32] | None]:
@@ -165,7 +235,20 @@ def analysed_ears(
         At the analysis' frequencies.
     lag : (E, F, L, A) float32 or None, s
         How much too late each ear hears an echo, beam included; None for an impulse.
+
+    Raises
+    ------
+    InputError, SettingsError
+        As :func:`ear_tables`.
     """
+    return _analysed(settings, call, analysis, directivity_content(settings))
+
+
+@lru_cache(maxsize=4)  # a fit and its read-out ask nine times; no one may write to the arrays
+def _analysed(
+    settings: EarSettings, call: CallSettings, analysis: SpectrogramSettings, content: str | None
+) -> tuple[Ears, NDArray[np.float32] | None]:
+    del content  # a changed file is read again
     wanted = frequency_axis(analysis)
     step = analysis.sampling_rate / analysis.fft
     window = np.hamming(analysis.window)
@@ -178,7 +261,7 @@ def analysed_ears(
     count = len(wanted) + 2 * reach
     # Below the first bin and above half the sampling rate there is nothing to hear.
     bins = np.clip(np.arange(first, first + count), 1, analysis.fft // 2)
-    fine = synthetic_ears(settings, bins.clip(1) * step + np.arange(count) * 1e-9)
+    fine = ear_tables(settings, bins.clip(1) * step + np.arange(count) * 1e-9)
     rows = np.arange(len(wanted))[:, None] + np.arange(2 * reach + 1)  # (F, K) of the fine bins
 
     def smeared(table: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -187,11 +270,11 @@ def analysed_ears(
         total = sum(np.moveaxis(padded[row], 0, -3) * part for part, row in parts)
         return np.asarray(total)
 
-    beam, ears = fine.beam.astype(np.float64), fine.ears.astype(np.float64)
-    lag: NDArray[np.float32] | None = None
+    beam = fine.beam.astype(np.float64)
+    lags: list[NDArray[np.float32]] = []
+    ears: list[NDArray[np.float32]] = []
     if call.kind == "impulse":
         weight = np.tile(smear / smear.sum(), (len(wanted), 1))
-        beam, ears = np.abs(smeared(beam, weight)), np.abs(smeared(ears, weight))
     else:
         waveform = call_waveform(call, analysis.sampling_rate)
         finer = math.ceil(len(waveform) / analysis.fft)
@@ -200,45 +283,28 @@ def analysed_ears(
         weight /= weight.sum(axis=1, keepdims=True)
         delay = sweep_delay(call, bins * step)
         later = weight * (delay[rows] - sweep_delay(call, wanted)[:, None])
-        heard = (beam * ears) ** 2
+    for single in fine.ears[:1] if fine.alike else fine.ears:  # one by one, for memory's sake
+        ear = single.astype(np.float64)
+        if call.kind == "impulse":
+            ears.append(np.abs(smeared(ear, weight)).astype(np.float32))
+            continue
+        heard = (beam * ear) ** 2
         late = smeared(heard, later) / np.maximum(smeared(heard, weight), 1e-30)
-        lag = late.astype(np.float32)
-        beam, ears = np.sqrt(smeared(beam**2, weight)), np.sqrt(smeared(ears**2, weight))
+        lags.append(late.astype(np.float32))
+        ears.append(np.sqrt(smeared(ear**2, weight)).astype(np.float32))
+    if call.kind == "impulse":
+        beam = np.abs(smeared(beam, weight))
+    else:
+        beam = np.sqrt(smeared(beam**2, weight))
+
+    def of_all(tables: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+        stacked = tables[0][None] if fine.alike else np.stack(tables)
+        return np.broadcast_to(stacked, (len(fine.positions), *stacked.shape[1:]))
+
     analysed = dataclasses.replace(
-        fine, frequency=wanted, beam=beam.astype(np.float32), ears=ears.astype(np.float32)
+        fine, frequency=wanted, beam=beam.astype(np.float32), ears=of_all(ears)
     )
-    return analysed, lag
-
-
-def _beam(
-    directions: NDArray[np.float64], radius: float, frequency: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    if radius == 0.0:
-        return np.ones((len(frequency), *directions.shape[:2]))
-    forward = directions[..., 0]
-    sine = np.sqrt(np.clip(1.0 - forward**2, 0.0, None))
-    x = (2.0 * np.pi * radius / SPEED) * frequency[:, None, None] * sine
-    piston = np.abs(np.where(x > 1e-6, 2.0 * j1(x) / np.where(x > 1e-6, x, 1.0), 1.0))
-    # An unbaffled source fades towards its back, smoothly.
-    return piston * (1.0 + forward) / 2.0
-
-
-def _lobe(
-    directions: NDArray[np.float64],
-    azimuth_deg: float,
-    settings: EarSettings,
-    frequency: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    azimuth, elevation = np.radians(azimuth_deg), np.radians(settings.elevation_deg)
-    axis = (
-        np.cos(elevation) * np.cos(azimuth),
-        np.cos(elevation) * np.sin(azimuth),
-        np.sin(elevation),
-    )
-    angle = np.arccos(np.clip(directions @ np.asarray(axis), -1.0, 1.0))
-    width = np.radians(settings.width_deg) * np.sqrt(WIDTH_FREQUENCY / frequency)
-    gain: NDArray[np.float64] = np.exp(-0.5 * (angle / width[:, None, None]) ** 2)
-    return gain
+    return analysed, of_all(lags) if lags else None
 
 
 def beam_gain(ears: Ears, directions_head: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -267,7 +333,7 @@ def ear_gain(ears: Ears, ear: int, directions_head: NDArray[np.float64]) -> NDAr
     ears : Ears
         Tables.
     ear : int
-        0 left, 1 right.
+        Its number.
     directions_head : (N, 3) float64
         Unit vectors from the ear to where the sound comes from, head frame.
 

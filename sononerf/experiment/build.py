@@ -12,7 +12,7 @@ from torch import Tensor
 
 from sononerf import plugins
 from sononerf.acoustics.air import absorption_in, speed_in
-from sononerf.acoustics.ears import analysed_ears, synthetic_ears
+from sononerf.acoustics.ears import analysed_ears, ear_tables
 from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import Settings, faults_of
@@ -29,7 +29,7 @@ from sononerf.renderer.renderer import Acquisition, Possible, Renderer
 
 
 def _tensor(values: NDArray[np.floating]) -> Tensor:
-    return torch.as_tensor(np.asarray(values), dtype=torch.float32)
+    return torch.tensor(np.asarray(values), dtype=torch.float32)
 
 
 def acquisition(settings: Settings) -> Acquisition:
@@ -129,7 +129,7 @@ def echo_region(
     echo = point_echo(settings)
     heard = heard or find_onsets(store, echo)
     hull = hull or echo_hull(settings, store, heard)
-    ears = synthetic_ears(settings.ears, frequency_axis(settings.spectrogram))
+    ears = ear_tables(settings.ears, frequency_axis(settings.spectrogram))
     rotations = np.asarray(store.rotations, dtype=np.float64)[heard.poses]
     found = EchoRegion(heard, hull, ears, rotations, echo.resolution)
     set_region = settings.region

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf import __version__, storage
+from sononerf.acoustics.ears import directivity_content
 from sononerf.acoustics.reception import warn_of_call
 from sononerf.acoustics.spectrogram import compress
 from sononerf.config import Settings
@@ -78,6 +79,9 @@ def _heard_settings(settings: Settings) -> dict[str, Any]:
     ):
         if section[key] == default:
             del section[key]
+    if "file" in ears:
+        # A measured directivity counts as what it is, not as where it lies.
+        ears["file"] = directivity_content(settings.ears)
     return plain
 
 
@@ -239,8 +243,8 @@ def simulate(
             split=split,
             range=simulator.range,
             frequency=simulator.frequency,
-            receivers=len(simulator.ears.positions),
             attributes=_attributes(settings, wanted, simulator),
+            receivers=len(simulator.ears.positions),
         )
         _fill(store, simulator, poses, settings, workers, scheduler, progress)
         store.seal()

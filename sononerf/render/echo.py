@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One pose: where its echo comes from, and what both ears hear."""
+"""One pose: where its echo comes from, and what the receivers hear."""
 
 from __future__ import annotations
 
@@ -22,13 +22,14 @@ from sononerf.render.shading import (
     camera_for,
     draw_mesh,
 )
-from sononerf.render.spectrogram import LEVEL_MAP, axis_edges, sounding_slice
+from sononerf.render.spectrogram import LEVEL_MAP, axis_edges, drawn_receivers, sounding_slice
 
 PALE = (0.84, 0.86, 0.88)
 HIT_MAP = "plasma"
 # What is fainter than the loudest hit by more than this is not drawn.
 HIT_RANGE_DB = 40.0
 EARS = ((46, 125, 50), (21, 101, 192))  # left, right
+MOST_ROWS = 3  # receivers; of more of them, so many are drawn, evenly chosen
 SIZE = (760, 800)
 # Of the head and of its look, as shares of the picture's height.
 HEAD, LOOK = 0.022, 0.25
@@ -51,7 +52,9 @@ def echo_png(
     speed_of_sound: float,
     title: str = "",
 ) -> bytes:
-    """Draw one pose: its hits on the scene, both ears' waveforms, and their spectrograms.
+    """Draw one pose: its hits on the scene, what receivers hear, and their spectrograms.
+
+    Of more than three receivers three are drawn.
 
     Parameters
     ----------
@@ -65,11 +68,12 @@ def echo_png(
         Of the head, world frame.
     rotation : (3, 3) float
         Head to world.
-    echo : (2, S) float
-        Pressure at the left and the right ear from the emission on, over that of the call at 1 m.
+    echo : (E, S) float
+        Pressure at the receivers from the emission on, over that of the call at 1 m. Two of them
+        are the left and the right ear.
     sampling_rate : float, Hz
         Of the echo.
-    spectrogram_db : (2, R, F) float, dB
+    spectrogram_db : (E, R, F) float, dB
         0 dB is silence.
     range_m : (R,) float, m
         Range axis, ascending; drawn only around what sounds.
@@ -99,12 +103,12 @@ def echo_png(
     sounds = np.asarray(spectrogram_db, dtype=np.float64)
     if levels.shape != (len(hits),):
         raise ValueError(f"levels have shape {levels.shape}, expected ({len(hits)},)")
-    if waves.ndim != 2 or len(waves) != 2 or not waves.size:
-        raise ValueError(f"the echo has shape {waves.shape}, expected (2, S)")
-    if sounds.shape != (2, len(ranges), len(frequencies)) or not sounds.size:
+    if waves.ndim != 2 or not waves.size:
+        raise ValueError(f"the echo has shape {waves.shape}, expected (E, S)")
+    if sounds.shape != (len(waves), len(ranges), len(frequencies)) or not sounds.size:
         raise ValueError(
-            f"the spectrogram has shape {sounds.shape}, expected (2, R, F) with "
-            f"R = {len(ranges)} and F = {len(frequencies)}"
+            f"the spectrogram has shape {sounds.shape}, expected (E, R, F) with "
+            f"E = {len(waves)}, R = {len(ranges)} and F = {len(frequencies)}"
         )
     for name, values in (("hits", hits), ("levels", levels), ("echo", waves), ("dB", sounds)):
         if not np.isfinite(values).all():
@@ -112,16 +116,20 @@ def echo_png(
     place = np.asarray(position, dtype=np.float64).reshape(3)
     turn = np.asarray(rotation, dtype=np.float64).reshape(3, 3)
     relative = levels - levels.max() if len(levels) else levels
-    view = hits_image(mesh, hits, relative, place, turn)
+    receivers = len(waves)
+    view = hits_image(mesh, hits, relative, place, turn, receivers=receivers)
     shown = sounding_slice(sounds, ranges)
     distance = np.arange(waves.shape[1], dtype=np.float64) * speed_of_sound / (2.0 * sampling_rate)
     with figure(13.0, 6.6, 130) as drawn:
         left, right = drawn.subfigures(1, 2, width_ratios=[1.0, 1.08])
         unhit = "no hit: edges alone are heard" if waves.any() else "no hit is heard"
         _draw_view(left, view, len(hits), int((relative >= -HIT_RANGE_DB).sum()), unhit)
-        axes = right.subplots(4, 1, sharex=True, height_ratios=[1, 1, 1.5, 1.5])
-        _draw_waves(axes[:2], distance, waves)
-        _draw_spectrograms(right, axes[2:], sounds[:, shown], ranges[shown], frequencies)
+        chosen, names = drawn_receivers(receivers, MOST_ROWS)
+        rows = len(chosen)
+        axes = right.subplots(2 * rows, 1, sharex=True, height_ratios=[1.0] * rows + [1.5] * rows)
+        _draw_waves(axes[:rows], distance, waves[chosen], names)
+        sounds = sounds[chosen][:, shown]
+        _draw_spectrograms(right, axes[rows:], sounds, ranges[shown], frequencies, names)
         axes[0].set_xlim(*axis_edges(ranges[shown]))
         _add_time_axis(axes[0], speed_of_sound)
         if title:
@@ -143,14 +151,17 @@ def _draw_view(part: Any, view: NDArray[np.uint8], count: int, drawn: int, unhit
     bar.set_label("strength of a hit (dB below the loudest)")
 
 
-def _draw_waves(axes: Any, distance: NDArray[np.float64], waves: NDArray[np.float64]) -> None:
+def _draw_waves(
+    axes: Any, distance: NDArray[np.float64], waves: NDArray[np.float64], names: list[str]
+) -> None:
     # A number that is easy to read, and its power of ten in the label.
     top = float(np.abs(waves).max())
     power = int(np.floor(np.log10(top))) if top > 0.0 else 0
-    for panel, wave, colour, name in zip(axes, waves, EARS, ("left", "right"), strict=True):
+    colours = (*EARS, (96, 96, 96))
+    for panel, wave, colour, name in zip(axes, waves, colours, names, strict=False):
         panel.plot(distance, wave / 10.0**power, color=np.divide(colour, 255), linewidth=0.7)
         panel.set_ylim(*(1.08 * (top / 10.0**power or 1.0) * np.array([-1.0, 1.0])))
-        panel.set_ylabel(f"{name} ear\npressure (10$^{{{power}}}$)")
+        panel.set_ylabel(f"{name}\npressure (10$^{{{power}}}$)")
         panel.grid(alpha=0.25, linewidth=0.5)
 
 
@@ -160,13 +171,14 @@ def _draw_spectrograms(
     sounds: NDArray[np.float64],
     ranges: NDArray[np.float64],
     frequencies: NDArray[np.float64],
+    names: list[str],
 ) -> None:
     extent = (*axis_edges(ranges), *axis_edges(frequencies / 1e3))
     top = max(5.0, float(np.ceil(sounds.max() / 5.0)) * 5.0)
-    for panel, sound, name in zip(axes, sounds, ("left", "right"), strict=True):
+    for panel, sound, name in zip(axes, sounds, names, strict=True):
         options = {"vmin": 0.0, "vmax": top, "extent": extent, "aspect": "auto"}
         level = panel.imshow(sound.T, cmap=LEVEL_MAP, **options)
-        panel.set_ylabel(f"{name} ear\nfrequency (kHz)")
+        panel.set_ylabel(f"{name}\nfrequency (kHz)")
     axes[-1].set_xlabel("range (m)")
     part.colorbar(level, ax=list(axes), label="level (dB)", pad=0.01, aspect=24)
 
@@ -186,6 +198,7 @@ def hits_image(
     position: NDArray[np.float64],
     rotation: NDArray[np.float64],
     *,
+    receivers: int = 2,
     size: tuple[int, int] = SIZE,
 ) -> NDArray[np.uint8]:
     """Draw a scene with its hits and the head that hears them, seen over the head's shoulder.
@@ -202,6 +215,8 @@ def hits_image(
         Of the head.
     rotation : (3, 3) float
         Head to world.
+    receivers : int
+        How many hear; of two, the head has ears.
     size : (int, int)
         Width and height in pixels.
 
@@ -225,7 +240,7 @@ def hits_image(
     nearness = draw_mesh(pixels, mesh, fine, PALE)
     _draw_hits(pixels, nearness, fine, points, relative_db, float(mesh.scale))
     picture = Image.fromarray(np.round(255 * pixels).astype(np.uint8))
-    _draw_head(picture, fine, position, rotation)
+    _draw_head(picture, fine, position, rotation, ears=receivers == 2)
     done = Image.fromarray(averaged(np.asarray(picture) / 255.0))
     draw_scale_bar(done, camera)
     draw_axes(done, camera)
@@ -281,13 +296,15 @@ def _draw_head(
     camera: Camera,
     position: NDArray[np.float64],
     rotation: NDArray[np.float64],
+    *,
+    ears: bool,
 ) -> None:
-    """Draw a head of a fixed size in the picture, its ears, and where it looks."""
+    """Draw a head of a fixed size in the picture, its ears if any, and where it looks."""
     draw = ImageDraw.Draw(picture)
     unit = camera.height / camera.scale  # m per height of the picture
     forward, left, up = rotation.T
     tip = position + LOOK * unit * forward
-    (start, end, *ears), _ = camera.project(
+    (start, end, *sides), _ = camera.project(
         np.stack(
             [
                 position,
@@ -306,7 +323,7 @@ def _draw_head(
         corners = [end + back * barb, end - side * barb / 2, end + side * barb / 2]
         draw.polygon([tuple(corner) for corner in corners], fill=INK)
     radius = HEAD * camera.height * 0.8
-    for ear, colour, name in zip(ears, EARS, "LR", strict=True):
+    for ear, colour, name in zip(sides if ears else [], EARS, "LR", strict=False):
         _disc(draw, ear, 0.55 * radius, colour)
         outwards = ear - start
         outwards = outwards / max(float(np.linalg.norm(outwards)), 1e-9)

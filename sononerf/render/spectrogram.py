@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Spectrograms of both ears: measured, predicted, and their difference."""
+"""Spectrograms of the receivers: measured, predicted, and their difference."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from sononerf.render.figure import figure, pixels_from_figure, png_from_pixels
 ACTIVE_DB = 3.0
 MARGIN = 0.02
 LEVEL_MAP, DIFFERENCE_MAP = "magma", "RdBu_r"
+MOST_ROWS = 8  # receivers; of more of them, so many are drawn, evenly chosen
 # Inches: what labels need on each side of the panels, between them, and for a colour bar.
 LEFT, TOP, BOTTOM, GAP = 0.76, 0.48, 0.46, 0.13
 BAR, BAR_GAP, BAR_WIDTH = 0.82, 0.08, 0.19
@@ -27,7 +28,7 @@ def spectrogram_png(
     frequency_hz: ArrayLike,
     title: str = "",
 ) -> bytes:
-    """Draw one pose's spectrograms, one row per ear.
+    """Draw one pose's spectrograms, one row per receiver, of eight at most.
 
     Parameters
     ----------
@@ -107,6 +108,22 @@ def _checked(
     return levels, ranges, frequencies
 
 
+def drawn_receivers(count: int, most: int = MOST_ROWS) -> tuple[NDArray[np.int64], list[str]]:
+    """Return which receivers are drawn, evenly chosen, and their names.
+
+    Parameters
+    ----------
+    count : int
+        How many there are.
+    most : int
+        How many are drawn at most.
+    """
+    chosen = np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
+    if count == 2:
+        return chosen, ["left ear", "right ear"]
+    return chosen, ["receiver" if count == 1 else f"receiver {number}" for number in chosen]
+
+
 def axis_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
     """Return the outer edges of an axis' first and last cell, so that ticks stand at centres."""
     half = (axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5
@@ -129,10 +146,11 @@ def _pixels(
     shown = sounding_slice(np.stack([*panels.values()]), ranges)
     panels, ranges = {name: values[:, shown] for name, values in panels.items()}, ranges[shown]
     top = _round_up(max(values.max() for values in panels.values()), 5)
-    columns, ears = len(panels), len(panels["predicted"])
+    chosen, names = drawn_receivers(len(panels["predicted"]))
+    panels = {name: values[chosen] for name, values in panels.items()}
+    columns, ears = len(panels), len(chosen)
     if columns == 2:
         panels["predicted − measured"] = panels["predicted"] - panels["measured"]
-    names = ["left ear", "right ear"] if ears == 2 else [f"ear {ear}" for ear in range(ears)]
     extent = (*axis_edges(ranges), *axis_edges(frequencies / 1e3))
     width, height = 10.5 * len(panels) / 3 + (len(panels) == 1), 0.9 + 2.3 * ears
     with figure(width, height, dpi, layout=None) as drawn:

@@ -30,7 +30,7 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
-from sononerf.acoustics.ears import NOTCH_WIDTH
+from sononerf.acoustics.gains import NOTCH_WIDTH
 from sononerf.config import SpectrogramSettings
 
 HIGHEST = 150e3

@@ -222,17 +222,10 @@ class Rays(Engine):
         # Laid out in the head's frame, the pattern turns with head and scene together.
         cap = CapSpiral(self.rays - extra, axis @ rotation, half_angle, offset, rotation)
 
-        _, ears = self.hearing.places(position, rotation)
-        if np.ptp(ears, axis=0).max() < EARS_APART:
-            ears = ears.mean(axis=0, keepdims=True)
+        listeners = self._listeners(position, rotation)
 
         def judge(bounce: Bounce) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-            audible, doubt = self._judge(bounce, ears[0])
-            for ear in ears[1:]:
-                also, more = self._judge(bounce, ear)
-                audible |= also
-                np.maximum(doubt, more, out=doubt)
-            return audible, doubt
+            return self._judge_all(bounce, listeners)
 
         index = self._reaching(cap, emitter)
         return echo_paths(
@@ -260,15 +253,15 @@ class Rays(Engine):
         outlines = self._outlines
         if shadow.none or outlines is None:
             return
-        emitter, ears = self.hearing.places(position, rotation)
-        middle = ears.mean(axis=0)
+        emitter, _ = self.hearing.places(position, rotation)
+        listeners = self._listeners(position, rotation)
         rays = round(self.rays * HIDDEN_SHARE)
         extra = round(rays * HIDDEN_DIVIDED)
         axis, half_angle = aim(emitter, self._centre, self._radius)
         cap = CapSpiral(max(rays - extra, 1), axis @ rotation, half_angle, offset, rotation)
 
         def judge(bounce: Bounce) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-            audible, doubt = self._judge(bounce, middle)
+            audible, doubt = self._judge_all(bounce, listeners)
             chosen = np.flatnonzero(audible)
             level = shadow.level(bounce.points[chosen], bounce.triangles[chosen, -1])
             audible[chosen] = level > LEAST
@@ -285,6 +278,31 @@ class Rays(Engine):
             index=index,
         ):  # fmt: skip
             yield replace(bounce, hidden=True)
+
+    def _listeners(
+        self, position: NDArray[np.float64], rotation: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Places (L, 3) that between them tell what any ear can hear, m, world frame."""
+        _, ears = self.hearing.places(position, rotation)
+        if np.ptp(ears, axis=0).max() < EARS_APART:
+            return np.asarray(ears.mean(axis=0, keepdims=True))
+        # One for all within a ball of that size about it.
+        chosen: list[NDArray[np.float64]] = []
+        for ear in ears:
+            if all(np.linalg.norm(ear - other) >= EARS_APART / 2.0 for other in chosen):
+                chosen.append(ear)
+        return np.stack(chosen)
+
+    def _judge_all(
+        self, bounce: Bounce, listeners: NDArray[np.float64]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        """Which hits some listener can hear (H,), and by how much each (H,) may be wrong."""
+        audible, doubt = self._judge(bounce, listeners[0])
+        for place in listeners[1:]:
+            also, more = self._judge(bounce, place)
+            audible |= also
+            np.maximum(doubt, more, out=doubt)
+        return audible, doubt
 
     def _judge(
         self, bounce: Bounce, listener: NDArray[np.float64]

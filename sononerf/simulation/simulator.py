@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.acoustics.air import absorption_in, speed_in
-from sononerf.acoustics.ears import Ears, synthetic_ears
+from sononerf.acoustics.ears import Ears, ear_tables, receiver_count
 from sononerf.acoustics.reception import WINDOW_BANDWIDTH, Reception
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import Settings, SimulationSettings, SpectrogramSettings
+from sononerf.errors import SettingsError
 from sononerf.scene import Scene
 from sononerf.simulation.arrival import silence_before
 from sononerf.simulation.boundary import Boundary
@@ -68,13 +69,18 @@ class Simulator:
         ------
         ValueError
             If the settings' ranges hold no analysis frame.
+        InputError
+            If the file of the directivity cannot be read.
+        SettingsError
+            If receivers of settings and file do not fit, or noise is set for two of others.
         """
+        _check_noise(settings)
         air = settings.air
         speed = speed_in(air)
         analysis = settings.spectrogram
         reception = Reception(settings.call, analysis, settings.noise, speed_of_sound=speed)
         synthesis = plan_synthesis(analysis, reception.samples)
-        gains, absorption = partial(synthetic_ears, settings.ears), partial(absorption_in, air)
+        gains, absorption = partial(ear_tables, settings.ears), partial(absorption_in, air)
         hearing = Hearing(gains(synthesis.nodes), synthesis, absorption(synthesis.nodes), speed)
         wanted = settings.simulation
         engine: Engine
@@ -112,7 +118,7 @@ class Simulator:
                     frequency_min=analysis.frequency_min,
                     **rays,
                 )
-        ears = synthetic_ears(settings.ears, frequency_axis(analysis))
+        ears = ear_tables(settings.ears, frequency_axis(analysis))
         return cls(engine, ears=ears, reception=reception)
 
     def hits(
@@ -184,6 +190,17 @@ class Simulator:
         """
         echo = self.echo(position, rotation, seed=seed)
         return self.reception.receive(echo, seed=seed)
+
+
+def _check_noise(settings: Settings) -> None:
+    """Refuse noise levels of two ears where a file has another number of receivers."""
+    if isinstance(settings.noise.snr_db, tuple):
+        count = receiver_count(settings.ears)
+        if count != 2:
+            raise SettingsError(
+                f"noise.snr_db: gives 2 levels, but {settings.ears.file} holds {count} receivers; "
+                "give one level for all"
+            )
 
 
 def solved_frequency(wanted: SimulationSettings, analysis: SpectrogramSettings) -> float:

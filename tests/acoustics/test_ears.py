@@ -4,7 +4,16 @@ import pytest
 from scipy.interpolate import RegularGridInterpolator
 
 from sononerf.acoustics.call import call_waveform, sweep_delay
-from sononerf.acoustics.ears import Ears, analysed_ears, beam_gain, ear_gain, synthetic_ears
+from sononerf.acoustics.directivity.sofa_writer import write_sofa
+from sononerf.acoustics.ears import (
+    Ears,
+    analysed_ears,
+    beam_gain,
+    directivity_content,
+    ear_gain,
+    ear_tables,
+    receiver_count,
+)
 from sononerf.acoustics.spectrogram import (
     echo_samples,
     frequency_axis,
@@ -12,14 +21,25 @@ from sononerf.acoustics.spectrogram import (
     spectrogram,
 )
 from sononerf.config import CallSettings, EarSettings, SpectrogramSettings
+from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.directions import fibonacci_sphere
+from tests.acoustics.directivity.patterns import (
+    AZIMUTH,
+    ELEVATION,
+    PLACES,
+    batslam_fields,
+    pair,
+    sononerf_fields,
+    write_v5,
+    write_v73,
+)
 
 FREQUENCY = np.array([10e3, 40e3, 60e3, 100e3])
 
 
 @pytest.fixture(scope="module")
 def ears():
-    return synthetic_ears(EarSettings(), FREQUENCY)
+    return ear_tables(EarSettings(), FREQUENCY)
 
 
 def direction(azimuth_deg, elevation_deg):
@@ -51,7 +71,7 @@ def test_left_ear_hears_best_on_its_axis(ears):
 
 
 def test_width_of_an_ear_at_50_kilohertz():
-    ears = synthetic_ears(EarSettings(azimuth_deg=0, elevation_deg=0, notch_depth=0), [50e3, 200e3])
+    ears = ear_tables(EarSettings(azimuth_deg=0, elevation_deg=0, notch_depth=0), [50e3, 200e3])
     gain = ear_gain(ears, 0, np.concatenate([direction(44, 0), direction(0, -44)]))
     expected = np.exp(-0.5 * (44 / 45) ** 2 * np.array([1.0, 4.0]))
     np.testing.assert_allclose(gain, np.stack([expected, expected]), rtol=1e-5)
@@ -61,9 +81,7 @@ def test_width_of_an_ear_at_50_kilohertz():
 def test_notch_rises_with_elevation(elevation_deg, notch):
     frequency = np.arange(20e3, 110e3, 500.0)
     deep, flat = (
-        ear_gain(
-            synthetic_ears(EarSettings(notch_depth=d), frequency), 0, direction(0, elevation_deg)
-        )
+        ear_gain(ear_tables(EarSettings(notch_depth=d), frequency), 0, direction(0, elevation_deg))
         for d in (0.8, 0.0)
     )
     ratio = (deep / flat)[0]
@@ -74,14 +92,14 @@ def test_notch_rises_with_elevation(elevation_deg, notch):
 def test_beam_has_the_pistons_null_where_the_book_says():
     # First null of a piston: ka sin(theta) = 3.8317.
     radius = 3.8317 * 343.0 / (2 * np.pi * 100e3) / np.sin(np.radians(40.0))
-    ears = synthetic_ears(EarSettings(beam_radius=radius), [100e3])
+    ears = ear_tables(EarSettings(beam_radius=radius), [100e3])
     gain = beam_gain(ears, np.concatenate([direction(0, 0), direction(40, 0), direction(0, 40)]))
     assert gain[0, 0] == pytest.approx(1.0, abs=1e-6)
     np.testing.assert_allclose(gain[1:, 0], 0.0, atol=1e-4)
 
 
 def test_no_radius_emits_alike_in_all_directions():
-    ears = synthetic_ears(EarSettings(beam_radius=0.0), FREQUENCY)
+    ears = ear_tables(EarSettings(beam_radius=0.0), FREQUENCY)
     np.testing.assert_array_equal(ears.beam, 1.0)
 
 
@@ -120,7 +138,7 @@ def test_analysed_ears_are_what_the_window_makes_of_an_echo():
     heard, lag = analysed_ears(head, CallSettings(), analysis)
     assert lag is None
     step = analysis.sampling_rate / analysis.fft
-    fine = synthetic_ears(head, np.arange(1, analysis.fft // 2 + 1) * step)
+    fine = ear_tables(head, np.arange(1, analysis.fft // 2 + 1) * step)
     row, column = 40, 95  # a little below and to the left of straight ahead
     gain = fine.ears[0, :, row, column].astype(float)
     spectrum = np.concatenate((gain[:1], gain))  # below the first bin as at it
@@ -151,7 +169,7 @@ def test_analysed_ears_are_what_a_sweeps_rows_hear(kind):
     waveform = call_waveform(call, analysis.sampling_rate)
     echo[2000 : 2000 + len(waveform)] = waveform
     frequency = np.fft.rfftfreq(len(echo), 1 / analysis.sampling_rate)
-    fine = synthetic_ears(head, np.maximum(frequency, 1.0) + 1e-6 * np.arange(len(frequency)))
+    fine = ear_tables(head, np.maximum(frequency, 1.0) + 1e-6 * np.arange(len(frequency)))
     row, column = 40, 95
     gain = fine.ears[0, :, row, column].astype(float)
     # The beam of no radius fades towards the back and sounds alike at all frequencies.
@@ -166,3 +184,149 @@ def test_analysed_ears_are_what_a_sweeps_rows_hear(kind):
     assert np.abs(raw - expected).max() > 0.05
     np.testing.assert_allclose(lag[0, :, row, column], late, atol=2e-6)
     assert np.abs(late).max() > 20e-6
+
+
+def line(count):
+    return [(0.0, 0.03 * (n - (count - 1) / 2), 0.0) for n in range(count)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 8, 32])
+@pytest.mark.parametrize("directivity", ["ear", "omnidirectional", "piston"])
+def test_any_number_of_receivers(count, directivity):
+    head = EarSettings(receivers=line(count), directivity=directivity)
+    ears = ear_tables(head, FREQUENCY)
+    assert receiver_count(head) == count
+    assert ears.ears.shape == (count, 4, 91, 181)
+    np.testing.assert_allclose(ears.positions, line(count))
+    assert ears.alike == (directivity != "ear" or count == 1)
+    np.testing.assert_allclose(
+        ear_gain(ears, count - 1, direction(20, 10)),
+        ears.ears[-1, :, 50, 100][None],
+        rtol=1e-4,
+    )
+
+
+def test_a_synthetic_ear_looks_to_its_own_side():
+    ears = ear_tables(EarSettings(receivers=[(0, -0.01, 0), (0, 0, 0), (0, 0.02, 0)]), [10e3])
+    looks = [np.degrees(ears.azimuth[table[0].max(axis=0).argmax()]) for table in ears.ears]
+    np.testing.assert_allclose(looks, [-25, 0, 25], atol=1.01)
+    two = ear_tables(EarSettings(), [10e3])
+    np.testing.assert_array_equal(ears.ears[2], two.ears[0])
+    np.testing.assert_array_equal(ears.ears[0], two.ears[1])
+
+
+def test_an_omnidirectional_receiver_hears_alike_everywhere():
+    ears = ear_tables(EarSettings(directivity="omnidirectional"), FREQUENCY)
+    assert (ears.ears == 1.0).all()
+    assert (ears.beam < 1.0).any()  # the emitter is another matter
+
+
+def test_a_piston_receiver_is_a_piston_of_its_radius():
+    head = EarSettings(directivity="piston", piston_radius=0.004, beam_radius=0.004)
+    ears = ear_tables(head, FREQUENCY)
+    np.testing.assert_array_equal(ears.ears[0], ears.beam)
+    wider = ear_tables(head.model_copy(update={"piston_radius": 0.002}), FREQUENCY)
+    assert (wider.ears >= ears.ears - 1e-6).mean() > 0.99
+
+
+def test_analysed_ears_of_receivers_that_are_alike_are_those_of_one():
+    analysis = SpectrogramSettings(frequency_min=50e3, frequency_max=52e3)
+    for call in (CallSettings(), CallSettings(kind="linear")):
+        one, alone = (
+            analysed_ears(EarSettings(directivity="piston", receivers=line(n)), call, analysis)
+            for n in (1, 8)
+        )
+        assert alone[0].ears.shape[0] == 8
+        np.testing.assert_array_equal(alone[0].ears[5], one[0].ears[0])
+        if one[1] is not None:
+            np.testing.assert_array_equal(alone[1][5], one[1][0])
+
+
+@pytest.fixture
+def file(tmp_path):
+    write_sofa(tmp_path / "a.sofa", pair())
+    return tmp_path / "a.sofa"
+
+
+def measured(path, **changes):
+    return EarSettings(directivity="file", file=path, **changes)
+
+
+def test_a_file_gives_ears_beam_and_places(file):
+    ears, known = ear_tables(measured(file), [30e3, 50e3]), pair()
+    np.testing.assert_allclose(ears.positions, PLACES)
+    for n, (azimuth, elevation) in enumerate((a, e) for a in AZIMUTH for e in ELEVATION):
+        towards = direction(azimuth, elevation)
+        for ear in (0, 1):
+            np.testing.assert_allclose(
+                ear_gain(ears, ear, towards)[0], known.gains[ear, n, :2], atol=1e-5
+            )
+        np.testing.assert_allclose(beam_gain(ears, towards)[0], known.beam[n, :2], atol=1e-5)
+
+
+def test_frequencies_outside_of_the_file_are_the_nearest(file):
+    ears = ear_tables(measured(file), [1e3, 30e3, 80e3, 150e3])
+    np.testing.assert_array_equal(ears.ears[:, 0], ears.ears[:, 1])
+    np.testing.assert_array_equal(ears.ears[:, 3], ears.ears[:, 2])
+
+
+def test_behind_the_measured_half_nothing_is_heard(file):
+    ears = ear_tables(measured(file), [50e3])
+    assert ear_gain(ears, 0, direction(90, 0))[0] > 0.1
+    assert ear_gain(ears, 0, direction(120, 0))[0] == 0.0
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_sofar_and_both_mat_layouts_give_the_same_tables(tmp_path):
+    from tests.acoustics.directivity.sofa_files import written
+
+    paths = [
+        written(tmp_path / "a.sofa", "SimpleFreeFieldHRTF"),
+        written(tmp_path / "b.sofa", "GeneralTF"),
+        write_v5(tmp_path / "a.mat", sononerf_fields()),
+        write_v73(tmp_path / "b.mat", sononerf_fields()),
+        write_v5(tmp_path / "c.mat", batslam_fields()),
+        write_v73(tmp_path / "d.mat", batslam_fields()),
+    ]
+    tables = [ear_tables(measured(path), [25e3, 40e3, 61e3]).ears for path in paths]
+    for table in tables[1:]:
+        np.testing.assert_allclose(table, tables[0], atol=1e-5)
+
+
+def test_places_of_settings_count_before_those_of_the_file(file, tmp_path):
+    there = ear_tables(measured(file, receivers=[(0, 0.1, 0), (0, -0.1, 0)]), [50e3])
+    np.testing.assert_allclose(there.positions[:, 1], [0.1, -0.1])
+    without = write_v5(tmp_path / "a.mat", batslam_fields())
+    np.testing.assert_allclose(
+        ear_tables(measured(without), [50e3]).positions, ear_tables(EarSettings(), [50e3]).positions
+    )
+
+
+def test_one_measured_receiver_serves_all_places(tmp_path):
+    table = tmp_path / "a.csv"
+    table.write_text("azimuth_deg,elevation_deg,frequency_hz,gain\n0,0,5e4,1\n9,9,5e4,0.5\n")
+    ears = ear_tables(measured(table, receivers=line(8)), [50e3])
+    assert ears.ears.shape[0] == 8
+    assert ears.alike
+    with pytest.raises(SettingsError, match="does not state the places of its 1 receiver"):
+        ear_tables(measured(table), [50e3])
+
+
+def test_numbers_of_receivers_must_fit(file):
+    with pytest.raises(SettingsError, match=r"gives 3 places, but .*a\.sofa holds 2 receivers"):
+        ear_tables(measured(file, receivers=line(3)), [50e3])
+    with pytest.raises(InputError, match="no such file"):
+        ear_tables(measured(file.with_name("b.sofa")), [50e3])
+
+
+def test_a_changed_file_is_heard(file):
+    analysis = SpectrogramSettings(frequency_min=40e3, frequency_max=50e3)
+    before = analysed_ears(measured(file), CallSettings(), analysis)[0]
+    content = directivity_content(measured(file))
+    known = pair()
+    object.__setattr__(known, "gains", known.gains / 2)
+    write_sofa(file, known)
+    after = analysed_ears(measured(file), CallSettings(), analysis)[0]
+    np.testing.assert_allclose(after.ears, before.ears / 2, rtol=1e-5)
+    assert directivity_content(measured(file)) != content
+    assert directivity_content(EarSettings()) is None

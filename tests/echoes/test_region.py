@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sononerf.acoustics.ears import synthetic_ears
+from sononerf.acoustics.ears import ear_tables
 from sononerf.config import EarSettings
 from sononerf.echoes.consistency import weighted
 from sononerf.echoes.free_space import EchoHull
@@ -16,7 +16,7 @@ from sononerf.geometry.poses import look_at
 
 STEP = 0.001
 RANGE = 0.15 + STEP * np.arange(601)
-EARS = synthetic_ears(EarSettings(), np.array([40e3, 70e3]))
+EARS = ear_tables(EarSettings(), np.array([40e3, 70e3]))
 HALF = 0.0054
 SAMPLES = np.linspace(-1, 1, 65)
 ECHO = PointEcho((0.54 + 0.46 * np.cos(np.pi * SAMPLES)) ** 4, HALF / 32, looks=4.0)

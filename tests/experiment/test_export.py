@@ -57,7 +57,7 @@ def test_prediction_volume_and_points_of_a_run(run, tmp_path):
         place = [
             float(file.variables[axis][...][k]) for axis, k in zip("xyz", loudest, strict=True)
         ]
-    assert np.linalg.norm(place) < 0.03  # the sphere of 20 mm lies at the origin
+    assert np.linalg.norm(place) < 0.04  # the sphere of 20 mm lies at the origin
     lines = export(run, tmp_path / "points.csv").read_text().splitlines()
     assert lines[0] == "x,y,z,nx,ny,nz,poses"
     table = np.loadtxt(io.StringIO("\n".join(lines[1:])), delimiter=",")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.metadata
 import json
 import os
@@ -16,6 +17,7 @@ import safetensors.torch
 import torch
 
 from sononerf import storage
+from sononerf.acoustics.directivity.sofa_writer import write_sofa
 from sononerf.callbacks.checkpoint import SIGNALS, CheckpointCallback
 from sononerf.callbacks.preview import PreviewCallback
 from sononerf.callbacks.progress import ProgressCallback
@@ -33,6 +35,7 @@ from sononerf.experiment import fit as fit_module
 from sononerf.experiment.build import acquisition, echo_hull
 from sononerf.experiment.fit import fit, peak_memory_bytes, require_accelerator
 from sononerf.module import EchoModule
+from tests.acoustics.directivity.patterns import pair
 
 STEPS, PER_EPOCH = 12, 4
 
@@ -436,3 +439,33 @@ def test_a_gpu_that_is_not_there(tiny, tmp_path, monkeypatch):
 
 def test_memory_is_counted_in_bytes():
     assert 50_000_000 < peak_memory_bytes() < 1_000_000_000_000
+
+
+def line(count):
+    return [[0.0, 0.03 * (n - (count - 1) / 2), 0.0] for n in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("count", "directivity"), [(1, "omnidirectional"), (8, "omnidirectional"), (3, "file")]
+)
+def test_any_receivers_from_scene_to_surface(tiny_settings, tmp_path, count, directivity):
+    ears = {"receivers": line(count), "directivity": directivity, "beam_radius": 0.0}
+    if directivity == "file":
+        known = pair()
+        known = dataclasses.replace(known, gains=known.gains[:1], places=None)
+        write_sofa(tmp_path / "a.sofa", known)
+        ears["file"] = str(tmp_path / "a.sofa")
+    settings = tiny_settings(
+        ears=ears,
+        fit={"epochs": 1, "steps_per_epoch": 2, "batch_poses": 2, "batch_frequencies": 2},
+        data={"store": str(tmp_path / "store")},
+    )
+    run(settings, tmp_path / "run")
+    store = EnsembleStore.open(tmp_path / "store")
+    assert store.receivers == count
+    heard = store.read_pose(0)
+    assert (heard.max(axis=(1, 2)) > 0.0).all()
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert metrics["cost"]["steps"] == 2
+    assert metrics["geometry"]["chamfer_m"] < 0.02
+    assert (tmp_path / "run" / "reconstruction" / "mesh.ply").is_file()

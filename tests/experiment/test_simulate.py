@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
+from sononerf.acoustics.directivity.sofa_writer import write_sofa
 from sononerf.data.store import EnsembleStore
 from sononerf.data.subtracted import SubtractedStore
 from sononerf.errors import (
@@ -33,6 +34,7 @@ from sononerf.experiment.simulate import (
 from sononerf.material import LEAF, RIGID
 from sononerf.scene import Scene, load_scene
 from sononerf.storage import lock
+from tests.acoustics.directivity.patterns import pair
 
 
 def hashed(settings):
@@ -48,6 +50,8 @@ def test_the_hash_covers_all_that_echoes_depend_on_and_nothing_else(tiny):
         {"simulation": {"rays": 501}},
         {"air": {"temperature_c": 20.0}},
         {"ears": {"azimuth_deg": 20.0}},
+        {"ears": {"receivers": [[0.0, 0.0, 0.0]]}},
+        {"ears": {"directivity": "piston"}},
         {"spectrogram": {"range_max": 0.46}},
     ):
         assert hashed(tiny(**changed)) != base, changed
@@ -58,6 +62,21 @@ def test_the_hash_covers_all_that_echoes_depend_on_and_nothing_else(tiny):
         {"reconstruction": {"spacing": 0.01}},
     ):
         assert hashed(tiny(**changed)) == base, changed
+
+
+def test_a_directivity_counts_as_what_it_is_not_as_where_it_lies(tiny, tmp_path):
+    first, second, third = (tmp_path / f"{name}.sofa" for name in "abc")
+    write_sofa(first, pair())
+    second.write_bytes(first.read_bytes())
+    write_sofa(third, pair(beam=False))
+    one, same, other = (
+        hashed(tiny(ears={"directivity": "file", "file": str(path)}))
+        for path in (first, second, third)
+    )
+    assert one == same
+    assert one != other
+    with pytest.raises(InputError, match="no such file"):
+        hashed(tiny(ears={"directivity": "file", "file": str(tmp_path / "d.sofa")}))
 
 
 def test_what_is_background_sounds_as_it_would_otherwise(tiny):

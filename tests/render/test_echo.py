@@ -145,7 +145,8 @@ def test_an_echo_without_a_hit_is_that_of_edges(ball, monkeypatch):
 def test_wrong_input_is_refused(ball):
     for changes, match in (
         ({"level_db": [0.0, 1.0]}, r"levels have shape \(2,\)"),
-        ({"echo": np.zeros((3, 9))}, r"expected \(2, S\)"),
+        ({"echo": np.zeros(9)}, r"expected \(E, S\)"),
+        ({"echo": np.zeros((3, 9))}, "E = 3"),
         ({"spectrogram_db": np.zeros((2, 5, 47))}, "R = 121 and F = 47"),
     ):
         with pytest.raises(ValueError, match=match):
@@ -160,3 +161,16 @@ def test_wrong_input_is_refused(ball):
             draw(ball, **{name: value})
     with pytest.raises(NumericalError, match="empty"):
         draw(trimesh.Trimesh())
+
+
+@pytest.mark.parametrize("receivers", [1, 3, 8])
+def test_any_number_of_receivers(ball, receivers):
+    data = draw(
+        ball,
+        echo=np.stack([wave()] * receivers),
+        spectrogram_db=np.stack([sounds()] * receivers),
+    )
+    image = pixels(data)
+    view = image[:, : int(0.45 * image.shape[1])]
+    for colour in EARS:  # no left and right ear on its head
+        assert not like(view, colour, 30).any()

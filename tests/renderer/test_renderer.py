@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from sononerf.acoustics.ears import beam_gain, synthetic_ears
+from sononerf.acoustics.ears import beam_gain, ear_tables
 from sononerf.config import EarSettings
 from sononerf.field.field import sphere_directions
 from sononerf.field.fourier import FourierField
@@ -39,7 +39,7 @@ def test_several_tables_are_looked_up_each_in_its_own_directions(acquisition):
 
 
 def test_gains_are_those_that_the_simulator_hears_with():
-    ears = synthetic_ears(EarSettings(), [30e3, 60e3])
+    ears = ear_tables(EarSettings(), [30e3, 60e3])
     directions = sphere_directions(500, REGION)
     found = look_up(torch.from_numpy(ears.beam).double(), directions)
     # The simulator's table is kept in single precision as well.

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from sononerf.acoustics.ears import beam_gain, ear_gain, synthetic_ears
+from sononerf.acoustics.ears import beam_gain, ear_gain, ear_tables
 from sononerf.acoustics.spectrogram import echo_samples
 from sononerf.config import EarSettings, SpectrogramSettings
 from sononerf.geometry.poses import rotation_from_euler
@@ -13,7 +13,7 @@ SPEED = 343.0
 ANALYSIS = SpectrogramSettings(range_max=0.4)
 SYNTHESIS = plan_synthesis(ANALYSIS, echo_samples(ANALYSIS, SPEED))
 NODES = SYNTHESIS.nodes
-EARS = synthetic_ears(EarSettings(left=(-0.01, 0.02, 0.03), emitter=(0.01, 0.0, -0.02)), NODES)
+EARS = ear_tables(EarSettings(left=(-0.01, 0.02, 0.03), emitter=(0.01, 0.0, -0.02)), NODES)
 POSITION = np.array([1.0, -2.0, 0.5])
 ROTATION = rotation_from_euler(1.0, 0.3, -0.2)
 POINT = POSITION + ROTATION @ np.array([[0.3, 0.05, -0.1]])[0]

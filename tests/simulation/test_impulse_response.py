@@ -4,7 +4,7 @@ import itertools
 import numpy as np
 import pytest
 
-from sononerf.acoustics.ears import NOTCH_WIDTH
+from sononerf.acoustics.gains import NOTCH_WIDTH
 from sononerf.acoustics.spectrogram import echo_samples
 from sononerf.config import SpectrogramSettings
 from sononerf.simulation import impulse_response

@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from scipy.integrate import quad
 
-from sononerf.acoustics.ears import Ears, beam_gain, ear_gain, synthetic_ears
+from sononerf.acoustics.ears import Ears, beam_gain, ear_gain, ear_tables
 from sononerf.acoustics.spectrogram import compress, echo_samples, spectrogram
 from sononerf.config import EarSettings, SpectrogramSettings
 from sononerf.geometry.poses import look_at, rotation_from_euler
@@ -194,7 +194,7 @@ def test_exchanging_emitter_and_ear_changes_nothing():
 
 
 def test_turning_scene_and_head_together_changes_nothing():
-    head = hearing(head=synthetic_ears(EarSettings(), NODES))
+    head = hearing(head=ear_tables(EarSettings(), NODES))
     position = np.array([0.3, 0.2, 0.1])
     rotation = look_at(position, np.array([0.02, 0.01, 0.0]))
     turn, shift = rotation_from_euler(1.0, 0.5, -0.3), np.array([1.0, -2.0, 0.5])
@@ -350,7 +350,7 @@ def test_a_pickled_engine_says_the_same():
 def test_beam_and_ears_weigh_what_comes_from_a_direction():
     """A small plate up to the left: the level of points, times beam and ear towards it."""
     wanted = EarSettings(emitter=(0.0, 0.0, 0.0), left=(0.0, 0.0, 0.0))
-    head = synthetic_ears(wanted, NODES)
+    head = ear_tables(wanted, NODES)
     towards = np.array([[0.3, 0.12, 0.08]])
     plate = wall(0.0, (-0.003, -0.003), (0.003, 0.003))
     plate.vertices = plate.vertices @ look_at(towards[0], np.zeros(3)).T + towards

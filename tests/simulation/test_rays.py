@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.acoustics.ears import synthetic_ears
+from sononerf.acoustics.ears import ear_tables
 from sononerf.config import EarSettings
 from sononerf.geometry.directions import CapSpiral
 from sononerf.geometry.poses import look_at, rotation_from_euler
@@ -39,7 +39,7 @@ def group_delay(pressure, frequency, expected):
 
 
 def bat():
-    head = synthetic_ears(EarSettings(), NODES)
+    head = ear_tables(EarSettings(), NODES)
     return Hearing(head, SYNTHESIS, np.zeros(len(NODES)), SPEED)
 
 

@@ -9,6 +9,7 @@ import scipy.signal
 import trimesh
 
 from sononerf.acoustics.air import air_absorption
+from sononerf.acoustics.directivity.sofa_writer import write_sofa
 from sononerf.acoustics.spectrogram import compress
 from sononerf.config import validate_settings
 from sononerf.errors import SettingsError
@@ -16,6 +17,7 @@ from sononerf.geometry.poses import look_at, rotation_from_euler
 from sononerf.material import RIGID, Material
 from sononerf.scene import Scene, load_scene
 from sononerf.simulation.simulator import Simulator
+from tests.acoustics.directivity.patterns import pair
 
 POINT_HEAD = {
     "emitter": [0, 0, 0], "left": [0, 0, 0], "beam_radius": 0, "azimuth_deg": 0,
@@ -314,3 +316,30 @@ def test_settings_of_the_rays_go_through():
 def test_kirchhoff_says_that_it_leaves_lobes_out(material, lines, caplog):
     simulator(load_scene("sphere", {"material": material}), simulation={"engine": "kirchhoff"})
     assert len([r for r in caplog.records if "lobes are left out" in r.getMessage()]) == lines
+
+
+def test_each_of_many_receivers_hears_as_it_does_alone():
+    """Eight of them, 0.2 m apart; the pattern of rays differs with what they judge between them."""
+    places = [(0.0, 0.03 * n - 0.105, 0.0) for n in range(8)]
+    scene = Scene(trimesh.creation.icosphere(subdivisions=5, radius=0.02))
+    pose = np.array([-0.4, 0.0, 0.0]), np.eye(3)
+    common = {"directivity": "omnidirectional", "beam_radius": 0.0}
+    together = simulator(scene, ears={"receivers": places, **common}).spectrogram(*pose, seed=0)
+    assert together.shape[0] == 8
+    for ear in (0, 5):
+        alone = simulator(scene, ears={"receivers": [places[ear]], **common})
+        assert active_error(alone.spectrogram(*pose, seed=0)[0], together[ear]) < 0.3
+
+
+def test_noise_of_two_ears_is_of_two_receivers(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("azimuth_deg,elevation_deg,frequency_hz,gain,receiver\n0,0,5e4,1,0\n")
+    scene = Scene(trimesh.creation.icosphere(radius=0.02))
+    ears = {"directivity": "file", "file": str(path), "receivers": [(0.0, 0.0, 0.0)]}
+    with pytest.raises(SettingsError, match=r"noise\.snr_db: gives 2 levels for 1 ears\.receivers"):
+        simulator(scene, ears=ears, noise={"snr_db": (10.0, 20.0)})
+    known = replace(pair(), gains=pair().gains[:1], places=np.zeros((1, 3)))
+    write_sofa(tmp_path / "a.sofa", known)
+    ears = {"directivity": "file", "file": str(tmp_path / "a.sofa")}
+    with pytest.raises(SettingsError, match=r"snr_db: gives 2 levels, but .* holds 1 receiver"):
+        simulator(scene, ears=ears, noise={"snr_db": (10.0, 20.0)})
