@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import poisson
 
 from sononerf.acoustics.call import covered
 from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.data.store import EnsembleStore
-from sononerf.echoes.detection import Levels, onsets, threshold_levels
+from sononerf.echoes.detection import FALSE_ALARMS, Levels, onsets, threshold_levels
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -49,13 +50,10 @@ class PointEcho:
         frequency = frequency_axis(analysis)
         swept = covered(call, frequency)
         heard = rows[swept] if swept.any() else rows[:1]
-        taper = np.hamming(analysis.window)
-        bandwidth = analysis.sampling_rate * (taper**2).sum() / taper.sum() ** 2
-        band = len(frequency) * analysis.sampling_rate / analysis.fft
         return cls(
             window=(heard**2).mean(axis=0),
             spacing=speed_of_sound / 2.0 / analysis.sampling_rate,
-            looks=max(band / bandwidth, 1.0),
+            looks=_looks(analysis, len(frequency)),
         )
 
     @property
@@ -63,6 +61,18 @@ class PointEcho:
         """Width in range over which its magnitude is above half of its greatest, m."""
         wide = np.flatnonzero(self.window >= 0.25 * self.window.max())
         return float(wide[-1] - wide[0] + 1) * self.spacing
+
+
+def _looks(analysis: SpectrogramSettings, rows: int) -> float:
+    """Return how many independent values white noise has in the mean power of rows.
+
+    It is the squared mean over the variance: overlapping rows share noise.
+    """
+    taper = np.hamming(analysis.window) ** 2
+    turns = np.multiply.outer(np.arange(rows), np.arange(analysis.window)) / analysis.fft
+    shared = np.abs(np.exp(-2j * np.pi * turns) @ taper / taper.sum()) ** 2
+    pairs = np.where(np.arange(rows) > 0, 2.0, 1.0) * (rows - np.arange(rows))
+    return float(rows**2 / (pairs * shared).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +98,18 @@ class Onsets:
     power: Array
     heard: Mask
     first: Array
+
+    def chance(self, resolution: float) -> float:
+        """Return the probability that noise alone makes so many onsets.
+
+        Parameters
+        ----------
+        resolution : float, m
+            Range resolution: as many slices as it is long share their noise.
+        """
+        extent = len(self.range) * float(self.range[1] - self.range[0])
+        tries = self.first.size * extent / resolution
+        return float(poisson.sf(np.isfinite(self.first).sum() - 1, FALSE_ALARMS * tries))
 
 
 def asked_poses(store: EnsembleStore) -> NDArray[np.int64]:

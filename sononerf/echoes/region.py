@@ -10,6 +10,7 @@ from scipy.spatial.distance import cdist
 
 from sononerf.acoustics.ears import Ears
 from sononerf.echoes.consistency import ACCURACY
+from sononerf.echoes.detection import FALSE_ALARMS
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.onsets import Onsets
 from sononerf.errors import NumericalError
@@ -29,6 +30,10 @@ arrive late and have no place of their own; they hold about as much."""
 NOTHING = (
     "no pose received an echo that another one confirms; check scene, poses and range limits, or "
     "set region.lower and region.upper"
+)
+NOISE = (
+    "no pose received an echo: an onset at {found} of {of} ears is no more than noise alone gives; "
+    "call louder or from nearer, or check scene, poses, range limits and noise"
 )
 
 # Sizes of the search: poses asked for their power, looks from coarse to fine, cells along the
@@ -56,7 +61,7 @@ class EchoRegion:
     Raises
     ------
     NumericalError
-        If no pose heard anything.
+        If no pose heard anything, or no more than noise gives.
     """
 
     def __init__(
@@ -64,6 +69,9 @@ class EchoRegion:
     ) -> None:
         if not np.isfinite(hull.trusted).any():
             raise NumericalError(NOTHING)
+        if heard.chance(resolution) > FALSE_ALARMS:
+            found, of = int(np.isfinite(heard.first).sum()), heard.first.size
+            raise NumericalError(NOISE.format(found=found, of=of))
         self.hull, self.resolution, self.range = hull, resolution, heard.range
         self.step = float(heard.range[1] - heard.range[0])
         count = len(heard.poses)

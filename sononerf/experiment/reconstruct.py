@@ -32,8 +32,8 @@ from sononerf.surface.refine import Refined
 
 OPEN = {
     "sheet": "the surface is a sheet: {0.thin_share:.0%} of it has its other side right behind it",
-    "one-sided": "the surface is open: what no pose can have heard, {0.unseen_share:.0%} of it, "
-    "is left out",
+    "one-sided": "the surface is open: {0.unseen_share:.0%} of it, which no pose heard, is "
+    "left out",
 }
 """What is said of surfaces that do not enclose a body."""
 REFINED: tuple[Method, ...] = ("open", "filled", "hull", "sheet")

@@ -2,20 +2,26 @@
 """Whether a reconstructed surface is the skin of a body, or a sheet, or one side of something.
 
 Every start surface is closed. Where no pose can have heard the other side, the part that closes it
-is a guess. Where both sides are heard and hardly anything lies between them, it is a sheet, such as
-a leaf.
+is a guess. Such a surface is left open, and it ends where what was heard ends: behind a body that
+was heard from one side the onsets leave room up to the walls of the region, but they do not tell
+that anything is there. Where both sides are heard and hardly anything lies between them, it is a
+sheet, such as a leaf.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
+from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.region import ENOUGH
 from sononerf.geometry.raycast import RayCaster
+from sononerf.surface.reliability import ALIGNED
 from sononerf.surface.sheet import THIN
 
 Array = NDArray[np.float64]
@@ -37,9 +43,9 @@ class Openness:
     Attributes
     ----------
     unseen : (T,) bool
-        The triangles that no pose can have heard.
+        The triangles that no pose can have heard, or that are unknown, see :func:`known_part`.
     unseen_share, thin_share : float
-        Fractions of the area: that no pose can have heard; that has the other side close behind it.
+        Fractions of the area: of these triangles; that has the other side close behind it.
     """
 
     unseen: NDArray[np.bool_]
@@ -101,6 +107,54 @@ def _seen(caster: RayCaster, middles: Array, normals: Array, sources: Array) -> 
             seen[which[caster.visible(middles[which], tested, normals=normals[which])]] = True
             left = left[~seen[start + left]]
     return seen
+
+
+def known_part(
+    mesh: trimesh.Trimesh, heard: NDArray[np.int32], hull: EchoHull, *, resolution: float
+) -> NDArray[np.bool_]:
+    """Tell which part of a surface that was heard from one side is known.
+
+    That is what two poses heard. Between such places a triangle is also known if it lies where the
+    onsets end. Between them is in their convex hull, or as little out of it as one smooth surface
+    may be. Where the onsets end is no deeper than a range resolution behind one of them.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        m.
+    heard : (V,) int32
+        How many poses heard the surface around each vertex, see
+        :func:`~sononerf.surface.support.poses_that_heard`.
+    hull : EchoHull
+        The onsets.
+    resolution : float, m
+        Range resolution of the analysis.
+
+    Returns
+    -------
+    known : (T,) bool
+    """
+    middles = np.asarray(mesh.triangles_center, dtype=np.float64)
+    bounded = hull.clearance(middles)[0] < resolution
+    enough = heard >= min(ENOUGH, int(heard.max(initial=0)))
+    if not heard.any():
+        return np.asarray(bounded)
+    places = np.asarray(mesh.vertices)[enough]
+    try:
+        planes = ConvexHull(places).equations
+    except (QhullError, ValueError):  # too few, or all in one plane
+        return np.asarray(enough[mesh.faces].any(axis=1))
+    between = np.ones(len(middles), dtype=bool)
+    for plane in planes:
+        between &= middles @ plane[:3] + plane[3] <= ALIGNED * resolution
+    return np.asarray(enough[mesh.faces].any(axis=1) | (between & bounded))
+
+
+def leaving_out(openness: Openness, unknown: NDArray[np.bool_], areas: Array) -> Openness:
+    """Return the openness with triangles (T,) of these areas among the unseen ones."""
+    unseen = openness.unseen | unknown
+    share = float(areas[unseen].sum() / areas.sum())
+    return replace(openness, unseen=unseen, unseen_share=share)
 
 
 def without_unseen(mesh: trimesh.Trimesh, openness: Openness) -> trimesh.Trimesh:

@@ -18,9 +18,15 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
 from sononerf.reconstruction.isosurface import automatic_level, isosurface
-from sononerf.reconstruction.openness import Openness, judge_openness, without_unseen
+from sononerf.reconstruction.openness import (
+    Openness,
+    judge_openness,
+    known_part,
+    leaving_out,
+    without_unseen,
+)
 from sononerf.reconstruction.volume import Volume, grid_over, volume_from_function
-from sononerf.surface.occupancy import Gathered, estimate_occupancy, gather_evidence
+from sononerf.surface.occupancy import QUIET, Gathered, estimate_occupancy, gather_evidence
 from sononerf.surface.sheet import fit_sheet
 from sononerf.surface.support import poses_that_heard
 
@@ -156,6 +162,8 @@ def reconstruct(
 def judged(found: Reconstruction, support: NDArray[np.int32] | None = None) -> Reconstruction:
     """Return a reconstruction with its openness and support, without what no pose can have heard.
 
+    An open surface also ends where what was heard of it ends.
+
     Parameters
     ----------
     found : Reconstruction
@@ -171,6 +179,11 @@ def judged(found: Reconstruction, support: NDArray[np.int32] | None = None) -> R
         support = poses_that_heard(mesh, known.evidence, known.resolution)
     openness = judge_openness(mesh, known.hull.sources, resolution=known.resolution)
     if openness.kind == "one-sided":
+        reliable = known.evidence.where(known.weight > QUIET)
+        heard = poses_that_heard(mesh, reliable, known.resolution)
+        part = known_part(mesh, heard, known.hull, resolution=known.resolution)
+        if (part & ~openness.unseen).any():
+            openness = leaving_out(openness, ~part, mesh.area_faces)
         used = np.unique(mesh.faces[~openness.unseen])
         mesh, support = without_unseen(mesh, openness), support[used]
     return replace(found, mesh=mesh, openness=openness, support=support)

@@ -7,8 +7,9 @@ import pytest
 from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.config import CallSettings, SpectrogramSettings
-from sononerf.echoes import onsets
-from sononerf.echoes.onsets import PointEcho, asked_poses, find_onsets
+from sononerf.echoes import detection, onsets
+from sononerf.echoes.detection import FALSE_ALARMS, RANK, threshold_factor
+from sononerf.echoes.onsets import Onsets, PointEcho, asked_poses, find_onsets
 
 STEP = 0.0007
 RANGE = 0.2 + STEP * np.arange(300)
@@ -75,10 +76,42 @@ def test_a_point_echo_is_told_by_window_and_band():
     np.testing.assert_allclose(ECHO.window, np.hamming(64) ** 2, rtol=1e-12)
     # A Hamming window is above half of its height for 0.53 of its length.
     assert ECHO.resolution == pytest.approx(0.53 * 64 * ECHO.spacing, rel=0.05)
-    # Its noise bandwidth is 1.36 over its length, 21 kHz of a band of 92.
-    assert ECHO.looks == pytest.approx(92 / 21.5, rel=0.05)
-    narrow = SpectrogramSettings(frequency_min=40e3, frequency_max=45e3)
-    assert PointEcho.of(CallSettings(), narrow, 343.0).looks == 1.0
+    narrow = SpectrogramSettings(frequency_min=40e3, frequency_max=41.5e3)
+    assert PointEcho.of(CallSettings(), narrow, 343.0).looks == pytest.approx(1.0, abs=0.02)
+
+
+def noise_power(count):
+    """Mean power over the rows of white noise in one window each, (N,)."""
+    analysis = SpectrogramSettings()
+    samples = np.random.default_rng(0).standard_normal((count, analysis.window))
+    spectrum = np.fft.rfft(samples * np.hamming(analysis.window), analysis.fft)
+    axis = np.fft.rfftfreq(analysis.fft, 1 / analysis.sampling_rate)
+    band = np.isin(np.round(axis), np.round(frequency_axis(analysis)))
+    assert band.sum() == len(frequency_axis(analysis))
+    return (np.abs(spectrum[:, band]) ** 2).mean(axis=1)
+
+
+def test_noise_has_as_many_independent_values_as_its_spread_tells():
+    power = noise_power(40_000)
+    assert ECHO.looks == pytest.approx(power.mean() ** 2 / power.var(), rel=0.05)
+
+
+def test_noise_is_detected_about_as_rarely_as_is_stated(monkeypatch):
+    """At one in a thousand, for it can be counted; the mean is not quite gamma-distributed."""
+    monkeypatch.setattr(detection, "FALSE_ALARMS", 1e-3)
+    power = noise_power(200_000)
+    factor = threshold_factor(ECHO.looks)
+    assert 0.5e-3 < (power > factor * np.quantile(power, RANK)).mean() < 1.6e-3
+
+
+@pytest.mark.parametrize(("found", "by_noise"), [(0, True), (3, True), (4, False), (100, False)])
+def test_so_many_onsets_can_be_noise(found, by_noise):
+    """Of 200 ears, 0.6 m at 6 mm: noise gives an onset in one ensemble of fifty."""
+    first = np.full((100, 2), -np.inf)
+    first[:found, 0] = 0.4
+    axis = 0.15 + 0.0006 * np.arange(1001)
+    heard = Onsets(np.arange(100), axis, np.zeros(0), np.zeros(0, bool), first)
+    assert (heard.chance(0.006) > FALSE_ALARMS) == by_noise
 
 
 def test_the_echo_of_a_sweep_is_that_of_the_rows_it_sounds_in():

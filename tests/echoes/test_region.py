@@ -132,9 +132,24 @@ def test_nothing_but_noise_is_one_clear_line():
         region_of(positions, rotations, heard).box()
 
 
+def test_as_few_onsets_as_noise_gives_are_one_clear_line():
+    """Two poses confirm each other, but among 2,000 ears noise gives as many."""
+    positions, rotations = around(1000)
+    one = np.zeros((2, len(RANGE), 1))
+    loud = [
+        echoes(p, r, PLACES[:1])[..., :1] for p, r in zip(positions[:2], rotations, strict=False)
+    ]
+    line = (
+        r"^no pose received an echo: an onset at 4 of 2000 ears is no more than noise alone gives"
+    )
+    with pytest.raises(NumericalError, match=line):
+        region_of(positions, rotations, [*loud, *[one] * 998])
+    region_of(positions[:20], rotations[:20], [*loud, *[one] * 18])  # among 40 it does not
+
+
 def test_echoes_of_one_pose_alone_are_one_clear_line():
-    positions, rotations = around(20)
-    heard = np.zeros((20, 2, len(RANGE), 2))
+    positions, rotations = around(4)
+    heard = np.zeros((4, 2, len(RANGE), 2))
     heard[0] = echoes(positions[0], rotations[0], PLACES)
     with pytest.raises(NumericalError, match=r"no pose received an echo that another one confirms"):
         region_of(positions, rotations, heard).box()

@@ -98,7 +98,7 @@ def test_what_kind_of_surface_it_is_is_written_and_of_open_ones_it_is_said(judge
     nothing = np.zeros(0, dtype=bool)
     folder, said = judged(Openness(nothing, unseen_share=0.384, thin_share=0.01))
     assert read_out(folder)["surface"] == "one-sided"
-    assert said == ["the surface is open: what no pose can have heard, 38% of it, is left out"]
+    assert said == ["the surface is open: 38% of it, which no pose heard, is left out"]
     folder, said = judged(Openness(nothing, unseen_share=0.02, thin_share=0.926))
     assert read_out(folder)["surface"] == "sheet"
     assert said == ["the surface is a sheet: 93% of it has its other side right behind it"]

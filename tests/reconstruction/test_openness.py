@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from skimage.measure import marching_cubes
 
 from sononerf.echoes.free_space import EchoHull
 from sononerf.field.fourier import FourierField
@@ -16,8 +17,11 @@ from sononerf.reconstruction.openness import (
     FACING,
     THIN,
     Openness,
+    known_part,
+    leaving_out,
     without_unseen,
 )
+from sononerf.surface.evidence import Evidence
 
 RADIUS, DISTANCE, RESOLUTION = 0.02, 0.4, 0.006
 THINNEST = THIN * RESOLUTION
@@ -226,6 +230,85 @@ def hull_over(sources):
     )
 
 
+def room_behind(half=0.06):
+    """What the onsets of a cap leave of a box, with the walls of the box behind."""
+    spacing = 0.002
+    hull = hull_over(cap())
+    axis = np.arange(-half, half + spacing / 2, spacing)
+    places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    inside = hull.clearance(places.reshape(-1, 3))[0].reshape(places.shape[:3])
+    vertices, faces, _, _ = marching_cubes(
+        np.pad(-inside, 1, constant_values=spacing), 0.0, gradient_direction="ascent"
+    )
+    mesh = trimesh.Trimesh(vertices * spacing - half - spacing, faces)
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh, hull, half
+
+
+def heard_where(mesh, chosen, poses=5):
+    return np.where(chosen(mesh.vertices), poses, 0).astype(np.int32)
+
+
+def test_an_open_surface_ends_where_what_was_heard_ends():
+    """Behind a ball heard from one side the onsets leave a cone up to the region's walls."""
+    mesh, hull, half = room_behind()
+    assert np.abs(mesh.vertices).max() > 0.98 * half
+    heard = heard_where(mesh, lambda p: np.linalg.norm(p, axis=1) < RADIUS + 0.001)
+    known = known_part(mesh, heard, hull, resolution=RESOLUTION)
+    middles = mesh.triangles_center
+    away = np.linalg.norm(middles, axis=1)
+    assert known[(away < RADIUS) & (middles[:, 0] > 0)].all()
+    assert not known[away > RADIUS + 2 * RESOLUTION].any()
+    judged = judge_openness(mesh, cap())
+    assert judged.kind == "one-sided"
+    left = leaving_out(judged, ~known, mesh.area_faces)
+    assert left.kind == "one-sided"
+    open_ = without_unseen(mesh, left)
+    assert 0 < open_.area < 2 * np.pi * RADIUS**2
+    assert left.unseen_share == pytest.approx(1 - open_.area / mesh.area)
+    assert np.abs(open_.vertices).max() < half - RESOLUTION
+
+
+def test_between_what_was_heard_the_onsets_close_an_open_surface():
+    """Only the middle and a ring of a ball's side are heard; what lies between is kept."""
+    mesh, hull, _ = room_behind()
+
+    def rings(places):
+        off = np.linalg.norm(places[:, 1:], axis=1)
+        return (places[:, 0] > 0) & ((off < 0.004) | (np.abs(off - 0.012) < 0.0015))
+
+    known = known_part(mesh, heard_where(mesh, rings), hull, resolution=RESOLUTION)
+    off = np.linalg.norm(mesh.triangles_center[:, 1:], axis=1)
+    between = (off > 0.006) & (off < 0.009) & (mesh.triangles_center[:, 0] > 0.01)
+    assert between.sum() > 50
+    # A ball bulges out of the convex hull of its places by less than the resolution.
+    assert known[between].all()
+    assert not known[off > 0.02].any()
+
+
+def test_one_pose_alone_does_not_tell_where_a_surface_ends():
+    mesh, hull, _ = room_behind()
+    heard = heard_where(mesh, lambda p: np.linalg.norm(p, axis=1) < RADIUS + 0.001)
+    stray = heard_where(mesh, lambda p: p[:, 1] > 0.05, 1)
+    assert stray.any()
+    one = known_part(mesh, heard, hull, resolution=RESOLUTION)
+    both = known_part(mesh, np.maximum(heard, stray), hull, resolution=RESOLUTION)
+    np.testing.assert_array_equal(one, both)
+
+
+def test_where_nothing_was_heard_of_a_surface_the_onsets_bound_it_and_walls_do_not():
+    mesh, hull, half = room_behind()
+    none = np.zeros(len(mesh.vertices), np.int32)
+    known = known_part(mesh, none, hull, resolution=RESOLUTION)
+    depth = hull.clearance(mesh.triangles_center)[0]
+    assert known.any()
+    assert depth[known].max() < RESOLUTION
+    assert not known[mesh.triangles_center[:, 0] < -0.9 * half].any()
+    flat = heard_where(mesh, lambda p: np.arange(len(p)) < 2)
+    assert 0 < known_part(mesh, flat, hull, resolution=RESOLUTION).sum() < 30
+
+
 @pytest.fixture
 def read(monkeypatch):
     """Read out a field whose occupancy is the sphere, whatever was heard."""
@@ -238,7 +321,11 @@ def read(monkeypatch):
         return SimpleNamespace(mesh=mesh)
 
     def gathered(*given):
-        return SimpleNamespace(hull=given[2], resolution=given[-1], evidence=None)
+        nothing = np.zeros((0, 3))
+        evidence = Evidence(nothing, nothing, np.zeros(0), np.zeros(0, np.intp))
+        return SimpleNamespace(
+            hull=given[2], resolution=given[-1], evidence=evidence, weight=np.zeros(0)
+        )
 
     monkeypatch.setattr(read_out, "gather_evidence", gathered)
     monkeypatch.setattr(
