@@ -186,8 +186,13 @@ def test_a_choice_of_types_is_told_under_its_own_key(write, key):
 
 def test_one_line_per_fault(write):
     lines = faults(write("fit: {epochs: 0, epoch: 1}\npose: 3\n"))
-    assert len(lines) == 4  # epochs, epoch, pose, and the scene that is missing
-    assert any("scene: missing" in line for line in lines)
+    assert len(lines) == 3  # epochs, epoch, pose
+
+
+def test_without_scene_and_store_there_are_no_echoes(write):
+    (line,) = faults(write("fit: {epochs: 3}\n"))
+    assert "scene: missing; set scene.name, or data.store" in line
+    assert load_settings(write("data: {store: somewhere}\n")).scene is None
 
 
 @pytest.mark.parametrize("key", ["fit", "=3", "fit..epochs=3", "fit.=1"])

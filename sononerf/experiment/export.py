@@ -159,7 +159,8 @@ def _volume(source: Path) -> Part:
     try:
         image = pyvista.ImageData(file)
         size = image.dimensions
-        values = np.asarray(image.point_data["reflectivity"], dtype=np.float32).reshape(size, order="F")
+        flat = np.asarray(image.point_data["reflectivity"], dtype=np.float32)
+        values = flat.reshape(size, order="F")
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{file}: damaged ({error}); reconstruct again") from error
     axes = {

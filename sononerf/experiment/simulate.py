@@ -128,9 +128,10 @@ def background_path(settings: Settings) -> Path | None:
 
 def _own_background(settings: Settings) -> tuple[Path, Scene]:
     alone = scene_of(settings).surroundings()
+    name = settings.scene.name if settings.scene else ""
     if alone is None:
         raise SettingsError(
-            "data.background: the scene marks no background; give the "
+            f"data.background: the scene {name!r} marks no background; give the "
             "ensemble of the surroundings alone, or leave it out"
         )
     path = default_store(settings, echo_hash(settings, alone))
