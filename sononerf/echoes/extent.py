@@ -33,8 +33,9 @@ def echo_extent(power: Array, axis: Array, looks: float, margin: float) -> tuple
     limits : (float, float), m
         Within the axis; all of it where nothing is heard.
     """
-    heard = (power > threshold_levels(power, looks).total).any(axis=1)  # (P, R)
-    some = heard.any(axis=1)
+    loud: NDArray[np.bool_] = power > threshold_levels(power, looks).total
+    heard = np.asarray(loud.any(axis=1))  # (P, R)
+    some = np.asarray(heard.any(axis=1))
     if not some.any():
         return float(axis[0]), float(axis[-1])
     first = axis[heard[some].argmax(axis=1)]

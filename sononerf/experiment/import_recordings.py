@@ -37,7 +37,7 @@ def echo_hash(understood: Understood) -> str:
     """Return a hash of all that the echoes come from: samples, poses, settings."""
     plain = understood.settings.plain()
     digest = hashlib.sha256(f"recordings {understood.form}".encode())
-    told = {k: v for k, v in understood.wanted.model_dump(mode="json").items() if k not in NOT_HASHED}
+    told = understood.wanted.model_dump(mode="json", exclude=set(NOT_HASHED))
     sections = {name: plain[name] for name in SECTIONS}
     digest.update(json.dumps([told, sections, understood.calibration], sort_keys=True).encode())
     poses = understood.poses[understood.pings]
@@ -228,9 +228,7 @@ def describe(known: Understood) -> list[str]:
 
 
 def _kinds(units: dict[str, str]) -> dict[str, str]:
-    return {
-        ("angles" if unit in ("deg", "rad") else "lengths"): unit for unit in units.values()
-    }
+    return {("angles" if unit in ("deg", "rad") else "lengths"): unit for unit in units.values()}
 
 
 def draw(known: Understood, folder: Path) -> Path:

@@ -72,8 +72,11 @@ class Columns:
     units: dict[str, str]
 
     def __len__(self) -> int:
-        sizes = [len(column) for column in (*self.values.values(), *self.texts.values())]
-        return sizes[0] if sizes else 0 if self.rotation is None else len(self.rotation)
+        for column in self.values.values():
+            return len(column)
+        for words in self.texts.values():
+            return len(words)
+        return 0 if self.rotation is None else len(self.rotation)
 
     def has(self, *names: str) -> bool:
         """Tell whether there are all of these columns."""

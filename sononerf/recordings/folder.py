@@ -65,7 +65,7 @@ def read_folder(source: Path, settings: ImportSettings) -> Recording:
     """
     table = source if source.is_file() else source / settings.poses
     if not table.is_file():
-        raise InputError(f"{table}: no table of poses; set import.poses, or write one line per ping")
+        raise InputError(f"{table}: no table of poses; write one line per ping")
     folder = table.parent if source.is_file() else source
     columns = read_table(table, settings)
     files = _files(folder, columns, settings)

@@ -136,9 +136,7 @@ def _struct(path: Path, file: Any, node: Any, name: str, depth: int) -> Any:
         and one.dtype.kind == "O"
         and "MATLAB_class" not in one.attrs
     ]
-    values = {
-        key: _new(path, file, one, f"{name}.{key}", depth + 1) for key, one in fields.items()
-    }
+    values = {key: _new(path, file, one, f"{name}.{key}", depth + 1) for key, one in fields.items()}
     if many and len(many) == len(fields):
         count = many[0].size
         return [{key: values[key][i] for key in values} for i in range(count)]

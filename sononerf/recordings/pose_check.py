@@ -5,7 +5,7 @@ First echoes are compared under the convention that was stated and under others 
 Three things tell them apart, each as a scale of errors s whose logarithm is summed over the pings,
 the log-likelihood of errors of an unknown scale:
 
-* how well each ping's range is predicted by the others' (:mod:`sononerf.recordings.distance_model`),
+* how well each ping's range is predicted by the others' (``distance_model``),
 * how well the *differences* between its receivers are: they tell left from right,
 * how far from the body the heads look.
 
@@ -41,6 +41,8 @@ CLEARLY = 0.15
 """Least gain in log-likelihood per ping for another convention to be named."""
 AT_LEAST = 12.0
 """Least gain in log-likelihood of all pings: odds of e^12."""
+EQUAL = 0.95
+"""Another convention whose gain is this part of the best one's is named beside it."""
 FAR_APART, CLOSE = 100.0, 0.01
 """Spread of the poses over the median range beyond which a unit is wrong, no unit. A flight of a
 hundred metres past things one metre away is still right."""
@@ -182,20 +184,22 @@ def check_poses(
         return unit
     head = _Head(emitter, receivers, resolution)
     own = head.misfit(stated[asked], ranges)
-    late = _late(stated[asked], ranges, own.prediction, resolution)
+    late = _late(stated[asked], own.prediction, resolution)
     if late.name:
         return late
-    best, found = "", own
-    for name, poses in others.items():
-        misfit = head.misfit(poses[asked], ranges)
-        if misfit.total < found.total:
-            best, found = name, misfit
-    gain = own.total - found.total
-    if gain < max(AT_LEAST, CLEARLY * len(asked)):
+    gains = {
+        name: own.total - head.misfit(poses[asked], ranges).total for name, poses in others.items()
+    }
+    best = max(gains, key=gains.__getitem__, default="")
+    if not best or gains[best] < max(AT_LEAST, CLEARLY * len(asked)):
         return Verdict()
-    if best == "left-handed frame" and _turns(stated):
-        best = "reversed turntable"
-    return Verdict(best, _message(best), gain)
+    equal = [name for name in gains if name != best and gains[name] >= EQUAL * gains[best]]
+    turns = _turns(stated)
+    told = [
+        "reversed turntable" if turns and name == "left-handed frame" else name
+        for name in (best, *equal)
+    ]
+    return Verdict(told[0], _message(told), gains[best])
 
 
 @dataclass(frozen=True, eq=False)
@@ -270,7 +274,7 @@ def _length(metres: float) -> str:
     return f"{metres:.3g} m" if metres >= 0.01 else f"{1000 * metres:.3g} mm"
 
 
-def _late(poses: Poses, ranges: Array, found: Prediction, resolution: float) -> Verdict:
+def _late(poses: Poses, found: Prediction, resolution: float) -> Verdict:
     """Tell whether the ranges are too long for any body amid the poses."""
     away = poses.positions - found.centre
     distance = np.linalg.norm(away, axis=1)
@@ -291,7 +295,7 @@ def _late(poses: Poses, ranges: Array, found: Prediction, resolution: float) -> 
 
 
 def _turns(poses: Poses) -> bool:
-    """Tell whether the poses are those of a turntable: on a cylinder, level, looking at its axis."""
+    """Tell whether poses are those of a turntable: on a cylinder, level, looking at its axis."""
     forward = poses.rotations[:, :, 0]
     if np.abs(forward[:, 2]).max() > 0.05:
         return False
@@ -313,12 +317,15 @@ HINTS = {
 }
 
 
-def _message(name: str) -> str:
+def _message(names: list[str]) -> str:
+    hints = " or ".join(dict.fromkeys(_hint(name) for name in names))
+    return f"another convention of poses explains the first echoes better: {hints}"
+
+
+def _hint(name: str) -> str:
     if name.startswith("swapped axes"):
         order = name.removeprefix("swapped axes, ")[:3]
-        hint = "x, y and z stand in the columns {}, {} and {}".format(*order)
-    elif name.startswith("sign of"):
-        hint = f"the {name} is the opposite one"
-    else:
-        hint = HINTS[name]
-    return f"another convention of poses explains the first echoes better: {hint}"
+        return "x, y and z stand in the columns {}, {} and {}".format(*order)
+    if name.startswith("sign of"):
+        return f"the {name} is the opposite one"
+    return HINTS[name]

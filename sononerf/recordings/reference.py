@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Calibration against the echo of a known sphere: level of each receiver, and range offset.
+r"""Calibration against the echo of a known sphere: level of each receiver, and range offset.
 
 A rigid sphere of radius a, large against the wavelength, sends back a/2 of the pressure that falls
 on it, at 1 m [1]_. Heard at distance r of its surface that is, of the call's pressure at 1 m,
 
-.. math:: \\frac{a}{2} \\frac{10^{-\\alpha (d_e + d_r) / 20}}{(d_e + a)(d_r + a)} G_e G_r
+.. math:: \frac{a}{2} \frac{10^{-\alpha (d_e + d_r) / 20}}{(d_e + a)(d_r + a)} G_e G_r
 
 with :math:`d_e, d_r` from emitter and receiver to the surface and G the gains straight ahead.
 
