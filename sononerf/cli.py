@@ -196,6 +196,10 @@ def simulate(
     preview: Annotated[
         Path | None, typer.Option(help="Draw the scene with its poses into this folder.")
     ] = None,
+    waveforms: Annotated[
+        Path | None,
+        typer.Option(help="Also write what the receivers hear, as WAV files with a table."),
+    ] = None,
 ) -> None:
     """Simulate the echoes of a scene at all poses of an experiment."""
     from sononerf.config import load_settings
@@ -217,6 +221,57 @@ def simulate(
         if preview is not None:
             for path in draw_ensemble(settings, store, preview):
                 _print(f"wrote {path}")
+    if waveforms is not None:
+        from sononerf.experiment.waveforms import write_waveforms
+
+        for path in write_waveforms(settings, waveforms, progress=Progress()):
+            _print(f"wrote {path}")
+
+
+@app.command(name="import")
+def import_(
+    form: Annotated[
+        str,
+        typer.Argument(
+            metavar="FORMAT", help="recordings, numpy, sonotracelab, sononerf-matlab or airsas."
+        ),
+    ],
+    source: Annotated[Path, typer.Argument(help="Folder or file of the recordings.")],
+    overrides: Overrides = None,
+    output: Annotated[Path | None, typer.Option(help="The store.")] = None,
+    settings: Annotated[
+        Path | None,
+        typer.Option(help="Settings of the import; import.yaml beside the recordings by default."),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say and draw what was understood.")
+    ] = False,
+    preview: Annotated[
+        Path | None, typer.Option(help="Draw poses and the first pings into this folder.")
+    ] = None,
+) -> None:
+    """Make a store of recordings, for `fit CONFIG data.store=STORE`."""
+    if output is None:
+        raise SettingsError("--output is missing; name the store, such as --output data/recorded")
+    from sononerf.experiment.import_recordings import describe, draw, import_understood
+    from sononerf.experiment.run_folder import results_folder
+    from sononerf.experiment.understand import understand
+    from sononerf.progress import Progress
+
+    known = understand(form, source, output, settings_file=settings, overrides=overrides or ())
+    for line in describe(known):
+        _print(line)
+    if dry_run and preview is None:
+        preview = output.with_name(f"{output.name}-preview")
+    if preview is not None:
+        with results_folder(preview):
+            _print(f"wrote {draw(known, preview)}")
+    if dry_run:
+        return
+    store, verdict = import_understood(known, output, progress=Progress())
+    if verdict.message:
+        _print(f"warning: {verdict.message}")
+    _print(f"wrote {store.path} ({len(store)} poses)")
 
 
 @app.command()

@@ -20,8 +20,8 @@ PACKAGE = ROOT / "sononerf"
 # In the order in which data flows: each may import what stands before it, and itself.
 LAYERS = (
     "errors memory config plugins progress storage checkpoint_io weights geometry material scene "
-    "composition acoustics simulation data echoes field renderer module surface reconstruction "
-    "render callbacks experiment cli"
+    "composition acoustics simulation data recordings echoes field renderer module surface "
+    "reconstruction render callbacks experiment cli"
 ).split()
 # Below the place that turns settings into objects, nobody chooses a device.
 DEVICELESS = LAYERS[: LAYERS.index("experiment")]
@@ -32,6 +32,7 @@ PURE = {"field": {"errors", "field"}, "renderer": {"errors", "field", "renderer"
 WITHOUT_TEST_FILE = {
     "errors.py": "names and numbers only; each is met in the tests of who raises it",
     "simulation/engine.py": "what the engines share, seen through rays, kirchhoff and spheres",
+    "recordings/recording.py": "a record alone, met in the tests of every reader",
     "data/attributes.py": "seen through the store, tests/data/test_store.py",
     "data/layout.py": "seen through the store, tests/data/test_store.py",
 }

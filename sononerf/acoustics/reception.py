@@ -97,7 +97,17 @@ class Reception:
             )
             level = noise_level(self.noise, power, self.analysis)
             waveform = waveform + draw_noise(level, waveform.shape[-1], seed=seed)
-        return waveform, spectrogram(waveform, self.analysis, self.speed_of_sound, self.delay)
+        return waveform, self.analyse(waveform)
+
+    def analyse(self, waveform: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the spectrogram (E, R, F) of what was heard, (E, S) from the emission on.
+
+        Raises
+        ------
+        ValueError
+            If the waveform is shorter than ``samples``.
+        """
+        return spectrogram(waveform, self.analysis, self.speed_of_sound, self.delay)
 
 
 def row_duration(

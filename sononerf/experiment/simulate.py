@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 from sononerf import __version__, storage
 from sononerf.acoustics.ears import directivity_content
 from sononerf.acoustics.reception import warn_of_call
-from sononerf.acoustics.spectrogram import compress
 from sononerf.config import Settings
 from sononerf.data.store import EnsembleStore
 from sononerf.data.subtracted import SubtractedStore
-from sononerf.errors import IncompatibleError, NumericalError, SettingsError
+from sononerf.errors import IncompatibleError, SettingsError
+from sononerf.experiment.sealing import seal
 from sononerf.experiment.sources import complete_store
 from sononerf.geometry.poses import Poses
 from sononerf.progress import Progress
-from sononerf.reconstruction.prediction import mae_db
 from sononerf.scene import Scene, load_scene
 from sononerf.simulation.ensemble import (
     check_poses,
@@ -35,8 +34,6 @@ from sononerf.simulation.ensemble import (
 from sononerf.simulation.simulator import VERSION, Simulator
 from sononerf.simulation.validity import expected_error_db
 
-REFERENCE_RATIO = 1e-3
-"""The reported decibels start 60 dB below the greatest magnitude of the training poses."""
 HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")
 MOST_WORKERS = 8
 WORTH_WORKERS = 64
@@ -248,7 +245,6 @@ def simulate(
             receivers=len(simulator.ears.positions),
         )
         _fill(store, simulator, poses, settings, workers, scheduler, progress)
-        store.seal()
     return EnsembleStore.open(path)
 
 
@@ -318,17 +314,8 @@ def _fill(
             workers=workers,
             scheduler=scheduler,
         )
-    loudest = max(float(store.read_pose(int(i)).max()) for i in store.indices("train"))
-    if loudest <= 0.0:
-        raise NumericalError(deaf(settings.spectrogram.range_min, settings.spectrogram.range_max))
-    reference = loudest * REFERENCE_RATIO
-    noise: dict[str, float | None] = {"noise_floor_mae_db": None, "noise_floor_mae_db_active": None}
-    if len(test):
-        first = compress(np.stack([store.read_pose(int(i)) for i in test]), reference)
-        second = compress(np.stack([again[int(i)] for i in test]), reference)
-        noise["noise_floor_mae_db"] = mae_db(first, second)
-        noise["noise_floor_mae_db_active"] = mae_db(first, second, active=True)
-    store.update_attributes(reference=reference, **noise)
+    limits = settings.spectrogram.range_min, settings.spectrogram.range_max
+    seal(store, {int(i): again[int(i)] for i in test}, silent=deaf(*limits))
 
 
 def prepare(

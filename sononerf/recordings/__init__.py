@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Recordings: read, brought into our units and frame, cut into pings, checked."""

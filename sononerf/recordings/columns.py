@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: MIT
+"""Tables of poses: named columns whose units stand in their names or in the settings.
+
+=======================  ===========================================================================
+columns                  what they are
+=======================  ===========================================================================
+x, y, z                  the head's place: a length
+yaw, pitch, roll         its orientation: angles
+qw, qx, qy, qz           or a unit quaternion
+angle, height            or a turntable's: an angle and a length
+file, time               which recording holds the ping, and when its call left, s
+split                    train, val or test
+=======================  ===========================================================================
+
+A unit is appended to a name with an underscore: ``x_mm``, ``yaw_deg``, ``time_ms``.
+"""
+
+from __future__ import annotations
+
+import csv
+import difflib
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.data.layout import SPLITS
+from sononerf.errors import InputError
+from sononerf.recordings.settings import LENGTHS, ImportSettings
+
+Array = NDArray[np.float64]
+
+ANGLES = {"deg": math.pi / 180.0, "rad": 1.0}
+TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
+PLACE, EULER, QUATERNION = ("x", "y", "z"), ("yaw", "pitch", "roll"), ("qw", "qx", "qy", "qz")
+KINDS = {
+    **dict.fromkeys((*PLACE, "height"), "length"),
+    **dict.fromkeys((*EULER, "angle"), "angle"),
+    **dict.fromkeys(QUATERNION, "number"),
+    "time": "time",
+}
+TEXTS = ("file", "split")
+UNITS = {"length": LENGTHS, "angle": ANGLES, "time": TIMES}
+MOST_BYTES = 200_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """One table, in SI units and radians, in its own frame.
+
+    Attributes
+    ----------
+    where : str
+        The table, for messages.
+    values : dict of array
+        Numbers by name, each (P,).
+    texts : dict of list of str
+        Text by name, each of P.
+    rotation : (P, 3, 3) float or None
+        Head to world as matrices, where the source has them.
+    units : dict of str
+        The unit that each length and angle was given in.
+    """
+
+    where: str
+    values: dict[str, Array]
+    texts: dict[str, list[str]]
+    rotation: Array | None
+    units: dict[str, str]
+
+    def __len__(self) -> int:
+        for column in self.values.values():
+            return len(column)
+        for words in self.texts.values():
+            return len(words)
+        return 0 if self.rotation is None else len(self.rotation)
+
+    def has(self, *names: str) -> bool:
+        """Tell whether there are all of these columns."""
+        return all(name in self.values for name in names)
+
+    def take(self, rows: ArrayLike) -> Columns:
+        """Return the table of the chosen rows."""
+        chosen = np.asarray(rows)
+        return Columns(
+            self.where,
+            {name: column[chosen] for name, column in self.values.items()},
+            {name: [column[int(row)] for row in chosen] for name, column in self.texts.items()},
+            None if self.rotation is None else self.rotation[chosen],
+            self.units,
+        )
+
+    def split(self) -> NDArray[np.int8] | None:
+        """Return what each pose is for, (P,): 0 train, 1 validation, 2 test; None if not said.
+
+        Raises
+        ------
+        InputError
+            If a word is none of these three.
+        """
+        words = self.texts.get("split")
+        if words is None:
+            return None
+        bad = [row for row, word in enumerate(words) if word not in SPLITS]
+        if bad:
+            raise InputError(
+                f"{self.where}: column split of row {bad[0] + 1} is {words[bad[0]]!r}, expected "
+                f"{', '.join(SPLITS)}"
+            )
+        return np.array([SPLITS[word] for word in words], dtype=np.int8)
+
+
+def columns_of(
+    where: str,
+    given: dict[str, ArrayLike],
+    settings: ImportSettings,
+    *,
+    texts: dict[str, list[str]] | None = None,
+    rotation: ArrayLike | None = None,
+) -> Columns:
+    """Bring named columns into SI units.
+
+    Parameters
+    ----------
+    where : str
+        The table, for messages.
+    given : dict of (P,) float
+        Columns by name, with or without a unit in it.
+    settings : ImportSettings
+        Units of those without.
+    texts : dict of list of str
+        Columns of words.
+    rotation : (P, 3, 3) float
+        Rotation matrices, if there are any.
+
+    Raises
+    ------
+    InputError
+        If a name is unknown or stands twice, a unit is missing, or a value is not finite.
+    """
+    values: dict[str, Array] = {}
+    units: dict[str, str] = {}
+    for full, column in given.items():
+        name, unit = _parted(where, full)
+        if name in values:
+            raise InputError(f"{where}: column {name} stands twice; leave one of them out")
+        kind = KINDS[name]
+        if kind in ("length", "angle"):
+            stated = getattr(settings, kind)
+            if unit is None and stated is None:
+                known = UNITS[kind]
+                example = f"{name}_{next(iter(known))}"
+                raise InputError(
+                    f"{where}: column {full} has no unit; name it {example} or set import.{kind} "
+                    f"to one of {', '.join(known)}"
+                )
+            unit = unit or stated
+            units[name] = unit
+        factor = UNITS[kind][unit or "s"] if kind in UNITS else 1.0
+        values[name] = factor * np.asarray(column, dtype=np.float64)
+        bad = ~np.isfinite(values[name])
+        if bad.any():
+            row = int(bad.argmax()) + 1
+            raise InputError(f"{where}: column {full} of row {row} is no finite number")
+    matrices = None if rotation is None else np.asarray(rotation, dtype=np.float64)
+    return Columns(where, values, texts or {}, matrices, units)
+
+
+def _parted(where: str, full: str) -> tuple[str, str | None]:
+    """Return a column's name and the unit in it, if any."""
+    name, _, unit = full.rpartition("_")
+    if full in KINDS:
+        return full, None
+    if name in KINDS:
+        kind = KINDS[name]
+        known = UNITS.get(kind, {})
+        if unit in known:
+            return name, unit
+        raise InputError(
+            f"{where}: column {full}: unknown unit {unit!r}; known: {', '.join(known) or 'none'}"
+        )
+    allowed = [*KINDS, *TEXTS]
+    near = difflib.get_close_matches(full.lower(), allowed, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"known: {', '.join(allowed)}"
+    raise InputError(f"{where}: unknown column {full!r}; {hint}")
+
+
+def read_table(path: Path, settings: ImportSettings) -> Columns:
+    """Read a CSV table of poses with one header line.
+
+    Parameters
+    ----------
+    path : Path
+        UTF-8; separated by commas, semicolons or tabulators.
+    settings : ImportSettings
+        Units of columns that do not say theirs.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or anything in it is wrong, naming file, line and column.
+    """
+    header, rows = _cells(path)
+    numbers: dict[str, list[float]] = {name: [] for name in header if name not in TEXTS}
+    texts: dict[str, list[str]] = {name: [] for name in header if name in TEXTS}
+    for name in numbers:
+        _parted(f"{path}:1", name)
+    for line, row in rows:
+        if len(row) != len(header):
+            raise InputError(f"{path}:{line}: {len(row)} columns, expected {len(header)}")
+        for name, cell in zip(header, row, strict=True):
+            if name in texts:
+                texts[name].append(cell.strip())
+            else:
+                numbers[name].append(_number(path, line, name, cell))
+    return columns_of(str(path), {**numbers}, settings, texts=texts)
+
+
+def _number(path: Path, line: int, name: str, cell: str) -> float:
+    try:
+        number = float(cell)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(
+            f"{path}:{line}: column {name} is {cell!r}, expected a finite number with a decimal "
+            "point"
+        )
+    return number
+
+
+def _cells(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path}: larger than {MOST_BYTES} bytes; no table of poses")
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    first = text.partition("\n")[0]
+    separator = max(",;\t", key=first.count)
+    try:
+        reader = csv.reader(io.StringIO(text), delimiter=separator, strict=True)
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise InputError(f"{path}: no CSV table ({error})") from None
+    if len(rows) < 2:
+        raise InputError(f"{path}: holds no poses; expected a header line and one line per ping")
+    header = [cell.strip() for cell in rows[0][1]]
+    double = {name for name in header if header.count(name) > 1}
+    if double:
+        raise InputError(f"{path}:1: column {sorted(double)[0]!r} stands twice")
+    return header, rows[1:]

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: MIT
+"""Format ``recordings``: a folder of sound files and a table of poses.
+
+One file per ping (column ``file``), or one long file (``import.file``, or the only one there) with
+the time of each emission in the column ``time``. A file is WAV, FLAC, ``.npz`` or HDF5; the last
+two hold ``waveform`` (E, S) and ``sampling_rate``.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf.errors import InputError
+from sononerf.recordings import arrays, audio
+from sononerf.recordings.columns import Columns, read_table
+from sononerf.recordings.recording import Recording
+from sononerf.recordings.settings import ImportSettings
+
+SUFFIXES = (*audio.SUFFIXES, *arrays.SUFFIXES)
+
+
+def read_sound(path: Path, settings: ImportSettings) -> tuple[float, NDArray[Any]]:
+    """Read one file of any kind: its sampling rate (Hz) and samples (E, S).
+
+    Raises
+    ------
+    InputError
+        If it is missing, damaged, or of a kind that is not known.
+    """
+    suffix = path.suffix.lower()
+    if suffix in audio.SUFFIXES:
+        rate, samples = audio.read_audio(path)
+        wanted = settings.sampling_rate
+        # Recorders of ultrasound often write a tenth of their rate, so that it can be heard.
+        return (rate if wanted is None else wanted), samples
+    if suffix not in arrays.SUFFIXES:
+        raise InputError(f"{path}: unknown kind of file; known: {', '.join(SUFFIXES)}")
+    rate, samples = arrays.waveform_of(path, arrays.read_arrays(path), settings)
+    samples = samples[None] if samples.ndim == 1 else samples
+    if samples.ndim != 2 or not samples.size:
+        raise InputError(
+            f"{path}: waveform has shape {samples.shape}, expected (receivers, samples)"
+        )
+    return rate, samples
+
+
+def read_folder(source: Path, settings: ImportSettings) -> Recording:
+    """Read the format ``recordings``.
+
+    Parameters
+    ----------
+    source : Path
+        The folder, or the table of poses in it.
+    settings : ImportSettings
+        Where the table is, and its units.
+
+    Raises
+    ------
+    InputError
+        If files or poses are missing, or files differ in rate or channels.
+    """
+    table = source if source.is_file() else source / settings.poses
+    if not table.is_file():
+        raise InputError(f"{table}: no table of poses; write one line per ping")
+    folder = table.parent if source.is_file() else source
+    columns = read_table(table, settings)
+    files = _files(folder, columns, settings)
+    keep = _present(folder, files, columns, settings)
+    dropped = len(columns) - len(keep)
+    columns = columns.take(keep)
+    files = [files[row] for row in keep]
+    rate, first = read_sound(files[0], settings)
+    for path in dict.fromkeys(files):
+        other, samples = read_sound(path, settings)
+        if other != rate or len(samples) != len(first):
+            raise InputError(
+                f"{path}: {len(samples)} channels at {other:g} Hz, {files[0].name} has "
+                f"{len(first)} at {rate:g} Hz; all must have the same"
+            )
+    times = columns.values.get("time")
+    if times is None and len(set(files)) < len(files):
+        twice = next(path for path in files if files.count(path) > 1)
+        raise InputError(
+            f"{table}: {files.count(twice)} pings in {twice.name} and no column time; add the time "
+            "of each emission, s from the start of the file"
+        )
+
+    def read(index: int) -> NDArray[Any]:
+        return read_sound(files[index], settings)[1]
+
+    single = len(set(files)) == len(files) and len(files) > 1
+    names = [
+        path.name if single else f"{path.name}, row {row + 1}"
+        for row, path in zip(keep, files, strict=True)
+    ]
+    return Recording(
+        path=table,
+        sampling_rate=rate,
+        labels=tuple(names),
+        emission=np.zeros(len(files)) if times is None else times,
+        read=read,
+        columns=columns,
+        notes=(f"{dropped} poses without a recording are left out",) if dropped else (),
+    )
+
+
+def _others(settings: ImportSettings) -> set[Path]:
+    """Return the files of the settings that are no pings."""
+    reference = [settings.reference.file] if settings.reference is not None else []
+    return {path for path in (settings.background, *reference) if path is not None}
+
+
+def _files(folder: Path, columns: Columns, settings: ImportSettings) -> list[Path]:
+    """Return the file of each row."""
+    if "file" in columns.texts:
+        empty = [row for row, name in enumerate(columns.texts["file"]) if not name]
+        if empty:
+            raise InputError(f"{columns.where}: column file of row {empty[0] + 1} is empty")
+        return [folder / name for name in columns.texts["file"]]
+    if settings.file is not None:
+        return [folder / settings.file] * len(columns)
+    found = _sounds(folder, settings)
+    if len(found) == 1:
+        return found * len(columns)
+    raise InputError(
+        f"{columns.where}: no column file, and {len(found)} recordings in {folder}; name each "
+        "ping's file in a column file, or the long one in import.file"
+    )
+
+
+def _sounds(folder: Path, settings: ImportSettings) -> list[Path]:
+    apart = {(folder / path).resolve() for path in _others(settings)}
+    return [
+        path
+        for path in sorted(folder.iterdir())
+        if path.suffix.lower() in SUFFIXES and path.resolve() not in apart
+    ]
+
+
+def _present(
+    folder: Path, files: list[Path], columns: Columns, settings: ImportSettings
+) -> list[int]:
+    """Return the rows whose file is there; refuse what has no partner unless told to skip it."""
+    keep = [row for row, path in enumerate(files) if path.is_file()]
+    if settings.missing == "skip":
+        if not keep:
+            raise InputError(f"{columns.where}: none of its {len(files)} recordings is there")
+        return keep
+    way_out = "correct the table, or set import.missing=skip"
+    lost = [path for path in dict.fromkeys(files) if not path.is_file()]
+    if lost:
+        raise InputError(
+            f"{columns.where}: {len(lost)} poses have no recording, such as {lost[0].name}; "
+            f"{way_out}"
+        )
+    used = {path.resolve() for path in files}
+    folders = {path.parent for path in files}
+    unused = [p for place in folders for p in _sounds(place, settings) if p.resolve() not in used]
+    if unused:
+        raise InputError(
+            f"{folder}: {len(unused)} recordings have no pose, such as {unused[0].name}; {way_out}"
+        )
+    return keep

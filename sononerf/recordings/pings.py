@@ -1,0 +1,258 @@
+# SPDX-License-Identifier: MIT
+"""From recordings to the echo of each ping: from the emission on, calibrated, checked.
+
+A ping that begins between two samples is moved by an exact phase shift.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.fft
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.errors import InputError
+from sononerf.recordings.audio import as_float
+from sononerf.recordings.recording import Recording
+
+Array = NDArray[np.float64]
+
+GUARD = 64
+"""Samples on both sides of a cut that take up what a shift by part of a sample leaks."""
+RUN = 3
+"""A clipped wave stays at its greatest value for so many samples in a row."""
+STEPS = 64
+"""Least height of a wave over the steps of its numbers for it to be called clipped: a fainter one
+stays at the same number for long anyway."""
+
+
+def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -> Array:
+    """Return samples from the emission on; zeros where the recording had not begun or has ended.
+
+    Parameters
+    ----------
+    samples : (E, S)
+        As they are on disk.
+    emission : float
+        When the call left, in samples from the first one on; between two of them too.
+    count : int
+        How many samples, N.
+    first : int
+        The first of them, counted from the emission.
+
+    Returns
+    -------
+    echo : (E, N) float64
+    """
+    whole = int(np.floor(emission))
+    part = emission - whole
+    if part > 1.0 - 1e-6:
+        whole, part = whole + 1, 0.0
+    guard = GUARD if part > 1e-6 else 0
+    begin = whole + first - guard
+    length = count + 2 * guard
+    low, high = max(begin, 0), min(begin + length, samples.shape[1])
+    echo = np.zeros((len(samples), length))
+    if high > low:
+        echo[:, low - begin : high - begin] = as_float(np.asarray(samples[:, low:high]))
+    if not guard:
+        return echo
+    size = int(scipy.fft.next_fast_len(length, real=True))
+    spectrum = np.fft.rfft(echo, size) * np.exp(2j * np.pi * np.fft.rfftfreq(size) * part)
+    return np.fft.irfft(spectrum, size)[:, guard : guard + count]
+
+
+def mix(samples: Array, channels: tuple[int | tuple[int, ...], ...] | None) -> Array:
+    """Return the chosen channels (E, S); those that stand together are averaged.
+
+    Raises
+    ------
+    InputError
+        If there is no such channel.
+    """
+    if channels is None:
+        return samples
+    groups = [(one,) if isinstance(one, int) else one for one in channels]
+    highest = max(max(group) for group in groups)
+    if highest >= len(samples):
+        raise InputError(
+            f"import.channels: no channel {highest}; the recordings have 0 to {len(samples) - 1}"
+        )
+    return np.stack([samples[list(group)].mean(axis=0) for group in groups])
+
+
+@dataclass(frozen=True, eq=False)
+class Cutter:
+    """Cuts pings out of a recording.
+
+    Attributes
+    ----------
+    recording : Recording
+        All pings.
+    channels : tuple or None
+        Which channels become receivers; see :func:`mix`.
+    delay : float, s
+        Added to the time of every emission.
+    gain : (E,) float
+        Factor of each receiver.
+    background : (E, S) float or None
+        Echoes of the surroundings alone, from the emission on, before the factors.
+    """
+
+    recording: Recording
+    channels: tuple[int | tuple[int, ...], ...] | None = None
+    delay: float = 0.0
+    gain: ArrayLike = 1.0
+    background: Array | None = None
+
+    def samples(self, index: int) -> int:
+        """Return how many samples a ping has from the emission on; less than one if none."""
+        there = self.recording.read(index).shape[1]
+        return int(np.floor(there - self._emission(index)))
+
+    def begins(self, index: int) -> int:
+        """Return the first sample after the emission that was recorded."""
+        return max(int(np.ceil(-self._emission(index))), 0)
+
+    def _emission(self, index: int) -> float:
+        time = float(self.recording.emission[index]) + self.delay
+        return round(time * self.recording.sampling_rate, 6)
+
+    def echo(self, index: int, count: int, *, first: int = 0) -> Array:
+        """Return what the receivers of a ping heard, (E, N), calibrated.
+
+        Parameters
+        ----------
+        index : int
+            Number of the ping.
+        count : int
+            How many samples N.
+        first : int
+            The first of them, counted from the emission.
+        """
+        raw = cut(self.recording.read(index), self._emission(index), count, first=first)
+        if self.background is not None:
+            there = self.background[:, first : first + count]
+            raw[:, : there.shape[1]] -= there
+        return mix(raw, self.channels) * np.reshape(self.gain, (-1, 1))
+
+    def clipped(self, index: int, first: int, last: int) -> Clipping:
+        """Return how a ping's loudest samples look, from one sample after the emission to another.
+
+        Parameters
+        ----------
+        index : int
+            Number of the ping.
+        first, last : int
+            Counted from the emission.
+        """
+        samples = self.recording.read(index)
+        begin = round(self._emission(index))
+        part = np.asarray(samples[:, max(begin + first, 0) : max(begin + last, 0)])
+        step = 0.0 if samples.dtype.kind == "f" else 0.5 ** (8 * samples.dtype.itemsize - 1)
+        return Clipping.of(as_float(part), step)
+
+    def digest(self, last: int) -> bytes:
+        """Return a hash of the samples that are read of all pings, up to one after the emission."""
+        digest = hashlib.sha256()
+        for index in range(len(self.recording)):
+            samples = self.recording.read(index)
+            begin = int(np.floor(self._emission(index)))
+            part = np.asarray(samples[:, max(begin, 0) : max(begin + last + GUARD, 0)])
+            digest.update(np.ascontiguousarray(part).astype(part.dtype.newbyteorder("<")).tobytes())
+        return digest.digest()
+
+
+@dataclass(frozen=True, eq=False)
+class Clipping:
+    """The greatest magnitude of each channel of a ping, and how long it stays there.
+
+    Attributes
+    ----------
+    peak : (E,) float
+        Greatest magnitude, as a fraction of full scale, or in the unit of the recording.
+    run : (E,) int
+        The longest stretch of samples at that value, positive or negative.
+    step : float
+        Between two numbers of the recording; 0 of floats.
+    """
+
+    peak: Array
+    run: NDArray[np.int64]
+    step: float
+
+    @classmethod
+    def of(cls, samples: Array, step: float) -> Clipping:
+        """Look at samples (E, S)."""
+        if not samples.shape[1]:
+            return cls(np.zeros(len(samples)), np.zeros(len(samples), dtype=np.int64), step)
+        runs = []
+        for wave in samples:
+            longest = 0
+            for value in (wave.max(), wave.min()):
+                if abs(value) < np.abs(wave).max() - 1.5 * step:
+                    continue  # the other side alone reaches the end
+                edges = np.flatnonzero(np.diff(np.r_[0, wave == value, 0]))
+                longest = max(longest, int((edges[1::2] - edges[::2]).max()))
+            runs.append(longest)
+        return cls(np.abs(samples).max(axis=1), np.asarray(runs), step)
+
+
+def clipped_pings(found: list[Clipping]) -> NDArray[np.bool_]:
+    """Tell which pings are clipped, (P,).
+
+    A ping is clipped if one of its channels stays for three samples or more at a value that no
+    ping of this channel exceeds, or at full scale.
+    """
+    if not found:
+        return np.zeros(0, dtype=bool)
+    peak = np.stack([each.peak for each in found])
+    run = np.stack([each.run for each in found])
+    step = found[0].step
+    limit = peak.max(axis=0)
+    loud = (peak >= limit - 1.5 * step) & (limit > max(STEPS * step, 0.0))
+    full = (peak >= 1.0 - 1.5 * step) if step else np.zeros_like(loud)
+    return np.asarray(((run >= RUN) & (loud | full)).any(axis=1))
+
+
+def check_numbers(recording: Recording, cutter: Cutter, last: int) -> None:
+    """Refuse pings that hold NaN, or whose times lie outside the recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        All pings.
+    cutter : Cutter
+        Cuts them.
+    last : int
+        Samples after the emission that are needed; 0 where that is not known yet.
+
+    Raises
+    ------
+    InputError
+        Naming the first one and how many there are.
+    """
+
+    def refuse(bad: list[int], what: str) -> None:
+        if bad:
+            more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
+            raise InputError(f"{recording.path}: {recording.labels[bad[0]]}{more}: {what}")
+
+    pings = range(len(recording))
+    there = [cutter.samples(index) for index in pings]
+    refuse(
+        [index for index in pings if there[index] < 1],
+        "the time of the emission lies after the end of the recording; check its column time, its "
+        "unit and import.time_offset",
+    )
+    refuse(
+        [index for index in pings if there[index] < last],
+        "the recording ends before the last range; lower spectrogram.range_max, or leave it out",
+    )
+    floats = recording.read(0).dtype.kind == "f"
+    if floats:
+        bad = [i for i in pings if not np.isfinite(recording.read(i)).all()]
+        refuse(bad, "holds samples that are NaN or infinite")

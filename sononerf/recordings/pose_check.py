@@ -1,0 +1,331 @@
+# SPDX-License-Identifier: MIT
+r"""Which convention of poses explains the first echoes best.
+
+First echoes are compared under the convention that was stated and under others that people mix up.
+Three things tell them apart, each as a scale of errors s whose logarithm is summed over the pings,
+the log-likelihood of errors of an unknown scale:
+
+* how well each ping's range is predicted by the others' (``distance_model``),
+* how well the *differences* between its receivers are: they tell left from right,
+* how far from the body the heads look.
+
+Another convention is named if it explains the echoes clearly better. Three faults show without
+another convention: places that lie a thousand times too far apart or too close together for the
+ranges, and ranges too long for any body to fit between the poses, as a late time zero makes them.
+
+What first echoes cannot tell: a time zero that is too early (the body is then larger all around,
+and every ping agrees), and a mirrored world as heard by one microphone beside its emitter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf.geometry.poses import Poses
+from sononerf.recordings.columns import EULER, PLACE, Columns
+from sononerf.recordings.conventions import to_poses
+from sononerf.recordings.distance_model import Prediction, predict
+from sononerf.recordings.settings import ImportSettings
+
+Array = NDArray[np.float64]
+
+FEWEST = 12
+"""Fewer pings than this tell nothing."""
+MOST = 400
+"""Of more pings so many are asked, evenly."""
+CLEARLY = 0.15
+"""Least gain in log-likelihood per ping for another convention to be named."""
+AT_LEAST = 12.0
+"""Least gain in log-likelihood of all pings: odds of e^12."""
+EQUAL = 0.95
+"""Another convention whose gain is this part of the best one's is named beside it."""
+FAR_APART, CLOSE = 100.0, 0.01
+"""Spread of the poses over the median range beyond which a unit is wrong, no unit. A flight of a
+hundred metres past things one metre away is still right."""
+AIM_FLOOR = np.radians(20.0)
+"""Heads that look closer to the body than this do so equally well, rad."""
+AROUND = 0.15
+"""Least part of the directions' variance along their weakest axis for poses to be all around."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is wrong with poses, if anything.
+
+    Attributes
+    ----------
+    name : str
+        Of the convention that explains the echoes best; empty if it is the stated one.
+    message : str
+        One line for the user; empty if nothing is wrong.
+    gain : float
+        How much better, in log-likelihood.
+    """
+
+    name: str = ""
+    message: str = ""
+    gain: float = 0.0
+
+
+def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]:
+    """Return the poses of a table under conventions that are easily mixed up with the stated one.
+
+    Parameters
+    ----------
+    columns : Columns
+        The table as read.
+    settings : ImportSettings
+        As stated.
+
+    Returns
+    -------
+    poses : dict
+        By name; those that do not differ from the stated ones are left out.
+    """
+    stated = to_poses(columns, settings)
+    found: dict[str, Poses] = {}
+    if settings.turntable is not None:
+        table = settings.turntable
+        other = "counterclockwise" if table.turns == "clockwise" else "clockwise"
+        turned = table.model_copy(update={"turns": other})
+        found["reversed turntable"] = to_poses(
+            columns, settings.model_copy(update={"turntable": turned})
+        )
+        for name, factor in _angle_factors(columns, "angle"):
+            found[name] = to_poses(_scaled(columns, ("angle",), factor), settings)
+        return _different(stated, found)
+    found["left-handed frame"] = mirrored(stated)
+    if columns.has(*EULER):
+        for name, factor in _angle_factors(columns, "yaw"):
+            found[name] = to_poses(_scaled(columns, EULER, factor), settings)
+        for angle in ("yaw", "pitch"):
+            found[f"sign of {angle}"] = to_poses(_scaled(columns, (angle,), -1.0), settings)
+        swapped = {**columns.values, "yaw": columns.values["roll"], "roll": columns.values["yaw"]}
+        found["yaw and roll swapped"] = to_poses(_with(columns, swapped), settings)
+    for order in ("yxz", "zyx", "xzy", "yzx", "zxy"):
+        places = {name: columns.values[old] for name, old in zip(PLACE, order, strict=True)}
+        found[f"swapped axes, {order} for xyz"] = to_poses(
+            _with(columns, {**columns.values, **places}), settings
+        )
+    for axis in PLACE:
+        found[f"sign of {axis}"] = to_poses(_scaled(columns, (axis,), -1.0), settings)
+    return _different(stated, found)
+
+
+def mirrored(poses: Poses) -> Poses:
+    """Return poses as a mirror shows them: the world's and the head's y point the other way."""
+    mirror = np.diag([1.0, -1.0, 1.0])
+    return Poses(poses.positions @ mirror, mirror @ poses.rotations @ mirror)
+
+
+def _with(columns: Columns, values: dict[str, Array]) -> Columns:
+    return Columns(columns.where, values, columns.texts, columns.rotation, columns.units)
+
+
+def _scaled(columns: Columns, names: tuple[str, ...], factor: float) -> Columns:
+    scaled = {name: factor * columns.values[name] for name in names}
+    return _with(columns, {**columns.values, **scaled})
+
+
+def _angle_factors(columns: Columns, name: str) -> list[tuple[str, float]]:
+    if columns.units.get(name) == "rad":
+        return [("degrees for radians", np.pi / 180.0)]
+    return [("radians for degrees", 180.0 / np.pi)]
+
+
+def _different(stated: Poses, found: dict[str, Poses]) -> dict[str, Poses]:
+    size = float(np.abs(stated.positions - stated.positions.mean(axis=0)).max()) + 1e-12
+    return {
+        name: poses
+        for name, poses in found.items()
+        if not np.allclose(poses.positions, stated.positions, atol=1e-3 * size)
+        or not np.allclose(poses.rotations, stated.rotations, atol=1e-3)
+    }
+
+
+def check_poses(
+    first: Array,
+    stated: Poses,
+    others: Mapping[str, Poses],
+    *,
+    emitter: Array,
+    receivers: Array,
+    resolution: float,
+) -> Verdict:
+    """Name the convention that explains the first echoes, if it is not the stated one.
+
+    Parameters
+    ----------
+    first : (P, E) float, m
+        Ranges of the first echoes; not finite where there is none.
+    stated : Poses
+        The poses as they were read.
+    others : mapping
+        The same poses under other conventions, by name.
+    emitter : (3,) float, m
+        Head frame.
+    receivers : (E, 3) float, m
+        Head frame.
+    resolution : float, m
+        Range resolution; onsets are known to a tenth of it.
+    """
+    heard = np.flatnonzero(np.isfinite(first).any(axis=1))
+    if len(heard) < FEWEST:
+        return Verdict()
+    asked = heard[np.linspace(0, len(heard) - 1, min(MOST, len(heard))).round().astype(int)]
+    asked = np.unique(asked)
+    ranges = np.where(np.isfinite(first[asked]), first[asked], np.nan)
+    unit = _unit(stated[asked], ranges)
+    if unit.name:
+        return unit
+    head = _Head(emitter, receivers, resolution)
+    own = head.misfit(stated[asked], ranges)
+    late = _late(stated[asked], own.prediction, resolution)
+    if late.name:
+        return late
+    gains = {
+        name: own.total - head.misfit(poses[asked], ranges).total for name, poses in others.items()
+    }
+    best = max(gains, key=gains.__getitem__, default="")
+    if not best or gains[best] < max(AT_LEAST, CLEARLY * len(asked)):
+        return Verdict()
+    equal = [name for name in gains if name != best and gains[name] >= EQUAL * gains[best]]
+    turns = _turns(stated)
+    told = [
+        "reversed turntable" if turns and name == "left-handed frame" else name
+        for name in (best, *equal)
+    ]
+    return Verdict(told[0], _message(told), gains[best])
+
+
+@dataclass(frozen=True, eq=False)
+class _Misfit:
+    total: float
+    prediction: Prediction
+
+
+@dataclass(frozen=True, eq=False)
+class _Head:
+    emitter: Array
+    receivers: Array
+    resolution: float
+
+    def misfit(self, poses: Poses, first: Array) -> _Misfit:
+        """Return the sum of logarithms of error scales of pings (P, E)."""
+        out = poses.positions + poses.rotations @ self.emitter
+        back = poses.positions[:, None] + np.einsum("pij,ej->pei", poses.rotations, self.receivers)
+        middle = (out[:, None] + back) / 2.0
+        found = predict(middle, back - out[:, None], first)
+        floor = 0.1 * self.resolution
+        both = np.isfinite(found.residual).sum(axis=1) > 1
+        common = np.nanmean(found.residual[np.isfinite(found.residual).any(axis=1)], axis=1)
+        total = len(common) * np.log(_scale(common, floor)) if len(common) else 0.0
+        if both.any():
+            rest = found.residual[both]
+            apart = rest - np.nanmean(rest, axis=1, keepdims=True)
+            apart = apart[np.isfinite(apart)]
+            freedom = len(apart) * (1.0 - 1.0 / rest.shape[1])
+            total += freedom * np.log(_scale(apart, floor / 2.0))
+        if self._hears_direction():
+            angle = _off_axis(poses, found.centre, float(np.nanmedian(first)))
+            total += len(angle) * np.log(max(float(np.median(angle)), AIM_FLOOR))
+        return _Misfit(float(total), found)
+
+    def _hears_direction(self) -> bool:
+        """Tell whether it matters which way the head looks."""
+        return bool(np.abs(self.receivers - self.emitter).max() > 0.0)
+
+
+def _scale(error: Array, floor: float) -> float:
+    """Return a robust standard deviation, m."""
+    return float(np.hypot(1.48 * np.median(np.abs(error)), floor))
+
+
+def _off_axis(poses: Poses, centre: Array, reach: float) -> Array:
+    """Return the angles (P,) between where heads look and where the body is, rad."""
+    to_body = centre - poses.positions
+    distance = np.linalg.norm(to_body, axis=1)
+    cosine = (to_body * poses.rotations[:, :, 0]).sum(axis=1) / np.maximum(distance, 1e-9 * reach)
+    return np.arccos(cosine.clip(-1.0, 1.0))
+
+
+def _unit(poses: Poses, ranges: Array) -> Verdict:
+    """Compare how far poses lie apart with how far their echoes come from."""
+    spread = float(
+        np.sqrt(np.square(poses.positions - poses.positions.mean(axis=0)).sum(axis=1).mean())
+    )
+    reach = float(np.nanmedian(ranges))
+    said = (
+        f"poses lie {_length(spread)} from their mean, and their first echoes come from "
+        f"{_length(reach)}"
+    )
+    if spread > FAR_APART * reach:
+        return Verdict("millimetres for metres", f"{said}: are the lengths in mm?", np.inf)
+    if 0.0 < spread < CLOSE * reach:
+        return Verdict("metres for millimetres", f"{said}: are the lengths in m?", np.inf)
+    return Verdict()
+
+
+def _length(metres: float) -> str:
+    return f"{metres:.3g} m" if metres >= 0.01 else f"{1000 * metres:.3g} mm"
+
+
+def _late(poses: Poses, found: Prediction, resolution: float) -> Verdict:
+    """Tell whether the ranges are too long for any body amid the poses."""
+    away = poses.positions - found.centre
+    distance = np.linalg.norm(away, axis=1)
+    direction = away / np.maximum(distance, 1e-12)[:, None]
+    if np.linalg.eigvalsh(direction.T @ direction / len(direction))[0] < AROUND:
+        return Verdict()
+    error = np.abs(found.residual[np.isfinite(found.residual)])
+    slack = resolution + (2.0 * float(np.median(error)) if len(error) else 0.0)
+    if found.size > -slack:
+        return Verdict()
+    late = -found.size
+    return Verdict(
+        "time offset",
+        f"first echoes come {1000 * late:.0f} mm too late, or more, for any body amid the poses: "
+        "check the time of the emission (import.time_offset)",
+        np.inf,
+    )
+
+
+def _turns(poses: Poses) -> bool:
+    """Tell whether poses are those of a turntable: on a cylinder, level, looking at its axis."""
+    forward = poses.rotations[:, :, 0]
+    if np.abs(forward[:, 2]).max() > 0.05:
+        return False
+    # The axis is nearest to all lines of sight, seen from above.
+    across = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
+    offset = (across * poses.positions[:, :2]).sum(axis=1)
+    axis, *_ = np.linalg.lstsq(across, offset, rcond=None)
+    radius = np.linalg.norm(poses.positions[:, :2] - axis, axis=1)
+    return bool(np.abs(across @ axis - offset).max() < 0.02 * radius.mean() > 10 * radius.std())
+
+
+HINTS = {
+    "left-handed frame": "left and right are mixed up; is the frame left-handed, or does z point "
+    "down (import.frame)?",
+    "reversed turntable": "the turntable turns the other way (import.turntable.turns)",
+    "degrees for radians": "angles are in degrees, not in radians (import.angle)",
+    "radians for degrees": "angles are in radians, not in degrees (import.angle)",
+    "yaw and roll swapped": "the columns yaw and roll are swapped",
+}
+
+
+def _message(names: list[str]) -> str:
+    hints = " or ".join(dict.fromkeys(_hint(name) for name in names))
+    return f"another convention of poses explains the first echoes better: {hints}"
+
+
+def _hint(name: str) -> str:
+    if name.startswith("swapped axes"):
+        order = name.removeprefix("swapped axes, ")[:3]
+        return "x, y and z stand in the columns {}, {} and {}".format(*order)
+    if name.startswith("sign of"):
+        return f"the {name} is the opposite one"
+    return HINTS[name]
