@@ -19,7 +19,7 @@ PACKAGE = ROOT / "sononerf"
 
 # In the order in which data flows: each may import what stands before it, and itself.
 LAYERS = (
-    "errors memory config plugins progress storage checkpoint_io weights geometry material scene "
+    "errors memory presets config plugins progress storage checkpoint_io weights geometry material scene "
     "composition acoustics simulation data echoes field renderer module surface reconstruction "
     "render callbacks experiment cli"
 ).split()

@@ -8,16 +8,16 @@ elevation is positive up. Ear 0 is the left one.
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import j1
 
-from sononerf.acoustics.call import call_waveform, sweep_delay
+from sononerf.acoustics.smearing import smearing
 from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.config import CallSettings, EarSettings, SpectrogramSettings
 
@@ -166,22 +166,10 @@ def analysed_ears(
     lag : (E, F, L, A) float32 or None, s
         How much too late each ear hears an echo, beam included; None for an impulse.
     """
-    wanted = frequency_axis(analysis)
-    step = analysis.sampling_rate / analysis.fft
-    window = np.hamming(analysis.window)
-    # The transform about the window's own middle is real; two main lobes on each side suffice.
-    reach = math.ceil(4.0 * analysis.fft / analysis.window)
-    time = np.arange(analysis.window) - (analysis.window - 1) / 2.0
-    offsets = np.arange(-reach, reach + 1)
-    smear = np.cos(2.0 * np.pi / analysis.fft * np.outer(offsets, time)) @ window
-    first = round(float(wanted[0]) / step) - reach
-    count = len(wanted) + 2 * reach
-    # Below the first bin and above half the sampling rate there is nothing to hear.
-    bins = np.clip(np.arange(first, first + count), 1, analysis.fft // 2)
-    fine = synthetic_ears(settings, bins.clip(1) * step + np.arange(count) * 1e-9)
-    rows = np.arange(len(wanted))[:, None] + np.arange(2 * reach + 1)  # (F, K) of the fine bins
+    fine_frequency, rows, weight, later = smearing(call, analysis)
+    fine = synthetic_ears(settings, fine_frequency)
 
-    def smeared(table: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    def smeared(table: NDArray[np.float64], weight: NDArray[Any]) -> NDArray[Any]:
         padded = np.moveaxis(table, -3, 0)
         parts = zip(weight.T[:, :, None, None], rows.T, strict=True)
         total = sum(np.moveaxis(padded[row], 0, -3) * part for part, row in parts)
@@ -189,23 +177,18 @@ def analysed_ears(
 
     beam, ears = fine.beam.astype(np.float64), fine.ears.astype(np.float64)
     lag: NDArray[np.float32] | None = None
-    if call.kind == "impulse":
-        weight = np.tile(smear / smear.sum(), (len(wanted), 1))
+    if later is None:
         beam, ears = np.abs(smeared(beam, weight)), np.abs(smeared(ears, weight))
     else:
-        waveform = call_waveform(call, analysis.sampling_rate)
-        finer = math.ceil(len(waveform) / analysis.fft)
-        emitted = np.fft.rfft(waveform, finer * analysis.fft)[finer * bins]
-        weight = smear**2 * (np.abs(emitted) ** 2)[rows]
-        weight /= weight.sum(axis=1, keepdims=True)
-        delay = sweep_delay(call, bins * step)
-        later = weight * (delay[rows] - sweep_delay(call, wanted)[:, None])
         heard = (beam * ears) ** 2
         late = smeared(heard, later) / np.maximum(smeared(heard, weight), 1e-30)
         lag = late.astype(np.float32)
         beam, ears = np.sqrt(smeared(beam**2, weight)), np.sqrt(smeared(ears**2, weight))
     analysed = dataclasses.replace(
-        fine, frequency=wanted, beam=beam.astype(np.float32), ears=ears.astype(np.float32)
+        fine,
+        frequency=frequency_axis(analysis),
+        beam=beam.astype(np.float32),
+        ears=ears.astype(np.float32),
     )
     return analysed, lag
 

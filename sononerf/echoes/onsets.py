@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sononerf.acoustics.call import covered
 from sononerf.acoustics.reception import effective_window
-from sononerf.acoustics.spectrogram import frequency_axis
+from sononerf.acoustics.row_filters import row_filters
 from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.data.store import EnsembleStore
 from sononerf.echoes.detection import Levels, onsets, threshold_levels
@@ -46,16 +46,13 @@ class PointEcho:
     ) -> PointEcho:
         """Return the echo of a call (m/s) in an analysis."""
         rows = effective_window(call, analysis)
-        frequency = frequency_axis(analysis)
-        swept = covered(call, frequency)
+        filters = row_filters(analysis)
+        swept = covered(call, filters.frequency)
         heard = rows[swept] if swept.any() else rows[:1]
-        taper = np.hamming(analysis.window)
-        bandwidth = analysis.sampling_rate * (taper**2).sum() / taper.sum() ** 2
-        band = len(frequency) * analysis.sampling_rate / analysis.fft
         return cls(
             window=(heard**2).mean(axis=0),
             spacing=speed_of_sound / 2.0 / analysis.sampling_rate,
-            looks=max(band / bandwidth, 1.0),
+            looks=filters.looks,
         )
 
     @property

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf import __version__, storage
+from sononerf.acoustics.call import call_content
 from sononerf.acoustics.reception import warn_of_call
 from sononerf.acoustics.spectrogram import compress
 from sononerf.config import Settings
@@ -46,7 +47,7 @@ def echo_hash(settings: Settings, scene: Scene) -> str:
     Poses count as what they are, not as how they were asked for: a changed table at the same
     place is another ensemble, the same table at another place is not.
     """
-    plain = settings.plain()
+    plain = {**settings.plain(), "call": call_content(settings.call)}
     digest = hashlib.sha256(f"simulator {VERSION}".encode())
     digest.update(json.dumps([plain[name] for name in HASHED_SECTIONS], sort_keys=True).encode())
     poses, split = ensemble_poses(settings)
