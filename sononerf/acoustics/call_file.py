@@ -3,9 +3,8 @@ r"""A call from a WAV file: its waveform, when it emits each frequency, and whic
 
 The call is looked at through Hamming windows of the length that resolves a sweep of its duration
 and bandwidth best. At each frequency the output is loudest when the frequency is emitted: the
-*delay* is the centroid of the power about that time, as far as the magnitude is above half. Where
-several harmonics pass a frequency it is therefore the loudest one's. *Covered* is what lies within
-20 dB of the loudest frequency.
+*delay* is the centroid of the power's top about that time. Where several harmonics pass a frequency it is therefore the loudest one's. *Covered* is what lies within
+20 dB of the loudest frequency, gaps narrower than a window's bandwidth included.
 """
 
 from __future__ import annotations
@@ -21,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import scipy.fft
 import scipy.io.wavfile
+import scipy.ndimage
 import scipy.signal
 from numpy.typing import NDArray
 
@@ -32,7 +32,9 @@ SHORTEST = 8  # samples
 MOST_BYTES = 16_000_000
 LARGEST_STEP = 10_000  # of a ratio of sampling rates
 COVERED_DB = 20.0  # below the loudest frequency
+SMOOTHING = 0.1  # of a spectrum to both sides, in bandwidths of the window
 ENERGY = 0.99  # that a call's duration holds
+TOP = 0.7  # of an output's power: what lies above it tells the time
 ROWS = 200  # frequencies that the delay is read at
 
 
@@ -180,18 +182,32 @@ def _examined(waveform: NDArray[np.float64], rate: float) -> CallFile:
     ring = 2.0 * np.pi / rate * np.arange(len(window))
     # Output sample k holds the window that is centred here:
     time = (np.arange(size) - (len(window) - 1) / 2.0) / rate
-    delay, level = np.zeros((2, len(frequency)))
+    delay = np.zeros(len(frequency))
     for row, middle in enumerate(frequency):
         kernel = np.fft.fft(window * np.exp(1j * ring * middle), size)
         power = np.abs(np.fft.ifft(spectrum * kernel)) ** 2
         top = int(power.argmax())
-        low = np.flatnonzero(power < 0.25 * power[top])
+        low = np.flatnonzero(power < TOP * power[top])
         first = int(low[low < top].max(initial=-1)) + 1
         last = int(low[low > top].min(initial=size))
-        delay[row] = np.average(time[first:last], weights=power[first:last] + 1e-300)
-        level[row] = power.sum()
-    loud = level >= level.max() * 10.0 ** (-COVERED_DB / 10.0)
+        above = power[first:last] - TOP * power[top] + 1e-300
+        delay[row] = np.average(time[first:last], weights=above)
+    loud = _loud(waveform, rate, frequency, bandwidth)
     return CallFile(waveform, rate, frequency, np.maximum(delay, 0.0), loud, bandwidth)
+
+
+def _loud(
+    waveform: NDArray[np.float64], rate: float, frequency: NDArray[np.float64], bandwidth: float
+) -> NDArray[np.bool_]:
+    """Tell which frequencies (F,) lie within 20 dB of the loudest."""
+    power = np.abs(np.fft.rfft(waveform, 4 * len(waveform))) ** 2
+    step = rate / (4 * len(waveform))
+    wide = max(1, round(SMOOTHING * bandwidth / step))
+    mean = np.convolve(np.pad(power, wide, mode="edge"), np.ones(2 * wide + 1), mode="valid")
+    level = np.interp(frequency, step * np.arange(len(power)), mean)
+    loud = level >= level.max() * 10.0 ** (-COVERED_DB / 10.0)
+    gap = round(bandwidth / (frequency[1] - frequency[0]))
+    return np.asarray(loud | scipy.ndimage.binary_closing(loud, np.ones(gap + 1)))
 
 
 def _duration(waveform: NDArray[np.float64], rate: float) -> float:

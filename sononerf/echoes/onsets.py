@@ -57,9 +57,15 @@ class PointEcho:
 
     @property
     def resolution(self) -> float:
-        """Width in range over which its magnitude is above half of its greatest, m."""
-        wide = np.flatnonzero(self.window >= 0.25 * self.window.max())
-        return float(wide[-1] - wide[0] + 1) * self.spacing
+        """Width in range over which its magnitude is above half of its greatest, m.
+
+        What lies apart from its greatest, as another harmonic's echo does, is not counted.
+        """
+        low = np.flatnonzero(self.window < 0.25 * self.window.max())
+        top = int(self.window.argmax())
+        first = int(low[low < top].max(initial=-1)) + 1
+        last = int(low[low > top].min(initial=len(self.window))) - 1
+        return float(last - first + 1) * self.spacing
 
 
 @dataclass(frozen=True, eq=False)

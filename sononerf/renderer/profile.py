@@ -437,8 +437,11 @@ class ProfileRenderer(Renderer):
 def _resolution(acquisition: Acquisition) -> float:
     """Return the width in range over which a point echo is above half of its magnitude, m."""
     power = acquisition.window.double().square().mean(dim=0)
-    wide = (power >= 0.25 * power.max()).nonzero()[:, 0]
-    samples = int(wide[-1] - wide[0]) + 1
+    low = (power < 0.25 * power.max()).nonzero()[:, 0].tolist()
+    top = int(power.argmax())  # what lies apart from it is another harmonic's echo
+    first = max((sample for sample in low if sample < top), default=-1)
+    last = min((sample for sample in low if sample > top), default=len(power))
+    samples = last - first - 1
     return samples * acquisition.speed_of_sound / acquisition.sampling_rate / 2
 
 
