@@ -140,18 +140,32 @@ def _carrier(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Which harmonic sweeps nearest to each frequency, the loudest of several, and where; (F,).
 
-    The slower one sweeps over a frequency, the louder it is there.
+    The slower one sweeps over a frequency, and the farther it is from a tapered end, the louder it
+    is there.
     """
     harmonic = np.asarray(list(settings.bands), dtype=np.float64)
     low, high = np.asarray(list(settings.bands.values())).T
     amplitude = np.asarray([settings.harmonics[int(h) - 1] for h in harmonic])
-    # Over what all of them have in common: a linear sweep's rate is h, a hyperbolic one's 1 / h.
-    loudness = amplitude * harmonic ** (-0.5 if settings.kind == "linear" else 0.5)
-    order = np.argsort(-loudness, kind="stable")
     f = frequency[:, None]
     off = np.maximum(np.maximum(low - f, f - high), 0.0)
-    nearest = order[np.argmin(off[:, order], axis=1)]
+    # Over what all of them have in common: a linear sweep's rate is h, a hyperbolic one's 1 / h.
+    slowness = amplitude * harmonic ** (-0.5 if settings.kind == "linear" else 0.5)
+    loudness = slowness * _envelope(settings, _time_of(settings, np.clip(f, low, high), harmonic))
+    nearest = np.where(off == off.min(axis=1, keepdims=True), loudness, -1.0).argmax(axis=1)
     return harmonic[nearest], np.clip(frequency, low[nearest], high[nearest])
+
+
+def _time_of(
+    settings: CallSettings, swept: NDArray[np.float64], harmonic: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return when harmonics have frequencies (Hz) that they sweep over, s."""
+    start, end = settings.frequency_start, settings.frequency_end
+    if settings.kind == "linear":
+        share = (swept / harmonic - start) / (end - start)
+    else:
+        share = (harmonic / swept - 1.0 / start) / (1.0 / end - 1.0 / start)
+    delay: NDArray[np.float64] = settings.duration * np.clip(share, 0.0, 1.0)
+    return delay
 
 
 def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.float64]:
@@ -186,13 +200,7 @@ def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.floa
     if settings.kind == "file":
         return _file(settings).delay_at(f)
     harmonic, swept = _carrier(settings, f)
-    start, end = settings.frequency_start, settings.frequency_end
-    if settings.kind == "linear":
-        share = (swept / harmonic - start) / (end - start)
-    else:
-        share = (harmonic / swept - 1.0 / start) / (1.0 / end - 1.0 / start)
-    delay: NDArray[np.float64] = settings.duration * np.clip(share, 0.0, 1.0)
-    return delay
+    return _time_of(settings, swept, harmonic)
 
 
 def sweep_rate(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.float64]:

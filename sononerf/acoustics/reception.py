@@ -34,6 +34,8 @@ logger = logging.getLogger("sononerf")
 FAR = 2.0  # factor between a window and the best one that is worth a warning
 FAINT = 1e-2
 """A point echo is followed over time down to this, over its height at its own range."""
+MOST = 2.0
+"""How much louder it may be at another time: at a sweep's end its own range is hardly heard."""
 
 
 class Reception:
@@ -273,6 +275,7 @@ def _cropped(
     heard = covered(call, _within(analysis))
     if not heard.all() and heard.any():
         window[~heard] = np.minimum(window[~heard], 1.0)  # it has no middle of its own
+    window = np.minimum(window, MOST)
     loud = np.flatnonzero((window[heard] if heard.any() else window).max(axis=0) >= FAINT)
     spare = min(int(loud[0]), width - 1 - int(loud[-1]))
     return window[:, spare : width - spare]

@@ -16,8 +16,10 @@ so that an impulse gives the envelope reversed in time, with its greatest value 
     :math:`3 / (2 \pi b)`. The equivalent rectangular bandwidth is :math:`f / Q`, so equal steps on
     the axis of bandwidths are equal ratios of frequency [2]_. Low rows last longer than high ones.
 
-Where one length is needed for all rows, it is that of the Hamming window that is as wide (-6 dB)
-as the root mean square of the rows' envelopes.
+Where rows are averaged, each counts with its part of the band in hertz (:func:`band_mean`), as FFT
+bins do: an echo then lasts as its upper channels have it, which tell its range best. Where one
+length is needed for all rows, it is that of the Hamming window that is as wide (-6 dB) as the root
+mean square of the rows' envelopes, averaged so.
 
 References
 ----------
@@ -33,6 +35,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -69,11 +72,11 @@ class RowFilters:
     centre : float
         Of the envelopes, samples from the frame's start: the frame's time.
     length : int
-        Of the Hamming window that is as wide as all rows are on the mean, samples.
+        Of the Hamming window that is as wide as the mean over the band, samples.
     band : (float, float), Hz
         What the rows let through.
     looks : float
-        How many independent values there are among the rows, for noise.
+        How many independent values of noise there are in a mean over the band.
     """
 
     frequency: NDArray[np.float64]
@@ -116,6 +119,24 @@ def fft_bins(settings: SpectrogramSettings) -> tuple[int, int]:
     """Numbers of the FFT's bins nearest to the two ends of the band."""
     width = settings.sampling_rate / settings.fft
     return round(settings.frequency_min / width), round(settings.frequency_max / width)
+
+
+def band_mean(values: NDArray[Any], frequency: ArrayLike) -> NDArray[Any]:
+    """Return the mean over frequency, each row with its part of the band.
+
+    Parameters
+    ----------
+    values : (..., F) float
+        Of the rows.
+    frequency : (F,) float, Hz
+        Ascending; where its steps are equal this is the mean.
+    """
+    f = np.asarray(frequency, dtype=np.float64)
+    steps = np.diff(f)
+    if len(steps) < 2 or np.ptp(steps) <= 1e-6 * steps.mean():
+        return np.asarray(values.mean(axis=-1))
+    part = np.gradient(f)
+    return np.asarray(values @ (part / part.sum()))
 
 
 def row_widths(
@@ -182,7 +203,8 @@ def _gammatone(settings: SpectrogramSettings) -> RowFilters:
     envelope = (x * np.exp(1.0 - x)) ** (ORDER - 1)
     envelope[envelope < FLOOR] = 0.0
     noise = (envelope**2).sum(axis=1) / envelope.sum(axis=1) ** 2 * rate
-    mean = np.sqrt((envelope**2).mean(axis=0))
+    mean = np.sqrt(band_mean((envelope**2).T, frequency))
+    part = np.gradient(frequency)
     wide = np.flatnonzero(mean >= 0.5 * mean.max())
     return RowFilters(
         frequency=frequency,
@@ -191,7 +213,7 @@ def _gammatone(settings: SpectrogramSettings) -> RowFilters:
         centre=0.0,
         length=max(round((wide[-1] - wide[0] + 1) / WINDOW_DURATION), 2),
         band=(float(frequency[0] - SKIRT * b[0]), float(frequency[-1] + SKIRT * b[-1])),
-        looks=max(float((np.gradient(frequency) / noise).sum()), 1.0),
+        looks=max(float(part.sum() ** 2 / (part * noise).sum()), 1.0),
     )
 
 

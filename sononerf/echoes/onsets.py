@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sononerf.acoustics.call import covered
 from sononerf.acoustics.reception import effective_window
-from sononerf.acoustics.row_filters import row_filters
+from sononerf.acoustics.row_filters import band_mean, row_filters
 from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.data.store import EnsembleStore
 from sononerf.echoes.detection import Levels, onsets, threshold_levels
@@ -29,7 +29,7 @@ class PointEcho:
     Attributes
     ----------
     window : (W,) float
-        Its power over range, averaged over the frequencies that the call has.
+        Its power over range, averaged over the part of the band that the call has.
     spacing : float, m
         Between these values.
     looks : float
@@ -48,9 +48,9 @@ class PointEcho:
         rows = effective_window(call, analysis)
         filters = row_filters(analysis)
         swept = covered(call, filters.frequency)
-        heard = rows[swept] if swept.any() else rows[:1]
+        kept = swept if swept.any() else slice(1)
         return cls(
-            window=(heard**2).mean(axis=0),
+            window=band_mean((rows[kept] ** 2).T, filters.frequency[kept]),
             spacing=speed_of_sound / 2.0 / analysis.sampling_rate,
             looks=filters.looks,
         )
@@ -79,7 +79,7 @@ class Onsets:
     range : (R,) float, m
         Of the slices.
     power : (P, E, R) float
-        Averaged over frequency.
+        Averaged over the band.
     heard : (P, E, R) bool
         Which slices hold an echo.
     first : (P, E) float, m
@@ -113,7 +113,10 @@ def find_onsets(store: EnsembleStore, echo: PointEcho) -> Onsets:
     poses = asked_poses(store)
     axis = np.asarray(store.range, dtype=np.float64)
     power = np.stack(
-        [np.square(store.read_pose(int(i)), dtype=np.float64).mean(axis=-1) for i in poses]
+        [
+            band_mean(np.square(store.read_pose(int(i)), dtype=np.float64), store.frequency)
+            for i in poses
+        ]
     )
     levels = threshold_levels(power, echo.looks)
     step = float(axis[1] - axis[0])

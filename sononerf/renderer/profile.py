@@ -19,6 +19,9 @@ KERNEL_SKIRT = 31e-6
 """The kernel reaches so much further than the window, s: beam and ears lengthen an echo."""
 KERNEL_FLOOR = -9.0
 """What the squared kernel starts with beyond the window, as a natural logarithm."""
+UNEVEN_FLOOR = -14.0
+"""The same of a kernel with two different sides: it is many times longer, and so much would sum up
+to a twentieth of an echo's energy."""
 
 
 COHERENT_AFTER = 0.5
@@ -132,11 +135,12 @@ class ProfileRenderer(Renderer):
         offsets = half - torch.arange(reach + 1) * self.bin / per_sample  # from the middle down
         left = offsets.floor().long().clamp(0, last - 1)
         part = offsets - left
+        floor = KERNEL_FLOOR if self._even else UNEVEN_FLOOR
         sides = []
         for side in (window,) if self._even else (window, window.flip(1)):
             between = side[:, left] * (1 - part) + side[:, left + 1] * part
-            skirt = (2 * between.log()).clamp_min(KERNEL_FLOOR)
-            sides.append(torch.where(offsets >= 0, skirt, KERNEL_FLOOR).float()[:, 1:])
+            skirt = (2 * between.log()).clamp_min(floor)
+            sides.append(torch.where(offsets >= 0, skirt, floor).float()[:, 1:])
         self.log_kernel = nn.Parameter(torch.cat(sides, dim=1))
         self._taps = 2 * reach + 1
         self.first = float(acquisition.range[0]) - reach * self.bin
@@ -436,7 +440,9 @@ class ProfileRenderer(Renderer):
 
 def _resolution(acquisition: Acquisition) -> float:
     """Return the width in range over which a point echo is above half of its magnitude, m."""
-    power = acquisition.window.double().square().mean(dim=0)
+    band = acquisition.frequency.double()  # each row counts with its part of it
+    part = torch.gradient(band)[0] if len(band) > 1 else torch.ones_like(band)
+    power = (part / part.sum()) @ acquisition.window.double().square()
     low = (power < 0.25 * power.max()).nonzero()[:, 0].tolist()
     top = int(power.argmax())  # what lies apart from it is another harmonic's echo
     first = max((sample for sample in low if sample < top), default=-1)

@@ -2,8 +2,9 @@
 import numpy as np
 import pytest
 
+from sononerf.acoustics.call import call_waveform, sweep_delay
 from sononerf.acoustics.reception import effective_window
-from sononerf.acoustics.row_filters import row_filters, row_frequencies, row_widths
+from sononerf.acoustics.row_filters import band_mean, row_filters, row_frequencies, row_widths
 from sononerf.acoustics.spectrogram import echo_samples, range_axis, spectrogram
 from sononerf.config import CallSettings, SpectrogramSettings
 
@@ -48,14 +49,12 @@ def test_widths_are_counted_above_half_height(analysis):
 def test_the_length_is_that_of_a_window_as_wide():
     assert row_filters(SpectrogramSettings()).length == 64
     filters = row_filters(gammatone())
-    mean = np.sqrt((filters.envelope**2).mean(axis=0))
+    mean = np.sqrt(band_mean((filters.envelope**2).T, filters.frequency))
     assert wide(np.hamming(filters.length), 0.5) == pytest.approx(wide(mean, 0.5), rel=0.05)
 
 
 @pytest.mark.parametrize("call", [CallSettings(), CallSettings(kind="linear", duration=0.2e-3)])
 def test_an_impulse_peaks_at_its_range_in_every_channel(call):
-    from sononerf.acoustics.call import call_waveform, sweep_delay
-
     analysis = gammatone(hop=1, frequency_min=42e3 if call.kind == "linear" else 10e3)
     delay = sweep_delay(call, row_frequencies(analysis))
     echo = np.zeros((1, echo_samples(analysis, SPEED, float(delay.max()))))
@@ -108,3 +107,14 @@ def test_independent_values_follow_the_band_and_q():
     assert row_filters(gammatone(channels=96)).looks == pytest.approx(
         row_filters(gammatone(channels=48)).looks, rel=0.02
     )
+
+
+def test_a_mean_over_the_band_counts_hertz():
+    frequency = np.geomspace(10e3, 100e3, 200)
+    # A power that lies above 55 kHz alone fills half of the band, a quarter of the channels.
+    power = (frequency > 55e3).astype(float)
+    assert band_mean(power, frequency) == pytest.approx(0.5, abs=0.02)
+    even = np.random.default_rng(0).random((3, 47))
+    axis = row_frequencies(SpectrogramSettings())
+    np.testing.assert_array_equal(band_mean(even, axis), even.mean(axis=-1))
+    assert band_mean(np.ones((2, 1)), [5e3]).tolist() == [1.0, 1.0]
