@@ -21,6 +21,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from sononerf.errors import SettingsError
+from sononerf.presets import CALL_PRESETS
 
 MAX_SETTINGS_BYTES = 1_000_000
 MAX_SETTINGS_DEPTH = 50
@@ -157,14 +158,32 @@ class EarSettings(_Section):
 
 
 class CallSettings(_Section):
-    """What is emitted: an impulse, or a sweep of frequency down or up, with its harmonics."""
+    """What is emitted: an impulse, a sweep of frequency with its harmonics, or a ``file``.
 
-    kind: Literal["impulse", "linear", "hyperbolic"] = "impulse"
+    A ``preset`` fills the other keys with those of a published call; what is set beside it wins.
+    The file is a WAV of one channel that holds one call from the start of the emission on.
+    """
+
+    preset: str | None = None
+    kind: Literal["impulse", "linear", "hyperbolic", "file"] = "impulse"
+    file: Path | None = None
     duration: Annotated[float, Field(ge=1e-5, le=0.1)] = 0.4e-3
     frequency_start: Positive = 150e3
     frequency_end: Positive = 40e3
     harmonics: Annotated[tuple[Level, ...], Field(min_length=1, max_length=10)] = (1.0,)
     taper: Annotated[float, Field(ge=0, le=1)] = 0.1  # of the duration, half at either end
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset_fills_what_is_not_set(cls, given: Any) -> Any:
+        if not isinstance(given, Mapping) or given.get("preset") is None:
+            return given
+        name = given["preset"]
+        if not isinstance(name, str) or name not in CALL_PRESETS:
+            near = difflib.get_close_matches(str(name), CALL_PRESETS, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(CALL_PRESETS)}"
+            raise ValueError(f"preset: found {name!r}; {hint}")
+        return {**CALL_PRESETS[name].keys, **given}
 
     @model_validator(mode="after")
     def _sweeps(self) -> CallSettings:
@@ -172,15 +191,21 @@ class CallSettings(_Section):
             raise ValueError("frequency_start and frequency_end must differ")
         if not any(self.harmonics):
             raise ValueError("one of the harmonics at least must be above 0")
+        if (self.file is None) == (self.kind == "file"):
+            raise ValueError(
+                "kind file needs file, the WAV of one call"
+                if self.file is None
+                else f"file is of the kind file, not of {self.kind}; set kind, or leave it out"
+            )
         return self
 
     @property
     def bands(self) -> dict[int, tuple[float, float]]:
-        """Lowest and highest frequency (Hz) of each harmonic that is emitted; none of an impulse.
+        """Lowest and highest frequency (Hz) of each harmonic that is emitted, of sweeps alone.
 
         Harmonics count from 1, the fundamental.
         """
-        if self.kind == "impulse":
+        if self.kind in ("impulse", "file"):
             return {}
         low, high = sorted((self.frequency_start, self.frequency_end))
         return {h: (h * low, h * high) for h, a in enumerate(self.harmonics, start=1) if a > 0.0}
@@ -209,8 +234,10 @@ def _fft_of(analysis: dict[str, Any]) -> int:
 
 
 class SpectrogramSettings(_Section):
-    """The analysis: a symmetric Hamming window, a hop, a padded FFT, and a crop in range.
+    """The analysis: filters of equal or of growing width, a hop, and a crop in range.
 
+    Of the kind ``stft`` a symmetric Hamming ``window`` and a padded ``fft``; of ``gammatone`` a
+    bank of ``channels`` on a logarithmic frequency axis, each ``q`` times as high as it is wide.
     Window, hop and FFT follow from the band where they are not set.
     """
 
@@ -223,6 +250,9 @@ class SpectrogramSettings(_Section):
     range_min: Positive = 0.15
     range_max: Positive = 0.75
     dynamic_range_db: Annotated[float, Field(gt=0, le=200)] = 60.0
+    kind: Literal["stft", "gammatone"] = "stft"
+    channels: Annotated[int, Field(ge=2, le=512)] = 48
+    q: Annotated[float, Field(ge=1, le=50)] = 4.0  # centre over equivalent rectangular bandwidth
 
     @model_validator(mode="after")
     def _ordered(self) -> SpectrogramSettings:

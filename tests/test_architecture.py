@@ -19,8 +19,8 @@ PACKAGE = ROOT / "sononerf"
 
 # In the order in which data flows: each may import what stands before it, and itself.
 LAYERS = (
-    "errors memory config plugins progress storage checkpoint_io weights geometry material scene "
-    "composition acoustics simulation data recordings echoes field renderer module surface "
+    "errors memory presets config plugins progress storage checkpoint_io weights geometry material "
+    "scene composition acoustics simulation data recordings echoes field renderer module surface "
     "reconstruction render callbacks experiment cli"
 ).split()
 # Below the place that turns settings into objects, nobody chooses a device.

@@ -121,7 +121,10 @@ def test_settings_do_not_change(write):
         ("spectrogram.fft=32", ["spectrogram: fft must be at least window"]),
         ("region.lower=[0,0,0]", ["region: lower and upper are set together"]),
         ("ears.left=[1,2]", ["ears.left"]),
-        ("call.kind=chirp", ["call.kind: found 'chirp'", "'impulse', 'linear' or 'hyperbolic'"]),
+        (
+            "call.kind=chirp",
+            ["call.kind: found 'chirp'", "'impulse', 'linear', 'hyperbolic' or 'file'"],
+        ),
         ("call.duration=3", ["call.duration: found 3", "less than or equal to 0.1"]),
         ("call.frequency_end=150000", ["call: frequency_start and frequency_end must differ"]),
         ("call.harmonics=[0, 0]", ["call: one of the harmonics at least must be above 0"]),

@@ -1,14 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""The emitted call: an impulse, or a sweep of frequency with its harmonics."""
+"""The emitted call: an impulse, a sweep of frequency with its harmonics, or a file's waveform."""
 
 from __future__ import annotations
 
+import hashlib
 import math
+from typing import Any
 
 import numpy as np
 import scipy.signal
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.acoustics.call_file import CallFile, contents, load_call
 from sononerf.config import CallSettings
 
 
@@ -40,7 +43,13 @@ def call_waveform(settings: CallSettings, sampling_rate: float) -> NDArray[np.fl
     Returns
     -------
     waveform : (N,) float64
-        One sample of height 1 for an impulse; never higher than 1 for a sweep.
+        One sample of height 1 for an impulse; never higher than 1 for a sweep; of a file resampled
+        where the rates differ, with a greatest of 1 before that.
+
+    Raises
+    ------
+    InputError
+        If the settings name a file that cannot be used.
 
     References
     ----------
@@ -49,6 +58,8 @@ def call_waveform(settings: CallSettings, sampling_rate: float) -> NDArray[np.fl
     """
     if settings.kind == "impulse":
         return np.ones(1)
+    if settings.kind == "file":
+        return _file(settings).resampled(sampling_rate)
     duration = settings.duration
     time = np.arange(math.ceil(duration * sampling_rate) + 1) / sampling_rate
     phase = _phase(settings, np.minimum(time, duration))
@@ -56,6 +67,11 @@ def call_waveform(settings: CallSettings, sampling_rate: float) -> NDArray[np.fl
     number = np.arange(1, len(amplitude) + 1)
     swept = amplitude / amplitude.sum() @ np.cos(number[:, None] * phase)
     return _envelope(settings, time) * swept
+
+
+def _file(settings: CallSettings) -> CallFile:
+    assert settings.file is not None  # the settings see to it
+    return load_call(settings.file)
 
 
 def _phase(settings: CallSettings, time: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -88,23 +104,68 @@ def covered(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.bool_]:
     Returns
     -------
     covered : (F,) bool
-        Whether a harmonic sweeps over it; an impulse covers all.
+        Whether a harmonic sweeps over it; an impulse covers all, a file what lies within 20 dB of
+        its loudest frequency.
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "impulse":
         return np.ones(f.shape, dtype=bool)
+    if settings.kind == "file":
+        return _file(settings).covers(f)
     return np.any([(f >= low) & (f <= high) for low, high in settings.bands.values()], axis=0)
+
+
+def has_ghosts(settings: CallSettings, frequency: ArrayLike) -> bool:
+    """Tell whether a point may be heard at several ranges in a row that is dechirped once.
+
+    That is so where several harmonics sweep over one of the frequencies, each at a time of its own,
+    and has to be expected of a file.
+
+    Parameters
+    ----------
+    settings : CallSettings
+        The call.
+    frequency : (F,) float, Hz
+        Of the rows.
+    """
+    f = np.asarray(frequency, dtype=np.float64)
+    if settings.kind == "file":
+        return True
+    sweeping = [(f >= low) & (f <= high) for low, high in settings.bands.values()]
+    return bool((np.sum(sweeping, axis=0) > 1).any())
 
 
 def _carrier(
     settings: CallSettings, frequency: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Which harmonic sweeps nearest to each frequency, the lowest of several, and where; (F,)."""
+    """Which harmonic sweeps nearest to each frequency, the loudest of several, and where; (F,).
+
+    The slower one sweeps over a frequency, and the farther it is from a tapered end, the louder it
+    is there.
+    """
     harmonic = np.asarray(list(settings.bands), dtype=np.float64)
     low, high = np.asarray(list(settings.bands.values())).T
+    amplitude = np.asarray([settings.harmonics[int(h) - 1] for h in harmonic])
     f = frequency[:, None]
-    nearest = np.argmin(np.maximum(np.maximum(low - f, f - high), 0.0), axis=1)
+    off = np.maximum(np.maximum(low - f, f - high), 0.0)
+    # Over what all of them have in common: a linear sweep's rate is h, a hyperbolic one's 1 / h.
+    slowness = amplitude * harmonic ** (-0.5 if settings.kind == "linear" else 0.5)
+    loudness = slowness * _envelope(settings, _time_of(settings, np.clip(f, low, high), harmonic))
+    nearest = np.where(off == off.min(axis=1, keepdims=True), loudness, -1.0).argmax(axis=1)
     return harmonic[nearest], np.clip(frequency, low[nearest], high[nearest])
+
+
+def _time_of(
+    settings: CallSettings, swept: NDArray[np.float64], harmonic: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return when harmonics have frequencies (Hz) that they sweep over, s."""
+    start, end = settings.frequency_start, settings.frequency_end
+    if settings.kind == "linear":
+        share = (swept / harmonic - start) / (end - start)
+    else:
+        share = (harmonic / swept - 1.0 / start) / (1.0 / end - 1.0 / start)
+    delay: NDArray[np.float64] = settings.duration * np.clip(share, 0.0, 1.0)
+    return delay
 
 
 def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.float64]:
@@ -123,9 +184,9 @@ def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.floa
     Returns
     -------
     delay : (F,) float64, s
-        Of the lowest harmonic that sweeps over the frequency, or else of the nearest end of a
-        sweep; zero for an impulse. Higher harmonics that sweep over it too are heard as weaker
-        echoes at other ranges.
+        Of the loudest harmonic that sweeps over the frequency, or else of the nearest end of a
+        sweep; zero for an impulse. Other harmonics that sweep over it too are heard at other
+        ranges, as :func:`sononerf.acoustics.reception.effective_window` has it.
 
     Examples
     --------
@@ -136,14 +197,10 @@ def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.floa
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "impulse":
         return np.zeros(f.shape)
+    if settings.kind == "file":
+        return _file(settings).delay_at(f)
     harmonic, swept = _carrier(settings, f)
-    start, end = settings.frequency_start, settings.frequency_end
-    if settings.kind == "linear":
-        share = (swept / harmonic - start) / (end - start)
-    else:
-        share = (harmonic / swept - 1.0 / start) / (1.0 / end - 1.0 / start)
-    delay: NDArray[np.float64] = settings.duration * np.clip(share, 0.0, 1.0)
-    return delay
+    return _time_of(settings, swept, harmonic)
 
 
 def sweep_rate(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.float64]:
@@ -167,12 +224,30 @@ def sweep_rate(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.float
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "impulse":
         return np.full(f.shape, np.inf)
+    if settings.kind == "file":
+        return _file(settings).rate_at(f)
     harmonic, swept = _carrier(settings, f)
     start, end = settings.frequency_start, settings.frequency_end
     if settings.kind == "linear":
         return harmonic * (abs(end - start) / settings.duration)
     k = abs(1.0 / end - 1.0 / start) / settings.duration
     return k * swept**2 / harmonic
+
+
+def call_content(settings: CallSettings) -> dict[str, Any]:
+    """Return all that echoes depend on of a call, as plain data: for hashes.
+
+    A preset counts as what it fills, a file as what it holds.
+
+    Raises
+    ------
+    InputError
+        If the settings name a file that cannot be used.
+    """
+    plain = settings.model_dump(mode="json", exclude={"preset", "file"})
+    if settings.file is None:
+        return plain
+    return {"kind": "file", "content": hashlib.sha256(contents(settings.file)).hexdigest()}
 
 
 def emit(impulse_responses: ArrayLike, waveform: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -8,18 +8,18 @@ elevation is positive up. Of two ears, ear 0 is the left one.
 from __future__ import annotations
 
 import dataclasses
-import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
 from sononerf.acoustics import gains
-from sononerf.acoustics.call import call_waveform, sweep_delay
 from sononerf.acoustics.directivity.read import content_hash, read_directivity
 from sononerf.acoustics.directivity.record import Directivity, unit_vectors
+from sononerf.acoustics.smearing import smearing
 from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.config import CallSettings, EarSettings, SpectrogramSettings
 from sononerf.errors import SettingsError
@@ -249,22 +249,10 @@ def _analysed(
     settings: EarSettings, call: CallSettings, analysis: SpectrogramSettings, content: str | None
 ) -> tuple[Ears, NDArray[np.float32] | None]:
     del content  # a changed file is read again
-    wanted = frequency_axis(analysis)
-    step = analysis.sampling_rate / analysis.fft
-    window = np.hamming(analysis.window)
-    # The transform about the window's own middle is real; two main lobes on each side suffice.
-    reach = math.ceil(4.0 * analysis.fft / analysis.window)
-    time = np.arange(analysis.window) - (analysis.window - 1) / 2.0
-    offsets = np.arange(-reach, reach + 1)
-    smear = np.cos(2.0 * np.pi / analysis.fft * np.outer(offsets, time)) @ window
-    first = round(float(wanted[0]) / step) - reach
-    count = len(wanted) + 2 * reach
-    # Below the first bin and above half the sampling rate there is nothing to hear.
-    bins = np.clip(np.arange(first, first + count), 1, analysis.fft // 2)
-    fine = ear_tables(settings, bins.clip(1) * step + np.arange(count) * 1e-9)
-    rows = np.arange(len(wanted))[:, None] + np.arange(2 * reach + 1)  # (F, K) of the fine bins
+    fine_frequency, rows, weight, later = smearing(call, analysis)
+    fine = ear_tables(settings, fine_frequency)
 
-    def smeared(table: NDArray[np.float64], weight: NDArray[np.float64]) -> NDArray[np.float64]:
+    def smeared(table: NDArray[np.float64], weight: NDArray[Any]) -> NDArray[Any]:
         padded = np.moveaxis(table, -3, 0)
         parts = zip(weight.T[:, :, None, None], rows.T, strict=True)
         total = sum(np.moveaxis(padded[row], 0, -3) * part for part, row in parts)
@@ -273,26 +261,16 @@ def _analysed(
     beam = fine.beam.astype(np.float64)
     lags: list[NDArray[np.float32]] = []
     ears: list[NDArray[np.float32]] = []
-    if call.kind == "impulse":
-        weight = np.tile(smear / smear.sum(), (len(wanted), 1))
-    else:
-        waveform = call_waveform(call, analysis.sampling_rate)
-        finer = math.ceil(len(waveform) / analysis.fft)
-        emitted = np.fft.rfft(waveform, finer * analysis.fft)[finer * bins]
-        weight = smear**2 * (np.abs(emitted) ** 2)[rows]
-        weight /= weight.sum(axis=1, keepdims=True)
-        delay = sweep_delay(call, bins * step)
-        later = weight * (delay[rows] - sweep_delay(call, wanted)[:, None])
     for single in fine.ears[:1] if fine.alike else fine.ears:  # one by one, for memory's sake
         ear = single.astype(np.float64)
-        if call.kind == "impulse":
+        if later is None:
             ears.append(np.abs(smeared(ear, weight)).astype(np.float32))
             continue
         heard = (beam * ear) ** 2
         late = smeared(heard, later) / np.maximum(smeared(heard, weight), 1e-30)
         lags.append(late.astype(np.float32))
         ears.append(np.sqrt(smeared(ear**2, weight)).astype(np.float32))
-    if call.kind == "impulse":
+    if later is None:
         beam = np.abs(smeared(beam, weight))
     else:
         beam = np.sqrt(smeared(beam**2, weight))
@@ -302,7 +280,10 @@ def _analysed(
         return np.broadcast_to(stacked, (len(fine.positions), *stacked.shape[1:]))
 
     analysed = dataclasses.replace(
-        fine, frequency=wanted, beam=beam.astype(np.float32), ears=of_all(ears)
+        fine,
+        frequency=frequency_axis(analysis),
+        beam=beam.astype(np.float32),
+        ears=of_all(ears),
     )
     return analysed, of_all(lags) if lags else None
 

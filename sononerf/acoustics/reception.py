@@ -9,16 +9,33 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.acoustics.call import call_waveform, covered, emit, sweep_delay, sweep_rate
+from sononerf.acoustics.call import (
+    call_waveform,
+    covered,
+    emit,
+    has_ghosts,
+    sweep_delay,
+    sweep_rate,
+)
+from sononerf.acoustics.call_file import load_call
 from sononerf.acoustics.noise import draw_noise, loudest_power, noise_level, target_gain
+from sononerf.acoustics.row_filters import (
+    WINDOW_BANDWIDTH,
+    WINDOW_DURATION,
+    row_filters,
+    row_widths,
+)
 from sononerf.acoustics.spectrogram import echo_samples, frequency_axis, spectrogram
 from sononerf.config import CallSettings, NoiseSettings, SpectrogramSettings
+from sononerf.errors import InputError
 
 logger = logging.getLogger("sononerf")
 
-WINDOW_DURATION = 0.528  # of a Hamming window's length, where it is above half its height
-WINDOW_BANDWIDTH = 1.81  # over its length: where its transform is above half its height
 FAR = 2.0  # factor between a window and the best one that is worth a warning
+FAINT = 1e-2
+"""A point echo is followed over time down to this, over its height at its own range."""
+MOST = 2.0
+"""How much louder it may be at another time: at a sweep's end its own range is hardly heard."""
 
 
 class Reception:
@@ -43,6 +60,11 @@ class Reception:
         When each of the analysis' frequencies is emitted.
     samples : int
         Length S of the received waveforms: to the end of what the last frame's rows read.
+
+    Raises
+    ------
+    InputError
+        If the call is a file that cannot be used, or that holds nothing of the analysed band.
     """
 
     def __init__(
@@ -55,9 +77,11 @@ class Reception:
     ) -> None:
         self.analysis, self.noise, self.speed_of_sound = analysis, noise, speed_of_sound
         self.waveform = call_waveform(call, analysis.sampling_rate)
+        if call.file is not None and not covered(call, _within(analysis)).any():
+            raise InputError(_outside(call, analysis))
         self.delay = sweep_delay(call, frequency_axis(analysis))
         self.samples = echo_samples(analysis, speed_of_sound, float(self.delay.max()))
-        self._stretch = max(analysis.window, len(self.waveform))
+        self._stretch = max(row_filters(analysis).length, len(self.waveform))
         target = target_gain(noise.target_strength_db, noise.target_distance)
         self._target_power = loudest_power(target * self.waveform[None], analysis, self._stretch)
 
@@ -110,6 +134,17 @@ class Reception:
         return spectrogram(waveform, self.analysis, self.speed_of_sound, self.delay)
 
 
+def _outside(call: CallSettings, analysis: SpectrogramSettings) -> str:
+    assert call.file is not None
+    bands = load_call(call.file).bands
+    held = ", ".join(f"{low / 1e3:.1f} to {high / 1e3:.1f}" for low, high in bands)
+    return (
+        f"{call.file}: holds sound at {held} kHz, nothing within spectrogram.frequency_min to "
+        f"frequency_max ({analysis.frequency_min / 1e3:g} to {analysis.frequency_max / 1e3:g} kHz); "
+        "change these, or take another call"
+    )
+
+
 def row_duration(
     call: CallSettings, analysis: SpectrogramSettings, frequency: ArrayLike
 ) -> NDArray[np.float64]:
@@ -117,10 +152,10 @@ def row_duration(
 
     .. math:: \sqrt{T_w^2 + (B_w / |\dot f|)^2}
 
-    with :math:`T_w` the window's own duration, :math:`B_w` its bandwidth and :math:`|\dot f|` the
+    with :math:`T_w` the filter's own duration, :math:`B_w` its bandwidth and :math:`|\dot f|` the
     sweep rate; each width is counted where the magnitude is above half its greatest (-6 dB). A
-    row is the window's transform, turned by the sweep's quadratic phase and transformed back; for
-    a Gaussian window and a linear sweep that gives exactly this.
+    row is the filter's transform, turned by the sweep's quadratic phase and transformed back; for
+    a Gaussian filter and a linear sweep that gives exactly this.
 
     Parameters
     ----------
@@ -136,9 +171,8 @@ def row_duration(
     duration : (F,) float64, s
         Two-way: times ``c / 2`` it is a width in range.
     """
-    length = analysis.window / analysis.sampling_rate
-    swept = WINDOW_BANDWIDTH / length / sweep_rate(call, frequency)
-    duration: NDArray[np.float64] = np.hypot(WINDOW_DURATION * length, swept)
+    lasts, wide = row_widths(analysis, frequency)
+    duration: NDArray[np.float64] = np.hypot(lasts, wide / sweep_rate(call, frequency))
     return duration
 
 
@@ -159,7 +193,8 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
     Returns
     -------
     window : int
-        Samples. For an impulse shorter is always better, so it is the window that is set.
+        Samples. For an impulse shorter is always better, so it is the window that is set; a
+        gammatone's is not asked for.
 
     Examples
     --------
@@ -167,7 +202,7 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
     >>> best_window(call, SpectrogramSettings(frequency_min=40e3))
     306
     """
-    if call.kind == "impulse":
+    if call.kind == "impulse" or analysis.kind == "gammatone":
         return analysis.window
     slowness = math.sqrt(np.mean(sweep_rate(call, _heard(call, analysis)) ** -2.0))
     return round(analysis.sampling_rate * math.sqrt(WINDOW_BANDWIDTH / WINDOW_DURATION * slowness))
@@ -193,37 +228,67 @@ def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> NDArr
     call : CallSettings
         What is emitted.
     analysis : SpectrogramSettings
-        Window, transform and frequencies.
+        Filters and frequencies.
 
     Returns
     -------
     window : (F, W) float64
-        One value per sample, symmetric about its middle (the mean power of both sides), where it
-        is 1. For an impulse the analysis window, of a height of almost 1; for a sweep as much
-        longer as the sweep stays in the window's main lobe.
+        One value per sample; the point's own range is in the middle, where it is 1. For an impulse
+        the rows' envelopes, of a height of almost 1; for a sweep as much longer as the sweep stays
+        in the window's main lobe. Of Hamming windows and a sweep it is made symmetric (the mean
+        power of both sides). Of gammatones it is not, nor where harmonics overlap: what one more
+        harmonic adds at other times is part of it.
     """
-    frequency, length = frequency_axis(analysis), analysis.window
+    frequency, filters = frequency_axis(analysis), row_filters(analysis)
     if call.kind == "impulse":
-        return np.tile(np.hamming(length), (len(frequency), 1))
+        return filters.point_echo()
+    if analysis.kind == "gammatone" or has_ghosts(call, frequency):
+        side = filters.envelope.shape[1] + call_waveform(call, analysis.sampling_rate).size
+        return _cropped(_point_echo(call, analysis, side), call, analysis)
+    length = analysis.window
     slowest = float(sweep_rate(call, _heard(call, analysis)).min())
     lobe = 2.0 * analysis.sampling_rate / length  # Hz, from the middle to the first zero
     extra = math.ceil(lobe / slowest * analysis.sampling_rate)
-    count = length + 2 * extra
-    # At a speed of 2 m/s ranges are seconds. Frame k is centred on sample k + (length - 1) / 2.
-    last = ((length - 1) / 2.0 + count - 0.5) / analysis.sampling_rate
-    frames = {"hop": 1, "range_min": 1e-12, "range_max": last}
-    fine = analysis.model_copy(update=frames)
+    row = _point_echo(call, analysis, extra + (length - 1) / 2.0)
+    power = row**2 + row[:, ::-1] ** 2
+    middle = power[:, (power.shape[1] - 1) // 2]
+    window: NDArray[np.float64] = np.sqrt(power / middle[:, None])
+    return window
+
+
+def _point_echo(
+    call: CallSettings, analysis: SpectrogramSettings, side: float
+) -> NDArray[np.float64]:
+    """Return a point's echo in each row, (F, W), as far as ``side`` samples to both sides."""
+    centre = row_filters(analysis).centre
+    side = math.ceil(side - centre % 1.0) + centre % 1.0
+    count = round(2 * side) + 1
+    # At a speed of 2 m/s ranges are seconds. Frame k is centred on sample k + centre.
+    last = (centre + count - 0.5) / analysis.sampling_rate
+    fine = analysis.model_copy(update={"hop": 1, "range_min": 0.0, "range_max": last})
     waveform = call_waveform(call, analysis.sampling_rate)
-    delay = sweep_delay(call, frequency)
-    start = length - 1 + extra
+    delay = sweep_delay(call, frequency_axis(analysis))
+    start = round(centre + side)
     samples = max(echo_samples(fine, 2.0, float(delay.max())), start + len(waveform))
     echo = np.zeros((1, samples))
     echo[0, start : start + len(waveform)] = waveform
-    row = spectrogram(echo, fine, 2.0, delay)[0].T
-    power = row**2 + row[:, ::-1] ** 2
-    middle = power[:, (count - 1) // 2]
-    window: NDArray[np.float64] = np.sqrt(power / middle[:, None])
-    return window
+    return spectrogram(echo, fine, 2.0, delay)[0].T[:, :count]
+
+
+def _cropped(
+    row: NDArray[np.float64], call: CallSettings, analysis: SpectrogramSettings
+) -> NDArray[np.float64]:
+    """Return point echoes over their height at their own range, without what is faint all over."""
+    width = row.shape[1]
+    middle = row[:, [(width - 1) // 2, width // 2]].mean(axis=1)
+    window = row / np.maximum(middle, 1e-12 * row.max())[:, None]
+    heard = covered(call, _within(analysis))
+    if not heard.all() and heard.any():
+        window[~heard] = np.minimum(window[~heard], 1.0)  # it has no middle of its own
+    window = np.minimum(window, MOST)
+    loud = np.flatnonzero((window[heard] if heard.any() else window).max(axis=0) >= FAINT)
+    spare = min(int(loud[0]), width - 1 - int(loud[-1]))
+    return window[:, spare : width - spare]
 
 
 def warn_of_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
@@ -249,7 +314,7 @@ def warn_of_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
             bands,
         )
     best = best_window(call, analysis)
-    if not 1.0 / FAR <= best / analysis.window <= FAR:
+    if analysis.kind == "stft" and not 1.0 / FAR <= best / analysis.window <= FAR:
         here, there = (
             1e6 * math.sqrt(np.mean(row_duration(call, chosen, _heard(call, analysis)) ** 2))
             for chosen in (analysis, analysis.model_copy(update={"window": best}))

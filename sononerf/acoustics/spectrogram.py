@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From echo to spectrogram: short windows over range, dechirp, magnitude, compression."""
+"""From echo to spectrogram: short filters over range, dechirp, magnitude, compression."""
 
 from __future__ import annotations
 
@@ -10,11 +10,15 @@ import scipy.fft
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.acoustics.row_filters import fft_bins, row_filters, row_frequencies
 from sononerf.config import SpectrogramSettings
 
 
 def frequency_axis(settings: SpectrogramSettings) -> NDArray[np.float64]:
-    """Frequencies of the FFT's bins nearest to the two ends, and all between.
+    """Frequencies of the rows, see :mod:`sononerf.acoustics.row_filters`.
+
+    Of the kind ``stft`` the FFT's bins nearest to the two ends, and all between,
+    ``sampling_rate / fft`` apart; of ``gammatone`` equal ratios from one end to the other.
 
     Parameters
     ----------
@@ -24,7 +28,7 @@ def frequency_axis(settings: SpectrogramSettings) -> NDArray[np.float64]:
     Returns
     -------
     frequency : (F,) float64, Hz
-        Ascending, ``sampling_rate / fft`` apart.
+        Ascending.
 
     Examples
     --------
@@ -32,18 +36,11 @@ def frequency_axis(settings: SpectrogramSettings) -> NDArray[np.float64]:
     >>> len(axis), float(axis[0]), float(axis[-1])
     (47, 9765.625, 99609.375)
     """
-    first, last = _bins(settings)
-    bins = np.arange(first, last + 1, dtype=np.float64)
-    return bins * (settings.sampling_rate / settings.fft)
-
-
-def _bins(settings: SpectrogramSettings) -> tuple[int, int]:
-    width = settings.sampling_rate / settings.fft
-    return round(settings.frequency_min / width), round(settings.frequency_max / width)
+    return row_frequencies(settings)
 
 
 def range_axis(settings: SpectrogramSettings, speed_of_sound: float) -> NDArray[np.float64]:
-    """Ranges of the analysis frames, ``c t / 2`` with t at the window's centre.
+    """Ranges of the analysis frames, ``c t / 2`` with t at the centre of the frame's envelopes.
 
     Parameters
     ----------
@@ -68,15 +65,14 @@ def range_axis(settings: SpectrogramSettings, speed_of_sound: float) -> NDArray[
     875
     """
     first, last = _frames(settings, speed_of_sound)
-    centre = (
-        np.arange(first, last + 1, dtype=np.float64) * settings.hop + (settings.window - 1) / 2.0
-    )
+    frames = np.arange(first, last + 1, dtype=np.float64)
+    centre = frames * settings.hop + row_filters(settings).centre
     return centre * (speed_of_sound / 2.0 / settings.sampling_rate)
 
 
 def _frames(settings: SpectrogramSettings, speed_of_sound: float) -> tuple[int, int]:
     samples_per_metre = 2.0 * settings.sampling_rate / speed_of_sound
-    centre = (settings.window - 1) / 2.0
+    centre = row_filters(settings).centre
     first = math.ceil((settings.range_min * samples_per_metre - centre) / settings.hop)
     last = math.floor((settings.range_max * samples_per_metre - centre) / settings.hop)
     first = max(first, 0)
@@ -113,7 +109,8 @@ def echo_samples(
         If no frame lies between the settings' ranges.
     """
     last = _frames(settings, speed_of_sound)[1]
-    return last * settings.hop + settings.window + math.ceil(longest_delay * settings.sampling_rate)
+    reach = row_filters(settings).reach
+    return last * settings.hop + reach + math.ceil(longest_delay * settings.sampling_rate)
 
 
 def spectrogram(
@@ -122,15 +119,16 @@ def spectrogram(
     speed_of_sound: float,
     delay: ArrayLike | None = None,
 ) -> NDArray[np.float64]:
-    r"""Magnitude of the short-time Fourier transform on the range and frequency axes, dechirped.
+    r"""Magnitude in the rows' filters on the range and frequency axes, dechirped.
 
-    A symmetric Hamming window, unnormalised. A sweep emits each frequency at a time
-    :math:`\tau(f)` of its own; its row is advanced by exactly that [1]_,
+    Of the kind ``stft`` that is the short-time Fourier transform with a symmetric Hamming window,
+    unnormalised. A sweep emits each frequency at a time :math:`\tau(f)` of its own; its row is
+    advanced by exactly that [1]_,
 
     .. math:: S(r, f) = \left| X\left(\tfrac{2 r}{c} + \tau(f), f\right) \right|
 
-    with :math:`X(t, f)` the transform of the window that is centred at :math:`t`, between two
-    samples too.
+    with :math:`X(t, f)` the output of the filter whose envelope is centred at :math:`t`, between
+    two samples too.
 
     Parameters
     ----------
@@ -169,31 +167,35 @@ def spectrogram(
         )
     first, last = _frames(settings, speed_of_sound)
     starts = slice(first * settings.hop, last * settings.hop + 1, settings.hop)
-    if advance.any():
-        return _dechirped(signal, settings, starts, advance)
+    if advance.any() or settings.kind != "stft":
+        return _filtered(signal, settings, starts, advance)
     frames = sliding_window_view(signal, settings.window, axis=-1)[..., starts, :]
-    low, high = _bins(settings)
+    low, high = fft_bins(settings)
     spectrum = np.fft.rfft(frames * np.hamming(settings.window), n=settings.fft, axis=-1)
     magnitude: NDArray[np.float64] = np.abs(spectrum[..., low : high + 1])
     return magnitude
 
 
-def _dechirped(
+def _filtered(
     signal: NDArray[np.float64],
     settings: SpectrogramSettings,
     starts: slice,
     delay: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Each frequency's row as a filter, the window on that frequency; a delay is then a phase."""
-    length = int(scipy.fft.next_fast_len(signal.shape[-1]))
+    """Each frequency's row as a filter, an envelope on that frequency; a delay is then a phase."""
+    filters = row_filters(settings)
+    delays = np.broadcast_to(delay, filters.frequency.shape)
+    # What a filter reads before the emission is the silence behind the signal's end.
+    length = int(scipy.fft.next_fast_len(signal.shape[-1] - filters.origin))
     spectrum = np.fft.fft(signal, length)
     turn = 2j * np.pi * np.fft.fftfreq(length)
-    sample = np.arange(settings.window) / settings.sampling_rate
-    window = np.hamming(settings.window)
+    sample = np.arange(filters.envelope.shape[1]) / settings.sampling_rate
     rows = []
-    for frequency, advance in zip(frequency_axis(settings), delay, strict=True):
-        kernel = np.fft.fft(window * np.exp(2j * np.pi * frequency * sample), length)
-        phase = np.exp(turn * (advance * settings.sampling_rate))
+    for frequency, envelope, advance in zip(
+        filters.frequency, filters.envelope, delays, strict=True
+    ):
+        kernel = np.fft.fft(envelope * np.exp(2j * np.pi * frequency * sample), length)
+        phase = np.exp(turn * (advance * settings.sampling_rate + filters.origin))
         rows.append(np.abs(np.fft.ifft(spectrum * kernel.conj() * phase)[..., starts]))
     return np.stack(rows, axis=-1)
 

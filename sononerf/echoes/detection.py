@@ -145,7 +145,7 @@ def onsets(power: Array, levels: Levels, window: Array, fineness: float) -> Arra
     levels : Levels
         What an echo exceeds.
     window : (W,) float
-        Power of a point echo over range.
+        Power of a point echo over range, its own range in the middle.
     fineness : float
         Spacing of its values in slices.
 
@@ -170,10 +170,12 @@ def onsets(power: Array, levels: Levels, window: Array, fineness: float) -> Arra
 
 
 def _flank(window: Array) -> tuple[Array, float]:
-    """Return the rise of a point echo up to its middle, from zero to one, and where that is."""
+    """Return the rise of a point echo up to its greatest, from zero to one, and its own range."""
     tops = np.flatnonzero(window == window.max())
     rising = window[: tops[0] + 1] / window.max()
-    return np.concatenate(([0.0], rising)), float(tops.mean()) + 1.0
+    even = np.allclose(window, window[::-1])
+    middle = float(tops.mean()) if even else (len(window) - 1) / 2.0
+    return np.concatenate(([0.0], rising)), middle + 1.0
 
 
 def _crossing(rising: Array, fraction: float) -> float:

@@ -11,7 +11,7 @@ from scipy.stats import poisson
 
 from sononerf.acoustics.call import covered
 from sononerf.acoustics.reception import effective_window
-from sononerf.acoustics.spectrogram import frequency_axis
+from sononerf.acoustics.row_filters import band_mean, row_filters
 from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.data.store import EnsembleStore
 from sononerf.echoes.detection import FALSE_ALARMS, Levels, onsets, threshold_levels
@@ -30,7 +30,7 @@ class PointEcho:
     Attributes
     ----------
     window : (W,) float
-        Its power over range, averaged over the frequencies that the call has.
+        Its power over range, averaged over the part of the band that the call has.
     spacing : float, m
         Between these values.
     looks : float
@@ -47,32 +47,26 @@ class PointEcho:
     ) -> PointEcho:
         """Return the echo of a call (m/s) in an analysis."""
         rows = effective_window(call, analysis)
-        frequency = frequency_axis(analysis)
-        swept = covered(call, frequency)
-        heard = rows[swept] if swept.any() else rows[:1]
+        filters = row_filters(analysis)
+        swept = covered(call, filters.frequency)
+        kept = swept if swept.any() else slice(1)
         return cls(
-            window=(heard**2).mean(axis=0),
+            window=band_mean((rows[kept] ** 2).T, filters.frequency[kept]),
             spacing=speed_of_sound / 2.0 / analysis.sampling_rate,
-            looks=_looks(analysis, len(frequency)),
+            looks=filters.looks,
         )
 
     @property
     def resolution(self) -> float:
-        """Width in range over which its magnitude is above half of its greatest, m."""
-        wide = np.flatnonzero(self.window >= 0.25 * self.window.max())
-        return float(wide[-1] - wide[0] + 1) * self.spacing
+        """Width in range over which its magnitude is above half of its greatest, m.
 
-
-def _looks(analysis: SpectrogramSettings, rows: int) -> float:
-    """Return how many independent values white noise has in the mean power of rows.
-
-    It is the squared mean over the variance: overlapping rows share noise.
-    """
-    taper = np.hamming(analysis.window) ** 2
-    turns = np.multiply.outer(np.arange(rows), np.arange(analysis.window)) / analysis.fft
-    shared = np.abs(np.exp(-2j * np.pi * turns) @ taper / taper.sum()) ** 2
-    pairs = np.where(np.arange(rows) > 0, 2.0, 1.0) * (rows - np.arange(rows))
-    return float(rows**2 / (pairs * shared).sum())
+        What lies apart from its greatest, as another harmonic's echo does, is not counted.
+        """
+        low = np.flatnonzero(self.window < 0.25 * self.window.max())
+        top = int(self.window.argmax())
+        first = int(low[low < top].max(initial=-1)) + 1
+        last = int(low[low > top].min(initial=len(self.window))) - 1
+        return float(last - first + 1) * self.spacing
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +80,7 @@ class Onsets:
     range : (R,) float, m
         Of the slices.
     power : (P, E, R) float
-        Averaged over frequency.
+        Averaged over the band.
     heard : (P, E, R) bool
         Which slices hold an echo.
     first : (P, E) float, m
@@ -132,7 +126,10 @@ def find_onsets(store: EnsembleStore, echo: PointEcho) -> Onsets:
     poses = asked_poses(store)
     axis = np.asarray(store.range, dtype=np.float64)
     power = np.stack(
-        [np.square(store.read_pose(int(i)), dtype=np.float64).mean(axis=-1) for i in poses]
+        [
+            band_mean(np.square(store.read_pose(int(i)), dtype=np.float64), store.frequency)
+            for i in poses
+        ]
     )
     levels = threshold_levels(power, echo.looks)
     step = float(axis[1] - axis[0])

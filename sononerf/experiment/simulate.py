@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf import __version__, storage
+from sononerf.acoustics.call import call_content
 from sononerf.acoustics.ears import directivity_content
 from sononerf.acoustics.reception import warn_of_call
 from sononerf.config import Settings
@@ -64,8 +65,11 @@ def echo_hash(settings: Settings, scene: Scene) -> str:
 
 def _heard_settings(settings: Settings) -> dict[str, Any]:
     """Return the settings that the echoes depend on, without optional keys that do not apply."""
-    plain = settings.plain()
-    ears, air = plain["ears"], plain["air"]
+    plain = {**settings.plain(), "call": call_content(settings.call)}
+    ears, air, analysis = plain["ears"], plain["air"], plain["spectrogram"]
+    if analysis["kind"] == "stft":
+        for key in ("kind", "channels", "q"):
+            del analysis[key]
     if ears["directivity"] != "piston":
         del ears["piston_radius"]
     for section, key, default in (

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.acoustics.matched_filter import matched_filter
 from sononerf.errors import NumericalError
 from sononerf.reconstruction.isosurface import isosurface
 from sononerf.reconstruction.nearest import Nearest
@@ -20,6 +22,10 @@ from sononerf.reconstruction.volume import Volume, grid_over
 LEVEL_SHARES = np.geomspace(0.002, 0.5, 12)
 LEVEL_SAMPLES = 4000
 LEVEL_DISTANCE = 0.005
+# Of the coherent sum: samples per period of the call's highest frequency (straight lines between
+# them err by 2 %), and how much of the call's energy lies below that.
+SAMPLES_PER_PERIOD = 16
+ENERGY = 0.99
 
 
 def backprojection(
@@ -86,6 +92,104 @@ def backprojection(
             half = (outward + _distance(points, receiver)) * np.float32(0.5)
             total += _interpolated(profile, half, axis[0], step)
     return volume.with_values((total / max(len(emitters), 1)).reshape(volume.shape))
+
+
+def coherent_backprojection(
+    waveforms: Iterable[ArrayLike],
+    positions: ArrayLike,
+    rotations: ArrayLike,
+    lower: ArrayLike,
+    upper: ArrayLike,
+    spacing: float,
+    *,
+    call: ArrayLike,
+    sampling_rate: float,
+    speed_of_sound: float,
+    emitter_offset: ArrayLike,
+    ear_offsets: ArrayLike,
+) -> Volume:
+    r"""Delay-and-sum with phase over poses and ears, for comparison.
+
+    .. math:: I(x) = \left|\frac{1}{P E} \sum_p \sum_e
+              y_{p,e}\left(\frac{|x - x_p| + |x - x_{p,e}|}{c}\right)\right|
+
+    with :math:`y` the pulse-compressed recordings,
+    :func:`sononerf.acoustics.matched_filter.matched_filter`. It asks for poses that are right to a
+    fraction of a wavelength.
+
+    Parameters
+    ----------
+    waveforms : iterable of (E, S) float
+        Recordings from the start of the emission on, one per pose in order; read one at a time.
+    positions : (P, 3) float, m
+        Heads, world frame.
+    rotations : (P, 3, 3) float
+        Head to world.
+    lower, upper : (3,) float, m
+        The box.
+    spacing : float, m
+        Voxel size; a quarter of the shortest wavelength shows all there is.
+    call : (N,) float
+        Emitted waveform, at the same sampling rate.
+    sampling_rate : float, Hz
+        Of recordings and call.
+    speed_of_sound : float, m/s
+        Of the medium.
+    emitter_offset : (3,) float, m
+        Emitter in the head frame.
+    ear_offsets : (E, 3) float, m
+        Ears in the head frame.
+
+    Returns
+    -------
+    volume : Volume
+        Magnitude of the mean compressed pressure per voxel.
+
+    Raises
+    ------
+    ValueError
+        If shapes do not fit.
+    NumericalError
+        If a recording is not finite.
+    ResourceError
+        If the grid would not fit in memory.
+    """
+    emitted = np.asarray(call, dtype=np.float64)
+    finer = _oversampling(emitted)
+    step = speed_of_sound / (2.0 * sampling_rate * finer)
+    emitters, receivers, _ = places_heard_from(
+        positions, rotations, (0.0, step), emitter_offset=emitter_offset, ear_offsets=ear_offsets
+    )
+    volume = grid_over(lower, upper, spacing)
+    points = volume.points().astype(np.float32)
+    total = np.zeros(len(points), dtype=np.complex64)
+    count = 0
+    for count, recording in enumerate(waveforms, start=1):
+        heard = np.asarray(recording, dtype=np.float64)
+        if count > len(emitters) or heard.ndim != 2 or len(heard) != receivers.shape[1]:
+            raise ValueError(
+                f"recording {count - 1}: shape {heard.shape}, expected ({receivers.shape[1]}, S), "
+                f"one for each of {len(emitters)} poses"
+            )
+        if not np.isfinite(heard).all():
+            raise NumericalError(f"the recording of pose {count - 1} is not finite")
+        outward = _distance(points, emitters[count - 1])
+        compressed = matched_filter(heard, emitted, oversampling=finer).astype(np.complex64)
+        for echo, receiver in zip(compressed, receivers[count - 1], strict=True):
+            half = (outward + _distance(points, receiver)) * np.float32(0.5)
+            total += _interpolated(echo, half, 0.0, step)
+    if count != len(emitters):
+        raise ValueError(f"recordings: {count}, expected one for each of {len(emitters)} poses")
+    summed = np.abs(total).astype(np.float64) / max(receivers.shape[0] * receivers.shape[1], 1)
+    return volume.with_values(summed.reshape(volume.shape))
+
+
+def _oversampling(call: NDArray[np.float64]) -> int:
+    """Return how much finer a compressed call is sampled, so that straight lines will do."""
+    power = np.abs(np.fft.rfft(call, 2 * max(len(call), 8))) ** 2
+    below = np.cumsum(power) / max(power.sum(), 1e-300)
+    highest = (int(np.searchsorted(below, ENERGY)) + 1) / (2 * len(power))  # per sample
+    return max(1, int(np.ceil(SAMPLES_PER_PERIOD * highest)))
 
 
 def places_heard_from(
@@ -161,17 +265,18 @@ def _distance(points: NDArray[np.float32], place: NDArray[np.float64]) -> NDArra
 
 
 def _interpolated(
-    energy: NDArray[np.float64], ranges: NDArray[np.float32], start: float, step: float
-) -> NDArray[np.float32]:
-    """Read an evenly spaced profile linearly; zero outside it."""
+    profile: NDArray[Any], ranges: NDArray[np.float32], start: float, step: float
+) -> NDArray[Any]:
+    """Read an evenly spaced profile linearly; zero outside it. In single precision."""
     # One silent slice at each end stands for everything beyond, and the last index stays inside.
-    padded = np.zeros(len(energy) + 3, np.float32)
-    padded[1:-2] = energy
-    place = np.clip((ranges - np.float32(start)) / np.float32(step) + 1, 0, len(energy) + 1)
+    kind = np.complex64 if np.iscomplexobj(profile) else np.float32
+    padded = np.zeros(len(profile) + 3, kind)
+    padded[1:-2] = profile
+    place = np.clip((ranges - np.float32(start)) / np.float32(step) + 1, 0, len(profile) + 1)
     index = place.astype(np.intp)
     fraction = place - index.astype(np.float32)
     low = padded[index]
-    value: NDArray[np.float32] = low + fraction * (padded[index + 1] - low)
+    value: NDArray[Any] = low + fraction * (padded[index + 1] - low)
     return value
 
 

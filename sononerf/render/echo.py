@@ -22,7 +22,13 @@ from sononerf.render.shading import (
     camera_for,
     draw_mesh,
 )
-from sononerf.render.spectrogram import LEVEL_MAP, axis_edges, drawn_receivers, sounding_slice
+from sononerf.render.spectrogram import (
+    LEVEL_MAP,
+    axis_edges,
+    draw_cells,
+    drawn_receivers,
+    sounding_slice,
+)
 
 PALE = (0.84, 0.86, 0.88)
 HIT_MAP = "plasma"
@@ -173,11 +179,10 @@ def _draw_spectrograms(
     frequencies: NDArray[np.float64],
     names: list[str],
 ) -> None:
-    extent = (*axis_edges(ranges), *axis_edges(frequencies / 1e3))
     top = max(5.0, float(np.ceil(sounds.max() / 5.0)) * 5.0)
     for panel, sound, name in zip(axes, sounds, names, strict=True):
-        options = {"vmin": 0.0, "vmax": top, "extent": extent, "aspect": "auto"}
-        level = panel.imshow(sound.T, cmap=LEVEL_MAP, **options)
+        options = {"cmap": LEVEL_MAP, "vmin": 0.0, "vmax": top}
+        level = draw_cells(panel, sound, ranges, frequencies, **options)
         panel.set_ylabel(f"{name}\nfrequency (kHz)")
     axes[-1].set_xlabel("range (m)")
     part.colorbar(level, ax=list(axes), label="level (dB)", pad=0.01, aspect=24)

@@ -19,6 +19,8 @@ MOST_ROWS = 8  # receivers; of more of them, so many are drawn, evenly chosen
 # Inches: what labels need on each side of the panels, between them, and for a colour bar.
 LEFT, TOP, BOTTOM, GAP = 0.76, 0.48, 0.46, 0.13
 BAR, BAR_GAP, BAR_WIDTH = 0.82, 0.08, 0.19
+# Where a logarithmic axis is marked.
+KHZ_MARKS = [digit * 10.0**power for power in range(-3, 4) for digit in (1, 2, 5)]
 
 
 def spectrogram_png(
@@ -130,6 +132,35 @@ def axis_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
     return float(axis[0] - half), float(axis[-1] + half)
 
 
+def draw_cells(
+    panel: Any,
+    values: NDArray[np.float64],
+    ranges: NDArray[np.float64],
+    frequencies: NDArray[np.float64],
+    **options: Any,
+) -> Any:
+    """Draw cells (R, F) over range (m) and frequency (Hz, drawn in kHz) and return the picture.
+
+    Where the steps of the frequency axis grow, the axis is logarithmic and each cell as tall as
+    its channel is wide.
+    """
+    steps = np.diff(frequencies)
+    if len(steps) < 2 or np.ptp(steps) <= 1e-6 * steps.mean():
+        extent = (*axis_edges(ranges), *axis_edges(frequencies / 1e3))
+        return panel.imshow(values.T, extent=extent, aspect="auto", **options)
+    levels = np.log(frequencies / 1e3)
+    between = (levels[1:] + levels[:-1]) / 2
+    ends = 2 * levels[[0, -1]] - between[[0, -1]]
+    rows = np.exp(np.concatenate(([ends[0]], between, [ends[1]])))
+    columns = np.linspace(*axis_edges(ranges), len(ranges) + 1)
+    picture = panel.pcolormesh(columns, rows, values.T, rasterized=True, **options)
+    panel.set_yscale("log")
+    marks = [mark for mark in KHZ_MARKS if rows[0] <= mark <= rows[-1]]
+    panel.set_yticks(marks, labels=[f"{mark:g}" for mark in marks])
+    panel.minorticks_off()
+    return picture
+
+
 def _round_up(value: float, step: float) -> float:
     return max(step, step * float(np.ceil(value / step - 1e-9)))
 
@@ -151,7 +182,6 @@ def _pixels(
     columns, ears = len(panels), len(chosen)
     if columns == 2:
         panels["predicted − measured"] = panels["predicted"] - panels["measured"]
-    extent = (*axis_edges(ranges), *axis_edges(frequencies / 1e3))
     width, height = 10.5 * len(panels) / 3 + (len(panels) == 1), 0.9 + 2.3 * ears
     with figure(width, height, dpi, layout=None) as drawn:
         axes, bars = _axes(drawn, ears, columns, len(panels))
@@ -164,7 +194,7 @@ def _pixels(
             axes[0][column].set_title(name)
             axes[-1][column].set_xlabel("range (m)")
             for row, level in zip(axes, values, strict=True):
-                picture = row[column].imshow(level.T, extent=extent, aspect="auto", **options)
+                picture = draw_cells(row[column], level, ranges, frequencies, **options)
                 row[column].locator_params(axis="x", nbins=5)  # more would touch one another
             if column in bars:
                 label = "difference (dB)" if column == 2 else "level (dB)"

@@ -19,6 +19,9 @@ KERNEL_SKIRT = 31e-6
 """The kernel reaches so much further than the window, s: beam and ears lengthen an echo."""
 KERNEL_FLOOR = -9.0
 """What the squared kernel starts with beyond the window, as a natural logarithm."""
+UNEVEN_FLOOR = -14.0
+"""The same of a kernel with two different sides: it is many times longer, and so much would sum up
+to a twentieth of an echo's energy."""
 
 
 COHERENT_AFTER = 0.5
@@ -43,7 +46,7 @@ class ProfileRenderer(Renderer):
     so both ears hear it at their own time; of a sweep each row hears it by the row's lag farther
     off. Spreading and absorption are known physics and stay out of the field. The kernel
     :math:`W_f` starts as the square of a point echo in its row, the analysis window or what that
-    makes of a sweep, and is learned on. Summing power ignores interference between glints inside
+    makes of a sweep, and is learned on; it has two equal sides where the point echoes have. Summing power ignores interference between glints inside
     one window. Mode ``coherent`` sums pressures instead, each with the phase of its own way,
     through the root of the kernel:
 
@@ -123,17 +126,23 @@ class ProfileRenderer(Renderer):
         step = float(acquisition.range[1] - acquisition.range[0])
         self.bin = step / oversampling
         per_sample = acquisition.speed_of_sound / acquisition.sampling_rate / 2
-        window = acquisition.window.clamp(1e-6, 1.0)  # a row that is not swept has no middle
+        self._even = torch.allclose(acquisition.window, acquisition.window.flip(1))
+        # A row that is not swept has no middle. Of uneven ones the middle may not be the greatest.
+        window = acquisition.window.clamp(1e-6, 1.0 if self._even else None)
         last = window.shape[1] - 1
         half = last / 2
         reach = math.ceil((half + KERNEL_SKIRT * acquisition.sampling_rate) * per_sample / self.bin)
         offsets = half - torch.arange(reach + 1) * self.bin / per_sample  # from the middle down
         left = offsets.floor().long().clamp(0, last - 1)
         part = offsets - left
-        window = window[:, left] * (1 - part) + window[:, left + 1] * part
-        skirt = (2 * window.log()).clamp_min(KERNEL_FLOOR)
-        skirt = torch.where(offsets >= 0, skirt, KERNEL_FLOOR).float()
-        self.log_kernel = nn.Parameter(skirt[:, 1:].clone())
+        floor = KERNEL_FLOOR if self._even else UNEVEN_FLOOR
+        sides = []
+        for side in (window,) if self._even else (window, window.flip(1)):
+            between = side[:, left] * (1 - part) + side[:, left + 1] * part
+            skirt = (2 * between.log()).clamp_min(floor)
+            sides.append(torch.where(offsets >= 0, skirt, floor).float()[:, 1:])
+        self.log_kernel = nn.Parameter(torch.cat(sides, dim=1))
+        self._taps = 2 * reach + 1
         self.first = float(acquisition.range[0]) - reach * self.bin
         self.register_buffer("absorption", acquisition.absorption.clone())
         self.register_buffer("lag", acquisition.lag)
@@ -301,7 +310,9 @@ class ProfileRenderer(Renderer):
         profile, slices = self._profile(field, which, weight, position, rotation, bins)
         phased = self._sums_phase
         half = (self.log_kernel.index_select(0, bins) / (2 if phased else 1)).exp()
-        kernel = torch.cat((half.flip(1), torch.ones_like(half[:, :1]), half), dim=1)
+        before, after = (half, half) if self._even else half.chunk(2, dim=1)
+        # A place nearer than a slice is heard there after its own time.
+        kernel = torch.cat((after.flip(1), torch.ones_like(half[:, :1]), before), dim=1)
         heard = Window.apply(profile, kernel, self.oversampling)  # (1 or 2, E, B, P, n)
         heard = heard.square().sum(0) if phased else heard[0]
         heard = F.pad(heard, (slices.start, len(self.range) - slices.stop))
@@ -375,10 +386,6 @@ class ProfileRenderer(Renderer):
         at = at - slices.start * self.oversampling
         return Deposit.apply(echoes, at, pose, len(position), held), slices
 
-    @property
-    def _taps(self) -> int:
-        return 2 * self.log_kernel.shape[1] + 1
-
     def _sounding(self, at: Tensor) -> range:
         """Return the slices that may see one of the bins, counted from the first; never none."""
         last = len(self.range) - 1
@@ -433,9 +440,14 @@ class ProfileRenderer(Renderer):
 
 def _resolution(acquisition: Acquisition) -> float:
     """Return the width in range over which a point echo is above half of its magnitude, m."""
-    power = acquisition.window.double().square().mean(dim=0)
-    wide = (power >= 0.25 * power.max()).nonzero()[:, 0]
-    samples = int(wide[-1] - wide[0]) + 1
+    band = acquisition.frequency.double()  # each row counts with its part of it
+    part = torch.gradient(band)[0] if len(band) > 1 else torch.ones_like(band)
+    power = (part / part.sum()) @ acquisition.window.double().square()
+    low = (power < 0.25 * power.max()).nonzero()[:, 0].tolist()
+    top = int(power.argmax())  # what lies apart from it is another harmonic's echo
+    first = max((sample for sample in low if sample < top), default=-1)
+    last = min((sample for sample in low if sample > top), default=len(power))
+    samples = last - first - 1
     return samples * acquisition.speed_of_sound / acquisition.sampling_rate / 2
 
 

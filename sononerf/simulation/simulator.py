@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from sononerf.acoustics.air import absorption_in, speed_in
 from sononerf.acoustics.ears import Ears, ear_tables, receiver_count
-from sononerf.acoustics.reception import WINDOW_BANDWIDTH, Reception
+from sononerf.acoustics.reception import Reception
+from sononerf.acoustics.row_filters import row_widths
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import Settings, SimulationSettings, SpectrogramSettings
 from sononerf.errors import SettingsError
@@ -207,10 +208,10 @@ def solved_frequency(wanted: SimulationSettings, analysis: SpectrogramSettings) 
     """Return the frequency (Hz) at which what is solved for has fallen to zero.
 
     Where it is not set, the response is whole up to the highest analysed frequency and the
-    window's bandwidth (-6 dB) above it.
+    bandwidth (-6 dB) of a row there above it.
     """
     if wanted.frequency_max is None:
-        bandwidth = WINDOW_BANDWIDTH * analysis.sampling_rate / analysis.window
+        bandwidth = float(row_widths(analysis, analysis.frequency_max)[1])
         return min(TAPER * (analysis.frequency_max + bandwidth), analysis.sampling_rate / 2.0)
     whole = wanted.frequency_max / TAPER
     if whole < analysis.frequency_max:

@@ -2,7 +2,7 @@
 """From echoes with a strength per frequency node to the power in the rows of a spectrogram.
 
 Echoes are laid into time bins per node; the bins' spectra, each with the part of the spectrum that
-its node stands for, are added up; each row of the spectrogram is a filter of that, with window,
+its node stands for, are added up; each row of the spectrogram is a filter of that, with its own,
 call and dechirp in it, and is transformed back at the rate of its frames. For any call this equals
 :func:`sononerf.acoustics.spectrogram.spectrogram` of the simulator's echo.
 """
@@ -19,11 +19,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from sononerf.acoustics.reception import Reception
-from sononerf.acoustics.spectrogram import frequency_axis
+from sononerf.acoustics.row_filters import row_filters
 from sononerf.simulation.impulse_response import between
 
-LOBE = 2.0
-"""Half the main lobe of a Hamming window's transform, times its length."""
 FINE = 5.0
 """Least time bins per period of the highest frequency; quadratic splines between them err by
 0.3 %."""
@@ -55,10 +53,9 @@ class FilterBank:
         self.reception, self.analysis, self.nodes, self.soft = (
             reception, reception.analysis, nodes, soft,
         )  # fmt: skip
-        self.frequencies = frequency_axis(self.analysis)
+        self.filters = row_filters(self.analysis)
         rate = self.analysis.sampling_rate
-        reach = LOBE * rate / self.analysis.window
-        self._band = (float(self.frequencies[0]) - reach, float(self.frequencies[-1]) + reach)
+        self._band = self.filters.band
         self.spacing = 2.0 * float(nodes[0])
         self._top = self.spacing * len(nodes)
         # Interpolation uses nodes on both sides; the ones beyond the band hardly count.
@@ -124,12 +121,12 @@ class FilterBank:
         level = absolute * 1j + np.hypot(absolute, self.soft)
         level = level / np.sinc(absolute / fine) ** 3
         basis = (hats * level[:, None]).T
-        time = np.arange(analysis.window)
-        window = np.hamming(analysis.window)
+        filters = self.filters
+        time = np.arange(filters.envelope.shape[1]) + filters.origin
         rows = np.stack(
             [
-                np.exp(2j * np.pi / rate * np.outer(frequency - row, time)) @ window
-                for row in self.frequencies
+                np.exp(2j * np.pi / rate * np.outer(frequency - row, time)) @ envelope
+                for row, envelope in zip(filters.frequency, filters.envelope, strict=True)
             ]
         )
         call = self.reception.waveform

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from sononerf.acoustics.reception import Reception
+from sononerf.acoustics.row_filters import row_filters
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.simulation.hearing import Hearing
 from sononerf.surface.filter_bank import FilterBank, fast_length
@@ -97,7 +98,8 @@ class Optics(nn.Module):
     wavelength : float, m
         The shortest of the analysed band.
     resolution : float, m
-        In range: half of the analysis window's length.
+        In range: half of the analysis window's length, of a gammatone's that of a Hamming window
+        which is as wide as its rows are on the mean.
     rows, ears : int
         Range slices of a spectrogram, R, and ears, E.
     kept_nodes : (N,) int64
@@ -115,14 +117,16 @@ class Optics(nn.Module):
         self.ears = len(hearing.ears.positions)
         axis = range_axis(analysis, self.speed_of_sound)
         self.rows = len(axis)
-        start = axis[0] * 2.0 * rate / self.speed_of_sound - (analysis.window - 1) / 2.0
+        filters = row_filters(analysis)
+        start = axis[0] * 2.0 * rate / self.speed_of_sound - filters.centre
         self._first = round(start / analysis.hop)
         self.wavelength = self.speed_of_sound / float(rows[-1])
-        self.resolution = self.speed_of_sound * analysis.window / rate / 2.0
+        self.resolution = self.speed_of_sound * filters.length / rate / 2.0
+        self._reads = filters.envelope.shape[1]
         self._soft = FADE_FREQUENCY * float(rows[-1])
         self.bank = FilterBank(reception, hearing.synthesis.nodes, self._soft)
         self.kept_nodes = self.bank.kept_nodes
-        ring = rate / self.bank.spacing + max(0, window.shape[1] - analysis.window) / 2.0
+        ring = rate / self.bank.spacing + max(0, window.shape[1] - self._reads) / 2.0
         self._pad = math.ceil(ring)
         nodes = hearing.synthesis.nodes[self.kept_nodes]
         turn = 2.0 * math.pi / self.speed_of_sound
@@ -344,7 +348,7 @@ class Optics(nn.Module):
 
     def _span(self, path: Tensor, pieces: Pieces, poses: int) -> tuple[int, Tensor]:
         """Return how many frames hold all echoes of any pose, and the first of each pose."""
-        hop, window = self.analysis.hop, self.analysis.window
+        hop, window = self.analysis.hop, self._reads
         late, early = path.amax(1), path.amin(1)
         huge = torch.full((poses,), torch.inf, device=path.device, dtype=path.dtype)
         nearest = huge.scatter_reduce(0, pieces.pose, early, "amin")

@@ -3,7 +3,14 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from sononerf.acoustics.call import call_waveform, covered, emit, sweep_delay, sweep_rate
+from sononerf.acoustics.call import (
+    call_waveform,
+    covered,
+    emit,
+    has_ghosts,
+    sweep_delay,
+    sweep_rate,
+)
 from sononerf.config import CallSettings
 
 SWEEPS = [
@@ -96,3 +103,27 @@ def test_emission_is_a_convolution():
     expected = [np.convolve(row, waveform) for row in responses]
     np.testing.assert_allclose(emit(responses, waveform), expected, atol=1e-12)
     np.testing.assert_array_equal(emit(responses, np.ones(1)), responses)
+
+
+@pytest.mark.parametrize(
+    ("kind", "harmonics", "number"),
+    [
+        ("linear", (1.0, 0.5), 1),
+        ("linear", (0.5, 1.0), 2),
+        ("linear", (1.0, 1.2), 1),  # the second is swept over twice as fast
+        ("hyperbolic", (1.0, 0.8), 2),  # and here half as fast
+        ("hyperbolic", (1.0, 0.6), 1),
+    ],
+)
+def test_of_overlapping_harmonics_the_loudest_is_dechirped(kind, harmonics, number):
+    ends = {"frequency_start": 90e3, "frequency_end": 25e3, "duration": 1e-3}
+    call = CallSettings(kind=kind, harmonics=harmonics, **ends)
+    alone = tuple(float(h == number) for h in (1, 2))
+    single = CallSettings(kind=kind, harmonics=alone, **ends)
+    frequency = np.linspace(60e3, 75e3, 9)
+    np.testing.assert_array_equal(sweep_delay(call, frequency), sweep_delay(single, frequency))
+    np.testing.assert_array_equal(sweep_rate(call, frequency), sweep_rate(single, frequency))
+    assert has_ghosts(call, frequency)
+    assert not has_ghosts(call, [30e3, 40e3])
+    # Where one is fading in or out, the other one is heard.
+    assert sweep_delay(call, [89.9e3])[0] > 0.3e-3

@@ -273,3 +273,30 @@ def test_bands_that_the_call_does_not_cover_are_named(caplog):
     (record,) = caplog.records
     message = record.getMessage()
     assert message.startswith("the call does not cover 10.0 to 29.3 kHz, 46.9 to 58.6 kHz, 91.8")
+
+
+@pytest.mark.parametrize("ends", [(90e3, 25e3), (25e3, 90e3)])
+def test_the_effective_window_has_the_other_harmonics_echo(ends):
+    """Where two harmonics pass a frequency, a point is heard at two ranges of its row."""
+    call = CallSettings(
+        kind="linear",
+        duration=1e-3,
+        frequency_start=ends[0],
+        frequency_end=ends[1],
+        harmonics=(1.0, 0.5),
+    )
+    found = effective_window(call, analysis(window=160))
+    heard = reception(call, window=160, hop=1, range_max=0.9)
+    rows = heard.receive(impulse(heard), seed=0)[1][0]
+    time = 2 * range_axis(heard.analysis, SPEED) / SPEED - 2500e-6
+    offset = (np.arange(found.shape[1]) - (found.shape[1] - 1) / 2) / 1e6
+    for row in (8, 16):  # 55 and 70 kHz
+        there = np.interp(offset, time, rows[:, row], left=0.0, right=0.0)
+        expected = there / there[len(there) // 2]
+        np.testing.assert_allclose(found[row], expected, atol=5e-3)
+        # Half as loud and twice as fast: by up to a root of two less in a window that sees it pass.
+        frequency = frequency_axis(heard.analysis)[row]
+        apart = (frequency / 2 - frequency) / (ends[1] - ends[0]) * 1e-3
+        ghost = np.abs(offset - apart) < 50e-6
+        assert 0.5 / np.sqrt(2) < found[row][ghost].max() < 0.5
+        assert found[row][np.abs(offset + apart) < 50e-6].max() < 0.1

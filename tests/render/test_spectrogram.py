@@ -81,3 +81,19 @@ def test_wrong_input_is_refused():
         spectrogram_png(echo()[:, :-1], echo()[:, :-1], RANGE, FREQUENCY)
     with pytest.raises(NumericalError, match="predicted"):
         spectrogram_png(echo(), echo() * np.nan, RANGE, FREQUENCY)
+
+
+def test_a_logarithmic_axis_is_drawn_as_one():
+    """A tone at the geometric mean of the ends is drawn half-way up, and no channel is lost."""
+    frequency = np.geomspace(10e3, 100e3, 48)
+    level = np.zeros((1, 121, 48))
+    level[..., 23:25] = 40.0
+    level[:, :, 0] = 40.0
+    image = spectrogram_image(level, level, RANGE, frequency)
+    column = image[:, 150].astype(int).sum(axis=1)
+    inside = np.flatnonzero(image[:, 150].max(axis=1) < 250)  # panel, but for the bright tone
+    top, bottom = inside.min(), inside.max()
+    bright = np.flatnonzero(column[top : bottom + 12] > 500)
+    middle = bright[bright < 0.9 * (bottom - top)]
+    assert middle.mean() == pytest.approx((bottom - top) / 2, abs=5)
+    assert (bright > 0.95 * (bottom - top)).any()  # the lowest channel

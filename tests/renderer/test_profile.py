@@ -720,15 +720,29 @@ def test_gradients_of_a_lead(acquisition, formula, gradients_are_right):
     assert gradient.abs().max() > 1
 
 
-@pytest.mark.parametrize("kind", ["impulse", "linear", "hyperbolic"])
-def test_a_tiny_sphere_sounds_where_and_as_long_as_the_simulator_hears_it(kind):
+@pytest.mark.parametrize(
+    ("kind", "front"),
+    [
+        ("impulse", "stft"),
+        ("linear", "stft"),
+        ("hyperbolic", "stft"),
+        ("harmonics", "stft"),
+        ("impulse", "gammatone"),
+        ("linear", "gammatone"),
+    ],
+)
+def test_a_tiny_sphere_sounds_where_and_as_long_as_the_simulator_hears_it(kind, front):
     analysis = {} if kind == "impulse" else {"window": 160, "frequency_min": 45e3}
+    call = {"kind": kind, "duration": 1e-3, "frequency_end": 30e3}
+    if kind == "harmonics":  # the second is heard a quarter of a metre farther off at 60 kHz
+        call = {"kind": "linear", "duration": 1e-3, "frequency_start": 100e3}
+        call |= {"frequency_end": 25e3, "harmonics": [1.0, 0.5]}
     settings = validate_settings(
         {
             "scene": {"name": "test"},
             "simulation": {"engine": "rays", "rays": 20_000},  # nothing creeps around
-            "call": {"kind": kind, "duration": 1e-3, "frequency_end": 30e3},
-            "spectrogram": analysis,
+            "call": call,
+            "spectrogram": {"kind": front, **analysis},
         },
         "test",
     )

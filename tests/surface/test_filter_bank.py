@@ -8,7 +8,7 @@ from scipy.fft import next_fast_len
 
 from sononerf.acoustics.call import emit
 from sononerf.acoustics.reception import Reception
-from sononerf.acoustics.spectrogram import spectrogram
+from sononerf.acoustics.spectrogram import range_axis, spectrogram
 from sononerf.config import CallSettings, NoiseSettings, SpectrogramSettings
 from sononerf.surface.filter_bank import FilterBank, fast_length
 
@@ -16,9 +16,9 @@ NODES = (np.arange(19) + 0.5) * 8e3
 SOFT = 25e3
 
 
-def bank_of(kind):
-    analysis = SpectrogramSettings(range_min=0.2, range_max=0.5)
-    call = CallSettings(kind=kind)
+def bank_of(kind, harmonics=(1.0,), analysis_kind="stft", **changes):
+    analysis = SpectrogramSettings(range_min=0.2, range_max=0.5, kind=analysis_kind, **changes)
+    call = CallSettings(kind=kind, harmonics=harmonics, frequency_end=40e3 / len(harmonics))
     reception = Reception(call, analysis, NoiseSettings(), speed_of_sound=343.0)
     return FilterBank(reception, NODES, SOFT), reception
 
@@ -35,19 +35,31 @@ def power(bank, strength, at, frames, receiver=0, receivers=1):
     )
 
 
-@pytest.mark.parametrize("kind", ["impulse", "linear", "hyperbolic"])
-def test_rows_are_those_of_the_analysis_for_any_call(kind):
-    bank, reception = bank_of(kind)
+@pytest.mark.parametrize(
+    ("kind", "changes"),
+    [
+        ("impulse", {}),
+        ("linear", {}),
+        ("hyperbolic", {}),
+        ("linear", {"harmonics": (1.0, 0.5)}),
+        ("impulse", {"analysis_kind": "gammatone"}),
+        ("linear", {"analysis_kind": "gammatone", "frequency_min": 42e3}),
+    ],
+)
+def test_rows_are_those_of_the_analysis_for_any_call(kind, changes):
+    bank, reception = bank_of(kind, **changes)
     analysis = reception.analysis
     place, first = 1703.3, 1280
+    top = 150e3 if analysis.kind == "stft" else 200e3  # a gammatone's skirts reach farther
     length = next_fast_len(reception.samples)
     frequency = np.fft.rfftfreq(length, 1 / analysis.sampling_rate)
     level = 1j * frequency + np.hypot(frequency, SOFT)
-    level *= np.exp(-2j * np.pi * frequency * place / analysis.sampling_rate) * (frequency < 150e3)
+    level *= np.exp(-2j * np.pi * frequency * place / analysis.sampling_rate) * (frequency < top)
     echo = emit(np.fft.irfft(level, n=length)[None], reception.waveform)[:, : reception.samples]
     wanted = spectrogram(echo, analysis, 343.0, reception.delay)[0]
-    found = power(bank, torch.ones(1), torch.tensor([place - first]), 256)[0].sqrt().numpy()
-    row = round(first / analysis.hop) - 284  # the axis begins with frame 284
+    found = power(bank, torch.ones(1), torch.tensor([place - first]), 512)[0].sqrt().numpy()
+    start = range_axis(analysis, 343.0)[0] * 2.0 * analysis.sampling_rate / 343.0
+    row = round((first - start + bank.filters.centre) / analysis.hop)
     part = wanted[row + 20 : row + 200]
     loud = part > 0.1 * part.max()
     error = 20 * np.log10(found[20:200][loud] / part[loud])
