@@ -19,9 +19,9 @@ PACKAGE = ROOT / "sononerf"
 
 # In the order in which data flows: each may import what stands before it, and itself.
 LAYERS = (
-    "errors memory presets config plugins progress storage checkpoint_io weights geometry material scene "
-    "composition acoustics simulation data echoes field renderer module surface reconstruction "
-    "render callbacks experiment cli"
+    "errors memory presets config plugins progress storage checkpoint_io weights geometry material "
+    "scene composition acoustics simulation data echoes field renderer module surface "
+    "reconstruction render callbacks experiment cli"
 ).split()
 # Below the place that turns settings into objects, nobody chooses a device.
 DEVICELESS = LAYERS[: LAYERS.index("experiment")]

@@ -244,4 +244,3 @@ def contents(path: Path) -> bytes:
     """
     call = load_call(path)
     return np.float64(call.sampling_rate).tobytes() + call.waveform.astype("<f8").tobytes()
-

@@ -130,8 +130,8 @@ def _outside(call: CallSettings, analysis: SpectrogramSettings) -> str:
     held = ", ".join(f"{low / 1e3:.1f} to {high / 1e3:.1f}" for low, high in bands)
     return (
         f"{call.file}: holds sound at {held} kHz, nothing within spectrogram.frequency_min to "
-        f"frequency_max ({analysis.frequency_min / 1e3:g} to {analysis.frequency_max / 1e3:g} kHz); "
-        "change these, or take another call"
+        f"frequency_max ({analysis.frequency_min / 1e3:g} to {analysis.frequency_max / 1e3:g} "
+        "kHz); change these, or take another call"
     )
 
 

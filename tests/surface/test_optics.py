@@ -46,9 +46,7 @@ def whole(optics, heard, like):
     ],
 )
 def test_a_sphere_sounds_as_the_simulator_says(call, front, ball, poses, simulated):
-    settings = given(
-        call=call, spectrogram={"range_min": 0.2, "range_max": 0.4, "kind": front}
-    )
+    settings = given(call=call, spectrogram={"range_min": 0.2, "range_max": 0.4, "kind": front})
     optics = optics_of(settings, Scene(ball))
     fine = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     wanted = simulated(fine, settings, poses)
