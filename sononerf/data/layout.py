@@ -222,9 +222,9 @@ def read_axes(root: Path, group: Any) -> tuple[dict[str, NDArray[Any]], Any]:
     dims = ("pose", "ear", "range", "frequency")
     sizes = (len(axes["range"]), len(axes["frequency"]))
     spectrogram = _open_array(root, SPECTROGRAM, group, "float32", dims, sizes)
-    if len(spectrogram) != len(axes["position"]):
+    if spectrogram.shape[0] != len(axes["position"]):
         raise InputError(
-            f"{root / SPECTROGRAM}: holds {len(spectrogram)} poses, expected "
+            f"{root / SPECTROGRAM}: holds {spectrogram.shape[0]} poses, expected "
             f"{len(axes['position'])}"
         )
     return axes, spectrogram

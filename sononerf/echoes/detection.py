@@ -177,12 +177,28 @@ def onsets(
 
 
 def _flank(window: Array) -> tuple[Array, float]:
-    """Return the rise of a point echo up to its greatest, from zero to one, and its own range."""
-    tops = np.flatnonzero(window == window.max())
-    rising = window[: tops[0] + 1] / window.max()
-    even = np.allclose(window, window[::-1])
-    middle = float(tops.mean()) if even else (len(window) - 1) / 2.0
+    """Return the rise of a point echo up to its first top, from zero to one, and its own range."""
+    if np.allclose(window, window[::-1]):
+        tops = np.flatnonzero(window == window.max())
+        first, middle = int(tops[0]), float(tops.mean())
+    else:
+        first, middle = own_top(window), (len(window) - 1) / 2.0
+    rising = window[: first + 1] / window[first]
     return np.concatenate(([0.0], rising)), middle + 1.0
+
+
+def own_top(window: Array) -> int:
+    """Return where a point echo (W,) is greatest about its own range, which is in the middle.
+
+    What lies apart from that, as another harmonic's echo does, may be greater.
+    """
+    top = (len(window) - 1) // 2
+    while 0 < top < len(window) - 1:
+        beside = top + (1 if window[top + 1] > window[top - 1] else -1)
+        if window[beside] <= window[top]:
+            break
+        top = beside
+    return top
 
 
 def _crossing(rising: Array, fraction: float) -> float:

@@ -13,7 +13,7 @@ from sononerf.acoustics.reception import effective_window
 from sononerf.acoustics.row_filters import band_mean, band_parts, row_filters
 from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.data.store import EnsembleStore
-from sononerf.echoes.detection import Levels, onsets, threshold_levels
+from sononerf.echoes.detection import Levels, onsets, own_top, threshold_levels
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -70,10 +70,10 @@ class PointEcho:
     def resolution(self) -> float:
         """Width in range over which its magnitude is above half of its greatest, m.
 
-        What lies apart from its greatest, as another harmonic's echo does, is not counted.
+        What lies apart from its own range, as another harmonic's echo does, is not counted.
         """
-        low = np.flatnonzero(self.window < 0.25 * self.window.max())
-        top = int(self.window.argmax())
+        top = own_top(self.window)
+        low = np.flatnonzero(self.window < 0.25 * self.window[top])
         first = int(low[low < top].max(initial=-1)) + 1
         last = int(low[low > top].min(initial=len(self.window))) - 1
         return float(last - first + 1) * self.spacing

@@ -443,8 +443,8 @@ def _resolution(acquisition: Acquisition) -> float:
     band = acquisition.frequency.double()  # each row counts with its part of it
     part = torch.gradient(band)[0] if len(band) > 1 else torch.ones_like(band)
     power = (part / part.sum()) @ acquisition.window.double().square()
-    low = (power < 0.25 * power.max()).nonzero()[:, 0].tolist()
-    top = int(power.argmax())  # what lies apart from it is another harmonic's echo
+    top = (len(power) - 1) // 2  # what lies apart from its own range is another harmonic's echo
+    low = (power < 0.25 * power[top]).nonzero()[:, 0].tolist()
     first = max((sample for sample in low if sample < top), default=-1)
     last = min((sample for sample in low if sample > top), default=len(power))
     samples = last - first - 1
