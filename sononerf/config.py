@@ -252,7 +252,7 @@ class SpectrogramSettings(_Section):
     dynamic_range_db: Annotated[float, Field(gt=0, le=200)] = 60.0
     kind: Literal["stft", "gammatone"] = "stft"
     channels: Annotated[int, Field(ge=2, le=512)] = 48
-    q: Annotated[float, Field(ge=1, le=50)] = 4.0  # centre over equivalent rectangular bandwidth
+    q: Annotated[float, Field(ge=1, le=50)] = 3.0  # centre over equivalent rectangular bandwidth
 
     @model_validator(mode="after")
     def _ordered(self) -> SpectrogramSettings:

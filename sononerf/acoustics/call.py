@@ -14,6 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from sononerf.acoustics.call_file import CallFile, contents, load_call
 from sononerf.config import CallSettings
 
+LOUD = 0.25
+"""A harmonic counts where it has this part of the loudest one's height: echoes that are fainter are
+not taken for onsets, whose level is a tenth of the power."""
+
 
 def call_waveform(settings: CallSettings, sampling_rate: float) -> NDArray[np.float64]:
     r"""Pressure of the call, from the start of the emission on.
@@ -138,10 +142,10 @@ def has_ghosts(settings: CallSettings, frequency: ArrayLike) -> bool:
 def _carrier(
     settings: CallSettings, frequency: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Which harmonic sweeps nearest to each frequency, the loudest of several, and where; (F,).
+    """Which harmonic sweeps nearest to each frequency, the first of several, and where; (F,).
 
-    The slower one sweeps over a frequency, and the farther it is from a tapered end, the louder it
-    is there.
+    Those that are 12 dB fainter there than another one are passed over. The slower a harmonic
+    sweeps over a frequency, and the farther it is from a tapered end, the louder it is there.
     """
     harmonic = np.asarray(list(settings.bands), dtype=np.float64)
     low, high = np.asarray(list(settings.bands.values())).T
@@ -150,9 +154,12 @@ def _carrier(
     off = np.maximum(np.maximum(low - f, f - high), 0.0)
     # Over what all of them have in common: a linear sweep's rate is h, a hyperbolic one's 1 / h.
     slowness = amplitude * harmonic ** (-0.5 if settings.kind == "linear" else 0.5)
-    loudness = slowness * _envelope(settings, _time_of(settings, np.clip(f, low, high), harmonic))
-    nearest = np.where(off == off.min(axis=1, keepdims=True), loudness, -1.0).argmax(axis=1)
-    return harmonic[nearest], np.clip(frequency, low[nearest], high[nearest])
+    time = _time_of(settings, np.clip(f, low, high), harmonic)
+    near = off == off.min(axis=1, keepdims=True)
+    loudness = np.where(near, slowness * _envelope(settings, time), 0.0)
+    loud = near & (loudness >= LOUD * loudness.max(axis=1, keepdims=True))
+    first = np.where(loud, time, np.inf).argmin(axis=1)
+    return harmonic[first], np.clip(frequency, low[first], high[first])
 
 
 def _time_of(
@@ -184,9 +191,10 @@ def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.floa
     Returns
     -------
     delay : (F,) float64, s
-        Of the loudest harmonic that sweeps over the frequency, or else of the nearest end of a
-        sweep; zero for an impulse. Other harmonics that sweep over it too are heard at other
-        ranges, as :func:`sononerf.acoustics.reception.effective_window` has it.
+        Of the first harmonic that sweeps over the frequency, or else of the nearest end of a
+        sweep; zero for an impulse. Other harmonics that sweep over it too are heard farther off, as
+        :func:`sononerf.acoustics.reception.effective_window` has it, so that no echo is heard in
+        front of the first one.
 
     Examples
     --------

@@ -2,8 +2,10 @@
 r"""A call from a WAV file: its waveform, when it emits each frequency, and which it covers.
 
 The call is looked at through Hamming windows of the length that resolves a sweep of its duration
-and bandwidth best. At each frequency the output is loudest when the frequency is emitted: the
-*delay* is the centroid of the power's top about that time. Where several harmonics pass a frequency it is therefore the loudest one's. *Covered* is what lies within
+and bandwidth best. At each frequency the output is loud when the frequency is emitted: the
+*delay* is the centroid of the power's top about that time. Where several harmonics pass a frequency
+it is the first one's that is not 12 dB fainter than another, so that no echo is heard in front of
+the first one. *Covered* is what lies within
 20 dB of the loudest frequency, gaps narrower than a window's bandwidth included.
 """
 
@@ -34,6 +36,7 @@ LARGEST_STEP = 10_000  # of a ratio of sampling rates
 COVERED_DB = 20.0  # below the loudest frequency
 SMOOTHING = 0.1  # of a spectrum to both sides, in bandwidths of the window
 ENERGY = 0.99  # that a call's duration holds
+LOUD = 0.0625  # of the power, 12 dB below the loudest: what is fainter is passed over
 TOP = 0.7  # of an output's power: what lies above it tells the time
 ROWS = 200  # frequencies that the delay is read at
 
@@ -186,7 +189,7 @@ def _examined(waveform: NDArray[np.float64], rate: float) -> CallFile:
     for row, middle in enumerate(frequency):
         kernel = np.fft.fft(window * np.exp(1j * ring * middle), size)
         power = np.abs(np.fft.ifft(spectrum * kernel)) ** 2
-        top = int(power.argmax())
+        top = _first_top(power)
         low = np.flatnonzero(power < TOP * power[top])
         first = int(low[low < top].max(initial=-1)) + 1
         last = int(low[low > top].min(initial=size))
@@ -194,6 +197,14 @@ def _examined(waveform: NDArray[np.float64], rate: float) -> CallFile:
         delay[row] = np.average(time[first:last], weights=above)
     loud = _loud(waveform, rate, frequency, bandwidth)
     return CallFile(waveform, rate, frequency, np.maximum(delay, 0.0), loud, bandwidth)
+
+
+def _first_top(power: NDArray[np.float64]) -> int:
+    """Return where a row is loudest when the frequency is first emitted, if not 12 dB fainter."""
+    loud = np.flatnonzero(power >= LOUD * power.max())
+    ends = np.flatnonzero(np.diff(loud) > 1)
+    end = int(loud[ends[0]] if len(ends) else loud[-1]) + 1
+    return int(loud[0]) + int(power[loud[0] : end].argmax())
 
 
 def _loud(

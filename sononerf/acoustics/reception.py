@@ -34,8 +34,8 @@ logger = logging.getLogger("sononerf")
 FAR = 2.0  # factor between a window and the best one that is worth a warning
 FAINT = 1e-2
 """A point echo is followed over time down to this, over its height at its own range."""
-MOST = 2.0
-"""How much louder it may be at another time: at a sweep's end its own range is hardly heard."""
+MOST = 4.0
+"""How much louder it may be at another time, where another harmonic is: 12 dB."""
 
 
 class Reception:
@@ -140,8 +140,8 @@ def _outside(call: CallSettings, analysis: SpectrogramSettings) -> str:
     held = ", ".join(f"{low / 1e3:.1f} to {high / 1e3:.1f}" for low, high in bands)
     return (
         f"{call.file}: holds sound at {held} kHz, nothing within spectrogram.frequency_min to "
-        f"frequency_max ({analysis.frequency_min / 1e3:g} to {analysis.frequency_max / 1e3:g} kHz); "
-        "change these, or take another call"
+        f"frequency_max ({analysis.frequency_min / 1e3:g} to {analysis.frequency_max / 1e3:g} "
+        "kHz); change these, or take another call"
     )
 
 

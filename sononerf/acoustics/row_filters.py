@@ -131,12 +131,18 @@ def band_mean(values: NDArray[Any], frequency: ArrayLike) -> NDArray[Any]:
     frequency : (F,) float, Hz
         Ascending; where its steps are equal this is the mean.
     """
+    part = band_parts(frequency)
+    return np.asarray(values.mean(axis=-1) if part is None else values @ part)
+
+
+def band_parts(frequency: ArrayLike) -> NDArray[np.float64] | None:
+    """Return what part of the band each row (F,) stands for, together 1; None if all the same."""
     f = np.asarray(frequency, dtype=np.float64)
     steps = np.diff(f)
     if len(steps) < 2 or np.ptp(steps) <= 1e-6 * steps.mean():
-        return np.asarray(values.mean(axis=-1))
+        return None
     part = np.gradient(f)
-    return np.asarray(values @ (part / part.sum()))
+    return np.asarray(part / part.sum())
 
 
 def row_widths(

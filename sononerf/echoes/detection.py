@@ -36,6 +36,7 @@ References
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -132,7 +133,12 @@ def _precursors(power: Array) -> Array:
     return np.asarray(ratios)
 
 
-def onsets(power: Array, levels: Levels, window: Array, fineness: float) -> Array:
+def onsets(
+    power: Array,
+    levels: Levels,
+    window: Array | Callable[[int, int], Array],
+    fineness: float,
+) -> Array:
     """Return where the first echo of each row is, in slices from the first one, (N,).
 
     The range is read where the power has risen to a tenth of the echo's, or to the threshold of
@@ -144,8 +150,9 @@ def onsets(power: Array, levels: Levels, window: Array, fineness: float) -> Arra
         Power over range.
     levels : Levels
         What an echo exceeds.
-    window : (W,) float
-        Power of a point echo over range, its own range in the middle.
+    window : (W,) float or callable
+        Power of a point echo over range, its own range in the middle; or what gives it for a row
+        and the slice of its echo's greatest power.
     fineness : float
         Spacing of its values in slices.
 
@@ -155,7 +162,6 @@ def onsets(power: Array, levels: Levels, window: Array, fineness: float) -> Arra
         Minus infinity where nothing was heard, or where the first slice cuts an echo that the
         first whole one does not exceed by the threshold factor.
     """
-    rising, middle = _flank(window)
     found = np.full(len(power), -np.inf)
     inner = (_is_top(power) & (power > levels.total))[:, 1:-1]
     for row in np.flatnonzero(inner.any(axis=1)):
@@ -164,18 +170,35 @@ def onsets(power: Array, levels: Levels, window: Array, fineness: float) -> Arra
         fraction = max(ONSET, float(levels.noise[row, 0]) / power[row, top])
         before = np.flatnonzero(echo[:top] < fraction)
         if len(before):  # else it began before the first slice
+            rising, middle = _flank(window(int(row), top) if callable(window) else window)
             rise = middle - _crossing(rising, fraction)
             found[row] = _crossing(echo[int(before[-1]) :], fraction) + before[-1] + rise * fineness
     return found
 
 
 def _flank(window: Array) -> tuple[Array, float]:
-    """Return the rise of a point echo up to its greatest, from zero to one, and its own range."""
-    tops = np.flatnonzero(window == window.max())
-    rising = window[: tops[0] + 1] / window.max()
-    even = np.allclose(window, window[::-1])
-    middle = float(tops.mean()) if even else (len(window) - 1) / 2.0
+    """Return the rise of a point echo up to its first top, from zero to one, and its own range."""
+    if np.allclose(window, window[::-1]):
+        tops = np.flatnonzero(window == window.max())
+        first, middle = int(tops[0]), float(tops.mean())
+    else:
+        first, middle = own_top(window), (len(window) - 1) / 2.0
+    rising = window[: first + 1] / window[first]
     return np.concatenate(([0.0], rising)), middle + 1.0
+
+
+def own_top(window: Array) -> int:
+    """Return where a point echo (W,) is greatest about its own range, which is in the middle.
+
+    What lies apart from that, as another harmonic's echo does, may be greater.
+    """
+    top = (len(window) - 1) // 2
+    while 0 < top < len(window) - 1:
+        beside = top + (1 if window[top + 1] > window[top - 1] else -1)
+        if window[beside] <= window[top]:
+            break
+        top = beside
+    return top
 
 
 def _crossing(rising: Array, fraction: float) -> float:

@@ -11,10 +11,10 @@ from scipy.stats import poisson
 
 from sononerf.acoustics.call import covered
 from sononerf.acoustics.reception import effective_window
-from sononerf.acoustics.row_filters import band_mean, row_filters
+from sononerf.acoustics.row_filters import band_mean, band_parts, row_filters
 from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.data.store import EnsembleStore
-from sononerf.echoes.detection import FALSE_ALARMS, Levels, onsets, threshold_levels
+from sononerf.echoes.detection import FALSE_ALARMS, Levels, onsets, own_top, threshold_levels
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -35,11 +35,15 @@ class PointEcho:
         Between these values.
     looks : float
         How many independent values there are among the frequencies.
+    rows : (F, W) float or None
+        The same of each row, which the window is the sum of; None where all rows are about alike.
+        If low rows swell more slowly, an echo without high frequencies does so too.
     """
 
     window: Array
     spacing: float
     looks: float
+    rows: Array | None = None
 
     @classmethod
     def of(
@@ -49,21 +53,28 @@ class PointEcho:
         rows = effective_window(call, analysis)
         filters = row_filters(analysis)
         swept = covered(call, filters.frequency)
-        kept = swept if swept.any() else slice(1)
+        kept = swept if swept.any() else np.arange(len(rows)) < 1
+        part = band_parts(filters.frequency)
         return cls(
             window=band_mean((rows[kept] ** 2).T, filters.frequency[kept]),
+            rows=None if part is None else rows**2 * (part * kept)[:, None],
             spacing=speed_of_sound / 2.0 / analysis.sampling_rate,
             looks=filters.looks,
         )
+
+    def of_spectrum(self, magnitude: NDArray[np.floating]) -> Array:
+        """Return the window (W,) of an echo whose rows have some magnitudes (F,)."""
+        assert self.rows is not None
+        return np.asarray(np.square(magnitude, dtype=np.float64) @ self.rows)
 
     @property
     def resolution(self) -> float:
         """Width in range over which its magnitude is above half of its greatest, m.
 
-        What lies apart from its greatest, as another harmonic's echo does, is not counted.
+        What lies apart from its own range, as another harmonic's echo does, is not counted.
         """
-        low = np.flatnonzero(self.window < 0.25 * self.window.max())
-        top = int(self.window.argmax())
+        top = own_top(self.window)
+        low = np.flatnonzero(self.window < 0.25 * self.window[top])
         first = int(low[low < top].max(initial=-1)) + 1
         last = int(low[low > top].min(initial=len(self.window))) - 1
         return float(last - first + 1) * self.spacing
@@ -125,18 +136,22 @@ def find_onsets(store: EnsembleStore, echo: PointEcho) -> Onsets:
     """
     poses = asked_poses(store)
     axis = np.asarray(store.range, dtype=np.float64)
-    power = np.stack(
-        [
-            band_mean(np.square(store.read_pose(int(i)), dtype=np.float64), store.frequency)
-            for i in poses
-        ]
-    )
+    heard = (np.square(store.read_pose(int(i)), dtype=np.float64) for i in poses)
+    if echo.rows is None:
+        power = np.stack([each.mean(axis=-1) for each in heard])
+    else:
+        power = np.stack([band_mean(each, store.frequency) for each in heard])
     levels = threshold_levels(power, echo.looks)
     step = float(axis[1] - axis[0])
     fineness = echo.spacing / step
-    found = [
-        onsets(power[:, ear], Levels(*(each[:, ear] for each in levels)), echo.window, fineness)
-        for ear in range(power.shape[1])
-    ]
+    found = []
+    for ear in range(power.shape[1]):
+
+        def own_window(row: int, top: int, ear: int = ear) -> Array:
+            return echo.of_spectrum(store.read_pose(int(poses[row]))[ear, top])
+
+        window = echo.window if echo.rows is None else own_window
+        level = Levels(*(each[:, ear] for each in levels))
+        found.append(onsets(power[:, ear], level, window, fineness))
     first = axis[0] + step * np.stack(found, axis=1)
     return Onsets(poses, axis, power, power > levels.total, first)

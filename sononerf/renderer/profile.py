@@ -46,9 +46,9 @@ class ProfileRenderer(Renderer):
     so both ears hear it at their own time; of a sweep each row hears it by the row's lag farther
     off. Spreading and absorption are known physics and stay out of the field. The kernel
     :math:`W_f` starts as the square of a point echo in its row, the analysis window or what that
-    makes of a sweep, and is learned on; it has two equal sides where the point echoes have. Summing power ignores interference between glints inside
-    one window. Mode ``coherent`` sums pressures instead, each with the phase of its own way,
-    through the root of the kernel:
+    makes of a sweep, and is learned on; it has two equal sides where the point echoes have.
+    Summing power ignores interference between glints inside one window. Mode ``coherent`` sums
+    pressures instead, each with the phase of its own way, through the root of the kernel:
 
     .. math::
         S_e(f, r)^2 = n_f^2 + g^2 \left|\sum_i \sqrt{W_f(r - r_i)}\, \rho(x_i, u_i, f)
@@ -443,8 +443,8 @@ def _resolution(acquisition: Acquisition) -> float:
     band = acquisition.frequency.double()  # each row counts with its part of it
     part = torch.gradient(band)[0] if len(band) > 1 else torch.ones_like(band)
     power = (part / part.sum()) @ acquisition.window.double().square()
-    low = (power < 0.25 * power.max()).nonzero()[:, 0].tolist()
-    top = int(power.argmax())  # what lies apart from it is another harmonic's echo
+    top = (len(power) - 1) // 2  # what lies apart from its own range is another harmonic's echo
+    low = (power < 0.25 * power[top]).nonzero()[:, 0].tolist()
     first = max((sample for sample in low if sample < top), default=-1)
     last = min((sample for sample in low if sample > top), default=len(power))
     samples = last - first - 1

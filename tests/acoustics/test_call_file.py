@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: MIT
+import os
+
 import numpy as np
 import pytest
 import scipy.io.wavfile
@@ -93,12 +95,16 @@ def test_a_hash_is_of_what_a_file_holds(written):
     assert call_content(written(waveform[:-9], name="c.wav")) != call_content(first)
     assert call_content(written(waveform, 400_000, name="d.wav")) != call_content(first)
     assert call_content(SWEEP) != call_content(SWEEP.model_copy(update={"taper": 0.3}))
+    preset = CallSettings(preset="airsas")
+    assert call_content(preset) == call_content(preset.model_copy(update={"preset": None}))
 
 
 def test_a_file_that_changes_is_read_again(written):
     waveform = call_waveform(SWEEP, RATE).astype(np.float32)
     before = call_content(written(waveform))
-    assert call_content(written(waveform[:-50])) != before
+    other = written(waveform[::-1])  # of the same size
+    os.utime(other.file, ns=(1, 2))
+    assert call_content(other) != before
 
 
 @pytest.mark.parametrize(

@@ -96,3 +96,13 @@ def test_what_no_recording_could_hold_is_no_echo():
     # 77 dB below the loudest an echo is one, before faint poses too.
     rows[0] = echo(100.0, 2e-7)
     assert found_in(rows)[0] == pytest.approx(100.0, abs=1.0)
+
+
+def test_an_onset_is_at_a_point_echos_own_range_not_at_its_greatest():
+    """A filter may answer loudest a little after the time that it is read at."""
+    rise = np.interp(np.arange(41), [0, 26, 40], [0.0, 1.0, 0.0])  # its own range is at 20
+    power = np.full((12, SLICES), 1e-9)
+    for row in power:
+        row[130:171] += rise  # of an echo at 150
+    levels = threshold_levels(power, 4.0)
+    np.testing.assert_allclose(onsets(power, levels, rise, 1.0), 150.0, atol=0.2)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sononerf.acoustics.reception import effective_window
-from sononerf.acoustics.spectrogram import frequency_axis
+from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.echoes import detection, onsets
 from sononerf.echoes.detection import FALSE_ALARMS, RANK, threshold_factor
@@ -30,6 +31,7 @@ def store_of(poses, train=None):
     train = np.arange(len(poses)) if train is None else np.asarray(train)
     return SimpleNamespace(
         range=RANGE,
+        frequency=np.array([20e3, 40e3, 60e3]),
         indices=lambda split: {"train": train}[split],
         read_pose=lambda i: np.sqrt(np.asarray(poses[i]))[..., None].astype(np.float32) * gain,
     )
@@ -126,3 +128,30 @@ def test_lengths_go_with_the_speed_of_sound():
     slow, fast = (PointEcho.of(CallSettings(), SpectrogramSettings(), c) for c in (343.0, 1029.0))
     assert fast.resolution == pytest.approx(3 * slow.resolution)
     assert fast.looks == slow.looks
+
+
+@pytest.mark.parametrize("tilt", [-1.0, 0.0, 1.0])
+def test_an_onset_does_not_depend_on_which_channels_are_loud(tilt):
+    """Low channels of a gammatone swell slowly: an echo that they make up begins early."""
+    analysis = SpectrogramSettings(kind="gammatone", range_min=0.2, range_max=0.4)
+    point = PointEcho.of(CallSettings(), analysis, 343.0)
+    axis, frequency = range_axis(analysis, 343.0), frequency_axis(analysis)
+    window = effective_window(CallSettings(), analysis)
+    offset = (np.arange(window.shape[1]) - (window.shape[1] - 1) / 2) * 343.0 / 2e6
+    at = 0.3 + np.linspace(0, 0.0007, 12)
+    gain = (frequency / 30e3) ** tilt
+    rows = [
+        gain * np.stack([np.interp(axis - r, offset, row, left=0, right=0) for row in window], 1)
+        for r in at
+    ]
+    store = SimpleNamespace(
+        range=axis,
+        frequency=frequency,
+        indices=lambda split: np.arange(len(at)),
+        read_pose=lambda i: rows[i][None].astype(np.float32),
+    )
+    first = find_onsets(store, point).first[:, 0]
+    np.testing.assert_allclose(first, at, atol=3e-4)
+    alike = dataclasses.replace(point, rows=None)
+    if tilt < 0:
+        assert (find_onsets(store, alike).first[:, 0] < at - 1e-3).all()

@@ -36,9 +36,17 @@ def whole(optics, heard, like):
     return found
 
 
-@pytest.mark.parametrize("kind", ["impulse", "linear"])
-def test_a_sphere_sounds_as_the_simulator_says(kind, ball, poses, simulated):
-    settings = given(call={"kind": kind})
+@pytest.mark.parametrize(
+    ("call", "front"),
+    [
+        ({"kind": "impulse"}, "stft"),
+        ({"kind": "linear"}, "stft"),
+        ({"kind": "linear", "frequency_end": 25e3, "harmonics": [1.0, 0.5]}, "stft"),
+        ({"kind": "impulse"}, "gammatone"),
+    ],
+)
+def test_a_sphere_sounds_as_the_simulator_says(call, front, ball, poses, simulated):
+    settings = given(call=call, spectrogram={"range_min": 0.2, "range_max": 0.4, "kind": front})
     optics = optics_of(settings, Scene(ball))
     fine = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     wanted = simulated(fine, settings, poses)
