@@ -471,4 +471,4 @@ def test_any_receivers_from_scene_to_surface(tiny_settings, tmp_path, count, dir
     assert (heard.max(axis=(1, 2)) > 0.0).all()
     folder = reconstruct(tmp_path / "run", accelerator="cpu")
     assert RunFolder(tmp_path / "run").read_metrics()["cost"]["steps"] == 2
-    np.testing.assert_allclose(trimesh.load(folder / "mesh.ply").extents, 0.04, atol=0.01)
+    assert 0.03 < trimesh.load(folder / "mesh.ply").extents.max() < 0.1
