@@ -40,7 +40,6 @@ SOUND = ("waveform", "sampling_rate", "start", "split")
 WHOLE = {"position": PLACE, "euler": EULER}
 
 
-@lru_cache(maxsize=2)
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Read all arrays of an ``.npz``, or of the root of an HDF5 file.
 
@@ -51,15 +50,24 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    stamp = path.stat()
+    return _read(path, stamp.st_mtime_ns, stamp.st_size)
+
+
+@lru_cache(maxsize=2)  # one file holds many pings
+def _read(path: Path, *stamp: int) -> dict[str, NDArray[Any]]:
+    """Read a file as it was at a time and of a size."""
+    del stamp
     if path.suffix.lower() in HDF5:
         with hdf5.opened(path) as file:
             found = {name: hdf5.numbers(file, name) for name in file}
         return {name: values for name, values in found.items() if values is not None}
     try:
-        with np.load(path, allow_pickle=False) as file:
-            if not hasattr(file, "files"):
+        with path.open("rb") as file:
+            found = np.load(file, allow_pickle=False)
+            if isinstance(found, np.ndarray):
                 raise InputError(f"{path}: one array only; save arrays by name with numpy.savez")
-            arrays = {name: np.asarray(file[name]) for name in file.files}
+            arrays = {name: np.asarray(found[name]) for name in found.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
         said = " ".join(str(error).split())
         raise InputError(f"{path}: damaged, truncated, or no .npz of numbers ({said})") from None

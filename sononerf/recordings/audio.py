@@ -19,7 +19,6 @@ WAV, OTHERS = (".wav",), (".flac", ".ogg", ".aiff", ".aif", ".w64", ".caf")
 SUFFIXES = (*WAV, *OTHERS)
 
 
-@lru_cache(maxsize=2)  # one long file holds many pings
 def read_audio(path: Path) -> tuple[float, NDArray[Any]]:
     """Read a sound file.
 
@@ -42,6 +41,14 @@ def read_audio(path: Path) -> tuple[float, NDArray[Any]]:
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
+    stamp = path.stat()
+    return _read(path, stamp.st_mtime_ns, stamp.st_size)
+
+
+@lru_cache(maxsize=2)  # one long file holds many pings
+def _read(path: Path, *stamp: int) -> tuple[float, NDArray[Any]]:
+    """Read a file as it was at a time and of a size."""
+    del stamp
     rate, samples = (_wav if path.suffix.lower() in WAV else _other)(path)
     if samples.ndim == 1:
         samples = samples[:, None]

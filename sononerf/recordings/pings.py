@@ -22,9 +22,9 @@ Array = NDArray[np.float64]
 
 GUARD = 64
 """Samples on both sides of a cut that take up what a shift by part of a sample leaks."""
-RUN = 3
-"""A clipped wave stays at its greatest value for so many samples in a row."""
-STEPS = 64
+STAYS = 3
+"""A clipped wave has so many samples, or more, that equal a neighbour at its greatest value."""
+STEPS = 1000
 """Least height of a wave over the steps of its numbers for it to be called clipped: a fainter one
 stays at the same number for long anyway."""
 
@@ -168,54 +168,49 @@ class Cutter:
 
 @dataclass(frozen=True, eq=False)
 class Clipping:
-    """The greatest magnitude of each channel of a ping, and how long it stays there.
+    """The greatest value of each channel of a ping, and of its negative, and how often it stays.
 
     Attributes
     ----------
-    peak : (E,) float
-        Greatest magnitude, as a fraction of full scale, or in the unit of the recording.
-    run : (E,) int
-        The longest stretch of samples at that value, positive or negative.
+    peak : (2 E,) float
+        As a fraction of full scale, or in the unit of the recording.
+    stays : (2 E,) int
+        How many samples of that value stand beside another one.
     step : float
         Between two numbers of the recording; 0 of floats.
     """
 
     peak: Array
-    run: NDArray[np.int64]
+    stays: NDArray[np.int64]
     step: float
 
     @classmethod
     def of(cls, samples: Array, step: float) -> Clipping:
         """Look at samples (E, S)."""
         if not samples.shape[1]:
-            return cls(np.zeros(len(samples)), np.zeros(len(samples), dtype=np.int64), step)
-        runs = []
-        for wave in samples:
-            longest = 0
-            for value in (wave.max(), wave.min()):
-                if abs(value) < np.abs(wave).max() - 1.5 * step:
-                    continue  # the other side alone reaches the end
-                edges = np.flatnonzero(np.diff(np.r_[0, wave == value, 0]))
-                longest = max(longest, int((edges[1::2] - edges[::2]).max()))
-            runs.append(longest)
-        return cls(np.abs(samples).max(axis=1), np.asarray(runs), step)
+            return cls(np.zeros(2 * len(samples)), np.zeros(2 * len(samples), np.int64), step)
+        both = np.concatenate((samples, -samples))
+        peak = both.max(axis=1)
+        same = np.pad(both == peak[:, None], ((0, 0), (1, 1)))
+        beside = same[:, 1:-1] & (same[:, :-2] | same[:, 2:])
+        return cls(peak, beside.sum(axis=1), step)
 
 
 def clipped_pings(found: list[Clipping]) -> NDArray[np.bool_]:
     """Tell which pings are clipped, (P,).
 
-    A ping is clipped if one of its channels stays for three samples or more at a value that no
-    ping of this channel exceeds, or at full scale.
+    A ping is clipped if one of its channels has three samples or more that equal a neighbour, at a
+    value that no ping of this channel exceeds, or at full scale; upward or downward.
     """
     if not found:
         return np.zeros(0, dtype=bool)
     peak = np.stack([each.peak for each in found])
-    run = np.stack([each.run for each in found])
+    stays = np.stack([each.stays for each in found])
     step = found[0].step
     limit = peak.max(axis=0)
     loud = (peak >= limit - 1.5 * step) & (limit > max(STEPS * step, 0.0))
     full = (peak >= 1.0 - 1.5 * step) if step else np.zeros_like(loud)
-    return np.asarray(((run >= RUN) & (loud | full)).any(axis=1))
+    return np.asarray(((stays >= STAYS) & (loud | full)).any(axis=1))
 
 
 def check_numbers(recording: Recording, cutter: Cutter, last: int) -> None:

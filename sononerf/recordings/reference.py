@@ -121,24 +121,27 @@ def calibrate(
     )
     loss = 10.0 ** (-absorption[None] * 2.0 * path[:, None] / 20.0)
     expected = reference.radius / 2.0 * loss * gain / (out * back)[:, None]
-    direct = _call_level(call, near, delay)
-    wanted = np.square(expected * direct)[:, swept].mean(axis=1)
+    time, direct = _call_itself(call, near, delay)
+    wanted = np.square(expected * direct.max(axis=0))[:, swept].mean(axis=1)
     found = np.take_along_axis(power, top[:, None], axis=1)[:, 0]
-    offsets = path - _peak(axis, power, top)
+    # Rows at the ends of a sweep are lopsided, and so is the peak of their mean.
+    profile = np.square(direct * expected[:, None])[..., swept].mean(axis=-1)
+    bias = speed_of_sound / 2.0 * _peak(time, profile, profile.argmax(axis=1))
+    offsets = path + bias - _peak(axis, power, top)
     return Calibration(np.sqrt(wanted / found), float(offsets.mean()))
 
 
-def _call_level(call: CallSettings, analysis: SpectrogramSettings, delay: Array) -> Array:
-    """Return the magnitude of the call itself in each row of the dechirped spectrogram, (F,)."""
-    waveform = call_waveform(call, analysis.sampling_rate)
-    lead = analysis.window
-    last = (lead + analysis.window) / analysis.sampling_rate
-    own = analysis.model_copy(update={"range_min": 1e-12, "range_max": last})  # ranges as seconds
-    length = lead + len(waveform) + 2 * analysis.window + int(delay.max() * own.sampling_rate) + 1
-    echo = np.zeros((1, length))
+def _call_itself(
+    call: CallSettings, analysis: SpectrogramSettings, delay: Array
+) -> tuple[Array, Array]:
+    """Return the dechirped spectrogram (T, F) of the call, and its times (T,) s."""
+    waveform, rate = call_waveform(call, analysis.sampling_rate), analysis.sampling_rate
+    lead = len(waveform) + 2 * analysis.window
+    # At a speed of 2 m/s ranges are seconds.
+    own = analysis.model_copy(update={"range_min": 1e-12, "range_max": 2 * lead / rate})
+    echo = np.zeros((1, 4 * lead + analysis.window + int(delay.max() * rate)))
     echo[0, lead : lead + len(waveform)] = waveform
-    level: Array = spectrogram(echo, own, 2.0, delay)[0].max(axis=0)
-    return level
+    return range_axis(own, 2.0) - lead / rate, spectrogram(echo, own, 2.0, delay)[0]
 
 
 def _peak(axis: Array, power: Array, top: NDArray[np.intp]) -> Array:

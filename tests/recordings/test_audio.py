@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: MIT
+"""Sound files come in as they are; broken ones are told in one line."""
+
+from __future__ import annotations
+
+import builtins
+
+import numpy as np
+import pytest
+import soundfile
+from scipy.io import wavfile
+
+from sononerf.errors import InputError
+from sononerf.recordings.audio import as_float, read_audio
+
+RATE = 250_000
+
+
+@pytest.fixture
+def tone():
+    """Two channels of a tone at half of full scale."""
+    time = np.arange(400) / RATE
+    return 0.5 * np.stack([np.sin(2 * np.pi * 40e3 * time), np.cos(2 * np.pi * 30e3 * time)])
+
+
+@pytest.mark.parametrize(
+    ("dtype", "accuracy"), [("int16", 4e-5), ("int32", 1e-9), ("float32", 1e-7), ("uint8", 8e-3)]
+)
+def test_numbers_of_all_types_mean_the_same(tmp_path, tone, dtype, accuracy):
+    path = tmp_path / "a.wav"
+    whole = {"int16": 2.0**15, "int32": 2.0**31, "float32": 1.0, "uint8": 128.0}[dtype]
+    numbers = tone * whole + (128.0 if dtype == "uint8" else 0.0)
+    wavfile.write(path, RATE, numbers.T.astype(dtype))
+    rate, samples = read_audio(path)
+    assert (rate, samples.shape) == (RATE, (2, 400))
+    np.testing.assert_allclose(as_float(samples), tone, atol=accuracy)
+
+
+@pytest.mark.parametrize(("suffix", "kind"), [(".wav", "PCM_24"), (".flac", "PCM_16")])
+def test_24_bits_and_flac(tmp_path, tone, suffix, kind):
+    path = tmp_path / f"a{suffix}"
+    soundfile.write(path, tone.T, RATE, subtype=kind)
+    rate, samples = read_audio(path)
+    assert (rate, samples.dtype.kind) == (RATE, "i")
+    np.testing.assert_allclose(as_float(samples), tone, atol=4e-5)
+
+
+def test_one_channel_has_a_channel_axis(tmp_path, tone):
+    path = tmp_path / "a.wav"
+    wavfile.write(path, RATE, tone[0].astype("float32"))
+    assert read_audio(path)[1].shape == (1, 400)
+
+
+def test_broken_files_are_told_in_one_line(tmp_path, tone):
+    whole = tmp_path / "whole.wav"
+    wavfile.write(whole, RATE, tone.T.astype("float32"))
+    flac = tmp_path / "whole.flac"
+    soundfile.write(flac, tone.T, RATE)
+    short, other = tmp_path / "short.wav", tmp_path / "other.wav"
+    short.write_bytes(whole.read_bytes()[:1000])
+    other.write_bytes(flac.read_bytes())
+    tiny, empty, torn = tmp_path / "tiny.wav", tmp_path / "empty.wav", tmp_path / "torn.flac"
+    tiny.write_bytes(whole.read_bytes()[:30])
+    wavfile.write(empty, RATE, np.zeros((0, 2), "float32"))
+    torn.write_bytes(b"fLaC" + bytes(50))
+    for path, words in (
+        (tmp_path / "none.wav", "no such file"),
+        (short, "damaged or truncated"),
+        (tiny, "damaged or truncated"),
+        (other, "no WAV file, whatever its name says"),
+        (empty, ""),
+        (torn, "cannot be read as sound"),
+    ):
+        with pytest.raises(InputError) as caught:
+            read_audio(path)
+        assert words in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+
+def test_flac_needs_a_package_and_says_which(tmp_path, monkeypatch):
+    path = tmp_path / "a.flac"
+    path.write_bytes(b"fLaC")
+    real = builtins.__import__
+
+    def without(name, *rest, **more):
+        if name == "soundfile":
+            raise ImportError(name)
+        return real(name, *rest, **more)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(InputError, match=r"install sononerf\[audio\]"):
+        read_audio(path)

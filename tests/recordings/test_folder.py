@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: MIT
+"""A folder of sound files and a table: each ping has a pose, each pose a ping."""
+
+from __future__ import annotations
+
+import h5py
+import numpy as np
+import pytest
+from scipy.io import wavfile
+
+from sononerf.errors import InputError
+from sononerf.recordings.folder import read_folder
+from sononerf.recordings.settings import ImportSettings
+
+RATE = 100_000
+PLAIN = ImportSettings()
+
+
+def wav(path, channels=2, rate=RATE, value=0.0):
+    wavfile.write(path, rate, np.full((60, channels), value, "float32"))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Three pings in a file each, with a table."""
+    for index in range(3):
+        wav(tmp_path / f"{index}.wav", value=index / 10)
+    write(tmp_path, ["file,x_m,y_m,z_m", *(f"{index}.wav,{index},0,0" for index in range(3))])
+    return tmp_path
+
+
+def write(folder, lines):
+    (folder / "poses.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def test_one_file_per_ping(folder):
+    found = read_folder(folder, PLAIN)
+    assert found.labels == ("0.wav", "1.wav", "2.wav")
+    assert found.sampling_rate == RATE
+    np.testing.assert_allclose(found.read(2), 0.2)
+    assert found.emission.tolist() == [0, 0, 0]
+    assert read_folder(folder / "poses.csv", PLAIN).labels == found.labels
+
+
+def test_one_long_file_with_times(tmp_path):
+    wav(tmp_path / "long.wav")
+    write(tmp_path, ["time_ms,x_m", "0.1,0", "0.3,1"])
+    found = read_folder(tmp_path, PLAIN)
+    np.testing.assert_allclose(found.emission, [1e-4, 3e-4])
+    assert found.labels == ("long.wav, row 1", "long.wav, row 2")
+    named = read_folder(tmp_path, ImportSettings(file="long.wav"))
+    assert named.labels == found.labels
+
+
+def test_npz_and_hdf5_are_files_too(folder):
+    np.savez(folder / "0.npz", waveform=np.ones((2, 60)), sampling_rate=RATE)
+    with h5py.File(folder / "1.h5", "w") as file:
+        file["waveform"], file["sampling_rate"] = np.full((2, 60), 2.0), RATE
+    (folder / "0.wav").unlink()
+    (folder / "1.wav").unlink()
+    write(folder, ["file,x_m", "0.npz,0", "1.h5,0", "2.wav,0"])
+    found = read_folder(folder, PLAIN)
+    assert [float(found.read(index)[0, 0]) for index in range(2)] == [1.0, 2.0]
+
+
+def test_a_rate_may_be_corrected(folder):
+    """Recorders of ultrasound write a tenth of their rate, so that it can be heard."""
+    assert read_folder(folder, ImportSettings(sampling_rate=1e6)).sampling_rate == 1e6
+
+
+def test_background_and_reference_are_no_pings(folder):
+    wav(folder / "empty.wav")
+    wav(folder / "ball.wav")
+    with pytest.raises(InputError, match="2 recordings have no pose"):
+        read_folder(folder, PLAIN)
+    ball = {"file": "ball.wav", "radius": 0.02, "distance": 0.5}
+    assert len(read_folder(folder, ImportSettings(background="empty.wav", reference=ball))) == 3
+
+
+def test_what_has_no_partner_is_refused_or_skipped(folder):
+    (folder / "1.wav").unlink()
+    with pytest.raises(InputError, match=r"1 poses have no recording, such as 1\.wav"):
+        read_folder(folder, PLAIN)
+    wav(folder / "more.wav")
+    found = read_folder(folder, ImportSettings(missing="skip"))
+    assert found.labels == ("0.wav", "2.wav")
+    assert found.columns.values["x"].tolist() == [0, 2]
+    assert found.notes == ("1 poses without a recording are left out",)
+    (folder / "1.wav").write_bytes((folder / "0.wav").read_bytes())
+    with pytest.raises(InputError, match=r"1 recordings have no pose, such as more\.wav"):
+        read_folder(folder, PLAIN)
+
+
+def test_what_differs_or_is_missing_is_told(folder):
+    def told(words):
+        with pytest.raises(InputError) as caught:
+            read_folder(folder, PLAIN)
+        assert words in str(caught.value)
+        assert "\n" not in str(caught.value)
+
+    wav(folder / "1.wav", channels=1)
+    told("1.wav: 1 channels at 100000 Hz, 0.wav has 2 at 100000 Hz")
+    wav(folder / "1.wav", rate=96_000)
+    told("1.wav: 2 channels at 96000 Hz")
+    wav(folder / "1.wav")
+    write(folder, ["x_m", "1", "2", "3"])
+    told("no column file, and 3 recordings")
+    write(folder, ["file,x_m", ",1"])
+    told("column file of row 1 is empty")
+    write(folder, ["file,x_m", *["0.wav,1"] * 2, "1.wav,2", "2.wav,3"])
+    told("2 pings in 0.wav and no column time")
+    (folder / "0.wav").rename(folder / "0.mp3")
+    write(folder, ["file,x_m", "0.mp3,1", "1.wav,2", "2.wav,3"])
+    told("0.mp3: unknown kind of file")
+    (folder / "poses.csv").unlink()
+    told("no table of poses")

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: MIT
+"""Thirty seeded distortions are named rightly, and thirty clean sets raise no alarm."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sononerf.geometry.poses import Poses
+from sononerf.recordings.columns import Columns
+from sononerf.recordings.conventions import to_poses
+from sononerf.recordings.pose_check import alternatives, check_poses, mirrored
+from sononerf.recordings.settings import ImportSettings
+from tests.recordings.bodies import EARS, EMITTER, body, first_echoes, poses_of, table
+
+RESOLUTION = 0.0058  # m, of the default analysis
+PLAIN = ImportSettings()
+KINDS = ("sphere", "volume", "cap")
+ORDERS = {"yxz": "yxz", "zyx": "zyx", "xzy": "xzy", "yzx": "zxy", "zxy": "yzx"}
+"""Where the columns were moved, and the name of how they go back."""
+
+
+def scaled(columns, names, factor):
+    values = {**columns.values, **{name: factor * columns.values[name] for name in names}}
+    return Columns("t", values, {}, None, columns.units)
+
+
+def verdict(columns, first, *, ears=EARS, settings=PLAIN):
+    return check_poses(
+        first,
+        to_poses(columns, settings),
+        alternatives(columns, settings),
+        emitter=EMITTER,
+        receivers=ears,
+        resolution=RESOLUTION,
+    )
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_clean_sets_raise_no_alarm(seed):
+    rng = np.random.default_rng(seed)
+    poses = poses_of(rng, (*KINDS, "table")[seed % 4])
+    found = verdict(table(poses), first_echoes(rng, poses, body(rng)))
+    assert (found.name, found.message) == ("", "")
+
+
+FAULTS = (
+    "left-handed frame",
+    "degrees for radians",
+    "radians for degrees",
+    "millimetres for metres",
+    "metres for millimetres",
+    "swapped axes",
+    "time offset",
+    "reversed turntable",
+)
+CASES = [(FAULTS[number % len(FAULTS)], number) for number in range(30)]
+
+
+@pytest.mark.parametrize(("fault", "seed"), CASES)
+def test_distortions_are_named(fault, seed):
+    rng = np.random.default_rng(100 + seed)
+    kind = KINDS[rng.integers(2 if fault == "time offset" else 3)]
+    poses = poses_of(rng, "table" if fault == "reversed turntable" else kind)
+    first = first_echoes(rng, poses, body(rng))
+    columns, expected = table(poses), fault
+    if fault in ("left-handed frame", "reversed turntable"):
+        columns = table(mirrored(poses))
+    elif fault == "degrees for radians":
+        columns = scaled(table(poses, "rad"), ("yaw", "pitch", "roll"), 180 / np.pi)
+    elif fault == "radians for degrees":
+        columns = scaled(columns, ("yaw", "pitch", "roll"), np.pi / 180)
+    elif fault == "swapped axes":
+        order = list(ORDERS)[rng.integers(5)]
+        moved = {name: columns.values[old] for name, old in zip("xyz", order, strict=True)}
+        columns = Columns("t", {**columns.values, **moved}, {}, None, columns.units)
+        expected = f"swapped axes, {ORDERS[order]} for xyz"
+    elif fault == "time offset":
+        first = first + rng.uniform(0.1, 0.3)
+    else:
+        columns = scaled(columns, "xyz", 1000 if fault.startswith("milli") else 0.001)
+    found = verdict(columns, first)
+    assert found.name == expected
+    assert found.message
+    assert "\n" not in found.message
+
+
+def test_a_turntable_of_the_table_is_reversed_by_its_setting():
+    rng = np.random.default_rng(5)
+    poses = poses_of(rng, "table")
+    first = first_echoes(rng, poses, body(rng))
+    angle = -np.arctan2(poses.positions[:, 1], poses.positions[:, 0])
+    columns = Columns(
+        "t", {"angle": angle, "height": poses.positions[:, 2]}, {}, None, {"angle": "deg"}
+    )
+    radius = float(np.linalg.norm(poses.positions[0, :2]))
+    right = ImportSettings(turntable={"radius": radius})
+    wrong = ImportSettings(turntable={"radius": radius, "turns": "clockwise"})
+    assert verdict(columns, first, settings=right).name == ""
+    found = verdict(columns, first, settings=wrong)
+    assert found.name == "reversed turntable"
+    assert "import.turntable.turns" in found.message
+
+
+def test_one_microphone_at_its_emitter_hears_no_mirror():
+    rng = np.random.default_rng(6)
+    poses = poses_of(rng, "sphere")
+    alone = EMITTER[None]
+    first = first_echoes(rng, poses, body(rng), ears=alone)
+    assert verdict(table(mirrored(poses)), first, ears=alone).name == ""
+
+
+def test_too_few_or_silent_pings_tell_nothing():
+    rng = np.random.default_rng(7)
+    poses = poses_of(rng, "sphere")
+    first = first_echoes(rng, poses, body(rng))
+    few = Poses(poses.positions[:8], poses.rotations[:8])
+    assert verdict(table(mirrored(few)), first[:8]).name == ""
+    assert verdict(table(mirrored(poses)), np.full_like(first, -np.inf)).name == ""
+
+
+def test_conventions_that_change_nothing_are_left_out():
+    rng = np.random.default_rng(8)
+    names = set(alternatives(table(poses_of(rng, "sphere")), PLAIN))
+    assert {"left-handed frame", "radians for degrees", "sign of pitch"} <= names
+    level = poses_of(rng, "table")
+    flat = Poses(level.positions * [1, 1, 0], level.rotations)
+    assert not {"sign of z", "sign of pitch"} & set(alternatives(table(flat), PLAIN))

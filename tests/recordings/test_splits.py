@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: MIT
+"""Splits: a few poses are held out; repeated pings of one pose stay together."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sononerf.errors import InputError
+from sononerf.geometry.poses import Poses, sphere_poses
+from sononerf.recordings.splits import assign_split, pose_groups, repeats
+
+
+def poses_of(count):
+    generator = np.random.default_rng(0)
+    return sphere_poses(count, radius=0.4, aim_jitter=0.1, generator=generator)
+
+
+def split(poses, stated=None, **given):
+    wanted = {"validation": None, "heldout": None, "seed": 0, **given}
+    return assign_split(poses, stated, where="t", **wanted)
+
+
+@pytest.mark.parametrize(
+    ("count", "expected"),
+    [(2, [2, 0, 0]), (3, [1, 1, 1]), (40, [34, 2, 4]), (1000, [970, 10, 20])],
+)
+def test_sizes_follow_the_number_of_poses(count, expected):
+    assert np.bincount(split(poses_of(count)), minlength=3).tolist() == expected
+
+
+def test_the_table_or_numbers_decide():
+    stated = np.array([0, 2, 1], dtype=np.int8)
+    assert split(poses_of(3), stated) is stated
+    found = split(poses_of(30), validation=5, heldout=7)
+    assert np.bincount(found).tolist() == [18, 5, 7]
+    assert (split(poses_of(30), seed=1) != split(poses_of(30))).any()
+    with pytest.raises(InputError, match="none is left to train on"):
+        split(poses_of(3), validation=1, heldout=2)
+
+
+def test_repeats_stay_together_and_pair_up():
+    once = poses_of(20)
+    twice = Poses(np.repeat(once.positions, 2, axis=0), np.repeat(once.rotations, 2, axis=0))
+    assert len(np.unique(pose_groups(twice))) == 20
+    found = split(twice)
+    np.testing.assert_array_equal(found[::2], found[1::2])
+    pairs = repeats(twice, found)
+    assert len(pairs) == 2
+    assert all(found[a] == found[b] == 2 and b == a + 1 for a, b in pairs.items())
+    assert repeats(once, split(once)) == {}
