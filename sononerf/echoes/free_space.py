@@ -82,6 +82,13 @@ class EchoHull:
         return middle
 
     @property
+    def width(self) -> float:
+        """How far poses lie from the straight line that fits them best, at most, m."""
+        off = self.sources - self.sources.mean(axis=0)
+        along = np.linalg.svd(off, full_matrices=False)[2][0]
+        return float(np.linalg.norm(off - np.outer(off @ along, along), axis=1).max())
+
+    @property
     def chunk(self) -> int:
         """How many points are looked at in one go."""
         return max(AT_ONCE // max(self.first.size, 1), 1)

@@ -55,6 +55,11 @@ WAIT_SECONDS = 0.5
 LEAST_STEPS = 60
 """A pass over few poses takes fewer steps than a field needs: an epoch is then several."""
 
+LINE = (
+    "all training poses lie on a straight line: the echoes do not tell the angle around it, so the "
+    "surface may be drawn out around the line; fly another way as well"
+)
+
 
 def quiet_lightning() -> None:
     """Leave out Lightning's advertising and hints about what we do on purpose."""
@@ -208,11 +213,14 @@ def _fit(
 ) -> None:
     quiet_lightning()
     keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
-    heard = find_onsets(store, point_echo(settings))
+    echo = point_echo(settings)
+    heard = find_onsets(store, echo)
     hull = echo_hull(settings, store, heard)
     region, possible = echo_region(settings, store, hull, heard)
     corners = (1000 * region).round().int().tolist()
     progress.say(f"region {corners[0]} to {corners[1]} mm")
+    if hull.width < echo.resolution:
+        progress.say(LINE)
     field, renderer = field_and_renderer(settings, region)
     options = settings.fit
     data = data_for(settings, store, renderer)

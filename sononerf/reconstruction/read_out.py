@@ -182,6 +182,7 @@ def judged(found: Reconstruction, support: NDArray[np.int32] | None = None) -> R
         reliable = known.evidence.where(known.weight > QUIET)
         heard = poses_that_heard(mesh, reliable, known.resolution)
         part = known_part(mesh, heard, known.hull, resolution=known.resolution)
+        part &= ~known.lattice.at_wall(mesh.triangles_center)
         if (part & ~openness.unseen).any():
             openness = leaving_out(openness, ~part, mesh.area_faces)
         used = np.unique(mesh.faces[~openness.unseen])

@@ -47,6 +47,12 @@ class Lattice:
         """Return the centres of all voxels, (N, 3) m."""
         return self.origin + self.spacing * np.argwhere(np.ones(self.shape, dtype=bool))
 
+    def at_wall(self, points: Array) -> NDArray[np.bool_]:
+        """Tell which points lie at the end of the box, within a voxel, or beyond, (N,)."""
+        place, last = self.coordinates(points), np.asarray(self.shape) - 1
+        inner = (place > MARGIN + 1) & (place < last - MARGIN - 1)
+        return np.asarray(~inner.all(axis=1))
+
     def spread(self, points: Array, values: Array, deviation: float = 0.0) -> Grid:
         """Add values (N,) of points onto the voxels around them, and blur by so many voxels."""
         place = self.coordinates(points)

@@ -54,7 +54,8 @@ rises to the full one."""
 OPENING = 0.03
 """Full weight of a place that is outside by its winding number; evidence has 1 at its point."""
 UNHEARD = 0.03
-"""A part is left out if its evidence per area is below this fraction of the best part's."""
+"""A part is left out if its evidence per area is below this fraction of that of the part with most
+evidence."""
 _THICKER = 1.5  # voxels that each side of a thin part is moved outward, and the surface moved back:
 # two sides closer than the blur of their planes would cancel
 _BENDING = 1.0  # of a voxel; evidence at its point has 1: it sets the unit of all weights
@@ -254,7 +255,7 @@ def _without_parts(distance: Grid, known: Gathered | None) -> Grid:
         at = at.clip(0, np.asarray(lattice.shape) - 1)
         heard = np.bincount(labels[tuple(at.T)], known.weight, count + 1)[1:]
         dense = heard / size ** (2 / 3)
-        kept &= dense >= UNHEARD * dense.max()
+        kept &= dense >= UNHEARD * dense[heard.argmax()]
         best = heard if heard.any() else size
     if not kept.any():
         kept[best.argmax()] = True

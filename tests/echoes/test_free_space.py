@@ -238,3 +238,14 @@ def test_where_many_are_outliers_some_of_the_others_may_be():
     assert (hull.undetected, robust.undetected) == (0, 1)
     left = np.sort(robust.behind(points).min(axis=2), axis=1)
     np.testing.assert_allclose(robust.clearance(points)[0], left[:, 1])
+
+
+def test_how_far_poses_lie_from_a_line():
+    along = np.linspace(-1, 1, 9)[:, None] * [0.3, 0.1, -0.2] + [0.0, 0.5, 0.1]
+    straight = EchoHull(along, along[:, None], np.ones((9, 1)), along)
+    assert straight.width < 1e-12
+    bent = along.copy()
+    bent[4] += [0.1, -0.1, 0.1]  # across the line
+    hull = EchoHull(bent, bent[:, None], np.ones((9, 1)), bent)
+    assert hull.width == pytest.approx(np.sqrt(0.03) * 8 / 9, rel=0.02)
+    assert EchoHull(along[:1], along[:1, None], np.ones((1, 1)), along[:1]).width == 0.0

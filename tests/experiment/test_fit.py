@@ -24,6 +24,7 @@ from sononerf.callbacks.preview import PreviewCallback
 from sononerf.callbacks.progress import ProgressCallback
 from sononerf.checkpoint_io import DurableCheckpointIO
 from sononerf.data.store import EnsembleStore
+from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import (
     IncompatibleError,
     InputError,
@@ -38,6 +39,7 @@ from sononerf.experiment.fit import fit, peak_memory_bytes, require_accelerator
 from sononerf.experiment.reconstruct import reconstruct
 from sononerf.experiment.run_folder import RunFolder
 from sononerf.module import EchoModule
+from sononerf.progress import Progress
 from tests.acoustics.directivity.patterns import pair
 
 STEPS, PER_EPOCH = 12, 4
@@ -408,6 +410,15 @@ def test_a_run_holds_where_its_training_poses_listened(finished, echoes, tiny):
         np.testing.assert_allclose(held["hull.emitters"][row], emitter, rtol=0, atol=1e-12)
         np.testing.assert_allclose(held["hull.receivers"][row], ears, rtol=0, atol=1e-12)
         np.testing.assert_allclose(held["hull.axes"][row], turn[:, 0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("width", [0.0, 0.02])
+def test_of_poses_on_a_line_it_is_said_what_they_do_not_tell(tmp_path, tiny, monkeypatch, width):
+    monkeypatch.setattr(EchoHull, "width", width)
+    said, progress = [], Progress(quiet=True)
+    monkeypatch.setattr(progress, "say", said.append)
+    run(tiny(fit={"epochs": 1, "steps_per_epoch": 1}), tmp_path / "run", progress=progress)
+    assert any("straight line" in line for line in said) == (width == 0.0)
 
 
 def test_a_run_holds_what_its_training_poses_heard_first(finished, echoes, tiny):

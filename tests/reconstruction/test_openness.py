@@ -22,10 +22,12 @@ from sononerf.reconstruction.openness import (
     without_unseen,
 )
 from sononerf.surface.evidence import Evidence
+from sononerf.surface.lattice import Lattice
 
 RADIUS, DISTANCE, RESOLUTION = 0.02, 0.4, 0.006
 THINNEST = THIN * RESOLUTION
 CAP = np.radians(30)
+WALL = 0.05
 
 
 def judge_openness(mesh, sources, resolution=RESOLUTION):
@@ -324,7 +326,11 @@ def read(monkeypatch):
         nothing = np.zeros((0, 3))
         evidence = Evidence(nothing, nothing, np.zeros(0), np.zeros(0, np.intp))
         return SimpleNamespace(
-            hull=given[2], resolution=given[-1], evidence=evidence, weight=np.zeros(0)
+            hull=given[2],
+            resolution=given[-1],
+            evidence=evidence,
+            weight=np.zeros(0),
+            lattice=Lattice.over(np.full(3, -WALL), np.full(3, WALL), 0.002),
         )
 
     monkeypatch.setattr(read_out, "gather_evidence", gathered)
@@ -362,6 +368,13 @@ def test_a_read_out_loses_what_no_pose_can_have_heard(read):
     assert found.mesh.vertices[:, 0].min() > -0.6 * RADIUS
     # Each vertex keeps its own number of poses.
     np.testing.assert_array_equal(sphere().vertices[found.support], found.mesh.vertices)
+
+
+def test_a_wall_of_the_region_is_no_part_of_a_read_out(read, monkeypatch):
+    monkeypatch.setitem(globals(), "WALL", 0.015)
+    found = read(hull_over(cap()))
+    assert np.abs(found.mesh.triangles_center).max() < 0.013
+    assert found.openness.unseen.sum() == 5120 - len(found.mesh.faces)
 
 
 def test_a_hole_of_a_closed_surface_stays_closed(read):

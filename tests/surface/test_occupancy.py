@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: MIT
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,8 @@ import trimesh
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError
 from sononerf.field.field import Field, sphere_directions
+from sononerf.surface import occupancy
+from sononerf.surface.lattice import Lattice
 from sononerf.surface.occupancy import estimate_occupancy, gather_evidence
 from sononerf.surface.support import poses_that_heard
 
@@ -170,3 +174,20 @@ def test_a_part_that_no_pose_hears_stays_in_the_hull_alone():
     hull = estimate_occupancy(known, "hull")
     assert hull.mesh.bounds[1, 0] == pytest.approx(0.025 + RADIUS, abs=SPACING)
     assert (support_of(hull)[hull.mesh.vertices[:, 0] > 0.025] == 0).all()
+
+
+def test_a_crumb_that_is_full_of_evidence_does_not_remove_the_body():
+    """Evidence per area is compared with that of the part with most evidence."""
+    lattice = Lattice.over(np.zeros(3), np.full(3, 0.05), 0.001)
+    distance = np.ones(lattice.shape, np.float32)
+    distance[5:45, 5:45, 5:45], distance[50:53, 50:53, 50:53] = -1, -1
+    places = np.concatenate((np.full((30, 3), 25), np.full((20, 3), 51)))
+    normals = np.zeros((50, 3))
+    known = SimpleNamespace(
+        lattice=lattice,
+        points=lattice.origin + 0.001 * places,
+        evidence=SimpleNamespace(normals=normals),
+        weight=np.ones(50),
+    )
+    left = occupancy._without_parts(distance, known)
+    assert (left[5:45, 5:45, 5:45] < 0).all()
