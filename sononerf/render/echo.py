@@ -164,11 +164,11 @@ def _draw_waves(
     top = float(np.abs(waves).max())
     power = int(np.floor(np.log10(top))) if top > 0.0 else 0
     colours = (*EARS, (96, 96, 96))
-    for panel, wave, colour, name in zip(axes, waves, colours, names, strict=False):
+    for panel, wave, colour in zip(axes, waves, colours, strict=False):
         panel.plot(distance, wave / 10.0**power, color=np.divide(colour, 255), linewidth=0.7)
         panel.set_ylim(*(1.08 * (top / 10.0**power or 1.0) * np.array([-1.0, 1.0])))
-        panel.set_ylabel(f"{name}\npressure (10$^{{{power}}}$)")
         panel.grid(alpha=0.25, linewidth=0.5)
+    _label(axes, names, f"pressure (10$^{{{power}}}$)")
 
 
 def _draw_spectrograms(
@@ -180,12 +180,19 @@ def _draw_spectrograms(
     names: list[str],
 ) -> None:
     top = max(5.0, float(np.ceil(sounds.max() / 5.0)) * 5.0)
-    for panel, sound, name in zip(axes, sounds, names, strict=True):
+    for panel, sound in zip(axes, sounds, strict=True):
         options = {"cmap": LEVEL_MAP, "vmin": 0.0, "vmax": top}
         level = draw_cells(panel, sound, ranges, frequencies, **options)
-        panel.set_ylabel(f"{name}\nfrequency (kHz)")
+    _label(axes, names, "frequency (kHz)")
     axes[-1].set_xlabel("range (m)")
     part.colorbar(level, ax=list(axes), label="level (dB)", pad=0.01, aspect=24)
+
+
+def _label(axes: Any, names: list[str], quantity: str) -> None:
+    """Name each panel, and the quantity at the middle one: more than two names leave no room."""
+    for number, (panel, name) in enumerate(zip(axes, names, strict=True)):
+        every = len(names) <= 2 or number == len(names) // 2
+        panel.set_ylabel(f"{name}\n{quantity}" if every else f"{name}\n")
 
 
 def _add_time_axis(panel: Any, speed_of_sound: float) -> None:

@@ -56,4 +56,9 @@ def arrays(**changes):
     return {name: values for name, values in given.items() if values is not None}
 
 
-SETTINGS = (f"ears={EARS}", f"call={CALL}", "spectrogram.frequency_max=80e3", "spectrogram.frequency_min=20e3")  # fmt: skip
+SETTINGS = (
+    f"ears={EARS}",
+    f"call={CALL}",
+    "spectrogram.frequency_max=80e3",
+    "spectrogram.frequency_min=20e3",
+)

@@ -61,7 +61,7 @@ def test_a_background_is_taken_off(recorded, tmp_path):
 def test_a_reference_target_sets_level_and_range(recorded, tmp_path):
     # A sphere of 5 cm at 0.4 m ahead, heard 6 dB too faint in receiver 1, and 8 mm too far off.
     ahead, ears = 0.45, recorded().ears
-    back = np.linalg.norm(ears.emitter + [ahead, 0, 0] - ears.positions, axis=1)
+    back = np.linalg.norm(ears.emitter + np.array([ahead, 0, 0]) - ears.positions, axis=1)
     path = ahead + back - 0.1 + 2 * 0.008
     frequency = np.fft.rfftfreq(1600, 1 / RATE)
     level = 0.025 / (ahead * back) * [1.0, 0.5]

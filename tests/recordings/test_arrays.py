@@ -67,7 +67,8 @@ def test_one_receiver_needs_no_axis_and_a_turntable_no_orientation(tmp_path):
     found = read_numpy(save(tmp_path / "a.npz", given), settings)
     assert found.read(0).shape == (1, SAMPLES)
     np.testing.assert_allclose(found.emission, -np.arange(COUNT) * 1e-5)
-    np.testing.assert_allclose(np.linalg.norm(to_poses(found.columns, settings).positions, axis=1), 0.6)  # fmt: skip
+    away = np.linalg.norm(to_poses(found.columns, settings).positions, axis=1)
+    np.testing.assert_allclose(away, 0.6)
 
 
 @pytest.mark.parametrize("order", ["wxyz", "xyzw"])

@@ -7,12 +7,16 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
-from tests.recordings.matlab_files import write_new
 
 from sononerf.errors import InputError
 from sononerf.recordings.matlab import as_list, read_mat, vector
+from tests.recordings.matlab_files import write_new
 
-INNER = {"position": np.array([[1.0, 2.0, 3.0]]), "name": "bat", "taps": np.arange(6.0).reshape(2, 3)}  # fmt: skip
+INNER = {
+    "position": np.array([[1.0, 2.0, 3.0]]),
+    "name": "bat",
+    "taps": np.arange(6.0).reshape(2, 3),
+}
 
 
 def write_old(path, variables):

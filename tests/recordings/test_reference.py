@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sononerf.acoustics.call import call_waveform, emit
-from sononerf.acoustics.ears import beam_gain, ear_gain, synthetic_ears
+from sononerf.acoustics.ears import beam_gain, ear_gain, ear_tables
 from sononerf.acoustics.spectrogram import frequency_axis
 from sononerf.config import CallSettings, EarSettings, SpectrogramSettings
 from sononerf.errors import InputError
@@ -18,7 +18,7 @@ from sononerf.recordings.settings import ReferenceSettings
 
 RATE, SPEED = 1e6, 343.0
 ANALYSIS = SpectrogramSettings(frequency_min=30e3, frequency_max=90e3)
-EARS = synthetic_ears(EarSettings(notch_depth=0.0), frequency_axis(ANALYSIS))
+EARS = ear_tables(EarSettings(notch_depth=0.0), frequency_axis(ANALYSIS))
 TARGET = ReferenceSettings(file=Path("ball.wav"), radius=0.05, distance=0.4)
 CALLS = [
     CallSettings(),
@@ -28,7 +28,7 @@ CALLS = [
 
 def echo_of(call, gain=(1.0, 1.0), offset=0.0, samples=6000):
     """Receivers of some gain hear a sphere straight ahead, too far off by an offset."""
-    centre = EARS.emitter + [TARGET.distance + TARGET.radius, 0, 0]
+    centre = EARS.emitter + np.array([TARGET.distance + TARGET.radius, 0, 0])
     out = np.linalg.norm(centre - EARS.emitter)
     responses = np.zeros((2, samples))
     frequency = np.fft.rfftfreq(samples, 1 / RATE)
@@ -36,7 +36,9 @@ def echo_of(call, gain=(1.0, 1.0), offset=0.0, samples=6000):
         way = centre - EARS.positions[ear]
         back = np.linalg.norm(way)
         path = out + back - 2 * TARGET.radius + 2 * offset
-        level = beam_gain(EARS, np.array([[1.0, 0, 0]]))[0] * ear_gain(EARS, ear, way[None] / back)[0]  # fmt: skip
+        level = (
+            beam_gain(EARS, np.array([[1.0, 0, 0]]))[0] * ear_gain(EARS, ear, way[None] / back)[0]
+        )
         loudness = np.interp(frequency, EARS.frequency, level)
         spectrum = TARGET.radius / 2 / (out * back) / gain[ear] * loudness
         phase = np.exp(-2j * np.pi * frequency * path / SPEED)

@@ -6,13 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scipy.io
-from tests.recordings.matlab_files import write_new
 
 from sononerf.errors import InputError
 from sononerf.geometry.poses import rotation_from_euler
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.settings import ImportSettings
 from sononerf.recordings.sonotrace import read_sononerf_matlab, read_sonotracelab
+from tests.recordings.matlab_files import write_new
 
 PLAIN = ImportSettings()
 MICROPHONES = np.array([[-0.01, 0.01, 0.005], [-0.01, -0.01, 0.005], [0.0, 0.0, 0.01]])

@@ -173,4 +173,4 @@ def test_any_number_of_receivers(ball, receivers):
     image = pixels(data)
     view = image[:, : int(0.45 * image.shape[1])]
     for colour in EARS:  # no left and right ear on its head
-        assert not like(view, colour, 30).any()
+        assert not like(view, colour, 12).any()
