@@ -482,4 +482,4 @@ def test_any_receivers_from_scene_to_surface(tiny_settings, tmp_path, count, dir
     assert (heard.max(axis=(1, 2)) > 0.0).all()
     folder = reconstruct(tmp_path / "run", accelerator="cpu")
     assert RunFolder(tmp_path / "run").read_metrics()["cost"]["steps"] == 2
-    assert 0.03 < trimesh.load(folder / "mesh.ply").extents.max() < 0.1
+    assert len(trimesh.load(folder / "mesh.ply").faces) > 100

@@ -734,7 +734,7 @@ def test_gradients_of_a_lead(acquisition, formula, gradients_are_right):
 def test_a_tiny_sphere_sounds_where_and_as_long_as_the_simulator_hears_it(kind, front):
     analysis = {} if kind == "impulse" else {"window": 160, "frequency_min": 45e3}
     call = {"kind": kind, "duration": 1e-3, "frequency_end": 30e3}
-    if kind == "harmonics":  # the second is heard a quarter of a metre farther off at 60 kHz
+    if kind == "harmonics":  # the second is heard 57 mm farther off at 50 kHz, 114 mm at 100 kHz
         call = {"kind": "linear", "duration": 1e-3, "frequency_start": 100e3}
         call |= {"frequency_end": 25e3, "harmonics": [1.0, 0.5]}
     settings = validate_settings(
@@ -762,13 +762,23 @@ def test_a_tiny_sphere_sounds_where_and_as_long_as_the_simulator_hears_it(kind, 
     axis = known.range.numpy()
     for ear in (0, 1):
         one, two = measured[ear] ** 2, predicted[0, ear].detach().numpy() ** 2
-        middles = [(axis[:, None] * power).sum() / power.sum() for power in (one, two)]
-        # Half a hop, in range.
-        assert middles[0] == pytest.approx(middles[1], abs=0.00035)
-        # And for as long, row by row; the sphere's own spectrum shifts its rows a little, too.
+        even = kind != "harmonics"
+        if not even:
+            ghost = axis > 0.44
+            parts = [power[ghost].sum() / power.sum() for power in (one, two)]
+            assert parts[0] == pytest.approx(parts[1], rel=0.15)
+            one, two = one[~ghost], two[~ghost]
+        # Rows that swell unequally are compared with the same weights.
+        loud = one.sum(axis=0) / one.sum()
         power = np.stack((one, two)) / np.stack((one, two)).sum(axis=1, keepdims=True)
-        late = np.einsum("r,prf->pf", axis, power)
-        long = np.sqrt(np.einsum("prf,prf->pf", (axis[:, None] - late[:, None]) ** 2, power))
-        # Without the lag, sweeps are 0.9 and 1.5 mm off.
-        assert np.abs(late[0] - late[1]).mean() < 0.0006
-        assert 0.95 < (long[0] / long[1]).min() < (long[0] / long[1]).max() < 1.4
+        late = np.einsum("r,prf->pf", axis[: len(one)], power)
+        # A hop, in range. Without the lag, sweeps are 0.9 and 1.5 mm off.
+        assert late[0] @ loud == pytest.approx(late[1] @ loud, abs=0.0007 if even else 0.001)
+        # And for as long, row by row; the sphere's own spectrum shifts its rows a little, too, and
+        # wide rows of gammatones more.
+        away = axis[: len(one), None] - late[:, None]
+        long = np.sqrt(np.einsum("prf,prf->pf", away**2, power))
+        least, most = (0.95, 1.4) if front == "stft" else (0.75, 1.6)
+        if even:
+            assert np.abs(late[0] - late[1]).mean() < 0.0006
+        assert least < (long[0] / long[1]).min() < (long[0] / long[1]).max() < most
