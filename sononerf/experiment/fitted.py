@@ -19,6 +19,7 @@ from sononerf.data.range_slices import PoseReader, WholePoses
 from sononerf.data.store import EnsembleStore
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import IncompatibleError, InputError, SettingsError
+from sononerf.experiment.attached import with_attached
 from sononerf.experiment.build import field_and_renderer, module_for
 from sononerf.experiment.fit import quiet_lightning, require_accelerator
 from sononerf.experiment.simulate import default_store, open_ensemble
@@ -72,6 +73,7 @@ def load_fitted(path: Path) -> Fitted:
             f"{path / DESCRIPTION_NAME}: reference is {reference}, expected a finite number above "
             "0; fetch the run again, or repeat the fit with --overwrite"
         )
+    settings = with_attached(settings, path)
     field, renderer = field_and_renderer(settings, region)
     module = module_for(settings, field, renderer, reference=reference)
     for part, prefix in ((field, "field."), (renderer, "renderer.")):

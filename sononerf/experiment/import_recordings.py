@@ -19,6 +19,7 @@ from sononerf.acoustics.spectrogram import frequency_axis, range_axis
 from sononerf.data.store import EnsembleStore
 from sononerf.echoes.onsets import PointEcho, find_onsets
 from sononerf.errors import IncompatibleError
+from sononerf.experiment.attached import attach
 from sononerf.experiment.sealing import seal
 from sononerf.experiment.understand import SECTIONS, Understood, understand
 from sononerf.progress import Progress
@@ -133,6 +134,7 @@ def import_understood(
             attributes=_attributes(known, wanted),
             receivers=_receivers(known),
         )
+        attach(known.settings, output)
         missing = store.missing()
         with progress.task("importing", len(missing)) as task:
             for index in missing:

@@ -15,6 +15,7 @@ from typing import Any
 from sononerf import __version__, storage
 from sononerf.config import Settings, dump_yaml, read_yaml, validate_settings
 from sononerf.errors import IncompatibleError, InputError
+from sononerf.experiment.attached import attach
 from sononerf.weights import DESCRIPTION_NAME
 
 METRICS_SCHEMA = 1
@@ -138,6 +139,7 @@ class RunFolder:
         """
         self.check(settings)
         if not self.config.is_file():
+            attach(settings, self.path)
             storage.commit_text(self.config, dump_yaml(settings))
 
     def move_aside(self) -> Path | None:

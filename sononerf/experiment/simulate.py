@@ -20,6 +20,7 @@ from sononerf.config import Settings
 from sononerf.data.store import EnsembleStore
 from sononerf.data.subtracted import SubtractedStore
 from sononerf.errors import IncompatibleError, SettingsError
+from sononerf.experiment.attached import attach
 from sononerf.experiment.sealing import seal
 from sononerf.experiment.sources import complete_store
 from sononerf.geometry.poses import Poses
@@ -248,6 +249,7 @@ def simulate(
             attributes=_attributes(settings, wanted, simulator),
             receivers=len(simulator.ears.positions),
         )
+        attach(settings, path)
         _fill(store, simulator, poses, settings, workers, scheduler, progress)
     return EnsembleStore.open(path)
 

@@ -4,11 +4,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from sononerf.config import Settings, validate_settings
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError
+from sononerf.experiment.attached import with_attached
 
 KNOWN = ("air", "ears", "call", "spectrogram")
 """Sections of the settings that a store knows."""
@@ -66,7 +66,7 @@ def with_store(settings: Settings) -> Settings:
             f"{path}: the settings contradict the store; leave these keys out: "
             + "; ".join(sorted(different))
         )
-    return validate_settings(resolved, settings.source or str(path))
+    return with_attached(validate_settings(resolved, settings.source or str(path)), path)
 
 
 def complete_store(path: Path) -> EnsembleStore:
@@ -83,8 +83,3 @@ def complete_store(path: Path) -> EnsembleStore:
         what = f"{len(missing)} poses are missing" if missing else "it is not finished"
         raise InputError(f"{path}: {what}; give the same simulate or import command again")
     return store
-
-
-def origin_of(store: EnsembleStore) -> dict[str, Any]:
-    """Return what a store says of where its echoes come from: origin, source and licence."""
-    return {name: store.attributes.get(name) for name in ("origin", "source", "licence")}

@@ -18,6 +18,7 @@ from sononerf.acoustics.spectrogram import echo_samples, frequency_axis
 from sononerf.config import Settings, apply_override, read_yaml, validate_settings
 from sononerf.echoes.detection import RANK
 from sononerf.errors import InputError, SettingsError
+from sononerf.experiment.attached import SECTIONS as WITH_FILES
 from sononerf.experiment.import_calibration import calibrated
 from sononerf.experiment.import_ranges import reception_of, with_ranges
 from sononerf.geometry.poses import Poses
@@ -196,6 +197,10 @@ def _settings_data(
     if settings_file is None and (folder / OWN_SETTINGS).is_file():
         settings_file = folder / OWN_SETTINGS
     data = {} if settings_file is None else read_yaml(settings_file)
+    for section in WITH_FILES:  # such paths are relative, like all of the import
+        named = data.get(section)
+        if settings_file is not None and isinstance(named, dict) and named.get("file"):
+            named["file"] = str(settings_file.parent / str(named["file"]))
     for assignment in overrides:
         apply_override(data, assignment)
     where = "command line" if settings_file is None else str(settings_file)

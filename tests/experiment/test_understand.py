@@ -6,8 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sononerf.acoustics.call import call_waveform
+from sononerf.config import CallSettings, validate_settings
+from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
+from sononerf.experiment.import_recordings import import_understood
+from sononerf.experiment.sources import with_store
 from sononerf.experiment.understand import understand
+from sononerf.recordings.writer import wav_bytes
 from tests.experiment.recorded import CALL, EARS, RATE, SETTINGS, arrays, waveforms
 
 
@@ -59,6 +65,19 @@ def test_settings_lie_beside_the_recordings(recorded, tmp_path):
     (tmp_path / "other.yaml").write_text("import: {heldout: 5}\n")
     found = recorded("import.validation=2", settings_file=tmp_path / "other.yaml")
     assert np.bincount(found.split).tolist() == [17, 2, 5]
+
+
+def test_files_of_the_settings_lie_beside_them(recorded, tmp_path):
+    samples = call_waveform(CallSettings(**CALL), RATE)
+    (tmp_path / "call.wav").write_bytes(wav_bytes(samples[None], RATE))
+    (tmp_path / "import.yaml").write_text("call: {kind: file, file: call.wav}\n")
+    found = recorded(settings=(SETTINGS[0], *SETTINGS[2:]))
+    assert found.settings.call.file == tmp_path / "call.wav"
+    import_understood(found, tmp_path / "store")
+    (tmp_path / "call.wav").unlink()
+    known = with_store(validate_settings({"data": {"store": str(tmp_path / "store")}}, "test"))
+    assert known.call.file.parent == tmp_path / "store" / "attached"
+    assert EnsembleStore.open(tmp_path / "store").check() == []
 
 
 def test_clipped_pings_are_left_out_and_counted(recorded):
