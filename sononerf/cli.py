@@ -253,7 +253,12 @@ def import_(
     """Make a store of recordings, for `fit CONFIG data.store=STORE`."""
     if output is None:
         raise SettingsError("--output is missing; name the store, such as --output data/recorded")
-    from sononerf.experiment.import_recordings import describe, draw, import_understood
+    from sononerf.experiment.import_recordings import (
+        check_before,
+        describe,
+        draw,
+        import_understood,
+    )
     from sononerf.experiment.run_folder import results_folder
     from sononerf.experiment.understand import understand
     from sononerf.progress import Progress
@@ -267,11 +272,14 @@ def import_(
         with results_folder(preview):
             _print(f"wrote {draw(known, preview)}")
     if dry_run:
-        return
-    store, verdict = import_understood(known, output, progress=Progress())
+        verdict = check_before(known, progress=Progress())
+    else:
+        store, verdict = import_understood(known, output, progress=Progress())
+        _print(f"wrote {store.path} ({len(store)} poses)")
     if verdict.message:
         _print(f"warning: {verdict.message}")
-    _print(f"wrote {store.path} ({len(store)} poses)")
+    elif dry_run:
+        _print("check:      no other convention of poses explains the first echoes better")
 
 
 @app.command()

@@ -6,7 +6,9 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import tempfile
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +25,7 @@ from sononerf.experiment.attached import attach
 from sononerf.experiment.sealing import seal
 from sononerf.experiment.understand import SECTIONS, Understood, understand
 from sononerf.progress import Progress
-from sononerf.recordings.pose_check import Verdict, alternatives, check_poses
+from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses
 from sononerf.recordings.splits import repeats
 from sononerf.render.pings import pings_png
 
@@ -191,6 +193,23 @@ def verdict(known: Understood, store: EnsembleStore) -> Verdict:
         receivers=known.ears.positions if places is None else np.asarray(places, dtype=np.float64),
         resolution=echo.resolution,
     )
+
+
+def check_before(known: Understood, *, progress: Progress | None = None) -> Verdict:
+    """Return the verdict on the poses without making a store.
+
+    Raises
+    ------
+    NumericalError
+        If no pose hears anything.
+    StorageError
+        If the folder of temporary files cannot be written.
+    """
+    train = np.flatnonzero(known.split == 0)
+    chosen = train[np.linspace(0, len(train) - 1, min(MOST, len(train))).round().astype(int)]
+    part = replace(known, pings=known.pings[chosen], split=known.split[chosen])
+    with tempfile.TemporaryDirectory() as folder:
+        return import_understood(part, Path(folder) / "store", progress=progress)[1]
 
 
 def describe(known: Understood) -> list[str]:

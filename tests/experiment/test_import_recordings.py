@@ -8,7 +8,7 @@ import pytest
 
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, LockedError, NumericalError
-from sononerf.experiment.import_recordings import describe, draw, import_recordings
+from sononerf.experiment.import_recordings import check_before, describe, draw, import_recordings
 from sononerf.experiment.understand import understand
 from sononerf.storage import lock
 from tests.experiment.recorded import SETTINGS, TARGET, arrays, waveforms
@@ -99,15 +99,17 @@ def test_repeated_pings_tell_the_noise_floor(brought):
     np.testing.assert_array_equal(split[::2], split[1::2])
 
 
-def test_a_wrong_convention_is_told(brought):
-    given = arrays()
-    mirror = np.diag([1.0, -1.0, 1.0])
-    store, verdict = brought(
-        "call={kind: impulse}",
-        waveform=waveforms(call={"kind": "impulse"}),
-        position_m=given["position_m"] @ mirror,
-        rotation=mirror @ given["rotation"] @ mirror,
-    )
+def mirrored():
+    given, mirror = arrays(), np.diag([1.0, -1.0, 1.0])
+    return {
+        "waveform": waveforms(call={"kind": "impulse"}),
+        "position_m": given["position_m"] @ mirror,
+        "rotation": mirror @ given["rotation"] @ mirror,
+    }
+
+
+def test_a_wrong_convention_is_named(brought):
+    store, verdict = brought("call={kind: impulse}", **mirrored())
     assert verdict.name == "left-handed frame"
     assert len(store) == 24
 
@@ -122,6 +124,14 @@ def test_what_is_bad_leaves_nothing_behind(brought, tmp_path):
     assert not (tmp_path / "store").exists()
     with pytest.raises(NumericalError, match="all recordings are silent"):
         brought(waveform=np.zeros((24, 2, 1600)))
+
+
+def test_poses_are_checked_without_a_store(tmp_path):
+    np.savez(tmp_path / "a.npz", **arrays(**mirrored()))
+    given = [*GIVEN, "call={kind: impulse}"]
+    known = understand("numpy", tmp_path / "a.npz", tmp_path / "s", overrides=given)
+    assert check_before(known).name == "left-handed frame"
+    assert not (tmp_path / "s").exists()
 
 
 def test_a_store_in_use_is_not_touched(brought, tmp_path):
