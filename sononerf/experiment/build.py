@@ -73,19 +73,30 @@ def echo_hull(settings: Settings, store: EnsembleStore, heard: Onsets | None = N
     """
     known, echo = acquisition(settings), point_echo(settings)
     heard = heard or find_onsets(store, echo)
-    # Rows of a sweep may hear it that much too far off.
-    late = 0.0 if known.lag is None else float(known.lag.max())
     positions = np.asarray(store.positions, dtype=np.float64)[heard.poses]
     rotations = np.asarray(store.rotations, dtype=np.float64)[heard.poses]
     ears = known.ear_positions.double().numpy()
     hull = EchoHull(
         emitters=positions + rotations @ known.emitter.double().numpy(),
         receivers=positions[:, None] + np.einsum("pij,ej->pei", rotations, ears),
-        first=heard.first - late,
+        first=heard.first - _mean_lag(known),
         axes=rotations[:, :, 0],
         within=_beam_cosine(known),
     )
     return weighted(hull, echo.resolution)
+
+
+def _mean_lag(known: Acquisition) -> float:
+    """Return how much farther off a sweep is heard on the mean over rows and directions, m.
+
+    Each counts with its power. Rows that are nearly silent in a direction may lag by many times
+    as much, but they have no part in the onset.
+    """
+    if known.lag is None:
+        return 0.0
+    elevation = torch.linspace(-math.pi / 2, math.pi / 2, known.beam.shape[1]).double()
+    power = (known.beam * known.ears).double().square() * elevation.cos()[:, None]
+    return float((power * known.lag).sum() / power.sum())
 
 
 def _beam_cosine(known: Acquisition) -> float:
