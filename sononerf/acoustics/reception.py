@@ -301,18 +301,7 @@ def warn_of_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
     analysis : SpectrogramSettings
         Window and band.
     """
-    frequency = _within(analysis)
-    silent = ~covered(call, frequency)
-    if silent.any():
-        edges = np.flatnonzero(np.diff(silent, prepend=False, append=False)).reshape(-1, 2)
-        bands = ", ".join(
-            f"{frequency[a] / 1e3:.1f} to {frequency[b - 1] / 1e3:.1f} kHz" for a, b in edges
-        )
-        logger.warning(
-            "the call does not cover %s; these rows hold next to nothing. Narrow "
-            "spectrogram.frequency_min and frequency_max, or widen the call",
-            bands,
-        )
+    warn_of_band(call, analysis)
     best = best_window(call, analysis)
     if analysis.kind == "stft" and not 1.0 / FAR <= best / analysis.window <= FAR:
         here, there = (
@@ -328,4 +317,20 @@ def warn_of_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
             there,
             best,
             longer_fft if best > analysis.fft else "",
+        )
+
+
+def warn_of_band(call: CallSettings, analysis: SpectrogramSettings) -> None:
+    """Log one line if a call does not cover the analysed band."""
+    frequency = _within(analysis)
+    silent = ~covered(call, frequency)
+    if silent.any():
+        edges = np.flatnonzero(np.diff(silent, prepend=False, append=False)).reshape(-1, 2)
+        bands = ", ".join(
+            f"{frequency[a] / 1e3:.1f} to {frequency[b - 1] / 1e3:.1f} kHz" for a, b in edges
+        )
+        logger.warning(
+            "the call does not cover %s; these rows hold next to nothing. Narrow "
+            "spectrogram.frequency_min and frequency_max, or widen the call",
+            bands,
         )

@@ -233,7 +233,8 @@ def describe(known: Understood) -> list[str]:
         f"poses:      frame {frame}{'; ' + said if said else ''}; x {lower[0]:.3f} to "
         f"{upper[0]:.3f}, y {lower[1]:.3f} to {upper[1]:.3f}, z {lower[2]:.3f} to "
         f"{upper[2]:.3f} m",
-        f"call:       {call.kind}{', ' + bands if bands else ''}",
+        f"call:       {call.kind}{', ' + bands if bands else ''}"
+        f"{', by pulse compression' if known.wanted.compress else ''}",
         f"air:        {known.speed_of_sound:.1f} m/s",
         f"range:      {axis[0]:.3f} to {axis[-1]:.3f} m in {len(axis)} slices of "
         f"{1e3 * (axis[1] - axis[0]) if len(axis) > 1 else 0.0:.2f} mm",

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.acoustics.air import speed_in
+from sononerf.acoustics.call import call_content, call_waveform
 from sononerf.acoustics.ears import Ears, ear_tables
-from sononerf.acoustics.reception import Reception
+from sononerf.acoustics.reception import Reception, warn_of_band
 from sononerf.acoustics.spectrogram import echo_samples, frequency_axis
-from sononerf.config import Settings, apply_override, read_yaml, validate_settings
+from sononerf.config import CallSettings, Settings, apply_override, read_yaml, validate_settings
 from sononerf.echoes.detection import RANK
 from sononerf.errors import InputError, SettingsError
 from sononerf.experiment.attached import SECTIONS as WITH_FILES
@@ -160,6 +161,11 @@ def understand(
     if len(poses) != len(recording):
         raise InputError(f"{recording.path}: {len(recording)} pings and {len(poses)} poses")
     cutter, calibration = calibrated(recording, wanted, settings, ears, folder)
+    if wanted.compress:
+        warn_of_band(settings.call, settings.spectrogram)
+        cutter = replace(cutter, call=call_waveform(settings.call, recording.sampling_rate))
+        calibration["compressed"] = call_content(settings.call)
+        settings = settings.model_copy(update={"call": CallSettings()})
     check_numbers(recording, cutter, 0)
     settings, power = with_ranges(settings, cutter, recording, data)
     check_numbers(recording, cutter, reception_of(settings).samples)

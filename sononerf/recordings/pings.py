@@ -14,6 +14,7 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.acoustics.inverse_filter import inverse_filter
 from sononerf.errors import InputError
 from sononerf.recordings.audio import as_float
 from sononerf.recordings.recording import Recording
@@ -100,6 +101,8 @@ class Cutter:
         Factor of each receiver.
     background : (E, S) float or None
         Echoes of the surroundings alone, from the emission on, before the factors.
+    call : (N,) float or None
+        Waveform whose echoes become those of an impulse; None leaves them as they are.
     """
 
     recording: Recording
@@ -107,6 +110,7 @@ class Cutter:
     delay: float = 0.0
     gain: ArrayLike = 1.0
     background: Array | None = None
+    call: Array | None = None
 
     def samples(self, index: int) -> int:
         """Return how many samples a ping has from the emission on; less than one if none."""
@@ -133,11 +137,18 @@ class Cutter:
         first : int
             The first of them, counted from the emission.
         """
-        raw = cut(self.recording.read(index), self._emission(index), count, first=first)
+        whole = count + self._tail
+        raw = cut(self.recording.read(index), self._emission(index), whole, first=first)
         if self.background is not None:
-            there = self.background[:, first : first + count]
+            there = self.background[:, first : first + whole]
             raw[:, : there.shape[1]] -= there
-        return mix(raw, self.channels) * np.reshape(self.gain, (-1, 1))
+        echo = mix(raw, self.channels) * np.reshape(self.gain, (-1, 1))
+        return echo if self.call is None else inverse_filter(echo, self.call)[:, :count]
+
+    @property
+    def _tail(self) -> int:
+        """How many samples after the last one belong to an echo that begins there."""
+        return 0 if self.call is None else len(self.call) - 1
 
     def clipped(self, index: int, first: int, last: int) -> Clipping:
         """Return how a ping's loudest samples look, from one sample after the emission to another.
@@ -161,7 +172,8 @@ class Cutter:
         for index in range(len(self.recording)):
             samples = self.recording.read(index)
             begin = int(np.floor(self._emission(index)))
-            part = np.asarray(samples[:, max(begin, 0) : max(begin + last + GUARD, 0)])
+            end = begin + last + self._tail + GUARD
+            part = np.asarray(samples[:, max(begin, 0) : max(end, 0)])
             digest.update(np.ascontiguousarray(part).astype(part.dtype.newbyteorder("<")).tobytes())
         return digest.digest()
 

@@ -83,6 +83,7 @@ class ImportSettings(_Section):
     reference: ReferenceSettings | None = None
     background: Path | None = None
     background_time: float = 0.0  # s, of the emission in the background recording
+    compress: bool = False  # echoes of the call become those of an impulse
     # What becomes of it.
     validation: Annotated[int, Field(ge=0)] | None = None
     heldout: Annotated[int, Field(ge=0)] | None = None

@@ -10,7 +10,7 @@ from sononerf.acoustics.call import call_waveform
 from sononerf.config import CallSettings, validate_settings
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
-from sononerf.experiment.import_recordings import import_understood
+from sononerf.experiment.import_recordings import echo_hash, import_understood, spectrogram_of
 from sononerf.experiment.sources import with_store
 from sononerf.experiment.understand import understand
 from sononerf.recordings.writer import wav_bytes
@@ -147,3 +147,15 @@ def test_all_clipped_or_nan_or_short_is_told(recorded):
     with pytest.raises(InputError, match=r"begins after spectrogram\.range_min"):
         recorded("spectrogram.range_min=0.2", start=3e-3)
     assert CALL["kind"] == "linear"
+
+
+def test_pulse_compression_gives_echoes_of_an_impulse(recorded):
+    plain, found = recorded(), recorded("import.compress=true")
+    assert (plain.settings.call.kind, found.settings.call.kind) == ("linear", "impulse")
+    assert found.calibration["compressed"]["kind"] == "linear"
+    wide, narrow = (
+        (power > 0.25 * power.max()).sum()
+        for power in (np.square(spectrogram_of(each, 3)[0]).mean(axis=1) for each in (plain, found))
+    )
+    assert narrow < 0.6 * wide
+    assert echo_hash(plain) != echo_hash(found)
