@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from sononerf import __version__, storage
 from sononerf.acoustics.reception import warn_of_call
 from sononerf.acoustics.spectrogram import frequency_axis, range_axis
+from sononerf.config import CallSettings
 from sononerf.data.store import EnsembleStore
 from sononerf.echoes.onsets import PointEcho, find_onsets
 from sononerf.errors import IncompatibleError
@@ -34,6 +35,9 @@ logger = logging.getLogger("sononerf")
 SHOWN = 3  # pings in a picture
 NOT_HASHED = ("source", "licence")
 """What does not change the echoes."""
+COARSER = 1.5
+"""Range resolution over that of an impulse, no unit, from which on pulse compression is proposed:
+less would hardly be seen."""
 
 
 def echo_hash(understood: Understood) -> str:
@@ -243,6 +247,15 @@ def describe(known: Understood) -> list[str]:
         f"noise:      the loudest echo of a ping is {known.level_db:.0f} dB above the quietest "
         "tenth of its ranges",
     ]
+    here, there = (
+        1e3 * PointEcho.of(each, analysis, known.speed_of_sound).resolution
+        for each in (call, CallSettings())
+    )
+    if here > COARSER * there:
+        lines.append(
+            f"note:       ranges are resolved to {here:.0f} mm; import.compress=true resolves "
+            f"them to {there:.0f} mm"
+        )
     applied = {k: v for k, v in known.calibration.items() if v not in (0.0, 1.0)}
     if applied:
         lines.append(f"calibration: {json.dumps(applied)}")

@@ -151,7 +151,14 @@ def test_what_was_understood_is_said_and_drawn(tmp_path):
         "linear, 20 to 80 kHz",
         "(window 16, hop 1, fft 128)",
         "343.0 m/s",
+        "import.compress=true resolves them to",
     ):
         assert words in text
+    known = understand(
+        "numpy", tmp_path / "a.npz", tmp_path / "s", overrides=[*GIVEN, "import.compress=true"]
+    )
+    text = "\n".join(describe(known))
+    assert "impulse, by pulse compression" in text
+    assert "import.compress=true" not in text
     assert draw(known, tmp_path / "p").read_bytes().startswith(b"\x89PNG")
     assert not (tmp_path / "s").exists()
