@@ -48,15 +48,15 @@ class Level:
         Mean over active cells.
     steps : int
         How often they were brought up to date.
-    learns : {"none", "whole", "each"}
-        No gain, one for all, or one for each ear and frequency.
+    learns : {"none", "each"}
+        No gain, or one for each ear and frequency.
     """
 
     def __init__(self, ears: int, rows: int, like: Tensor) -> None:
         self.gain = torch.zeros(ears, rows, device=like.device)
         self.error = torch.full((ears, rows), 4.0, device=like.device)
         self.steps = 0
-        self.learns: Literal["none", "whole", "each"] = "each"
+        self.learns: Literal["none", "each"] = "each"
 
     def reset(self) -> None:
         """Forget everything that was learned."""
@@ -176,8 +176,5 @@ def _learn(
     loud = (magnitude > least) & (rendered > 0.5 * least)
     ratio = torch.log(magnitude.clamp_min(1e-30) / rendered.clamp_min(1e-30))
     ratio = torch.where(loud, ratio, torch.nan)
-    if level.learns == "whole":
-        level.gain = level.gain + rate * torch.nan_to_num(ratio.nanmedian())
-        return
     step = ratio.movedim(1, 0).movedim(3, 1).flatten(2).nanmedian(dim=2).values
     level.gain = level.gain + rate * torch.nan_to_num(step)

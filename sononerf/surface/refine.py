@@ -93,7 +93,8 @@ class Refinement:
         From coarse to fine.
     calibrated : bool
         Whether the measured level is absolute, as the simulator's is. Then gains are learned in
-        the last stage alone: a rough surface is too faint, and a gain would excuse it.
+        the last stage alone: a rough surface is too faint, and a gain would excuse it. The level of
+        a recording differs by frequency as well, so there they are learned from the first stage on.
     """
 
     def __init__(
@@ -216,7 +217,7 @@ class Refinement:
     def _descend(self, mesh: trimesh.Trimesh) -> Descent:
         stage = self.stages[self.stage]
         last = self.stage == len(self.stages) - 1
-        self.level.learns = "each" if last else "none" if self.calibrated else "whole"
+        self.level.learns = "none" if self.calibrated and not last else "each"
         correction = None
         if stage.beyond == "simulate":
             self._later, correction = None, self._correction(mesh)

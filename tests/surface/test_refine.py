@@ -45,6 +45,25 @@ SHORT = (
 )
 
 
+def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, echoes, optics):
+    tilt = np.linspace(0.3, 3.0, len(optics.frequencies)).astype(np.float32)
+    own = (echoes.positions, echoes.rotations, echoes.training, echoes.validation)
+    tilted = Echoes(*own, lambda pose: echoes.read(pose) * tilt)
+    work = Refinement(
+        {"body": bumpy},
+        tilted,
+        optics,
+        simulate=unasked,
+        seed=1,
+        stages=SHORT,
+        calibrated=False,
+    )
+    while work.stage == 0:
+        work.advance()
+    gain = work.level.gain[0].exp().numpy()
+    assert gain[-1] / gain[0] > 5.0
+
+
 @pytest.fixture(autouse=True)
 def few_rays(monkeypatch):
     monkeypatch.setattr(comparison, "RAYS", 4000)
