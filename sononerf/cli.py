@@ -503,6 +503,31 @@ def export(
 
 
 @app.command()
+def calibrate(
+    run: Annotated[Path, typer.Argument(help="Folder of a run with a surface.")],
+    kinds: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="ERROR...", help="gain, range_offset, speed_of_sound, position, aim."
+        ),
+    ],
+    output: Annotated[Path | None, typer.Option(help="The corrected store.")] = None,
+) -> None:
+    """Find errors of a recording by a run's surface, and write a corrected store."""
+    from sononerf.experiment.calibrate import calibrate as find_errors
+    from sononerf.progress import Progress
+
+    if output is None:
+        raise SettingsError("--output is missing; name the store, such as --output data/corrected")
+    found = find_errors(run, output, kinds, progress=Progress())
+    for line in found.lines:
+        _print(line)
+    for line in found.warnings:
+        _print(f"warning: {line}")
+    _print(f"wrote {found.store.path} ({len(found.store)} poses)")
+
+
+@app.command()
 def compare(
     run_a: Annotated[Path, typer.Argument(help="Folder of a run.")],
     run_b: Annotated[Path, typer.Argument(help="Folder of the run without it.")],

@@ -35,7 +35,7 @@ from sononerf.weights import load_weights, save_weights
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 SMOKE = str(CONFIGS / "smoke.yaml")
 COMMANDS = (
-    "scenes new-scene simulate import fit predict reconstruct evaluate export compare "
+    "scenes new-scene simulate import fit predict reconstruct evaluate export calibrate compare "
     "report".split()
 )
 SHORT = [  # of the smoke settings, so that a fit takes a second

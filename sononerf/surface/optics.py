@@ -288,8 +288,14 @@ class Optics(nn.Module):
         area: Tensor,
         pieces: Pieces,
         heads: tuple[Tensor, Tensor, Tensor],
+        *,
+        stretch: Tensor | None = None,
+        late: Tensor | None = None,
     ) -> Heard:
-        """Return the spectrograms of poses; gradients run to points and areas (V, 3) float32."""
+        """Return the spectrograms of poses; gradients run to points and areas (V, 3) float32.
+
+        The paths of a pose are multiplied by ``stretch`` (P,) and lengthened by ``late`` (P,), m.
+        """
         emitters, ears, _ = heads
         place, normal = points[pieces.vertex], area[pieces.vertex]
         u = place - emitters[pieces.pose]
@@ -298,7 +304,12 @@ class Optics(nn.Module):
         both = (u / d1[:, None])[:, None] + v / d2[:, :, None]
         strength = -(both * normal[:, None]).sum(2) * 0.5 / (self.speed_of_sound * d1[:, None] * d2)
         rate = self.analysis.sampling_rate
-        path = (d1[:, None] + d2) * (rate / self.speed_of_sound)  # samples
+        path = d1[:, None] + d2
+        if stretch is not None:
+            path = path * stretch[pieces.pose][:, None]
+        if late is not None:
+            path = path + late[pieces.pose][:, None]
+        path = path * (rate / self.speed_of_sound)  # samples
         frames, row = self._span(path.detach(), pieces, len(emitters))
         hop = self.analysis.hop
         origin = ((row + self._first) * hop).to(path.dtype)

@@ -116,7 +116,7 @@ def _visible(
     free = FREE * optics.wavelength
     points = vertices[vertex].detach().cpu().numpy()
     of = pose.cpu().numpy()
-    sources, places = emitters.cpu().numpy(), ears.cpu().numpy()
+    sources, places = emitters.detach().cpu().numpy(), ears.detach().cpu().numpy()
     lit = np.flatnonzero(seen(sight, points, sources[of], free=free))
     clear = np.zeros((len(points), optics.ears), dtype=np.float32)
     for ear in range(optics.ears):
