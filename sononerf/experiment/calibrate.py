@@ -17,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from sononerf import storage
 from sononerf.acoustics.air import speed_in
 from sononerf.acoustics.row_filters import row_widths
-from sononerf.acoustics.spectrogram import range_axis
 from sononerf.config import Settings, SpectrogramSettings
 from sononerf.data.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, SettingsError
@@ -171,9 +170,17 @@ def _write(
     plain = settings.plain()
     sections = {name: plain[name] for name in KNOWN}
     speed = speed_in(settings.air) * math.exp(found.speed_of_sound)
+    axis = np.asarray(store.range, dtype=np.float64)
     if "speed_of_sound" in kinds:
+        axis = axis * math.exp(found.speed_of_sound)
+        step = axis[1] - axis[0]
+        # The same slices: limits that lie between them do not depend on rounding.
+        limits = {
+            "range_min": float(axis[0] - step / 4.0),
+            "range_max": float(axis[-1] + step / 4.0),
+        }
         sections["air"] = {**sections["air"], "speed_of_sound": speed}
-    axis = range_axis(settings.spectrogram, speed)
+        sections["spectrogram"] = {**sections["spectrogram"], **limits}
     turned = Rotation.from_rotvec(found.aim).as_matrix()
     earlier = store.attributes
     kept = ("origin", "source", "licence", "format", "units")
