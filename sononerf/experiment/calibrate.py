@@ -30,10 +30,10 @@ from sononerf.surface.calibration import KINDS, Calibration, Calibrator, Estimat
 from sononerf.surface.echo_data import Echoes, optics_of
 from sononerf.surface.traced import quiet_scene
 
-STEPS = 12
+STEPS = 20
 """At most so many Gauss-Newton steps; they usually end earlier."""
-SETTLED = 0.01
-"""Part by which the error must still fall for another step."""
+SETTLED = 0.1
+"""Steps end when they are shorter than this, standard deviations."""
 TOLD = 0.25
 """Largest uncertainty of a length, range resolutions, at which an error counts as found."""
 TOLD_DB = 1.0
@@ -134,12 +134,10 @@ def _estimate(
         mesh, Echoes.of(store), optics, kinds, dependent=dependent_cells(settings.spectrogram)
     )
     with progress.task("calibrating", STEPS * len(work.poses)) as task:
-        before = math.inf
         for _ in range(STEPS):
-            error = work.step(task.advance)
-            if error > (1.0 - SETTLED) * before:
+            work.step(task.advance)
+            if work.change < SETTLED:
                 break
-            before = error
     return work.result()
 
 

@@ -189,6 +189,12 @@ class Calibrator:
         Which errors are looked for; see :data:`KINDS`.
     dependent : float
         How many cells of a spectrogram share their noise.
+
+    Attributes
+    ----------
+    change : float
+        Length of the last step over one standard deviation, of the error that changed most; of
+        poses the root mean square.
     """
 
     def __init__(
@@ -224,6 +230,7 @@ class Calibrator:
         self.weight = np.ones((optics.ears, 1, len(optics.frequencies)))
         self.error_db: list[float] = []
         self.deviation: dict[str, float] = {}
+        self.change = math.inf
 
     def step(self, shown: Callable[[], None] = lambda: None) -> float:
         """Do one step; return the error before it, dB. ``shown`` is called once per pose."""
@@ -287,6 +294,9 @@ class Calibrator:
         damped = reduced / np.outer(scale, scale) + 1e-6 * np.eye(len(scale))
         covariance = np.linalg.pinv(damped, hermitian=True) / np.outer(scale, scale)
         shared = covariance @ right
+        unit_of = np.sqrt(np.maximum(noise * np.diag(covariance), 1e-30))
+        self.change = float((np.abs(shared) / unit_of).max(initial=0.0))
+        steps: list[float] = []
         variances: dict[str, list[float]] = {"position": [], "aim": []}
         squares: dict[str, list[float]] = {"position": [], "aim": []}
         for (number, _, _), (inverse, cross, now) in zip(kept, inverses, strict=True):
@@ -294,6 +304,7 @@ class Calibrator:
                 break
             step = inverse @ (now - cross @ shared)
             self._move(number, step)
+            steps.extend((step**2 / np.maximum(noise * np.diag(inverse), 1e-30)).tolist())
             lever = inverse @ cross
             spread = noise * (np.diag(inverse) + ((lever @ covariance) * lever).sum(axis=1))
             for column, value, variance in zip(
@@ -301,6 +312,7 @@ class Calibrator:
             ):
                 variances[column.name].append(float(variance))
                 squares[column.name].append(float(value) ** 2)
+        self.change = max(self.change, math.sqrt(float(np.mean(steps))) if steps else 0.0)
         for name in {column.name for column in self.local}:
             self.deviation[name] = math.sqrt(float(np.mean(variances[name])))
             self.spread[name] = math.sqrt(float(np.mean(squares[name]) + np.mean(variances[name])))
