@@ -34,9 +34,9 @@ STEPS = 20
 """At most so many Gauss-Newton steps; they usually end earlier."""
 SETTLED = 0.1
 """Steps end when they are shorter than this, standard deviations."""
-TOLD = 0.25
+DETERMINED = 0.25
 """Largest uncertainty of a length, range resolutions, at which an error counts as found."""
-TOLD_DB = 1.0
+DETERMINED_DB = 1.0
 """The same of a gain, dB."""
 INFORMED = 0.7
 """Largest uncertainty of a pose over the spread of all poses, no unit, at which the echoes say more
@@ -57,7 +57,7 @@ class Calibrated:
     lines : list of str
         What was found, one line each.
     warnings : list of str
-        What the data cannot tell.
+        What the echoes do not determine.
     """
 
     store: EnsembleStore
@@ -251,7 +251,7 @@ def describe(
     estimate: Estimate,
     kinds: Sequence[Kind],
 ) -> tuple[list[str], list[str]]:
-    """Return what was found and what cannot be told, one line each.
+    """Return what was found and what is not determined, one line each.
 
     Parameters
     ----------
@@ -275,13 +275,15 @@ def describe(
     if "gain" in kinds:
         gains = ", ".join(f"{_DB * value:+.2f}" for value in found.gain)
         lines.append(f"gain:           {gains} dB, each ± {_DB * deviation['gain']:.2f} dB")
-        if _DB * deviation["gain"] > TOLD_DB:
-            warnings.append("gain: the echoes cannot tell it")
+        if _DB * deviation["gain"] > DETERMINED_DB:
+            warnings.append("gain: the echoes do not determine it")
     if "range_offset" in kinds:
         off, uncertain = 1e3 * found.range_offset, deviation["range_offset"]
         lines.append(f"range offset:   {off:+.2f} ± {1e3 * uncertain:.2f} mm")
-        if uncertain > TOLD * resolution:
-            warnings.append("range_offset: the echoes cannot tell it from the size of the object")
+        if uncertain > DETERMINED * resolution:
+            warnings.append(
+                "range_offset: the echoes do not separate it from the size of the object"
+            )
     if {"gain", "range_offset"} <= set(kinds):
         warnings.append(
             "gain and range_offset together: a larger object is louder and nearer, so both may be "
@@ -293,10 +295,10 @@ def describe(
             f"speed of sound: {speed * math.exp(found.speed_of_sound):.2f} "
             f"± {speed * uncertain:.2f} m/s"
         )
-        if uncertain * reach > TOLD * resolution or _one_distance(store, mesh, resolution):
+        if uncertain * reach > DETERMINED * resolution or _one_distance(store, mesh, resolution):
             warnings.append(
-                "speed_of_sound: all poses are at one distance, so it cannot be told from the size "
-                "of the object; record from several distances"
+                "speed_of_sound: all poses are at one distance, so it cannot be separated from "
+                "the size of the object; record from several distances"
             )
     for kind, name, factor, unit in (
         ("position", "position", 1e3, "mm"),
@@ -313,7 +315,9 @@ def describe(
             f"{factor * uncertain:.2f} {unit}"
         )
         if uncertain > INFORMED * spread:
-            warnings.append(f"{kind}: the echoes hardly tell it; the poses stay about as they were")
+            warnings.append(
+                f"{kind}: the echoes hardly determine it; the poses stay about as they were"
+            )
     return lines, warnings
 
 

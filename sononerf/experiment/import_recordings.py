@@ -44,9 +44,9 @@ def echo_hash(understood: Understood) -> str:
     """Return a hash of all that the echoes come from: samples, poses, settings."""
     plain = understood.settings.plain()
     digest = hashlib.sha256(f"recordings {understood.form}".encode())
-    told = understood.wanted.model_dump(mode="json", exclude=set(NOT_HASHED))
+    given = understood.wanted.model_dump(mode="json", exclude=set(NOT_HASHED))
     sections = {name: plain[name] for name in SECTIONS}
-    digest.update(json.dumps([told, sections, understood.calibration], sort_keys=True).encode())
+    digest.update(json.dumps([given, sections, understood.calibration], sort_keys=True).encode())
     poses = understood.poses[understood.pings]
     for values in (poses.positions, poses.rotations):
         digest.update((np.round(values, 9) + 0.0).astype("<f8").tobytes())

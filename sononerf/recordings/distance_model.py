@@ -23,7 +23,7 @@ from scipy.optimize import least_squares
 Array = NDArray[np.float64]
 
 DEGREE = 4
-"""Greatest degree of the polynomials, no unit: parts of a body 45 degrees apart are told apart."""
+"""Greatest degree of the polynomials, no unit: parts of a body 45 degrees apart are separated."""
 PER_COEFFICIENT = 4
 """Least number of pings for each coefficient, no unit."""
 PARTS = 6

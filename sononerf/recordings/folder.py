@@ -144,7 +144,7 @@ def _sounds(folder: Path, settings: ImportSettings) -> list[Path]:
 def _present(
     folder: Path, files: list[Path], columns: Columns, settings: ImportSettings
 ) -> list[int]:
-    """Return the rows whose file is there; refuse what has no partner unless told to skip it."""
+    """Return the rows whose file is there; refuse what has no partner unless it is to be skipped."""
     keep = [row for row, path in enumerate(files) if path.is_file()]
     if settings.missing == "skip":
         if not keep:

@@ -13,7 +13,7 @@ Another convention is named if it explains the echoes clearly better. Three faul
 another convention: places that lie a thousand times too far apart or too close together for the
 ranges, and ranges too long for any body to fit between the poses, as a late time zero makes them.
 
-What first echoes cannot tell: a time zero that is too early (the body is then larger all around,
+What first echoes do not show: a time zero that is too early (the body is then larger all around,
 and every ping agrees), and a mirrored world as heard by one microphone beside its emitter.
 """
 
@@ -195,11 +195,11 @@ def check_poses(
         return Verdict()
     equal = [name for name in gains if name != best and gains[name] >= EQUAL * gains[best]]
     turns = _turns(stated)
-    told = [
+    named = [
         "reversed turntable" if turns and name == "left-handed frame" else name
         for name in (best, *equal)
     ]
-    return Verdict(told[0], _message(told), gains[best])
+    return Verdict(named[0], _message(named), gains[best])
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an import has to be told of recordings, beside air, ears, call and analysis."""
+"""What an import must know of recordings, beside air, ears, call and analysis."""
 
 from __future__ import annotations
 

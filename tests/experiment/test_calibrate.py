@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A run's surface corrects a store; what the data cannot tell is said."""
+"""A run's surface corrects a store; what the echoes do not determine is said."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_poses_are_corrected_but_those_held_out(run, tmp_path):
     assert (off[store.split != 2] > 0.0).any()
 
 
-def test_what_cannot_be_told_is_said(run):
+def test_what_is_not_determined_is_said(run):
     fitted = load_fitted(run)
     store = store_of(fitted)
     kinds = ("gain", "range_offset", "speed_of_sound", "position")
@@ -88,11 +88,11 @@ def test_what_cannot_be_told_is_said(run):
     _, warnings = describe(fitted.settings, store, SPHERE, estimate, kinds)
     text = "\n".join(warnings)
     for words in (
-        "gain: the echoes cannot tell it",
-        "range_offset: the echoes cannot tell it",
+        "gain: the echoes do not determine it",
+        "range_offset: the echoes do not separate it",
         "gain and range_offset together",
         "speed_of_sound: all poses are at one distance",
-        "position: the echoes hardly tell it",
+        "position: the echoes hardly determine it",
     ):
         assert words in text
 
