@@ -144,7 +144,7 @@ def _sounds(folder: Path, settings: ImportSettings) -> list[Path]:
 def _present(
     folder: Path, files: list[Path], columns: Columns, settings: ImportSettings
 ) -> list[int]:
-    """Return the rows whose file is there; refuse what has no partner unless it is to be skipped."""
+    """Return the rows whose file is there; a row without one is refused or skipped, as set."""
     keep = [row for row, path in enumerate(files) if path.is_file()]
     if settings.missing == "skip":
         if not keep:
