@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from sononerf.composition import LARGEST_SCALE, Part, compose
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import rotation_from_euler
 from sononerf.scene import MATERIALS, MaterialName, Scene, load_scene
+from sononerf.scene.composition import LARGEST_SCALE, Part, compose
 
 from .bodies import Degrees
 

@@ -6,9 +6,9 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from sononerf.composition import Part, compose
 from sononerf.errors import SettingsError
 from sononerf.scene import MATERIALS, MaterialName, Scene
+from sononerf.scene.composition import Part, compose
 
 from .blade import Blade
 from .bodies import Degrees, turned

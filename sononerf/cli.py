@@ -124,7 +124,7 @@ def scenes(
     preview: Annotated[Path | None, typer.Option(help="Draw every scene into this folder.")] = None,
 ) -> None:
     """List the scenes that are installed, built-in and everyone's, or the options of one."""
-    from sononerf.experiment.scenes import (
+    from sononerf.run.scenes import (
         describe_scene,
         describe_scenes,
         draw_scenes,
@@ -166,7 +166,7 @@ def new_scene(
     """Write a scene of one's own to start from: a plugin of two files, and its test."""
     import shlex
 
-    from sononerf.experiment.new_scene import new_scene as write
+    from sononerf.run.new_scene import new_scene as write
 
     written = write(name, output)
     for path in written:
@@ -202,13 +202,13 @@ def simulate(
     ] = None,
 ) -> None:
     """Simulate the echoes of a scene at all poses of an experiment."""
-    from sononerf.config import load_settings
+    from sononerf.settings.schema import load_settings
 
     settings = load_settings(config, overrides or ())
-    from sononerf.experiment.run_folder import results_folder
-    from sononerf.experiment.scenes import draw_ensemble
-    from sononerf.experiment.simulate import simulate as run
     from sononerf.progress import Progress
+    from sononerf.run.run_folder import results_folder
+    from sononerf.run.scenes import draw_ensemble
+    from sononerf.run.simulate import simulate as run
 
     if workers is not None and scheduler is not None:
         raise SettingsError("--workers and --scheduler exclude each other; give one")
@@ -222,7 +222,7 @@ def simulate(
             for path in draw_ensemble(settings, store, preview):
                 _print(f"wrote {path}")
     if waveforms is not None:
-        from sononerf.experiment.waveforms import write_waveforms
+        from sononerf.run.waveforms import write_waveforms
 
         for path in write_waveforms(settings, waveforms, progress=Progress()):
             _print(f"wrote {path}")
@@ -253,15 +253,15 @@ def import_(
     """Make a store of recordings, for `fit CONFIG data.store=STORE`."""
     if output is None:
         raise SettingsError("--output is missing; name the store, such as --output data/recorded")
-    from sononerf.experiment.import_recordings import (
+    from sononerf.progress import Progress
+    from sononerf.recordings.understand import understand
+    from sononerf.run.import_recordings import (
         check_before,
         describe,
         draw,
         import_understood,
     )
-    from sononerf.experiment.run_folder import results_folder
-    from sononerf.experiment.understand import understand
-    from sononerf.progress import Progress
+    from sononerf.run.run_folder import results_folder
 
     known = understand(form, source, output, settings_file=settings, overrides=overrides or ())
     for line in describe(known):
@@ -302,14 +302,14 @@ def fit(
 
     The same command goes on where an interrupted one stopped.
     """
-    from sononerf.config import load_settings
+    from sononerf.settings.schema import load_settings
 
     extra = [] if seed is None else [f"fit.seed={seed}"]
     settings = load_settings(config, [*(overrides or ()), *extra])
-    from sononerf.experiment.finish import finish, is_finished
-    from sononerf.experiment.fit import fit as run
-    from sononerf.experiment.fit import follows
     from sononerf.progress import Progress
+    from sononerf.run.finish import finish, is_finished
+    from sononerf.run.fit import fit as run
+    from sononerf.run.fit import follows
 
     folder = output or Path("runs") / config.stem
     progress = Progress()
@@ -389,8 +389,8 @@ def predict(
     """Predict the spectrograms of poses that were never heard."""
     if split is not None and poses is not None:
         raise SettingsError("--split and --poses exclude each other; give one")
-    from sononerf.experiment.predict import predict as predict_run
     from sononerf.progress import Progress
+    from sononerf.run.predict import predict as predict_run
 
     folder = predict_run(
         run,
@@ -440,8 +440,8 @@ def reconstruct(
             raise SettingsError(f"--level: found {level!r}; give auto or a number from 0 on")
     if spacing is not None and not (math.isfinite(spacing) and spacing > 0):
         raise SettingsError(f"--spacing: found {spacing}; give metres above zero")
-    from sononerf.experiment.reconstruct import reconstruct as reconstruct_run
     from sononerf.progress import Progress
+    from sononerf.run.reconstruct import reconstruct as reconstruct_run
 
     folder = reconstruct_run(
         run,
@@ -470,8 +470,8 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Compare a run's mesh with the true surface, and show all its numbers."""
-    from sononerf.experiment.evaluate import evaluate as evaluate_run
     from sononerf.progress import Progress
+    from sononerf.run.evaluate import evaluate as evaluate_run
 
     metrics = evaluate_run(
         run,
@@ -497,7 +497,7 @@ def export(
     ] = Exported.auto,
 ) -> None:
     """Write echoes, predictions, volumes or surface points for other programs."""
-    from sononerf.experiment.export import export as export_part
+    from sononerf.run.export import export as export_part
 
     _print(f"wrote {export_part(source, output, what=what.value)}")
 
@@ -514,8 +514,8 @@ def calibrate(
     output: Annotated[Path | None, typer.Option(help="The corrected store.")] = None,
 ) -> None:
     """Find errors of a recording by a run's surface, and write a corrected store."""
-    from sononerf.experiment.calibrate import calibrate as find_errors
     from sononerf.progress import Progress
+    from sononerf.run.calibrate import calibrate as find_errors
 
     if output is None:
         raise SettingsError("--output is missing; name the store, such as --output data/corrected")
@@ -538,8 +538,8 @@ def compare(
 ) -> None:
     """Show what is heard in RUN_A and not in RUN_B, and where: a prey on a leaf."""
     from sononerf import storage
-    from sononerf.experiment.compare import compare_runs
     from sononerf.progress import Progress
+    from sononerf.run.compare import compare_runs
 
     folder = compare_runs(
         run_a, run_b, output=output, accelerator=accelerator.value, progress=Progress()
@@ -566,8 +566,8 @@ def report(
     ] = None,
 ) -> None:
     """Write one page of a run: numbers beside the baselines', pictures, settings."""
-    from sononerf.experiment.report import report as report_run
     from sononerf.progress import Progress
+    from sononerf.run.report_run import report as report_run
 
     _print(f"wrote {report_run(run, paper=paper, output=output, progress=Progress())}")
 

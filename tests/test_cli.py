@@ -27,10 +27,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from sononerf import __version__, cli, storage
 from sononerf.callbacks import preview, spectrogram_images
-from sononerf.experiment import evaluate as evaluate_module
-from sononerf.experiment import finish as finish_module
-from sononerf.reconstruction import baseline
-from sononerf.weights import load_weights, save_weights
+from sononerf.evaluation import baseline
+from sononerf.field.weights import load_weights, save_weights
+from sononerf.run import evaluate as evaluate_module
+from sononerf.run import finish as finish_module
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 SMOKE = str(CONFIGS / "smoke.yaml")
@@ -303,7 +303,7 @@ def test_the_options_of_one_scene_are_told():
 def test_a_comparison_is_told_in_millimetres(tmp_path, monkeypatch):
     found = {"strongest_m": [0.0071, 0.013, -0.06], "score": 0.52, "distance_m": 0.00484}
     (tmp_path / "comparison.json").write_text(json.dumps(found))
-    monkeypatch.setattr("sononerf.experiment.compare.compare_runs", lambda *a, **k: tmp_path)
+    monkeypatch.setattr("sononerf.run.compare.compare_runs", lambda *a, **k: tmp_path)
     said = done("compare", "runs/a", "runs/b").err
     assert "at (7.1, 13.0, -60.0) mm, 0.52 of the maximum; 4.8 mm from the middle of what" in said
 
@@ -713,7 +713,7 @@ def test_a_fault_of_ours_is_not_dressed_up(monkeypatch):
     def broken():
         raise ZeroDivisionError("ours")
 
-    from sononerf.experiment import scenes
+    from sononerf.run import scenes
 
     monkeypatch.setattr(scenes, "describe_scenes", broken)
     monkeypatch.setattr(sys, "argv", ["sononerf", "scenes"])
@@ -749,7 +749,7 @@ def test_nothing_and_nonsense_are_wrong_usage():
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signals_outside_the_fit_unwind_and_say_so(monkeypatch, number):
-    from sononerf.experiment import scenes
+    from sononerf.run import scenes
 
     closed = []
 

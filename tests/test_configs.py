@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from sononerf.config import dump_yaml, load_settings, read_yaml, validate_settings
-from sononerf.experiment.build import check_plugins, field_and_renderer
-from sononerf.experiment.fit import fit
-from sononerf.module import EchoModule
-from sononerf.scene import load_scene
+from sononerf.field.module import EchoModule
+from sononerf.run.build import check_plugins, field_and_renderer
+from sononerf.run.fit import fit
+from sononerf.scene.scene import load_scene
+from sononerf.settings.schema import dump_yaml, load_settings, read_yaml, validate_settings
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 FILES = sorted(set(CONFIGS.rglob("*.yaml")) - {CONFIGS / "store.yaml"})  # it needs a store

@@ -11,10 +11,10 @@ import pytest
 import typer
 
 from sononerf.cli import app
-from sononerf.config import load_settings
-from sononerf.experiment import new_scene as new_scene_module
-from sononerf.plugins import SCENES as GROUP
-from sononerf.plugins import check_options, load, registered
+from sononerf.run import new_scene as new_scene_module
+from sononerf.settings.plugins import SCENES as GROUP
+from sononerf.settings.plugins import check_options, load, registered
+from sononerf.settings.schema import load_settings
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")

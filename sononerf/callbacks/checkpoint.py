@@ -16,7 +16,7 @@ import lightning
 
 from sononerf.callbacks.epoch import EpochCallback, echo_module
 from sononerf.errors import StoppedError
-from sononerf.module import EchoModule
+from sononerf.field.module import EchoModule
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import lightning
 
-from sononerf.module import EchoModule
+from sononerf.field.module import EchoModule
 
 
 def echo_module(module: lightning.LightningModule) -> EchoModule:

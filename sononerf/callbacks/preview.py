@@ -12,13 +12,13 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from sononerf import storage
 from sononerf.callbacks.epoch import EpochCallback
 from sononerf.errors import NumericalError
-from sononerf.module import EchoModule
-from sononerf.reconstruction.isosurface import automatic_level, isosurface
-from sononerf.reconstruction.mesh import mesh_bytes
-from sononerf.reconstruction.projection import maximum_intensity_projections
-from sononerf.reconstruction.read_out import energy_volume
-from sononerf.render.figure import png_from_pixels
-from sononerf.render.projection import mip_image
+from sononerf.field.module import EchoModule
+from sononerf.report.mesh_files import mesh_bytes
+from sononerf.report.mip import maximum_intensity_projections
+from sononerf.report.pictures.figure import png_from_pixels
+from sononerf.report.pictures.mip_picture import mip_image
+from sononerf.surface.start.isosurface import automatic_level, isosurface
+from sononerf.surface.start.read_out import energy_volume
 
 
 class PreviewCallback(EpochCallback):

@@ -10,9 +10,9 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from sononerf.callbacks.epoch import EpochCallback
-from sononerf.data.range_slices import WholePoses
-from sononerf.module import EchoModule, decibels
-from sononerf.render.spectrogram import spectrogram_image
+from sononerf.field.module import EchoModule, decibels
+from sononerf.field.range_slices import WholePoses
+from sononerf.report.pictures.spectrogram_picture import spectrogram_image
 
 SHARE = 0.05
 """Part of the time that drawing may take; short epochs may go without a picture, but the last."""

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""What the echoes say before anything is fitted: onsets, free space and region."""
+"""Echoes, simulated or recorded: the store, onsets, free space and region."""

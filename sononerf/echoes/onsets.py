@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import poisson
 
-from sononerf.acoustics.call import covered
-from sononerf.acoustics.reception import effective_window
-from sononerf.acoustics.row_filters import band_mean, band_parts, row_filters
-from sononerf.config import CallSettings, SpectrogramSettings
-from sononerf.data.store import EnsembleStore
 from sononerf.echoes.detection import FALSE_ALARMS, Levels, onsets, own_top, threshold_levels
+from sononerf.echoes.store import EnsembleStore
+from sononerf.head.call import covered
+from sononerf.head.reception import effective_window
+from sononerf.head.row_filters import band_mean, band_parts, row_filters
+from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.distance import cdist
 
-from sononerf.acoustics.ears import Ears
 from sononerf.echoes.consistency import ACCURACY
 from sononerf.echoes.detection import FALSE_ALARMS
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.onsets import Onsets
 from sononerf.errors import NumericalError
+from sononerf.head.ears import Ears
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

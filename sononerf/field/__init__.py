@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Reflectivity fields: positions and directions in, complex pressure reflectivity out."""
+"""Reflectivity fields, the renderers that turn them into spectra, and their training."""

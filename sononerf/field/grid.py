@@ -13,8 +13,8 @@ from pydantic import Field as Option
 from torch import Tensor, nn
 
 from sononerf.errors import SettingsError
-from sononerf.field.correction import Correction
 from sononerf.field.lobe import CODE, LobeField, Lobes, Places
+from sononerf.field.lobe_correction import Correction
 
 SLIGHT = 1e-5
 """A vertex is not read where its weight is less: places of a lattice are off by roundings."""

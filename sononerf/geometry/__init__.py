@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""Poses, directions, surfaces and ray casting."""
+"""Poses, directions, ray casting, normals and grids."""

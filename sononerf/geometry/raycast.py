@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sononerf.geometry.surface import corner_normals, total_curvature, weight_gradients
+from sononerf.geometry.normals import corner_normals, total_curvature, weight_gradients
 
 try:
     from embreex.mesh_construction import TriangleMesh

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sononerf.geometry.surface import corner_normals
+from sononerf.geometry.normals import corner_normals
 
 POOL = 10  # points on the surface from which one is chosen
 PLASTIC = 1.324717957244746  # root of x^3 = x + 1; its powers spread points over a square evenly

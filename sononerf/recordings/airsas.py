@@ -32,7 +32,7 @@ from sononerf.errors import InputError
 from sononerf.recordings import hdf5
 from sononerf.recordings.columns import PLACE, Columns
 from sononerf.recordings.recording import Recording
-from sononerf.recordings.settings import ImportSettings
+from sononerf.settings.import_schema import ImportSettings
 
 ACROSS = np.pi / 2  # yaw of a head that looks to positive y, rad
 

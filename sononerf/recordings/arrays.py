@@ -27,12 +27,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.data.layout import SPLITS
+from sononerf.echoes.layout import SPLITS
 from sononerf.errors import InputError
 from sononerf.recordings import hdf5
 from sononerf.recordings.columns import EULER, PLACE, Columns, columns_of
 from sononerf.recordings.recording import Recording
-from sononerf.recordings.settings import ImportSettings
+from sononerf.settings.import_schema import ImportSettings
 
 HDF5 = (".h5", ".hdf5", ".hdf")
 SUFFIXES = (".npz", *HDF5)

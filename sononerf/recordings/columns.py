@@ -27,9 +27,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.data.layout import SPLITS
+from sononerf.echoes.layout import SPLITS
 from sononerf.errors import InputError
-from sononerf.recordings.settings import LENGTHS, ImportSettings
+from sononerf.settings.import_schema import LENGTHS, ImportSettings
 
 Array = NDArray[np.float64]
 

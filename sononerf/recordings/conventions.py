@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import Poses, look_at, rotation_from_euler
 from sononerf.recordings.columns import EULER, PLACE, QUATERNION, Columns
-from sononerf.recordings.settings import ImportSettings, TurntableSettings
+from sononerf.settings.import_schema import ImportSettings, TurntableSettings
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ from sononerf.errors import InputError
 from sononerf.recordings import arrays, audio
 from sononerf.recordings.columns import Columns, read_table
 from sononerf.recordings.recording import Recording
-from sononerf.recordings.settings import ImportSettings
+from sononerf.settings.import_schema import ImportSettings
 
 SUFFIXES = (*audio.SUFFIXES, *arrays.SUFFIXES)
 

@@ -14,8 +14,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.acoustics.inverse_filter import inverse_filter
 from sononerf.errors import InputError
+from sononerf.head.inverse_filter import inverse_filter
 from sononerf.recordings.audio import as_float
 from sononerf.recordings.recording import Recording
 

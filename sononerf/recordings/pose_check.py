@@ -29,7 +29,7 @@ from sononerf.geometry.poses import Poses
 from sononerf.recordings.columns import EULER, PLACE, Columns
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.distance_model import Prediction, predict
-from sononerf.recordings.settings import ImportSettings
+from sononerf.settings.import_schema import ImportSettings
 
 Array = NDArray[np.float64]
 

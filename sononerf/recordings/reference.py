@@ -20,12 +20,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.acoustics.call import call_waveform, covered, sweep_delay
-from sononerf.acoustics.ears import Ears, beam_gain, ear_gain
-from sononerf.acoustics.spectrogram import frequency_axis, range_axis, spectrogram
-from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.errors import InputError
-from sononerf.recordings.settings import ReferenceSettings
+from sononerf.head.call import call_waveform, covered, sweep_delay
+from sononerf.head.ears import Ears, beam_gain, ear_gain
+from sononerf.head.spectrogram import frequency_axis, range_axis, spectrogram
+from sononerf.settings.import_schema import ReferenceSettings
+from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 Array = NDArray[np.float64]
 

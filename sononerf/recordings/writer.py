@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.io import wavfile
 
-from sononerf.data.layout import SPLITS
+from sononerf.echoes.layout import SPLITS
 from sononerf.geometry.poses import Poses, euler_from_rotation
 
 HEADER = "file,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg,split"

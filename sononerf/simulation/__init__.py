@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""From a scene and a pose to the echoes of two ears."""
+"""From a scene and a pose to the echoes at each receiver."""

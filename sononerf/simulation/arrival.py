@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sononerf.scene import Scene
+from sononerf.scene.scene import Scene
 from sononerf.simulation.impulse_response import NODE_SPACING
 
 FINE = 0.05

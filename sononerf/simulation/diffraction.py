@@ -11,9 +11,9 @@ import trimesh
 from numpy.typing import NDArray
 
 from sononerf.geometry.directions import GOLDEN_TURN
+from sononerf.geometry.normals import CREASE
 from sononerf.geometry.raycast import RayCaster
-from sononerf.geometry.surface import CREASE
-from sononerf.scene import Scene
+from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing, Sound
 from sononerf.simulation.reflection import Reflection
 

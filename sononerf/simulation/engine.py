@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.geometry.raycast import RayCaster
-from sononerf.scene import Scene
+from sononerf.scene.scene import Scene
 from sononerf.simulation.arrival import Arrival
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.reflection import Reflection, reflection

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.config import PoseSettings, Settings
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
 from sononerf.geometry.inside import winding_numbers
 from sononerf.geometry.poses import (
@@ -29,7 +28,8 @@ from sononerf.geometry.poses import (
     read_pose_csv,
     sphere_poses,
 )
-from sononerf.scene import Scene
+from sononerf.scene.scene import Scene
+from sononerf.settings.schema import PoseSettings, Settings
 from sononerf.simulation.simulator import Simulator
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.acoustics.ears import Ears, beam_gain, ear_gain
+from sononerf.head.ears import Ears, beam_gain, ear_gain
 from sononerf.simulation.impulse_response import Bins, Synthesis, air_loss, deposit, synthesise
 
 MOST_WAITING = 300_000  # echoes; laying them into bins goes over all bins, so it is done seldom

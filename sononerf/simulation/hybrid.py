@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.acoustics.ears import Ears
-from sononerf.scene import Scene
+from sononerf.head.ears import Ears
+from sononerf.scene.scene import Scene
 from sononerf.simulation.engine import Engine
+from sononerf.simulation.equivalent_sources import THIN, Sources, resolved_frequency, sources_worth
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.rays import Rays
-from sononerf.simulation.sources import THIN, Sources, resolved_frequency, sources_worth
 
 FALL = 1.3
 """Highest frequency of the low band over the one from which it gives way to the rays. A wider

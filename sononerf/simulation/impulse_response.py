@@ -30,8 +30,8 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
-from sononerf.acoustics.gains import NOTCH_WIDTH
-from sononerf.config import SpectrogramSettings
+from sononerf.head.gains import NOTCH_WIDTH
+from sononerf.settings.schema import SpectrogramSettings
 
 HIGHEST = 150e3
 """Frequency up to which echoes are complete, Hz. Half more than the default band needs."""

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.geometry.directions import CapSpiral
+from sononerf.geometry.normals import bodies, enclosing_balls
 from sononerf.geometry.raycast import Hits
-from sononerf.geometry.surface import bodies, enclosing_balls
-from sononerf.scene import Scene
+from sononerf.scene.scene import Scene
 from sononerf.simulation.diffraction import Diffraction
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.footprint import Real

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.material import Material
+from sononerf.scene.material import Material
 
 COARSEST = 10.0  # rad
 LEAST_RISE = 1e-4  # sine of the angle at which what runs into a surface grazes it

@@ -12,8 +12,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sononerf.geometry.normals import CREASE, bodies, corner_normals, weight_gradients
 from sononerf.geometry.raycast import Hits, RayCaster
-from sononerf.geometry.surface import CREASE, bodies, corner_normals, weight_gradients
 from sononerf.simulation.impulse_response import NODE_SPACING
 
 RESOLVED_FREQUENCY = 80e3

@@ -10,24 +10,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.acoustics.air import absorption_in, speed_in
-from sononerf.acoustics.ears import Ears, ear_tables, receiver_count
-from sononerf.acoustics.reception import Reception
-from sononerf.acoustics.row_filters import row_widths
-from sononerf.acoustics.spectrogram import frequency_axis, range_axis
-from sononerf.config import Settings, SimulationSettings, SpectrogramSettings
 from sononerf.errors import SettingsError
-from sononerf.scene import Scene
+from sononerf.head.air import absorption_in, speed_in
+from sononerf.head.ears import Ears, ear_tables, receiver_count
+from sononerf.head.reception import Reception
+from sononerf.head.row_filters import row_widths
+from sononerf.head.spectrogram import frequency_axis, range_axis
+from sononerf.scene.scene import Scene
+from sononerf.settings.schema import Settings, SimulationSettings, SpectrogramSettings
 from sononerf.simulation.arrival import silence_before
-from sononerf.simulation.boundary import Boundary
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.hybrid import hybrid
 from sononerf.simulation.impulse_response import plan_synthesis
-from sononerf.simulation.kirchhoff import Kirchhoff
 from sononerf.simulation.rays import Rays
+from sononerf.simulation.reference.boundary import Boundary
+from sononerf.simulation.reference.kirchhoff import Kirchhoff
+from sononerf.simulation.reference.spheres import Spheres
 from sononerf.simulation.solved import TAPER, Solved
-from sononerf.simulation.spheres import Spheres
 
 logger = logging.getLogger("sononerf")
 

@@ -13,13 +13,13 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from sononerf.acoustics.ears import Ears, beam_gain, ear_gain
 from sononerf.errors import ResourceError
+from sononerf.head.ears import Ears, beam_gain, ear_gain
 from sononerf.memory import available_memory
-from sononerf.scene import Scene
+from sononerf.scene.scene import Scene
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import Hearing
-from sononerf.simulation.kirchhoff import Kirchhoff
+from sononerf.simulation.reference.kirchhoff import Kirchhoff
 
 logger = logging.getLogger("sononerf")
 

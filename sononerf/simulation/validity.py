@@ -8,10 +8,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.scene import Scene
+from sononerf.scene.scene import Scene
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hybrid import Hybrid
-from sononerf.simulation.kirchhoff import Kirchhoff
+from sononerf.simulation.reference.kirchhoff import Kirchhoff
 from sononerf.simulation.solved import Solved
 
 KA = (2.7, 4.3, 5.9, 7.5, 9.1, 10.7, 12.3, 15.6, 22.0)

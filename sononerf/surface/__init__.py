@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""The surface that explains the echoes: evidence, occupancy where it starts, and refinement."""
+"""Surfaces that explain the echoes: where they start and how they are refined."""

@@ -5,7 +5,7 @@ import functools
 
 import pytest
 
-from sononerf.experiment import build
+from sononerf.run import build
 
 
 @pytest.fixture(scope="module")

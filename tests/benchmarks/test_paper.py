@@ -12,12 +12,12 @@ import pytest
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
-from sononerf.config import load_settings
 from sononerf.errors import IncompatibleError
-from sononerf.experiment.build import field_and_renderer, module_for
-from sononerf.experiment.fit import _length
-from sononerf.experiment.simulate import echo_hash
-from sononerf.scene import load_scene
+from sononerf.run.build import field_and_renderer, module_for
+from sononerf.run.fit import _length
+from sononerf.run.simulate import echo_hash
+from sononerf.scene.scene import load_scene
+from sononerf.settings.schema import load_settings
 from tools import benchmark
 from tools.benchmarks import paper as module
 from tools.benchmarks.experiment import CONFIG

@@ -10,9 +10,9 @@ from argparse import Namespace
 
 import pytest
 
-from sononerf.config import load_settings
-from sononerf.experiment.build import acquisition, check_plugins
-from sononerf.scene import load_scene
+from sononerf.run.build import acquisition, check_plugins
+from sononerf.scene.scene import load_scene
+from sononerf.settings.schema import load_settings
 from tools.benchmarks import scale as module
 from tools.benchmarks.experiment import CONFIG
 from tools.benchmarks.scale import OTHERS, powers, sentences, table, watched

@@ -6,13 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sononerf.acoustics.air import air_absorption
-from sononerf.acoustics.ears import analysed_ears
-from sononerf.acoustics.spectrogram import frequency_axis, range_axis
-from sononerf.config import load_settings
-from sononerf.data.store import EnsembleStore
-from sononerf.experiment.simulate import _attributes, echo_hash, simulate
-from sononerf.scene import load_scene
+from sononerf.echoes.store import EnsembleStore
+from sononerf.head.air import air_absorption
+from sononerf.head.ears import analysed_ears
+from sononerf.head.spectrogram import frequency_axis, range_axis
+from sononerf.run.simulate import _attributes, echo_hash, simulate
+from sononerf.scene.scene import load_scene
+from sononerf.settings.schema import load_settings
 from sononerf.simulation.ensemble import ensemble_poses
 from sononerf.simulation.simulator import Simulator
 from tools.benchmarks.experiment import CONFIG

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sononerf.scene import load_scene
+from sononerf.scene.scene import load_scene
 from tools.benchmarks import shapes as module
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from sononerf.config import load_settings
 from sononerf.errors import IncompatibleError
-from sononerf.scene import load_scene
+from sononerf.scene.scene import load_scene
+from sononerf.settings.schema import load_settings
 from tools.benchmarks import surfaces as module
 from tools.benchmarks.experiment import CONFIG
 from tools.benchmarks.surfaces import CASES, NEW, PROCEDURAL, chosen_cases, measured, table

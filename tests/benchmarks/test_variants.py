@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from sononerf.config import load_settings
 from sononerf.errors import SettingsError
-from sononerf.experiment.build import check_plugins
+from sononerf.run.build import check_plugins
+from sononerf.settings.schema import load_settings
 from tools.benchmarks import variants as module
 from tools.benchmarks.paper import PAPER
 from tools.benchmarks.variants import VARIANTS, row_of, table

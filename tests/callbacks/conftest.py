@@ -9,13 +9,13 @@ import lightning
 import pytest
 from lightning.pytorch.loggers import TensorBoardLogger
 
-from sononerf.checkpoint_io import DurableCheckpointIO
-from sononerf.config import validate_settings
-from sononerf.data.datamodule import EchoDataModule
-from sononerf.data.store import EnsembleStore
-from sononerf.experiment.build import echo_region, field_and_renderer, module_for
-from sononerf.experiment.fit import quiet_lightning
-from sononerf.experiment.simulate import simulate
+from sononerf.echoes.store import EnsembleStore
+from sononerf.field.checkpoint_io import DurableCheckpointIO
+from sononerf.field.datamodule import EchoDataModule
+from sononerf.run.build import echo_region, field_and_renderer, module_for
+from sononerf.run.fit import quiet_lightning
+from sononerf.run.simulate import simulate
+from sononerf.settings.schema import validate_settings
 
 SETTINGS = {
     "scene": {"name": "sphere", "options": {"radius": 0.02}},

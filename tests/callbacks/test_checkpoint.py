@@ -11,8 +11,8 @@ import lightning
 import pytest
 
 from sononerf.callbacks.checkpoint import CheckpointCallback
-from sononerf.checkpoint_io import DurableCheckpointIO
 from sononerf.errors import StoppedError
+from sononerf.field.checkpoint_io import DurableCheckpointIO
 
 
 class Kill(lightning.Callback):

@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sononerf.acoustics.reception import effective_window
-from sononerf.acoustics.spectrogram import frequency_axis, range_axis
-from sononerf.config import CallSettings, SpectrogramSettings
 from sononerf.echoes import detection, onsets
 from sononerf.echoes.detection import FALSE_ALARMS, RANK, threshold_factor
 from sononerf.echoes.onsets import Onsets, PointEcho, asked_poses, find_onsets
+from sononerf.head.reception import effective_window
+from sononerf.head.spectrogram import frequency_axis, range_axis
+from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 STEP = 0.0007
 RANGE = 0.2 + STEP * np.arange(300)

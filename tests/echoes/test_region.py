@@ -4,8 +4,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sononerf.acoustics.ears import ear_tables
-from sononerf.config import EarSettings
 from sononerf.echoes.consistency import weighted
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.onsets import PointEcho, find_onsets
@@ -13,6 +11,8 @@ from sononerf.echoes.region import EchoRegion
 from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.poses import look_at
+from sononerf.head.ears import ear_tables
+from sononerf.settings.schema import EarSettings
 
 STEP = 0.001
 RANGE = 0.15 + STEP * np.arange(601)

@@ -4,7 +4,7 @@ import torch
 
 from sononerf.errors import SettingsError
 from sononerf.field.field import sphere_directions
-from sononerf.renderer.profile import lattice_over
+from sononerf.field.profile import lattice_over
 from tests.field.lobes import REGION, fill, grid, places_in
 
 WITH_OPTIONS = pytest.mark.parametrize("options", [{}, {"rank": 2}, {"rank": 1, "correction": 4}])

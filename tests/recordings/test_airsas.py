@@ -10,7 +10,7 @@ import pytest
 from sononerf.errors import InputError
 from sononerf.recordings.airsas import read_airsas
 from sononerf.recordings.conventions import to_poses
-from sononerf.recordings.settings import ImportSettings
+from sononerf.settings.import_schema import ImportSettings
 
 COUNT, SAMPLES = 5, 80
 RATE = ImportSettings(sampling_rate=1e5)

@@ -10,7 +10,7 @@ import pytest
 from sononerf.errors import InputError
 from sononerf.recordings.arrays import read_numpy
 from sononerf.recordings.conventions import to_poses
-from sononerf.recordings.settings import ImportSettings
+from sononerf.settings.import_schema import ImportSettings
 
 COUNT, RECEIVERS, SAMPLES = 4, 2, 50
 PLAIN = ImportSettings()

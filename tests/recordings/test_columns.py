@@ -8,7 +8,7 @@ import pytest
 
 from sononerf.errors import InputError
 from sononerf.recordings.columns import columns_of, read_table
-from sononerf.recordings.settings import ImportSettings
+from sononerf.settings.import_schema import ImportSettings
 
 PLAIN = ImportSettings()
 

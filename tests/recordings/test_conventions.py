@@ -11,7 +11,7 @@ from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import rotation_from_euler
 from sononerf.recordings.columns import columns_of
 from sononerf.recordings.conventions import frame_matrices, to_poses, turntable_poses
-from sononerf.recordings.settings import ImportSettings
+from sononerf.settings.import_schema import ImportSettings
 
 # A head at 1 m east, 2 m north, 3 m up that looks north and 30 degrees down, right ear down a bit.
 PLACE = np.array([1.0, 2.0, 3.0])

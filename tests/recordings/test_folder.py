@@ -10,7 +10,7 @@ from scipy.io import wavfile
 
 from sononerf.errors import InputError
 from sononerf.recordings.folder import read_folder
-from sononerf.recordings.settings import ImportSettings
+from sononerf.settings.import_schema import ImportSettings
 
 RATE = 100_000
 PLAIN = ImportSettings()

@@ -10,7 +10,7 @@ from sononerf.geometry.poses import Poses
 from sononerf.recordings.columns import Columns
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.pose_check import alternatives, check_poses, mirrored
-from sononerf.recordings.settings import ImportSettings
+from sononerf.settings.import_schema import ImportSettings
 from tests.recordings.bodies import EARS, EMITTER, body, first_echoes, poses_of, table
 
 RESOLUTION = 0.0058  # m, of the default analysis

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sononerf.acoustics.call import call_waveform, emit
-from sononerf.acoustics.ears import beam_gain, ear_gain, ear_tables
-from sononerf.acoustics.spectrogram import frequency_axis
-from sononerf.config import CallSettings, EarSettings, SpectrogramSettings
 from sononerf.errors import InputError
+from sononerf.head.call import call_waveform, emit
+from sononerf.head.ears import beam_gain, ear_gain, ear_tables
+from sononerf.head.spectrogram import frequency_axis
 from sononerf.recordings.reference import calibrate
-from sononerf.recordings.settings import ReferenceSettings
+from sononerf.settings.import_schema import ReferenceSettings
+from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 
 RATE, SPEED = 1e6, 343.0
 ANALYSIS = SpectrogramSettings(frequency_min=30e3, frequency_max=90e3)

@@ -10,8 +10,8 @@ import scipy.io
 from sononerf.errors import InputError
 from sononerf.geometry.poses import rotation_from_euler
 from sononerf.recordings.conventions import to_poses
-from sononerf.recordings.settings import ImportSettings
 from sononerf.recordings.sonotrace import read_sononerf_matlab, read_sonotracelab
+from sononerf.settings.import_schema import ImportSettings
 from tests.recordings.matlab_files import write_new
 
 PLAIN = ImportSettings()

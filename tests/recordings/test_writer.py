@@ -9,8 +9,8 @@ import pytest
 from sononerf.geometry.poses import sphere_poses
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.folder import read_folder
-from sononerf.recordings.settings import ImportSettings
 from sononerf.recordings.writer import pose_table, wav_bytes
+from sononerf.settings.import_schema import ImportSettings
 
 
 def test_a_folder_comes_back(tmp_path):

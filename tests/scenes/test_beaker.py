@@ -4,9 +4,9 @@ import pytest
 from sononerf_scenes.bodies import EDGE, SIDE
 
 from sononerf.errors import SettingsError
+from sononerf.evaluation.solid import Solid
 from sononerf.geometry.faults import surface_faults
-from sononerf.reconstruction.solid import Solid
-from sononerf.scene import MATERIALS, load_scene
+from sononerf.scene.scene import MATERIALS, load_scene
 
 
 @pytest.mark.parametrize(

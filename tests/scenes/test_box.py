@@ -4,7 +4,7 @@ import pytest
 
 from sononerf.errors import SettingsError
 from sononerf.geometry.faults import surface_faults
-from sononerf.scene import load_scene
+from sononerf.scene.scene import load_scene
 
 
 def test_a_box_has_its_size_about_the_origin():

@@ -5,7 +5,7 @@ from sononerf_scenes.bodies import EDGE, SIDE
 
 from sononerf.errors import SettingsError
 from sononerf.geometry.faults import surface_faults
-from sononerf.scene import load_scene
+from sononerf.scene.scene import load_scene
 
 
 def test_a_capsule_stands_upright_about_the_origin():

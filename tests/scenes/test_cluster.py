@@ -8,7 +8,7 @@ from sononerf_scenes.cluster import GAP
 
 from sononerf.errors import SettingsError
 from sononerf.geometry.faults import surface_faults
-from sononerf.scene import load_scene
+from sononerf.scene.scene import load_scene
 
 
 def balls(mesh):

@@ -2,9 +2,9 @@
 import numpy as np
 import pytest
 
-from sononerf.config import load_settings
 from sononerf.errors import InputError, SettingsError
-from sononerf.scene import MATERIALS, load_scene
+from sononerf.scene.scene import MATERIALS, load_scene
+from sononerf.settings.schema import load_settings
 
 BOX = {"scene": "box", "options": {"size": [0.02, 0.04, 0.06]}}
 

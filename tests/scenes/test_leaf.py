@@ -5,7 +5,7 @@ from sononerf_scenes.bodies import EDGE
 
 from sononerf.errors import SettingsError
 from sononerf.geometry.faults import surface_faults
-from sononerf.scene import MATERIALS, load_scene
+from sononerf.scene.scene import MATERIALS, load_scene
 
 FLAT = {"curl": 0.0, "bend": 0.0, "undulation": 0.0}
 CORNERS = [

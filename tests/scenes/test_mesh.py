@@ -8,8 +8,8 @@ import trimesh
 from trimesh.exchange.gltf import export_gltf
 
 from sononerf.errors import InputError, SettingsError
-from sononerf.material import MATERIALS
-from sononerf.scene import load_scene
+from sononerf.scene.material import MATERIALS
+from sononerf.scene.scene import load_scene
 
 BOX = trimesh.creation.box((30.0, 20.0, 10.0))
 

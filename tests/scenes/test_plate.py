@@ -4,7 +4,7 @@ import pytest
 
 from sononerf.errors import SettingsError
 from sononerf.geometry.faults import surface_faults
-from sononerf.scene import MATERIALS, load_scene
+from sononerf.scene.scene import MATERIALS, load_scene
 
 
 def test_a_plate_faces_x():

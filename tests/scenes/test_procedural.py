@@ -7,8 +7,8 @@ from sononerf_scenes.procedural import KINDS
 
 from sononerf.errors import SettingsError
 from sononerf.geometry.faults import surface_faults
-from sononerf.material import MATERIALS
-from sononerf.scene import load_scene
+from sononerf.scene.material import MATERIALS
+from sononerf.scene.scene import load_scene
 
 
 def shape(seed):

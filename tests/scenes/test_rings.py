@@ -5,9 +5,9 @@ from scipy.spatial import cKDTree
 from sononerf_scenes.bodies import EDGE, SIDE
 
 from sononerf.errors import SettingsError
+from sononerf.evaluation.solid import count_parts, solid_from_mesh
 from sononerf.geometry.faults import surface_faults
-from sononerf.reconstruction.solid import count_parts, solid_from_mesh
-from sononerf.scene import load_scene
+from sononerf.scene.scene import load_scene
 
 
 @pytest.mark.parametrize(("major", "minor"), [(0.035, 0.007), (0.04, 0.018)])

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from sononerf.scene import load_scene
+from sononerf.scene.scene import load_scene
 
 
 def bodies(scene):

@@ -6,7 +6,7 @@ from sononerf_scenes.stool import OUT
 
 from sononerf.errors import SettingsError
 from sononerf.geometry.faults import surface_faults
-from sononerf.scene import load_scene
+from sononerf.scene.scene import load_scene
 
 
 @pytest.mark.parametrize(

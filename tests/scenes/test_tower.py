@@ -5,7 +5,7 @@ from sononerf_scenes.bodies import EDGE
 
 from sononerf.errors import SettingsError
 from sononerf.geometry.faults import surface_faults
-from sononerf.scene import load_scene
+from sononerf.scene.scene import load_scene
 
 
 @pytest.mark.parametrize(("width", "height", "steps"), [(0.09, 0.09, 3), (0.06, 0.1, 2)])

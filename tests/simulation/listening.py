@@ -4,10 +4,10 @@
 import numpy as np
 import trimesh
 
-from sononerf.acoustics.ears import Ears
-from sononerf.acoustics.spectrogram import echo_samples
-from sononerf.config import SpectrogramSettings
-from sononerf.scene import Scene
+from sononerf.head.ears import Ears
+from sononerf.head.spectrogram import echo_samples
+from sononerf.scene.scene import Scene
+from sononerf.settings.schema import SpectrogramSettings
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.impulse_response import plan_synthesis
 from sononerf.simulation.rays import Rays

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from sononerf.scene import Scene, load_scene
+from sononerf.scene.scene import Scene, load_scene
 from sononerf.simulation.arrival import Arrival, silence_before
 from tests.simulation.listening import ball, wall
 
@@ -39,9 +39,9 @@ def test_no_scene_is_heard_more_than_10_mm_before_its_nearest_point(scene, heard
 @pytest.fixture
 def heard_near():
     """Return the highest level (dB above m0) of two poses more than 10 mm before the scene."""
-    from sononerf.acoustics.spectrogram import compress
-    from sononerf.config import validate_settings
     from sononerf.geometry.poses import look_at
+    from sononerf.head.decibels import compress
+    from sononerf.settings.schema import validate_settings
     from sononerf.simulation.simulator import Simulator
 
     def level(scene):

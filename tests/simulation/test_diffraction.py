@@ -7,10 +7,10 @@ import pytest
 import trimesh
 
 from sononerf.geometry.raycast import RayCaster
-from sononerf.material import RIGID
-from sononerf.scene import Scene
+from sononerf.scene.material import RIGID
+from sononerf.scene.scene import Scene
 from sononerf.simulation.diffraction import Diffraction, diffracting_edges, wedge_directivity
-from sononerf.simulation.kirchhoff import Kirchhoff
+from sononerf.simulation.reference.kirchhoff import Kirchhoff
 from sononerf.simulation.reflection import reflection
 from tests.simulation.exact import SPEED, disc_on_axis
 from tests.simulation.listening import (

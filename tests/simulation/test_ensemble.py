@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.config import validate_settings
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
 from sononerf.geometry.poses import Poses, look_at, write_pose_csv
-from sononerf.scene import Scene, load_scene
+from sononerf.scene.scene import Scene, load_scene
+from sononerf.settings.schema import validate_settings
 from sononerf.simulation import ensemble
 from sononerf.simulation.ensemble import (
     check_poses,

@@ -2,10 +2,10 @@
 import numpy as np
 import pytest
 
-from sononerf.acoustics.ears import beam_gain, ear_gain, ear_tables
-from sononerf.acoustics.spectrogram import echo_samples
-from sononerf.config import EarSettings, SpectrogramSettings
 from sononerf.geometry.poses import rotation_from_euler
+from sononerf.head.ears import beam_gain, ear_gain, ear_tables
+from sononerf.head.spectrogram import echo_samples
+from sononerf.settings.schema import EarSettings, SpectrogramSettings
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.impulse_response import plan_synthesis
 

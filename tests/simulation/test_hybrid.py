@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.config import validate_settings
 from sononerf.geometry.poses import look_at
-from sononerf.scene import Scene, load_scene
+from sononerf.scene.scene import Scene, load_scene
+from sononerf.settings.schema import validate_settings
 from sononerf.simulation.hybrid import Hybrid
 from sononerf.simulation.rays import Rays
 from sononerf.simulation.simulator import Simulator

@@ -4,9 +4,9 @@ import itertools
 import numpy as np
 import pytest
 
-from sononerf.acoustics.gains import NOTCH_WIDTH
-from sononerf.acoustics.spectrogram import echo_samples
-from sononerf.config import SpectrogramSettings
+from sononerf.head.gains import NOTCH_WIDTH
+from sononerf.head.spectrogram import echo_samples
+from sononerf.settings.schema import SpectrogramSettings
 from sononerf.simulation import impulse_response
 from sononerf.simulation.impulse_response import air_loss, deposit, plan_synthesis, synthesise
 

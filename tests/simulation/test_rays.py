@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.acoustics.ears import ear_tables
-from sononerf.config import EarSettings
 from sononerf.geometry.directions import CapSpiral
 from sononerf.geometry.poses import look_at, rotation_from_euler
-from sononerf.material import RIGID, Material
-from sononerf.scene import Scene, load_scene
+from sononerf.head.ears import ear_tables
+from sononerf.scene.material import RIGID, Material
+from sononerf.scene.scene import Scene, load_scene
+from sononerf.settings.schema import EarSettings
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.paths import aim
 from tests.simulation.exact import SPEED, rigid_sphere

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from sononerf.material import RIGID, SONOTRACELAB, Material
+from sononerf.scene.material import RIGID, SONOTRACELAB, Material
 from sononerf.simulation.reflection import (
     keep_outside,
     lobe_exponent,

@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.config import validate_settings
-from sononerf.material import RIGID
-from sononerf.scene import Scene
+from sononerf.scene.material import RIGID
+from sononerf.scene.scene import Scene
+from sononerf.settings.schema import validate_settings
 from sononerf.simulation.simulator import Simulator
 from tests.simulation.listening import ball, echoes, hearing, level_db, rays, spectrum, wall
 

@@ -8,16 +8,16 @@ import pytest
 import scipy.signal
 import trimesh
 
-from sononerf.acoustics.air import air_absorption
-from sononerf.acoustics.directivity.sofa_writer import write_sofa
-from sononerf.acoustics.spectrogram import compress
-from sononerf.config import validate_settings
 from sononerf.errors import SettingsError
 from sononerf.geometry.poses import look_at, rotation_from_euler
-from sononerf.material import RIGID, Material
-from sononerf.scene import Scene, load_scene
+from sononerf.head.air import air_absorption
+from sononerf.head.decibels import compress
+from sononerf.head.directivity.sofa_writer import write_sofa
+from sononerf.scene.material import RIGID, Material
+from sononerf.scene.scene import Scene, load_scene
+from sononerf.settings.schema import validate_settings
 from sononerf.simulation.simulator import Simulator
-from tests.acoustics.directivity.patterns import pair
+from tests.head.directivity.patterns import pair
 
 POINT_HEAD = {
     "emitter": [0, 0, 0], "left": [0, 0, 0], "beam_radius": 0, "azimuth_deg": 0,

@@ -5,12 +5,12 @@ import pickle
 import numpy as np
 import pytest
 
-from sononerf.acoustics.air import air_absorption
-from sononerf.acoustics.ears import beam_gain, ear_gain
-from sononerf.config import validate_settings
 from sononerf.errors import ResourceError, SettingsError
 from sononerf.geometry.poses import Poses, look_at
-from sononerf.scene import Scene, load_scene
+from sononerf.head.air import air_absorption
+from sononerf.head.ears import beam_gain, ear_gain
+from sononerf.scene.scene import Scene, load_scene
+from sononerf.settings.schema import validate_settings
 from sononerf.simulation import ensemble as ensemble_module
 from sononerf.simulation import solved as solved_module
 from sononerf.simulation.ensemble import simulate_ensemble

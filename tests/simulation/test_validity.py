@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.scene import Scene, load_scene
+from sononerf.scene.scene import Scene, load_scene
 from sononerf.simulation.validity import SOLVED_DB, expected_error_db
 from tests.simulation.listening import ball
 from tests.simulation.test_hybrid import simulator

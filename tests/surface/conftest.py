@@ -8,11 +8,11 @@ import pytest
 import torch
 import trimesh
 
-from sononerf.config import validate_settings
 from sononerf.geometry.poses import sphere_poses
-from sononerf.scene import Scene
+from sononerf.scene.scene import Scene
+from sononerf.settings.schema import validate_settings
 from sononerf.simulation.simulator import Simulator
-from sononerf.surface.echo_data import Echoes, optics_of
+from sononerf.surface.refine.echo_data import Echoes, optics_of
 
 RADIUS = 0.012
 POSES = 18

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from sononerf.config import load_settings
-from sononerf.scene import load_scene
+from sononerf.scene.scene import load_scene
+from sononerf.settings.schema import load_settings
 from sononerf.simulation.ensemble import ensemble_poses, pose_seed
 from sononerf.simulation.simulator import Simulator
 

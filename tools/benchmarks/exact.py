@@ -30,8 +30,8 @@ def exact(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _heard(scene: str, engine: str, poses: int) -> dict[str, Any]:
     """Return spectrograms (P, E, R, F) of the first test poses, and what goes with them."""
-    from sononerf.config import validate_settings
-    from sononerf.scene import load_scene
+    from sononerf.scene.scene import load_scene
+    from sononerf.settings.schema import validate_settings
     from sononerf.simulation.ensemble import ensemble_poses, pose_seed
     from sononerf.simulation.simulator import Simulator
 
@@ -67,7 +67,7 @@ def _heard(scene: str, engine: str, poses: int) -> dict[str, Any]:
 
 def _before(engine: str, found: dict[str, Any], reference: float) -> dict[str, Any]:
     """Return levels above m0 before the first loud echo, and before the nearest point."""
-    from sononerf.acoustics.spectrogram import compress
+    from sononerf.head.decibels import compress
 
     level, distance = compress(found["magnitude"], reference), found["range"]
     worst, mean, near = 0.0, [], 0.0
@@ -86,7 +86,7 @@ def _before(engine: str, found: dict[str, Any], reference: float) -> dict[str, A
 
 def _errors(found: dict[str, Any], truth: dict[str, Any]) -> dict[str, Any]:
     """Return mean error and bias of cells near the loudest, by band, and over all cells."""
-    from sononerf.acoustics.spectrogram import compress
+    from sononerf.head.decibels import compress
 
     reference = truth["reference"]
     error = compress(found["magnitude"], reference) - compress(truth["magnitude"], reference)

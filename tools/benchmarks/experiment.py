@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from sononerf import __version__, storage
-from sononerf.config import Settings, load_settings
 from sononerf.errors import SonoNerfError
-from sononerf.experiment.run_folder import RunFolder
-from sononerf.experiment.simulate import default_store, echo_hash
-from sononerf.scene import load_scene
+from sononerf.run.run_folder import RunFolder
+from sononerf.run.simulate import default_store, echo_hash
+from sononerf.scene.scene import load_scene
+from sononerf.settings.schema import Settings, load_settings
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "three_spheres.yaml"
 """Nothing but defaults; the scene is laid over it."""

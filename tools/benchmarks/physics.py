@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 def physics(_: argparse.Namespace) -> dict[str, Any]:
     """Compare the engines with a sphere's partial waves, and with each other."""
     from sononerf.geometry.poses import look_at
-    from sononerf.material import RIGID
-    from sononerf.scene import Scene
-    from sononerf.simulation.kirchhoff import Kirchhoff
+    from sononerf.scene.material import RIGID
+    from sononerf.scene.scene import Scene
+    from sononerf.simulation.reference.kirchhoff import Kirchhoff
     from tests.simulation.exact import rigid_sphere
     from tests.simulation.listening import ball, delay, echoes, hearing, level_db, rays, spectrum
     from tests.simulation.listening import wall as wall_at
@@ -73,9 +73,9 @@ def physics(_: argparse.Namespace) -> dict[str, Any]:
 
 def dechirp(_: argparse.Namespace) -> dict[str, Any]:
     """Measure a point echo's rows under sweeps of several lengths, as the tests do."""
-    from sononerf.acoustics.reception import best_window, row_duration
-    from sononerf.config import CallSettings
-    from tests.acoustics.test_reception import ANALYSIS, HOP, analysis, measured
+    from sononerf.head.reception import best_window, row_duration
+    from sononerf.settings.schema import CallSettings
+    from tests.head.test_reception import ANALYSIS, HOP, analysis, measured
 
     rows = []
     for kind, length in itertools.product(("linear", "hyperbolic"), (0.2e-3, 1e-3, 3e-3)):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sononerf import storage
-from sononerf.render.figure import figure, pixels_from_figure, png_from_pixels
+from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
 from tools.benchmarks.experiment import Row, run_series
 
 COUNTS = (12, 25, 50, 100, 200, 400)

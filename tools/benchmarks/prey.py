@@ -13,8 +13,8 @@ from typing import Any
 
 from sononerf import storage
 from sononerf.errors import SonoNerfError
-from sononerf.experiment.compare import compare_runs
-from sononerf.render.figure import figure, pixels_from_figure, png_from_pixels
+from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
+from sononerf.run.compare import compare_runs
 from tools.benchmarks.experiment import Row, aligned, ending, origin, run_experiment
 
 FOUND = 0.01

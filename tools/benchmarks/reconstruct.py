@@ -12,8 +12,8 @@ from pathlib import Path
 import torch
 
 from sononerf import storage
-from sononerf.experiment.fitted import load_fitted
-from sononerf.reconstruction.read_out import reconstruct as read_out
+from sononerf.run.fitted import load_fitted
+from sononerf.surface.start.read_out import reconstruct as read_out
 from tools.benchmarks.experiment import Row, aligned, ending
 from tools.benchmarks.record import keep, ratios
 

@@ -6,11 +6,11 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from sononerf.acoustics.spectrogram import frequency_axis, range_axis
-from sononerf.config import Settings
-from sononerf.data.store import EnsembleStore
-from sononerf.experiment.simulate import HASHED_SECTIONS, echo_hash
-from sononerf.scene import load_scene
+from sononerf.echoes.store import EnsembleStore
+from sononerf.head.spectrogram import frequency_axis, range_axis
+from sononerf.run.simulate import HASHED_SECTIONS, echo_hash
+from sononerf.scene.scene import load_scene
+from sononerf.settings.schema import Settings
 from sononerf.simulation.ensemble import ensemble_poses
 
 UNSCALED = ("ears.notch_depth=0",)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sononerf_scenes.procedural import KINDS
 
-from sononerf.scene import load_scene
+from sononerf.scene.scene import load_scene
 from tools.benchmarks.experiment import Row, run_series
 
 

@@ -13,10 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.acoustics.spectrogram import compress
-from sononerf.config import Settings, validate_settings
-from sononerf.reconstruction.prediction import mae_db
-from sononerf.scene import load_scene
+from sononerf.head.decibels import compress, mae_db
+from sononerf.scene.scene import load_scene
+from sononerf.settings.schema import Settings, validate_settings
 from sononerf.simulation.ensemble import ensemble_poses, pose_seed
 from sononerf.simulation.simulator import Simulator
 

@@ -31,23 +31,23 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from sononerf import storage
 from sononerf.callbacks.threads import ThreadsCallback
-from sononerf.config import Settings, load_settings
-from sononerf.data.datamodule import EchoDataModule
-from sononerf.experiment.build import (
+from sononerf.field.datamodule import EchoDataModule
+from sononerf.field.field import Field
+from sononerf.field.fourier import FourierField
+from sononerf.field.module import EchoModule
+from sononerf.field.shell import ShellRenderer
+from sononerf.progress import Progress
+from sononerf.run.build import (
     acquisition,
     data_for,
     echo_region,
     field_and_renderer,
     module_for,
 )
-from sononerf.experiment.fit import quiet_lightning, require_accelerator
-from sononerf.experiment.simulate import default_store, echo_hash, ensemble
-from sononerf.field.field import Field
-from sononerf.field.fourier import FourierField
-from sononerf.module import EchoModule
-from sononerf.progress import Progress
-from sononerf.renderer.shell import ShellRenderer
-from sononerf.scene import load_scene
+from sononerf.run.fit import quiet_lightning, require_accelerator
+from sononerf.run.simulate import default_store, echo_hash, ensemble
+from sononerf.scene.scene import load_scene
+from sononerf.settings.schema import Settings, load_settings
 from tools.benchmarks.experiment import CONFIG, Row, aligned, ending
 from tools.benchmarks.record import device_name, keep, ratios
 
@@ -218,12 +218,12 @@ def _step(arguments: argparse.Namespace, output: Path) -> str:
     quiet_lightning()
     if arguments.compare is not None:
         storage.read_json(arguments.compare)  # that it cannot be read is told before minutes pass
+    chosen = [_settings(pair, arguments, output) for pair in PAIRS]  # wrong ones cost no minutes
     device = device_name(arguments.accelerator)
     copy = copy_rate(device)
     products = {kind: matrix_rate(device, kind) for kind in ("float32", "bfloat16")}
     rows: list[Row] = []
-    for pair in PAIRS:
-        settings = _settings(pair, arguments, output)
+    for pair, settings in zip(PAIRS, chosen, strict=True):
         rows.append(_measured(pair, settings, arguments.accelerator, products, copy))
         print(f"{pair.name}: {1e3 * rows[-1]['step_s']:.1f} ms", file=sys.stderr, flush=True)
     by_name = {row["name"]: row for row in rows}

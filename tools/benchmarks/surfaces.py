@@ -16,10 +16,10 @@ from typing import Any
 import trimesh
 
 from sononerf import storage
-from sononerf.config import load_settings
-from sononerf.reconstruction.metrics import geometry_metrics
-from sononerf.reconstruction.truth import TrueSurface
-from sononerf.scene import load_scene
+from sononerf.evaluation.metrics import geometry_metrics
+from sononerf.evaluation.true_surface import TrueSurface
+from sononerf.scene.scene import load_scene
+from sononerf.settings.schema import load_settings
 from tools.benchmarks.experiment import (
     CONFIG,
     STOPPED,

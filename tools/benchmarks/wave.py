@@ -32,8 +32,8 @@ def bodies() -> dict[str, Any]:
     """Return the scenes: spheres that are known exactly, a thin leaf, a hollow beaker."""
     import trimesh
 
-    from sononerf.material import RIGID
-    from sononerf.scene import Scene, load_scene
+    from sononerf.scene.material import RIGID
+    from sononerf.scene.scene import Scene, load_scene
     from tests.simulation.listening import ball
 
     places = ((0.01, (0, 0, 0)), (0.008, (0.022, 0.004, 0)), (0.006, (0.006, 0.02, 0.01)))
@@ -61,8 +61,8 @@ def wave(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _heard(scene: Any, engine: str, poses: int) -> dict[str, Any]:
     """Return spectrograms in dB (P, E, R, F), their frequencies, and what they cost."""
-    from sononerf.config import validate_settings
     from sononerf.geometry.poses import sphere_poses
+    from sononerf.settings.schema import validate_settings
     from sononerf.simulation.simulator import Simulator
     from sononerf.simulation.solved import Solved
 

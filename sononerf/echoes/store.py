@@ -1,0 +1,341 @@
+# SPDX-License-Identifier: MIT
+"""The ensemble on disk: what the receivers heard at every pose, each pose whole or not there."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import zarr
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf import storage
+from sononerf.echoes.attributes import plain_attributes, read_attributes, write_group
+from sononerf.echoes.layout import (
+    AXES,
+    SPECTROGRAM,
+    SPLITS,
+    DurableStore,
+    checked_axes,
+    chunk_path,
+    create_arrays,
+    read_axes,
+)
+from sononerf.echoes.manifest import Manifest, PoseRecord
+from sononerf.errors import IncompatibleError, InputError, NumericalError
+
+
+class EnsembleStore:
+    """An ensemble in a zarr v3 group, one chunk per pose; open it with :meth:`open`.
+
+    A pose is committed in two durable steps: its chunk, then its line in the manifest. A
+    process that is killed in between leaves a pose that counts as missing. The same input gives
+    the same bytes, in whatever order the poses come.
+
+    Parameters
+    ----------
+    path : Path
+        The ensemble's folder.
+    mode : {"r", "r+"}
+        Reading, or adding poses too.
+
+    Raises
+    ------
+    InputError
+        If there is no store, or it is damaged.
+    IncompatibleError
+        If another version of the format wrote it.
+    """
+
+    def __init__(self, path: Path, *, mode: Literal["r", "r+"] = "r") -> None:
+        self.path = path
+        self.mode = mode
+        if not (path / "zarr.json").is_file():
+            raise InputError(f"{path}: no ensemble store; make one with `sononerf simulate`")
+        self._attributes = read_attributes(path)
+        try:
+            store = DurableStore(path, read_only=mode == "r")
+            group = zarr.open_group(store, mode=mode, zarr_format=3, use_consolidated=False)
+        except Exception as error:  # damaged metadata raises whatever its parser met first
+            raise InputError(f"{path}: damaged ({type(error).__name__}: {error})") from error
+        self._axes, self._spectrogram = read_axes(path, group)
+        self._manifest = Manifest(path)
+        self._records = self._manifest.read()
+        if mode == "r+":
+            storage.clean_leftovers(path)
+            storage.clean_leftovers(path / SPECTROGRAM)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _reopen, (self.path, self.mode)
+
+    @classmethod
+    def open(cls, path: Path, *, mode: Literal["r", "r+"] = "r") -> EnsembleStore:
+        """Open a store; see the class."""
+        return cls(path, mode=mode)
+
+    @classmethod
+    def create(
+        cls,
+        path: Path,
+        *,
+        poses_positions: ArrayLike,
+        poses_rotations: ArrayLike,
+        split: ArrayLike,
+        range: ArrayLike,  # noqa: A002 - the axis is called so
+        frequency: ArrayLike,
+        attributes: dict[str, Any],
+        receivers: int = 2,
+    ) -> EnsembleStore:
+        """Make a store with its axes and poses whole, or open the same one for more poses.
+
+        The group's own file comes last, so that a half-made store is none.
+
+        Parameters
+        ----------
+        path : Path
+            A folder that is a store, is empty, or is not there.
+        poses_positions : (P, 3) float, m
+            Head positions, world frame.
+        poses_rotations : (P, 3, 3) float
+            Head to world.
+        split : (P,) int
+            0 train, 1 validation, 2 test.
+        range : (R,) float, m
+            One-way distances of the slices.
+        frequency : (F,) float, Hz
+            Frequencies of the bins.
+        attributes : dict
+            Plain data; ``echo_hash`` tells ensembles apart.
+        receivers : int
+            Number E of receivers.
+
+        Raises
+        ------
+        IncompatibleError
+            If the folder holds another ensemble.
+        InputError
+            If shapes do not fit one another, or the folder holds something else.
+        NumericalError
+            If an axis or an attribute is NaN or infinite.
+        StorageError
+            If it cannot be written.
+        """
+        axes = checked_axes(
+            position=poses_positions,
+            rotation=poses_rotations,
+            split=split,
+            range=range,
+            frequency=frequency,
+        )
+        plain = plain_attributes(path, attributes)
+        if not (path / "zarr.json").exists():
+            _refuse_foreign(path)
+            storage.make_folder(path)
+            storage.clean_leftovers(path)
+            create_arrays(path, axes, receivers)
+            write_group(path, plain)
+        store = cls(path, mode="r+")
+        if store.attributes.get("echo_hash") != plain.get("echo_hash"):
+            raise IncompatibleError(
+                f"{path}: holds echoes of other settings; choose another folder, or --overwrite"
+            )
+        for name, values in axes.items():
+            if not np.array_equal(values, store._axes[name]):
+                raise IncompatibleError(
+                    f"{path}: its {name} differs; choose another folder, or --overwrite"
+                )
+        if store.receivers != receivers:
+            raise IncompatibleError(
+                f"{path}: holds {store.receivers} receivers, expected {receivers}; choose another "
+                "folder, or --overwrite"
+            )
+        return store
+
+    def __len__(self) -> int:
+        return len(self._axes["position"])
+
+    @property
+    def positions(self) -> NDArray[np.float64]:
+        """Head positions, (P, 3), m, world frame."""
+        return self._axes["position"].copy()
+
+    @property
+    def rotations(self) -> NDArray[np.float64]:
+        """Head to world, (P, 3, 3)."""
+        return self._axes["rotation"].copy()
+
+    @property
+    def split(self) -> NDArray[np.int8]:
+        """What each pose is for, (P,): 0 train, 1 validation, 2 test."""
+        return self._axes["split"].copy()
+
+    @property
+    def range(self) -> NDArray[np.float64]:
+        """One-way distances of the slices, (R,), m."""
+        return self._axes["range"].copy()
+
+    @property
+    def frequency(self) -> NDArray[np.float64]:
+        """Frequencies of the bins, (F,), Hz."""
+        return self._axes["frequency"].copy()
+
+    @property
+    def receivers(self) -> int:
+        """Number of receivers."""
+        return int(self._spectrogram.shape[1])
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """What the ensemble says of itself, a copy: settings, versions, units, c, m0 ..."""
+        return dict(self._attributes)
+
+    def indices(self, split: Literal["train", "val", "test"]) -> NDArray[np.int64]:
+        """Return the numbers of a split's poses, in order."""
+        if split not in SPLITS:
+            raise InputError(f"split {split!r}: there are {', '.join(SPLITS)}")
+        return np.flatnonzero(self.split == SPLITS[split])
+
+    def update_attributes(self, **values: Any) -> None:
+        """Set attributes, all at once or, if the process dies, none.
+
+        Raises
+        ------
+        NumericalError
+            If a value is NaN or infinite.
+        StorageError
+            If it cannot be written.
+        """
+        self._refuse_reading()
+        plain = plain_attributes(self.path, {**self._attributes, **values})
+        write_group(self.path, plain)
+        self._attributes = plain
+
+    def write_pose(self, index: int, spectrogram: ArrayLike) -> None:
+        """Commit one pose.
+
+        Parameters
+        ----------
+        index : int
+            Number of the pose.
+        spectrogram : (E, R, F) float32
+            Linear magnitude.
+
+        Raises
+        ------
+        InputError
+            If there is no such pose, or the shape is another.
+        NumericalError
+            If a value is NaN or infinite.
+        StorageError
+            If it cannot be written; the pose then counts as missing.
+        """
+        self._refuse_reading()
+        self._refuse_unknown(index)
+        values = np.ascontiguousarray(spectrogram, dtype="<f4")
+        if values.shape != self._spectrogram.shape[1:]:
+            raise InputError(
+                f"{self.path}: pose {index} has shape {values.shape}, "
+                f"expected (receivers, ranges, frequencies) {self._spectrogram.shape[1:]}"
+            )
+        if not np.isfinite(values).all():
+            raise NumericalError(f"{self.path}: pose {index} holds NaN or infinite magnitudes")
+        self._spectrogram[index] = values
+        size = self._chunk(index).stat().st_size
+        record = PoseRecord(size, _sha256(values))
+        self._manifest.add(index, record)
+        self._records[index] = record
+
+    def read_pose(self, index: int) -> NDArray[np.float32]:
+        """Return one pose's magnitude, (E, R, F), verified.
+
+        Raises
+        ------
+        InputError
+            If the pose is missing or damaged.
+        """
+        self._refuse_unknown(index)
+        if index not in self._records:  # another process may have added it since
+            self._records = self._manifest.read()
+        record = self._records.get(index)
+        way_out = "give the same simulate command again"
+        if record is None or not self._chunk(index).is_file():
+            raise InputError(f"{self.path}: pose {index} is missing; {way_out}")
+        try:
+            values = np.array(self._spectrogram[index], dtype=np.float32, order="C")
+        except Exception as error:  # zarr's codecs raise their own kinds
+            raise InputError(
+                f"{self.path}: pose {index} is damaged ({error}); {way_out}"
+            ) from error
+        if _sha256(values) != record.sha256:
+            raise InputError(f"{self.path}: pose {index} is damaged (SHA-256); {way_out}")
+        return values
+
+    def missing(self) -> list[int]:
+        """Return the poses that are not there, or whose file has another size than recorded."""
+        self._records = self._manifest.read()
+        return [index for index in np.arange(len(self)).tolist() if not self._is_there(index)]
+
+    def check(self) -> list[str]:
+        """Read everything and return what is wrong, one line each; nothing where all is well."""
+        try:
+            fresh = EnsembleStore(self.path)
+        except (InputError, IncompatibleError) as error:
+            return [str(error)]
+        faults = []
+        for index in np.arange(len(fresh)).tolist():
+            try:
+                fresh.read_pose(index)
+            except InputError as error:
+                faults.append(str(error))
+        return faults
+
+    def seal(self) -> None:
+        """Compact the journal of finished poses into ``manifest.json``.
+
+        Raises
+        ------
+        StorageError
+            If it cannot be written.
+        """
+        self._refuse_reading()
+        self._manifest.seal()
+
+    def _chunk(self, index: int) -> Path:
+        return chunk_path(self.path, SPECTROGRAM, (index, 0, 0, 0))
+
+    def _is_there(self, index: int) -> bool:
+        record = self._records.get(index)
+        try:
+            return record is not None and self._chunk(index).stat().st_size == record.size
+        except OSError:
+            return False
+
+    def _refuse_reading(self) -> None:
+        if self.mode == "r":
+            raise InputError(f"{self.path}: opened for reading; open it with mode='r+'")
+
+    def _refuse_unknown(self, index: int) -> None:
+        if not 0 <= index < len(self):
+            raise InputError(f"{self.path}: no pose {index}; there are 0 to {len(self) - 1}")
+
+
+def _reopen(path: Path, mode: Literal["r", "r+"]) -> EnsembleStore:
+    return EnsembleStore(path, mode=mode)
+
+
+def _sha256(values: NDArray[np.float32]) -> str:
+    return hashlib.sha256(values.astype("<f4", copy=False).tobytes()).hexdigest()
+
+
+def _refuse_foreign(path: Path) -> None:
+    """Refuse a folder that holds anything but what a half-made store may hold."""
+    if not path.exists():
+        return
+    if not path.is_dir():
+        raise InputError(f"{path}: is a file, expected a folder; choose another")
+    ours = {*AXES, SPECTROGRAM}
+    foreign = sorted(p.name for p in path.iterdir() if p.name not in ours and p.name[0] != ".")
+    if foreign:
+        raise InputError(f"{path}: holds {foreign[0]!r} and is no ensemble store; choose another")

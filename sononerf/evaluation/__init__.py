@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Prediction, metrics, baselines and the true surface."""

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: MIT
+"""What is heard of one scene and not of another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sononerf.errors import NumericalError
+from sononerf.surface.start.volume import Volume
+
+Array = NDArray[np.float64]
+SAME = 1e-6
+"""Triangles are the same where their corners' mean lies no farther apart, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two volumes over their common maximum, and what remains of one without the other.
+
+    Attributes
+    ----------
+    first, second : Volume
+        0 to 1, on one grid.
+    difference : Volume
+        First without second.
+    strongest : (3,) float or None, m
+        Where the difference is greatest; None where it is nowhere above zero.
+    score : float
+        How great it is at most: part of the common maximum.
+    """
+
+    first: Volume
+    second: Volume
+    difference: Volume
+    strongest: Array | None
+    score: float
+
+
+def compare(first: Volume, second: Volume) -> Comparison:
+    """Compare two volumes, place by place.
+
+    Parameters
+    ----------
+    first, second : Volume
+        What is heard from each place, on one grid.
+
+    Returns
+    -------
+    comparison : Comparison
+
+    Raises
+    ------
+    ValueError
+        If the grids differ.
+    NumericalError
+        If both are silent.
+    """
+    alike = first.shape == second.shape and np.allclose(first.origin, second.origin)
+    if not alike or first.spacing != second.spacing:
+        raise ValueError("the two volumes have different grids")
+    most = max(float(first.values.max()), float(second.values.max()))
+    if not most > 0:
+        raise NumericalError("nothing to compare: both are silent")
+    one, other = (volume.with_values(volume.values / most) for volume in (first, second))
+    difference = first.with_values(one.values - other.values)
+    index = np.unravel_index(int(difference.values.argmax()), difference.shape)
+    score = float(difference.values[index])
+    # Where nothing is stronger the greatest value lies anywhere, often in a corner.
+    strongest = difference.origin + difference.spacing * np.array(index) if score > 0 else None
+    return Comparison(one, other, difference, strongest, score)
+
+
+def added_part(mesh: trimesh.Trimesh, without: trimesh.Trimesh) -> trimesh.Trimesh | None:
+    """Return what a true surface has and another one has not; None where that is nothing.
+
+    Parameters
+    ----------
+    mesh, without : Trimesh
+        Metres, one world frame; equal parts are equal triangle for triangle.
+    """
+    if not len(without.faces):
+        return mesh
+    distance, _ = cKDTree(without.triangles_center).query(mesh.triangles_center)
+    added = np.flatnonzero(distance > SAME)
+    return mesh.submesh([added], append=True) if len(added) else None

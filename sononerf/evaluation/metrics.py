@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: MIT
+"""How close a reconstructed surface is to the true one."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sononerf.evaluation.nearest import Nearest
+from sononerf.evaluation.prediction import prediction_metrics
+from sononerf.evaluation.shared_volume import volumes
+from sononerf.evaluation.solid import (
+    Solid,
+    count_parts,
+    outer_surface,
+    sample_outer_surface,
+    sample_surface,
+    solid_from_mesh,
+)
+from sononerf.evaluation.true_surface import TrueSurface
+from sononerf.head.decibels import mae_db
+
+__all__ = [
+    "geometry_metrics",
+    "mae_db",
+    "outer_surface",
+    "prediction_metrics",
+    "sample_outer_surface",
+    "target_metrics",
+]
+
+
+def geometry_metrics(
+    reconstructed: trimesh.Trimesh,
+    truth: trimesh.Trimesh | TrueSurface,
+    *,
+    samples: int = 100_000,
+    seed: int = 0,
+    thresholds: tuple[float, ...] = (0.001, 0.002, 0.005),
+) -> dict[str, Any]:
+    """Compare a reconstructed surface with the true one.
+
+    The true surface is the outer surface of the solid union of the true bodies. Of the
+    reconstruction all surface counts, a wall inside it too. Distances are exact, from area-uniform
+    samples of the one surface to the triangles of the other.
+
+    Parameters
+    ----------
+    reconstructed : Trimesh
+        Metres, world frame.
+    truth : Trimesh or TrueSurface
+        Likewise; where several are compared with it, the latter.
+    samples : int
+        Points drawn from each surface.
+    seed : int
+        The same seed gives the same numbers.
+    thresholds : tuple of float, m
+        Distances at which the F-score is taken.
+
+    Returns
+    -------
+    metrics : dict
+        ``chamfer_m``
+            Mean of the two mean distances.
+        ``fscore``
+            Per threshold, as ``"0.005"``: harmonic mean of the shares of the reconstruction near
+            the truth and of the truth near the reconstruction.
+        ``thickness_bias_m``
+            Mean signed distance of the reconstruction from the truth, positive outside; None where
+            the truth is open.
+        ``volume_ratio``, ``iou``
+            Volume over true volume, shared volume over united volume; None where either is open.
+        ``normal_consistency``
+            Mean cosine between the normals, without sign, of each sample and its nearest sample of
+            the other surface, both ways.
+        ``components``, ``components_true``
+            Connected parts with more than 1 % of the largest one's area.
+
+    Raises
+    ------
+    ValueError
+        If ``samples`` is not positive.
+    NumericalError
+        If a mesh is empty or not finite.
+    """
+    if samples < 1:
+        raise ValueError(f"samples: {samples}, expected 1 or more")
+    true = truth if isinstance(truth, TrueSurface) else TrueSurface(truth)
+    found = solid_from_mesh(reconstructed, drop_cavities=False)
+    surface = trimesh.util.concatenate(found.parts)
+    true_points, true_normals = true.samples(samples, seed)
+    points, face = sample_surface(surface, samples, np.random.default_rng([seed, 1]))
+    normals = np.asarray(surface.face_normals)[face]
+    to_truth = true.nearest.distance(points)
+    to_found = Nearest(surface).distance(true_points)
+    return {
+        "chamfer_m": float(to_truth.mean() + to_found.mean()) / 2,
+        "fscore": {f"{limit:g}": _fscore(to_truth, to_found, limit) for limit in thresholds},
+        "thickness_bias_m": _thickness_bias(true.solid, points, to_truth),
+        **_volume_metrics(found, true.solid),
+        "normal_consistency": _normal_consistency(points, normals, true_points, true_normals),
+        "components": count_parts(found),
+        "components_true": true.components,
+    }
+
+
+def target_metrics(
+    reconstructed: trimesh.Trimesh,
+    target: trimesh.Trimesh,
+    background: trimesh.Trimesh,
+    *,
+    samples: int = 100_000,
+    seed: int = 0,
+    thresholds: tuple[float, ...] = (0.001, 0.002, 0.005),
+) -> dict[str, Any]:
+    """Compare a reconstruction of a target amid surroundings with the target alone.
+
+    Of the reconstruction counts what lies nearer to the true target than to the true surroundings;
+    else as :func:`geometry_metrics`.
+
+    Parameters
+    ----------
+    reconstructed, target, background : Trimesh
+        Metres, world frame.
+    samples : int
+        Points drawn from each surface.
+    seed : int
+        The same seed gives the same numbers.
+    thresholds : tuple of float, m
+        Distances at which the F-score is taken.
+
+    Returns
+    -------
+    metrics : dict
+        ``share``
+            The part of the reconstructed surface that counts.
+        ``chamfer_m``, ``fscore``
+            None and 0 where no part of it does.
+
+    Raises
+    ------
+    ValueError
+        If ``samples`` is not positive.
+    NumericalError
+        If a mesh is empty or not finite.
+    """
+    if samples < 1:
+        raise ValueError(f"samples: {samples}, expected 1 or more")
+    true = TrueSurface(target)
+    surface = trimesh.util.concatenate(solid_from_mesh(reconstructed, drop_cavities=False).parts)
+    points, face = sample_surface(surface, samples, np.random.default_rng([seed, 1]))
+    around = Nearest(background)
+    to_truth = true.nearest.distance(points)
+    counts = to_truth <= around.distance(points)
+    found: dict[str, Any] = {"share": float(counts.mean())}
+    if not counts.any():
+        return {**found, "chamfer_m": None, "fscore": {f"{limit:g}": 0.0 for limit in thresholds}}
+    to_truth = to_truth[counts]
+    # Whole triangles, by their middles and samples: the border is as coarse as the mesh.
+    middles = np.asarray(surface.triangles_center)
+    kept = true.nearest.distance(middles) <= around.distance(middles)
+    kept[face[counts]] = True
+    part = trimesh.Trimesh(surface.vertices, surface.faces[kept], process=False)
+    to_found = Nearest(part).distance(true.samples(samples, seed)[0])
+    return {
+        **found,
+        "chamfer_m": float(to_truth.mean() + to_found.mean()) / 2,
+        "fscore": {f"{limit:g}": _fscore(to_truth, to_found, limit) for limit in thresholds},
+    }
+
+
+def _fscore(to_truth: NDArray[np.float64], to_found: NDArray[np.float64], limit: float) -> float:
+    precision, recall = float((to_truth <= limit).mean()), float((to_found <= limit).mean())
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+def _thickness_bias(
+    true: Solid, points: NDArray[np.float64], to_truth: NDArray[np.float64]
+) -> float | None:
+    if not true.closed:
+        return None
+    # The sign comes from the closed bodies: the outer surface is open along its seams.
+    return float(np.where(true.contains(points), -to_truth, to_truth).mean())
+
+
+def _volume_metrics(found: Solid, true: Solid) -> dict[str, float | None]:
+    if not (found.closed and true.closed):
+        return {"volume_ratio": None, "iou": None}
+    volume, true_volume, shared = volumes(found, true)
+    if not true_volume > 0:
+        return {"volume_ratio": None, "iou": None}
+    return {
+        "volume_ratio": volume / true_volume,
+        "iou": shared / (volume + true_volume - shared),
+    }
+
+
+def _normal_consistency(
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    true_points: NDArray[np.float64],
+    true_normals: NDArray[np.float64],
+) -> float:
+    there, back = _nearest_of(true_points, points), _nearest_of(points, true_points)
+    forward = np.abs((normals * true_normals[there]).sum(axis=1)).mean()
+    backward = np.abs((true_normals * normals[back]).sum(axis=1)).mean()
+    return float(forward + backward) / 2
+
+
+def _nearest_of(points: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Return which of the points is nearest to each place, (N,)."""
+    # Neighbours one after another: what one needs of the tree is still at hand for the next.
+    cells = ((places - places.min(axis=0)) / max(float(np.ptp(places)), 1e-12) * 64).astype(np.intp)
+    order = np.lexsort(cells.T)
+    found = np.zeros(len(places), np.intp)
+    found[order] = cKDTree(points).query(places[order])[1]
+    return found

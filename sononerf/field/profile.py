@@ -1,0 +1,472 @@
+# SPDX-License-Identifier: MIT
+"""What the ear really measures: a fine range profile seen through the analysis window."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+import torch
+import torch.nn.functional as F
+from pydantic import Field as Option
+from torch import Tensor, nn
+
+from sononerf.field.field import Field
+from sononerf.field.range_bins import Deposit, Window
+from sononerf.field.renderer import Acquisition, Possible, Renderer, look_up
+
+KERNEL_SKIRT = 31e-6
+"""The kernel reaches so much further than the window, s: beam and ears lengthen an echo."""
+KERNEL_FLOOR = -9.0
+"""What the squared kernel starts with beyond the window, as a natural logarithm."""
+UNEVEN_FLOOR = -14.0
+"""The same of a kernel with two different sides: it is many times longer, and so much would sum up
+to a twentieth of an echo's energy."""
+
+
+COHERENT_AFTER = 0.5
+"""Mode ``coherent`` sums with phase after this share of the fit: before, it would find no way."""
+
+
+OPAQUE = 0.05
+"""A place casts a shadow where it has this part of the strongest energy in its surroundings."""
+FREE = 0.012
+"""So far in front of a place nothing shades it, m: a surface is some places thick."""
+
+
+class ProfileRenderer(Renderer):
+    r"""Power of a fine range profile, seen through the squared analysis window.
+
+    .. math::
+        S_e(f, r)^2 = n_f^2 + g^2 \sum_i W_f(r - r_i)\, |\rho(x_i, u_i, f)|^2
+        \frac{B(f)^2 E_e(f)^2 e^{-2 \alpha_f (d_i + d_i^e)}}{(d_i\, d_i^e)^2}
+
+    The sum runs over the vertices of a lattice that are still alive. Each is deposited, linearly
+    between two bins, at :math:`r_i = (d_i + d_i^e) / 2`, emitter and ear at their true places,
+    so both ears hear it at their own time; of a sweep each row hears it by the row's lag farther
+    off. Spreading and absorption are known physics and stay out of the field. The kernel
+    :math:`W_f` starts as the square of a point echo in its row, the analysis window or what that
+    makes of a sweep, and is learned on; it has two equal sides where the point echoes have.
+    Summing power ignores interference between glints inside one window. Mode ``coherent`` sums
+    pressures instead, each with the phase of its own way, through the root of the kernel:
+
+    .. math::
+        S_e(f, r)^2 = n_f^2 + g^2 \left|\sum_i \sqrt{W_f(r - r_i)}\, \rho(x_i, u_i, f)
+        \frac{B(f) E_e(f) e^{-\alpha_f (d_i + d_i^e)}}{d_i\, d_i^e} e^{-4 \pi j f r_i / c}\right|^2
+
+    Parameters
+    ----------
+    region : (2, 3) float, m
+        Lower and upper corner of the box that holds the field.
+    acquisition : Acquisition
+        How the measured spectra came to be.
+    mode : {"power", "coherent"}
+        What is summed. ``coherent`` costs about twice as much, starts as ``power``, and asks for
+        places that are right to a fraction of a wavelength.
+    occlusion : bool
+        Whether strong places hide from a pose what lies behind them. Where lobes are learned from
+        all around they have learned that already.
+    oversampling : int
+        Bins of the profile per range slice.
+    points : int
+        How many places a step evaluates at most; more are drawn by their running energy.
+    uniform : float
+        Share of the drawn places that are drawn uniformly.
+    start : int
+        How many places the first lattice may have. It is as often twice as coarse as the field
+        as that takes, and is refined around what is alive.
+    prune_every : int
+        Steps between two looks at which places are alive, and whether the lattice is refined;
+        0 never does.
+    prune_below : float
+        Places weaker than this part of the strongest in their surroundings are dropped.
+    surroundings : float
+        How far "surroundings" reaches, range resolutions: some of them, so that a part has its own
+        strongest place, and not a fraction of one, where all of a blur would stay.
+    """
+
+    lattice: Tensor
+    alive: Tensor
+    opaque: Tensor
+    energy: Tensor
+    spacing: Tensor
+    absorption: Tensor
+    lag: Tensor | None
+    phased: Tensor
+    wave: Tensor
+
+    def __init__(
+        self,
+        region: Tensor,
+        acquisition: Acquisition,
+        *,
+        mode: Literal["power", "coherent"] = "power",
+        occlusion: bool = False,
+        oversampling: Annotated[int, Option(ge=1, le=16)] = 2,
+        points: Annotated[int, Option(ge=1)] = 25_000,
+        uniform: Annotated[float, Option(gt=0, le=1)] = 0.4,
+        start: Annotated[int, Option(ge=1)] = 12_000,
+        prune_every: Annotated[int, Option(ge=0)] = 100,
+        prune_below: Annotated[float, Option(ge=0, lt=1)] = 1e-6,
+        surroundings: Annotated[float, Option(gt=0)] = 5.0,
+    ) -> None:
+        super().__init__(region, acquisition)
+        self.points, self.uniform, self.start = points, uniform, start
+        self.prune_every, self.prune_below = prune_every, prune_below
+        self.surroundings = surroundings * _resolution(acquisition)
+        self.occlusion = occlusion
+        self._turned = False
+        self._summed = (torch.zeros(0), -1, False)  # phased, as of when, and what it said
+        self.oversampling = oversampling
+        self.mode = mode
+        self.register_buffer("phased", torch.zeros(()))
+        self.register_buffer(
+            "wave", 4 * math.pi * acquisition.frequency / acquisition.speed_of_sound
+        )
+        step = float(acquisition.range[1] - acquisition.range[0])
+        self.bin = step / oversampling
+        per_sample = acquisition.speed_of_sound / acquisition.sampling_rate / 2
+        self._even = torch.allclose(acquisition.window, acquisition.window.flip(1))
+        # A row that is not swept has no middle. Of uneven ones the middle may not be the greatest.
+        window = acquisition.window.clamp(1e-6, 1.0 if self._even else None)
+        last = window.shape[1] - 1
+        half = last / 2
+        reach = math.ceil((half + KERNEL_SKIRT * acquisition.sampling_rate) * per_sample / self.bin)
+        offsets = half - torch.arange(reach + 1) * self.bin / per_sample  # from the middle down
+        left = offsets.floor().long().clamp(0, last - 1)
+        part = offsets - left
+        floor = KERNEL_FLOOR if self._even else UNEVEN_FLOOR
+        sides = []
+        for side in (window,) if self._even else (window, window.flip(1)):
+            between = side[:, left] * (1 - part) + side[:, left + 1] * part
+            skirt = (2 * between.log()).clamp_min(floor)
+            sides.append(torch.where(offsets >= 0, skirt, floor).float()[:, 1:])
+        self.log_kernel = nn.Parameter(torch.cat(sides, dim=1))
+        self._taps = 2 * reach + 1
+        self.first = float(acquisition.range[0]) - reach * self.bin
+        self.register_buffer("absorption", acquisition.absorption.clone())
+        self.register_buffer("lag", acquisition.lag)
+        self.log_spectrum = nn.Parameter(torch.zeros(len(acquisition.frequency)))
+        self.log_noise = nn.Parameter(torch.full((len(acquisition.frequency),), -16.0))
+        self.register_buffer("lattice", torch.zeros(0, 3))
+        self.register_buffer("alive", torch.zeros(0, dtype=torch.bool))
+        self.register_buffer("energy", torch.zeros(0))
+        self.register_buffer("opaque", torch.zeros(0, dtype=torch.bool))
+        self.register_buffer("spacing", torch.zeros(()))
+        self._living = (self.alive, -1, self.lattice)  # which, as of when, and where they are
+
+    def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        # The lattice's size is found by the fit, so a loaded one replaces ours whole.
+        for name in ("lattice", "alive", "opaque", "energy"):
+            if prefix + name in state_dict:
+                found = getattr(self, name).new_zeros(state_dict[prefix + name].shape)
+                setattr(self, name, found)
+        super()._load_from_state_dict(state_dict, prefix, *rest)
+
+    @property
+    def places_per_pose(self) -> int | None:
+        """How many places a step evaluates per pose."""
+        return min(len(self._there()), self.points) if len(self.alive) else None
+
+    @property
+    def _sums_phase(self) -> bool:
+        """What ``phased`` says, asked for only where it has changed."""
+        phased, version, said = self._summed
+        if phased is not self.phased or version != self.phased._version:
+            said = bool(self.phased)
+            self._summed = (self.phased, self.phased._version, said)
+        return said
+
+    def advance(self, step: int, total: int) -> None:
+        """Sum with phase from some step on, if at all."""
+        self._turned = (
+            self.mode == "coherent" and not self._sums_phase and step >= COHERENT_AFTER * total
+        )
+        if self._turned:
+            self.phased.fill_(1.0)
+
+    @torch.no_grad()
+    def prepare(self, field: Field, possible: Possible | None, step: int) -> bool:
+        """Lay the lattice at the first step; drop what has no energy and refine every so often."""
+        if not len(self.lattice):
+            self._lay(field, possible)
+            return True
+        if not self.prune_every or not step or step % self.prune_every:
+            return self._turned
+        self._prune(field)
+        field.keep(self.lattice[self.alive], float(self.spacing))
+        if float(self.spacing) > 1.5 * field.resolution:
+            self._refine(possible)
+            field.keep(self.lattice, float(self.spacing))
+            return True
+        return self._turned
+
+    def _lay(self, field: Field, possible: Possible | None) -> None:
+        """Begin as finely as ``start`` allows; to ask about every fine place would take long."""
+        spacing = field.resolution
+        while len(lattice_over(self.region, spacing)) > (4 if possible else 1) * self.start:
+            spacing *= 2
+        while True:
+            places = lattice_over(self.region, spacing)
+            if possible is not None:
+                places = places[possible(places, spacing * math.sqrt(3) / 2)]
+            if spacing <= field.resolution or 8 * len(places) > self.start:
+                break
+            spacing /= 2
+        self._replace(places, spacing)
+        field.keep(self.lattice, spacing)
+
+    def _refine(self, possible: Possible | None) -> None:
+        """Halve the spacing around what is alive."""
+        half = float(self.spacing) / 2
+        cell = ((self.lattice[self.alive] - self.region[0]) / half).round().long()
+        steps = torch.arange(-1, 2, device=cell.device)
+        around = torch.cartesian_prod(steps, steps, steps)
+        size = ((self.region[1] - self.region[0]) / half + 1e-3).floor().long() + 1
+        cells = (cell[:, None] + around).reshape(-1, 3)
+        cells = cells[((cells >= 0) & (cells < size)).all(dim=1)]
+        # As one number each: rows are sorted a hundred times slower.
+        flat = ((cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]).unique()
+        line, plane = flat % (size[1] * size[2]), flat // (size[1] * size[2])
+        cells = torch.stack((plane, line // size[2], line % size[2]), dim=1)
+        places = self.region[0] + cells * half
+        if possible is not None:
+            places = places[possible(places, half * math.sqrt(3) / 2)]
+        self._replace(places, half)
+
+    def _replace(self, places: Tensor, spacing: float) -> None:
+        self.lattice = places
+        self.alive = places.new_ones(len(places), dtype=torch.bool)
+        self.opaque = torch.zeros_like(self.alive)
+        self.energy = places.new_ones(len(places))
+        self.spacing = self.spacing.new_tensor(spacing)
+
+    def _prune(self, field: Field) -> None:
+        energy = field.oriented(self.lattice[self.alive], 32)[0]
+        self.energy = torch.zeros_like(self.energy).masked_scatter(self.alive, energy)
+        # The strongest of the surroundings, judged on coarse cubes and their neighbours, so
+        # that far and weak parts are not starved by a loud one.
+        cell = ((self.lattice - self.region[0]) / self.surroundings).long().clamp_min(0)
+        size = (cell.amax(0) + 1).tolist()
+        flat = (cell[:, 2] * size[1] + cell[:, 1]) * size[0] + cell[:, 0]
+        most = self.energy.new_zeros(size[0] * size[1] * size[2])
+        most = most.scatter_reduce(0, flat, self.energy, "amax").reshape(1, 1, *size[::-1])
+        most = F.max_pool3d(most, 3, 1, 1).reshape(-1)[flat]
+        self.alive = self.alive & (self.energy > self.prune_below * most)
+        self.opaque = self.alive & (self.energy > OPAQUE * most)
+
+    def _hidden(self, places: Tensor, towards: Tensor, way: Tensor) -> Tensor:
+        """Return which of (M, 3) places have an opaque one within (M,) m towards (M, 3)."""
+        if not bool(self.opaque.any()):
+            return torch.zeros(len(places), dtype=torch.bool, device=places.device)
+        size = ((self.region[1] - self.region[0]) / self.spacing).round().long() + 1
+        stride = torch.stack((size[1] * size[2], size[2], torch.ones_like(size[2])))
+        shadow = torch.zeros(int(size.prod()), dtype=torch.bool, device=places.device)
+        cell = ((self.lattice[self.opaque] - self.region[0]) / self.spacing).round().long()
+        shadow[(cell.clamp(min=0).minimum(size - 1) * stride).sum(-1)] = True
+        length = float((self.region[1] - self.region[0]).norm())
+        hidden = torch.zeros(len(places), dtype=torch.bool, device=places.device)
+        free = FREE + float(self.spacing) * math.sqrt(3) / 2  # a place stands for its cell
+        for far in torch.arange(free, length, float(self.spacing)).tolist():
+            cell = ((places + far * towards - self.region[0]) / self.spacing).round().long()
+            inside = ((cell >= 0) & (cell < size)).all(dim=-1)
+            if not bool(inside.any()):
+                break
+            index = (cell.clamp(min=0).minimum(size - 1) * stride).sum(-1)
+            hidden |= inside & (far < way) & shadow[index]
+        return hidden
+
+    def _there(self) -> Tensor:
+        """Return the places that are alive, (L, 3): the same tensor until others are."""
+        alive, version, places = self._living
+        if alive is not self.alive or version != alive._version:
+            # Validation may come first, and what it makes is of no use to a gradient.
+            with torch.inference_mode(False):
+                places = self.lattice[self.alive]
+            self._living = (self.alive, self.alive._version, places)
+        return places
+
+    def _draw(self) -> tuple[Tensor | None, Tensor | None]:
+        """Return which of the places alive are this step's, and their weights; None for all."""
+        if not self.training or len(self._there()) <= self.points:
+            return None, None
+        energy = self.energy[self.alive]
+        share = (1 - self.uniform) * energy / energy.sum() + self.uniform / len(energy)
+        drawn = torch.multinomial(share, self.points, replacement=True)
+        return drawn, 1.0 / (share[drawn] * self.points)
+
+    def forward(
+        self,
+        field: Field,
+        position: Tensor,
+        rotation: Tensor,
+        rows: Tensor,
+        bins: Tensor | None = None,
+    ) -> Tensor:
+        """Render; see the base class. Differentiable in the field, gain, spectrum and noise."""
+        which, weight = self._draw()
+        if bins is None:
+            bins = torch.arange(len(self.frequency), device=self.frequency.device)
+        profile, slices = self._profile(field, which, weight, position, rotation, bins)
+        phased = self._sums_phase
+        half = (self.log_kernel.index_select(0, bins) / (2 if phased else 1)).exp()
+        before, after = (half, half) if self._even else half.chunk(2, dim=1)
+        # A place nearer than a slice is heard there after its own time.
+        kernel = torch.cat((after.flip(1), torch.ones_like(half[:, :1]), before), dim=1)
+        heard = Window.apply(profile, kernel, self.oversampling)  # (1 or 2, E, B, P, n)
+        heard = heard.square().sum(0) if phased else heard[0]
+        heard = F.pad(heard, (slices.start, len(self.range) - slices.stop))
+        gain = (2 * (self.log_gain + self.log_spectrum[bins])).exp()
+        noise = (2 * self.log_noise[bins]).exp()
+        heard = torch.addcmul(noise[:, None, None], heard, gain[:, None, None])
+        heard = heard.permute(2, 0, 3, 1)  # (P, E, R, B)
+        whole = torch.arange(len(self.range), device=rows.device).expand(len(rows), -1)
+        if not (self.may_ask and torch.equal(rows, whole)):
+            heard = heard.gather(
+                2, rows[:, None, :, None].expand(-1, heard.shape[1], -1, heard.shape[3])
+            )
+        return heard.clamp_min(1e-24).sqrt()
+
+    def _profile(
+        self,
+        field: Field,
+        which: Tensor | None,
+        weight: Tensor | None,
+        position: Tensor,
+        rotation: Tensor,
+        bins: Tensor,
+    ) -> tuple[Tensor, range]:
+        """Return what fine range bins hold, and which slices see them; all others see nothing.
+
+        Power (1, E, B, P, K) or pressure (2, E, B, P, K).
+        """
+        emitters = position + rotation @ self.emitter  # (P, 3)
+        there = self._there()
+        code = field.code_of_lattice(there, which)
+        places = there if which is None else there[which]
+        phased = self._sums_phase
+        with torch.no_grad():
+            # Ears, vectors and frequencies come first in memory, pairs run along it: see LobeField.
+            if self.may_ask:
+                pair = field.audible(places, emitters, code).reshape(-1).nonzero()[:, 0]
+            else:
+                pair = torch.arange(len(position) * len(places), device=places.device)
+            pose = pair.div(len(places), rounding_mode="floor")
+            place = pair - pose * len(places)
+            # From here on a column for each pair of a pose and a place that answers it.
+            ray = places.T.index_select(1, place) - emitters.T.index_select(1, pose)
+            out = _length(ray)
+            if self.occlusion:
+                free = ~self._hidden(places[place], (ray / -out).T, out)
+                pair, pose, place = pair[free], pose[free], place[free]
+                ray, out = ray[:, free], out[free]
+            unit = ray / -out
+            # All places in all heads are turned at once: sooner done than pair by pair.
+            turn = rotation.permute(2, 0, 1)  # (3, P, 3), world to head
+            in_head = turn.reshape(-1, 3) @ places.T - (turn * position).sum(-1).reshape(-1, 1)
+            in_head = in_head.reshape(3, -1).index_select(1, pair)
+            known, way, middle = self._paths(in_head, out, bins)
+            if not phased:
+                known.square_()
+            if weight is not None:
+                known *= weight.index_select(0, place)
+        response, lead = field.echo(places, unit.T, bins, place, code)  # (M, B), (M,)
+        response = response.T
+        self.points_evaluated += len(place)
+        if phased:
+            turned = self.wave[bins, None] * (way / 2 - lead)[:, None]
+            pressure = response * torch.polar(known, -turned)
+            echoes = torch.stack((pressure.real, pressure.imag))
+        else:
+            squared = response.abs().square() if response.is_complex() else response.square()
+            echoes = (squared * known)[None]
+        at = middle - lead / self.bin
+        slices = self._sounding(at)
+        held = (len(slices) - 1) * self.oversampling + self._taps
+        at = at - slices.start * self.oversampling
+        return Deposit.apply(echoes, at, pose, len(position), held), slices
+
+    def _sounding(self, at: Tensor) -> range:
+        """Return the slices that may see one of the bins, counted from the first; never none."""
+        last = len(self.range) - 1
+        if not at.numel():
+            return range(1)
+        if not self.may_ask:
+            return range(last + 1)
+        nearest, farthest = torch.stack(at.detach().aminmax()).nan_to_num().tolist()
+        first = (math.floor(nearest) - self._taps) // self.oversampling
+        end = (math.floor(farthest) + 1) // self.oversampling + 1
+        first = min(max(first, 0), last)
+        return range(first, min(max(end, first), last) + 1)
+
+    def _paths(self, in_head: Tensor, out: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return what the way to places and back does to pressure.
+
+        Parameters
+        ----------
+        in_head : (3, M) float, m
+            Places, each in the head of its pose.
+        out : (M,) float, m
+            How far they lie from the emitter.
+        bins : (B,) int
+            Which frequencies.
+
+        Returns
+        -------
+        known : (E, B, M) float
+            By beam, ears, air and spreading.
+        way : (E, M) float, m
+            There and back.
+        middle : (E, 1, M) or (E, B, M) float
+            The bin of the profile that the echo is heard in.
+        """
+        ray = in_head - self.ear_positions[..., None]  # (E, 3, M)
+        back = _length(ray)
+        head = (ray / back[:, None]).mT
+        way = out + back  # (E, M)
+        # Each pass over all of it is made once, and in place: memory is what they wait for.
+        known = look_up(self.ears.index_select(1, bins), head).mT
+        ray = (in_head - self.emitter[:, None]) / out
+        known *= look_up(self.beam.index_select(0, bins), ray.T).T
+        absorption = self.absorption[bins]
+        factors = torch.stack((absorption, torch.ones_like(absorption)), dim=1)
+        lengths = torch.stack((way, torch.log(out * back)), dim=1)
+        known *= (-factors @ lengths).exp_()
+        middle = ((way / 2 - self.first) / self.bin)[:, None]
+        if self.lag is not None:
+            middle = middle + look_up(self.lag.index_select(1, bins), head).mT / self.bin
+        return known, way, middle
+
+
+def _resolution(acquisition: Acquisition) -> float:
+    """Return the width in range over which a point echo is above half of its magnitude, m."""
+    band = acquisition.frequency.double()  # each row counts with its part of it
+    part = torch.gradient(band)[0] if len(band) > 1 else torch.ones_like(band)
+    power = (part / part.sum()) @ acquisition.window.double().square()
+    top = (len(power) - 1) // 2  # what lies apart from its own range is another harmonic's echo
+    low = (power < 0.25 * power[top]).nonzero()[:, 0].tolist()
+    first = max((sample for sample in low if sample < top), default=-1)
+    last = min((sample for sample in low if sample > top), default=len(power))
+    samples = last - first - 1
+    return samples * acquisition.speed_of_sound / acquisition.sampling_rate / 2
+
+
+def _length(vectors: Tensor) -> Tensor:
+    """Return the lengths of (..., 3, M) vectors, (..., M)."""
+    x, y, z = vectors.unbind(-2)
+    return (x * x + y * y + z * z).clamp_min(1e-12).sqrt()
+
+
+def lattice_over(region: Tensor, spacing: float) -> Tensor:
+    """Return the vertices of a cubic lattice over a box, (N, 3), from its lower corner."""
+    steps = [
+        region[0, a]
+        + spacing
+        * torch.arange(
+            math.floor(float(region[1, a] - region[0, a]) / spacing + 1e-6) + 1,
+            dtype=region.dtype,
+            device=region.device,
+        )
+        for a in range(3)
+    ]
+    return torch.stack(torch.meshgrid(*steps, indexing="ij"), dim=-1).reshape(-1, 3)

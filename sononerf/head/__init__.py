@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""The head: emitter, receivers, air, call and front end."""

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: MIT
+"""Reported decibels: compressed levels, active cells, and the error between spectrograms."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.errors import NumericalError
+
+RANGE_DB = 60.0
+"""Level of the loudest cell above the reference, dB; also the scale of PSNR and SSIM."""
+ACTIVE_DB = 3.0
+"""Level from which a cell is active, dB."""
+CHUNK_POSES = 8
+"""Number of poses that are compared at once; more of them would only take more memory."""
+
+
+def compress(magnitude: ArrayLike, reference: float) -> NDArray[np.float64]:
+    """Decibels above a soft floor, ``20 log10(1 + magnitude / reference)``.
+
+    Parameters
+    ----------
+    magnitude : (...,) float
+        Linear, zero or more.
+    reference : float
+        Same unit; silence is 0 dB, a magnitude of the reference 6 dB.
+
+    Returns
+    -------
+    level_db : (...,) float64, dB
+        Zero or more.
+
+    Raises
+    ------
+    ValueError
+        If the reference is not above zero.
+    """
+    if not reference > 0.0:
+        raise ValueError(f"reference is {reference}, expected above 0")
+    level_db: NDArray[np.float64] = (20.0 / math.log(10.0)) * np.log1p(
+        np.asarray(magnitude, dtype=np.float64) / reference
+    )
+    return level_db
+
+
+def expand(level_db: ArrayLike, reference: float) -> NDArray[np.float64]:
+    """Return the linear magnitude of compressed levels: the inverse of :func:`compress`."""
+    magnitude: NDArray[np.float64] = reference * (10.0 ** (np.asarray(level_db) / 20.0) - 1.0)
+    return magnitude
+
+
+def same_shape(measured: ArrayLike, predicted: ArrayLike) -> tuple[Any, Any]:
+    """Return both as arrays; raises ValueError if their shapes differ or they are empty."""
+    a, b = np.asanyarray(measured), np.asanyarray(predicted)
+    if a.shape != b.shape:
+        raise ValueError(f"measured {a.shape} and predicted {b.shape} differ in shape")
+    if not a.size:
+        raise ValueError(f"measured has shape {a.shape}: nothing to compare")
+    return a, b
+
+
+def pose_chunks(
+    measured: NDArray[np.floating], predicted: NDArray[np.floating]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """Yield a few poses of both at a time; raises NumericalError at a value that is not finite."""
+    for start in range(0, len(measured), CHUNK_POSES):
+        a, b = (
+            np.asarray(spectrograms[start : start + CHUNK_POSES], dtype=np.float64)
+            for spectrograms in (measured, predicted)
+        )
+        for name, values in (("measured", a), ("predicted", b)):
+            if not np.isfinite(values).all():
+                pose = start + int(np.argwhere(~np.isfinite(values))[0][0])
+                raise NumericalError(f"the {name} spectrogram {pose} holds values not finite")
+        yield a, b
+
+
+def mae_all_and_active(
+    measured: NDArray[np.floating], predicted: NDArray[np.floating], active_db: float
+) -> tuple[float, float | None]:
+    """Mean absolute error over all cells, and over active ones; None where none is active."""
+    total = active_total = 0.0
+    active_count = 0
+    for a, b in pose_chunks(measured, predicted):
+        error = np.abs(a - b)
+        active = (a >= active_db) | (b >= active_db)
+        total += float(error.sum())
+        active_total += float(error[active].sum())
+        active_count += int(active.sum())
+    return total / measured.size, active_total / active_count if active_count else None
+
+
+def mae_db(
+    a: ArrayLike, b: ArrayLike, *, active: bool = False, active_db: float = ACTIVE_DB
+) -> float | None:
+    """Mean absolute difference of two sets of spectrograms.
+
+    Parameters
+    ----------
+    a, b : (P, ...) float, dB
+        Spectrograms.
+    active : bool
+        Whether only those cells count that reach ``active_db`` in either.
+    active_db : float, dB
+        What makes a cell active.
+
+    Returns
+    -------
+    error : float or None, dB
+        None where no cell is active.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or nothing is there.
+    NumericalError
+        If a value is not finite.
+    """
+    first, second = same_shape(a, b)
+    return mae_all_and_active(first, second, active_db)[1 if active else 0]

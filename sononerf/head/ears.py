@@ -1,0 +1,356 @@
+# SPDX-License-Identifier: MIT
+"""The emitter's beam and the receivers as tables over direction and frequency.
+
+Head frame: x forward, y left, z up. Azimuth counts from straight ahead, positive to the left;
+elevation is positive up. Of two ears, ear 0 is the left one.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+
+from sononerf.errors import SettingsError
+from sononerf.head import gains
+from sononerf.head.directivity.read import content_hash, read_directivity
+from sononerf.head.directivity.record import Directivity, unit_vectors
+from sononerf.head.smearing import smearing
+from sononerf.head.spectrogram import frequency_axis
+from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
+
+GRID_DEG = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Ears:
+    """Real, non-negative gains of the beam and of each receiver, and where they are.
+
+    Attributes
+    ----------
+    azimuth : (A,) float64, rad
+        Uniform from -pi to pi, both included.
+    elevation : (L,) float64, rad
+        Uniform from -pi/2 to pi/2, both included.
+    frequency : (F,) float64, Hz
+        Ascending.
+    beam : (F, L, A) float32
+        Gain of the emission.
+    ears : (E, F, L, A) float32
+        Gain of each receiver; all of them may share one table in memory.
+    emitter : (3,) float64, m
+        Head frame.
+    positions : (E, 3) float64, m
+        Of the receivers, head frame.
+    """
+
+    azimuth: NDArray[np.float64]
+    elevation: NDArray[np.float64]
+    frequency: NDArray[np.float64]
+    beam: NDArray[np.float32]
+    ears: NDArray[np.float32]
+    emitter: NDArray[np.float64]
+    positions: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        grid = (len(self.frequency), len(self.elevation), len(self.azimuth))
+        if self.beam.shape != grid or self.ears.shape != (len(self.positions), *grid):
+            raise ValueError(
+                f"beam {self.beam.shape} and ears {self.ears.shape} do not fit the grid {grid} "
+                f"of {len(self.positions)} receivers"
+            )
+
+    @property
+    def directions(self) -> NDArray[np.float64]:
+        """Unit vectors of the grid, (L, A, 3)."""
+        return unit_vectors(self.azimuth, self.elevation[:, None])
+
+    @property
+    def alike(self) -> bool:
+        """Whether all receivers share one table in memory."""
+        return len(self.ears) == 1 or self.ears.strides[0] == 0
+
+    @cached_property
+    def _by_direction(self) -> NDArray[np.float32]:
+        """Beam, then ears, with frequency last: (1 + E, L A, F); one look-up is one row."""
+        tables = np.concatenate([self.beam[None], self.ears])
+        flat = tables.reshape(*tables.shape[:2], -1).transpose(0, 2, 1)
+        return np.ascontiguousarray(flat, dtype=np.float32)
+
+
+def ear_tables(settings: EarSettings, frequency: ArrayLike) -> Ears:
+    """Tables of the emitter and of the receivers that settings describe.
+
+    Parameters
+    ----------
+    settings : EarSettings
+        Places and directivities; models are those of :mod:`sononerf.head.gains`. Between
+        measured directions and frequencies gains are linear. Below the lowest and above the
+        highest measured frequency they are those at it; outside the measured directions they fade
+        to zero over 10 degrees.
+    frequency : (F,) float, Hz
+        Ascending.
+
+    Returns
+    -------
+    ears : Ears
+        On a grid of 2 degrees.
+
+    Raises
+    ------
+    InputError
+        If the file of the directivity cannot be read.
+    SettingsError
+        If the receivers of settings and file do not fit.
+    """
+    f = np.asarray(frequency, dtype=np.float64)
+    measured = _measured(settings)
+    places, sides = _places(settings, measured)
+    azimuth, elevation, directions = _grid()
+    beam = None
+    if measured is not None:
+        tables, beam = _measured_tables(measured, f)
+    elif settings.directivity == "ear":
+        lobes = {side: gains.ear(directions, side, settings, f) for side in set(sides)}
+        tables = np.stack([lobes[side].astype(np.float32) for side in sides])
+    else:
+        radius = settings.piston_radius if settings.directivity == "piston" else 0.0
+        tables = gains.piston(directions, radius, f).astype(np.float32)[None]
+    if beam is None:
+        beam = gains.piston(directions, settings.beam_radius, f).astype(np.float32)
+    if len(tables) == 1:  # one table for all, however many they are
+        tables = np.broadcast_to(tables, (len(places), *tables.shape[1:]))
+    emitter = np.asarray(settings.emitter, dtype=np.float64)
+    return Ears(azimuth, elevation, f, beam, tables, emitter, places)
+
+
+def receiver_count(settings: EarSettings) -> int:
+    """Return how many receivers settings describe; raises as :func:`ear_tables`."""
+    return len(_places(settings, _measured(settings))[0])
+
+
+def directivity_content(settings: EarSettings) -> str | None:
+    """Return a hash of the directivity's file, None where there is none.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    return None if settings.file is None else content_hash(settings.file)
+
+
+@lru_cache(maxsize=1)
+def _grid() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return azimuths (A,), elevations (L,) and directions (L, A, 3) of the tables."""
+    azimuth = np.radians(np.linspace(-180.0, 180.0, round(360.0 / GRID_DEG) + 1))
+    elevation = np.radians(np.linspace(-90.0, 90.0, round(180.0 / GRID_DEG) + 1))
+    return azimuth, elevation, unit_vectors(azimuth, elevation[:, None])
+
+
+@lru_cache(maxsize=4)
+def _grid_weights(measured: Directivity) -> csr_array:
+    return measured.weights(_grid()[2].reshape(-1, 3))
+
+
+def _measured(settings: EarSettings) -> Directivity | None:
+    return None if settings.file is None else read_directivity(settings.file)
+
+
+def _places(
+    settings: EarSettings, measured: Directivity | None
+) -> tuple[NDArray[np.float64], list[float]]:
+    """Return places (E, 3) of the receivers, and which way synthetic ears there look."""
+    left = np.asarray(settings.left, dtype=np.float64)
+    if settings.receivers is not None:
+        places = np.asarray(settings.receivers, dtype=np.float64)
+        if measured is not None and len(measured.gains) not in (1, len(places)):
+            raise SettingsError(
+                f"ears.receivers: gives {len(places)} places, but {settings.file} holds "
+                f"{len(measured.gains)} receivers; give as many places, or leave them out"
+            )
+        return places, np.sign(places[:, 1]).tolist()
+    if measured is not None and measured.places is not None:
+        return measured.places, []
+    if measured is not None and len(measured.gains) != 2:
+        raise SettingsError(
+            f"ears.receivers: missing; {settings.file} does not state the places of its "
+            f"{len(measured.gains)} receiver{'s' * (len(measured.gains) > 1)}"
+        )
+    sides = [1.0, -1.0]
+    return np.stack([left * (1.0, side, 1.0) for side in sides]), sides
+
+
+def _measured_tables(
+    measured: Directivity, frequency: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+    """Return tables (E, F, L, A) and the beam (F, L, A) of a measured directivity."""
+    weights, shape = _grid_weights(measured), (len(frequency), *_grid()[2].shape[:2])
+
+    def table(values: NDArray[np.float64]) -> NDArray[np.float32]:
+        at_grid = weights @ measured.at(frequency, values)  # (L A, F)
+        return np.ascontiguousarray(at_grid.T, dtype=np.float32).reshape(shape)
+
+    ears = np.stack([table(gain) for gain in measured.gains])
+    return ears, None if measured.beam is None else table(measured.beam)
+
+
+def analysed_ears(
+    settings: EarSettings, call: CallSettings, analysis: SpectrogramSettings
+) -> tuple[Ears, NDArray[np.float32] | None]:
+    r"""Tables of the same head as an analysis hears it: smeared over frequency by its window.
+
+    A window of 64 µs cannot tell frequencies apart that lie closer than about 28 kHz. It fills a
+    narrow notch, and the spectrum of an echo in its middle is that of beam and ear convolved with
+    the window's transform. Beam and ear are smeared one by one: the beam varies slowly.
+
+    A sweep's frequencies enter the window one after the other. With :math:`G` the gain,
+    :math:`X` the call's spectrum, :math:`\tau` its delays and :math:`W` the window's transform,
+    a row at :math:`f` hears by Parseval's theorem the power and, on the mean, as much too late
+
+    .. math::
+        \overline{G}(f)^2 = \frac{\sum_\nu w_\nu G(\nu)^2}{\sum_\nu w_\nu}, \qquad
+        \overline{t}(f) = \frac{\sum_\nu w_\nu G(\nu)^2 (\tau(\nu) - \tau(f))}
+        {\sum_\nu w_\nu G(\nu)^2}, \qquad w_\nu = W(\nu - f)^2 |X(\nu)|^2
+
+    so that beside a notch an echo seems to come from millimetres nearer or farther.
+
+    Parameters
+    ----------
+    settings : EarSettings
+        Places, axes, widths.
+    call : CallSettings
+        An impulse or a sweep.
+    analysis : SpectrogramSettings
+        Window, transform and frequencies.
+
+    Returns
+    -------
+    ears : Ears
+        At the analysis' frequencies.
+    lag : (E, F, L, A) float32 or None, s
+        How much too late each ear hears an echo, beam included; None for an impulse.
+
+    Raises
+    ------
+    InputError, SettingsError
+        As :func:`ear_tables`.
+    """
+    return _analysed(settings, call, analysis, directivity_content(settings))
+
+
+@lru_cache(maxsize=4)  # a fit and its read-out ask nine times; no one may write to the arrays
+def _analysed(
+    settings: EarSettings, call: CallSettings, analysis: SpectrogramSettings, content: str | None
+) -> tuple[Ears, NDArray[np.float32] | None]:
+    del content  # a changed file is read again
+    fine_frequency, rows, weight, later = smearing(call, analysis)
+    fine = ear_tables(settings, fine_frequency)
+
+    def smeared(table: NDArray[np.float64], weight: NDArray[Any]) -> NDArray[Any]:
+        padded = np.moveaxis(table, -3, 0)
+        parts = zip(weight.T[:, :, None, None], rows.T, strict=True)
+        total = sum(np.moveaxis(padded[row], 0, -3) * part for part, row in parts)
+        return np.asarray(total)
+
+    beam = fine.beam.astype(np.float64)
+    lags: list[NDArray[np.float32]] = []
+    ears: list[NDArray[np.float32]] = []
+    for single in fine.ears[:1] if fine.alike else fine.ears:  # one by one, for memory's sake
+        ear = single.astype(np.float64)
+        if later is None:
+            ears.append(np.abs(smeared(ear, weight)).astype(np.float32))
+            continue
+        heard = (beam * ear) ** 2
+        late = smeared(heard, later) / np.maximum(smeared(heard, weight), 1e-30)
+        lags.append(late.astype(np.float32))
+        ears.append(np.sqrt(smeared(ear**2, weight)).astype(np.float32))
+    if later is None:
+        beam = np.abs(smeared(beam, weight))
+    else:
+        beam = np.sqrt(smeared(beam**2, weight))
+
+    def of_all(tables: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+        stacked = tables[0][None] if fine.alike else np.stack(tables)
+        return np.broadcast_to(stacked, (len(fine.positions), *stacked.shape[1:]))
+
+    analysed = dataclasses.replace(
+        fine,
+        frequency=frequency_axis(analysis),
+        beam=beam.astype(np.float32),
+        ears=of_all(ears),
+    )
+    return analysed, of_all(lags) if lags else None
+
+
+def beam_gain(ears: Ears, directions_head: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Gain of the emission towards directions, bilinear between the table's nodes.
+
+    Parameters
+    ----------
+    ears : Ears
+        Tables.
+    directions_head : (N, 3) float64
+        Unit vectors away from the emitter, head frame.
+
+    Returns
+    -------
+    gain : (N, F) float32
+        Linear, zero or more.
+    """
+    return _look_up(ears, 0, directions_head)
+
+
+def ear_gain(ears: Ears, ear: int, directions_head: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Gain of one ear for sound from directions, bilinear between the table's nodes.
+
+    Parameters
+    ----------
+    ears : Ears
+        Tables.
+    ear : int
+        Its number.
+    directions_head : (N, 3) float64
+        Unit vectors from the ear to where the sound comes from, head frame.
+
+    Returns
+    -------
+    gain : (N, F) float32
+        Linear, zero or more.
+    """
+    return _look_up(ears, 1 + ear, directions_head)
+
+
+def _look_up(ears: Ears, table: int, directions: NDArray[np.float64]) -> NDArray[np.float32]:
+    x, y, z = np.ascontiguousarray(directions.T, dtype=np.float32)
+    column, across = _place(ears.azimuth, np.arctan2(y, x))
+    row, upward = _place(ears.elevation, np.arctan2(z, np.hypot(x, y)))
+    width = len(ears.azimuth)
+    corner = row * width + column
+    corners = corner[:, None] + np.array([0, 1, width, width + 1], dtype=np.int32)
+    low = 1 - upward
+    weights = np.zeros(corners.shape, dtype=np.float32)
+    weights[:, 0], weights[:, 1] = low * (1 - across), low * across
+    weights[:, 2], weights[:, 3] = upward * (1 - across), upward * across
+    # One pass over the rows, where four gathers would write four tables first.
+    ends = np.arange(0, 4 * len(directions) + 1, 4, dtype=np.int32)
+    values = ears._by_direction[table]
+    pick = csr_array((weights.ravel(), corners.ravel(), ends), shape=(len(directions), len(values)))
+    gain: NDArray[np.float32] = pick @ values
+    return gain
+
+
+def _place(
+    nodes: NDArray[np.float64], values: NDArray[np.float32]
+) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+    """Index of the node below, and the fraction of the way to the next."""
+    per_step = np.float32((len(nodes) - 1) / (nodes[-1] - nodes[0]))
+    steps = (values - np.float32(nodes[0])) * per_step
+    steps = np.clip(steps, np.float32(0.0), np.float32(len(nodes) - 1))
+    index = np.minimum(steps.astype(np.int32), np.int32(len(nodes) - 2))
+    return index, steps - index.astype(np.float32)

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: MIT
+"""White Gaussian noise of the ears, set by a signal-to-noise ratio.
+
+The ratio is one of powers within the analysis band, in the waveform as the ear receives it,
+before dechirp and analysis: the mean power of an echo over its loudest stretch, as long as the
+call lasts but at least one analysis window, to the noise's power. Whose echo, is a choice:
+
+``target``
+    That of a target of ``target_strength_db`` at ``target_distance``, on the beam's axis, to an
+    ear of gain 1, in air that absorbs nothing. Microphones have one noise level whatever they
+    hear, so this is the default: a pose that hears little is drowned.
+``pose``
+    Each ear's own, so that all poses are drowned alike. A silent ear has no noise.
+
+Either way a pose's noise depends on settings, seed and the pose alone.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.fft
+from numpy.typing import NDArray
+
+from sononerf.settings.schema import NoiseSettings, SpectrogramSettings
+
+NOISE_STREAM = 1  # keeps a pose's noise apart from what else is drawn from its seed
+
+
+def target_gain(target_strength_db: float, distance: float) -> float:
+    """Echo of a small target, as a part of the call's pressure at 1 m.
+
+    Parameters
+    ----------
+    target_strength_db : float, dB
+        Of the echo at 1 m from the target, over the pressure that falls on it;
+        20 log10(radius / 2 m) of a rigid sphere that is large against the wavelength [1]_.
+    distance : float, m
+        From emitter and ear to the target.
+
+    Returns
+    -------
+    gain : float
+        Spherical spreading both ways.
+
+    References
+    ----------
+    .. [1] R. J. Urick, Principles of Underwater Sound, 3rd edition, 1983, table 9.1.
+
+    Examples
+    --------
+    >>> round(target_gain(-46.02, 0.4), 4)
+    0.0313
+    """
+    return float(10.0 ** (target_strength_db / 20.0)) / distance**2
+
+
+def loudest_power(
+    echo: NDArray[np.float64], analysis: SpectrogramSettings, samples: int
+) -> NDArray[np.float64]:
+    """Mean power within the analysis band over an echo's loudest stretch.
+
+    Parameters
+    ----------
+    echo : (E, S) float64
+        Waveforms.
+    analysis : SpectrogramSettings
+        Sampling rate and band.
+    samples : int
+        Length of a stretch.
+
+    Returns
+    -------
+    power : (E,) float64
+        Square of the echo's unit.
+    """
+    padded = np.pad(echo, ((0, 0), (samples, samples)))
+    length = int(scipy.fft.next_fast_len(padded.shape[-1], real=True))
+    frequency = np.fft.rfftfreq(length, 1.0 / analysis.sampling_rate)
+    band = (frequency >= analysis.frequency_min) & (frequency <= analysis.frequency_max)
+    heard = np.fft.irfft(np.fft.rfft(padded, length) * band, length)
+    total = np.cumsum(heard**2, axis=-1)
+    power: NDArray[np.float64] = (total[:, samples:] - total[:, :-samples]).max(axis=-1) / samples
+    return power
+
+
+def noise_level(
+    settings: NoiseSettings, power: NDArray[np.float64], analysis: SpectrogramSettings
+) -> NDArray[np.float64]:
+    """Set each ear's noise: the standard deviation of its samples.
+
+    Parameters
+    ----------
+    settings : NoiseSettings
+        The ratio, which must be set.
+    power : (E,) float64
+        Of the echo that it is relative to, from :func:`loudest_power`.
+    analysis : SpectrogramSettings
+        Sampling rate and band: of white noise's power, the band holds its share of all
+        frequencies up to half the sampling rate.
+
+    Returns
+    -------
+    level : (E,) float64
+        Unit of the echo.
+    """
+    share = 2.0 * (analysis.frequency_max - analysis.frequency_min) / analysis.sampling_rate
+    ratio = 10.0 ** (np.asarray(settings.snr_db, dtype=np.float64) / 10.0)
+    level: NDArray[np.float64] = np.sqrt(power / (ratio * share))
+    return level
+
+
+def draw_noise(level: NDArray[np.float64], samples: int, *, seed: int) -> NDArray[np.float64]:
+    """White Gaussian noise, each ear's its own.
+
+    Parameters
+    ----------
+    level : (E,) float64
+        Standard deviations.
+    samples : int
+        Per ear.
+    seed : int
+        Of the pose; what else is drawn from it is independent of the noise.
+
+    Returns
+    -------
+    noise : (E, samples) float64
+        Unit of ``level``.
+    """
+    generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(NOISE_STREAM,)))
+    return level[:, None] * generator.standard_normal((len(level), samples))

@@ -1,0 +1,336 @@
+# SPDX-License-Identifier: MIT
+"""From impulse responses to what the ears hear of a call, and to its dechirped spectrogram."""
+
+from __future__ import annotations
+
+import logging
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.errors import InputError
+from sononerf.head.call import (
+    call_waveform,
+    covered,
+    emit,
+    has_ghosts,
+    sweep_delay,
+    sweep_rate,
+)
+from sononerf.head.call_file import load_call
+from sononerf.head.noise import draw_noise, loudest_power, noise_level, target_gain
+from sononerf.head.row_filters import (
+    WINDOW_BANDWIDTH,
+    WINDOW_DURATION,
+    row_filters,
+    row_widths,
+)
+from sononerf.head.spectrogram import echo_samples, frequency_axis, spectrogram
+from sononerf.settings.schema import CallSettings, NoiseSettings, SpectrogramSettings
+
+logger = logging.getLogger("sononerf")
+
+FAR = 2.0  # factor between a window and the best one that is worth a warning
+FAINT = 1e-2
+"""A point echo is followed over time down to this, over its height at its own range."""
+MOST = 4.0
+"""How much louder it may be at another time, where another harmonic is: 12 dB."""
+
+
+class Reception:
+    """Call, noise and analysis, ready to be applied to the impulse responses of pose after pose.
+
+    Parameters
+    ----------
+    call : CallSettings
+        What is emitted.
+    analysis : SpectrogramSettings
+        How echoes become spectrograms.
+    noise : NoiseSettings
+        Of the ears.
+    speed_of_sound : float, m/s
+        Of the medium.
+
+    Attributes
+    ----------
+    waveform : (N,) float64
+        The call.
+    delay : (F,) float64, s
+        When each of the analysis' frequencies is emitted.
+    samples : int
+        Length S of the received waveforms: to the end of what the last frame's rows read.
+
+    Raises
+    ------
+    InputError
+        If the call is a file that cannot be used, or that holds nothing of the analysed band.
+    """
+
+    def __init__(
+        self,
+        call: CallSettings,
+        analysis: SpectrogramSettings,
+        noise: NoiseSettings,
+        *,
+        speed_of_sound: float,
+    ) -> None:
+        self.analysis, self.noise, self.speed_of_sound = analysis, noise, speed_of_sound
+        self.waveform = call_waveform(call, analysis.sampling_rate)
+        if call.file is not None and not covered(call, _within(analysis)).any():
+            raise InputError(_outside(call, analysis))
+        self.delay = sweep_delay(call, frequency_axis(analysis))
+        self.samples = echo_samples(analysis, speed_of_sound, float(self.delay.max()))
+        self._stretch = max(row_filters(analysis).length, len(self.waveform))
+        target = target_gain(noise.target_strength_db, noise.target_distance)
+        self._target_power = loudest_power(target * self.waveform[None], analysis, self._stretch)
+
+    def receive(
+        self, impulse_responses: ArrayLike, *, seed: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Pressure at the ears, noise included, and its spectrogram.
+
+        Parameters
+        ----------
+        impulse_responses : (E, S) float
+            Pressure for a call that is one sample of height 1. They should have ``samples``
+            samples; of shorter ones, down to the last frame of an impulse, the last rows lack
+            what the window lets in from behind.
+        seed : int
+            Of the pose; the noise is drawn from it.
+
+        Returns
+        -------
+        waveform : (E, S) float64
+            From the start of the emission on.
+        magnitude : (E, R, F) float64
+            Linear.
+
+        Raises
+        ------
+        ValueError
+            If the impulse responses are too short.
+        """
+        waveform = emit(impulse_responses, self.waveform)[:, : self.samples]
+        if self.noise.snr_db is not None:
+            own = self.noise.relative_to == "pose"
+            power = (
+                loudest_power(waveform, self.analysis, self._stretch)
+                if own
+                else np.repeat(self._target_power, len(waveform))
+            )
+            level = noise_level(self.noise, power, self.analysis)
+            waveform = waveform + draw_noise(level, waveform.shape[-1], seed=seed)
+        return waveform, self.analyse(waveform)
+
+    def analyse(self, waveform: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the spectrogram (E, R, F) of what was heard, (E, S) from the emission on.
+
+        Raises
+        ------
+        ValueError
+            If the waveform is shorter than ``samples``.
+        """
+        return spectrogram(waveform, self.analysis, self.speed_of_sound, self.delay)
+
+
+def _outside(call: CallSettings, analysis: SpectrogramSettings) -> str:
+    assert call.file is not None
+    bands = load_call(call.file).bands
+    held = ", ".join(f"{low / 1e3:.1f} to {high / 1e3:.1f}" for low, high in bands)
+    return (
+        f"{call.file}: holds sound at {held} kHz, nothing within spectrogram.frequency_min to "
+        f"frequency_max ({analysis.frequency_min / 1e3:g} to {analysis.frequency_max / 1e3:g} "
+        "kHz); change these, or take another call"
+    )
+
+
+def row_duration(
+    call: CallSettings, analysis: SpectrogramSettings, frequency: ArrayLike
+) -> NDArray[np.float64]:
+    r"""How long a point echo lasts in a row of the dechirped spectrogram.
+
+    .. math:: \sqrt{T_w^2 + (B_w / |\dot f|)^2}
+
+    with :math:`T_w` the filter's own duration, :math:`B_w` its bandwidth and :math:`|\dot f|` the
+    sweep rate; each width is counted where the magnitude is above half its greatest (-6 dB). A
+    row is the filter's transform, turned by the sweep's quadratic phase and transformed back; for
+    a Gaussian filter and a linear sweep that gives exactly this.
+
+    Parameters
+    ----------
+    call : CallSettings
+        What is emitted.
+    analysis : SpectrogramSettings
+        Window and sampling rate.
+    frequency : (F,) float, Hz
+        Of the rows.
+
+    Returns
+    -------
+    duration : (F,) float64, s
+        Two-way: times ``c / 2`` it is a width in range.
+    """
+    lasts, wide = row_widths(analysis, frequency)
+    duration: NDArray[np.float64] = np.hypot(lasts, wide / sweep_rate(call, frequency))
+    return duration
+
+
+def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
+    """Length of the window that keeps a point echo shortest in the dechirped spectrogram.
+
+    A short window is wide in frequency, so a slow sweep stays in it for long; a long one lasts
+    long itself. What is made smallest is the root mean square of :func:`row_duration` over the
+    analysed frequencies that the call covers.
+
+    Parameters
+    ----------
+    call : CallSettings
+        What is emitted.
+    analysis : SpectrogramSettings
+        Sampling rate and frequencies.
+
+    Returns
+    -------
+    window : int
+        Samples. For an impulse shorter is always better, so it is the window that is set; a
+        gammatone's is not asked for.
+
+    Examples
+    --------
+    >>> call = CallSettings(kind="linear", duration=3e-3)
+    >>> best_window(call, SpectrogramSettings(frequency_min=40e3))
+    306
+    """
+    if call.kind == "impulse" or analysis.kind == "gammatone":
+        return analysis.window
+    slowness = math.sqrt(np.mean(sweep_rate(call, _heard(call, analysis)) ** -2.0))
+    return round(analysis.sampling_rate * math.sqrt(WINDOW_BANDWIDTH / WINDOW_DURATION * slowness))
+
+
+def _within(analysis: SpectrogramSettings) -> NDArray[np.float64]:
+    """Return the rows' frequencies, the outermost drawn to the ends of the band asked for."""
+    return np.clip(frequency_axis(analysis), analysis.frequency_min, analysis.frequency_max)
+
+
+def _heard(call: CallSettings, analysis: SpectrogramSettings) -> NDArray[np.float64]:
+    """Return those of the rows' frequencies that the call covers; all, where it covers none."""
+    frequency = _within(analysis)
+    heard = covered(call, frequency)
+    return frequency[heard] if heard.any() else frequency
+
+
+def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> NDArray[np.float64]:
+    """Point echo in each row of the dechirped spectrogram, as a window over the received time.
+
+    Parameters
+    ----------
+    call : CallSettings
+        What is emitted.
+    analysis : SpectrogramSettings
+        Filters and frequencies.
+
+    Returns
+    -------
+    window : (F, W) float64
+        One value per sample; the point's own range is in the middle, where it is 1. For an impulse
+        the rows' envelopes, of a height of almost 1; for a sweep as much longer as the sweep stays
+        in the window's main lobe. Of Hamming windows and a sweep it is made symmetric (the mean
+        power of both sides). Of gammatones it is not, nor where harmonics overlap: what one more
+        harmonic adds at other times is part of it.
+    """
+    frequency, filters = frequency_axis(analysis), row_filters(analysis)
+    if call.kind == "impulse":
+        return filters.point_echo()
+    if analysis.kind == "gammatone" or has_ghosts(call, frequency):
+        side = filters.envelope.shape[1] + call_waveform(call, analysis.sampling_rate).size
+        return _cropped(_point_echo(call, analysis, side), call, analysis)
+    length = analysis.window
+    slowest = float(sweep_rate(call, _heard(call, analysis)).min())
+    lobe = 2.0 * analysis.sampling_rate / length  # Hz, from the middle to the first zero
+    extra = math.ceil(lobe / slowest * analysis.sampling_rate)
+    row = _point_echo(call, analysis, extra + (length - 1) / 2.0)
+    power = row**2 + row[:, ::-1] ** 2
+    middle = power[:, (power.shape[1] - 1) // 2]
+    window: NDArray[np.float64] = np.sqrt(power / middle[:, None])
+    return window
+
+
+def _point_echo(
+    call: CallSettings, analysis: SpectrogramSettings, side: float
+) -> NDArray[np.float64]:
+    """Return a point's echo in each row, (F, W), as far as ``side`` samples to both sides."""
+    centre = row_filters(analysis).centre
+    side = math.ceil(side - centre % 1.0) + centre % 1.0
+    count = round(2 * side) + 1
+    # At a speed of 2 m/s ranges are seconds. Frame k is centred on sample k + centre.
+    last = (centre + count - 0.5) / analysis.sampling_rate
+    fine = analysis.model_copy(update={"hop": 1, "range_min": 0.0, "range_max": last})
+    waveform = call_waveform(call, analysis.sampling_rate)
+    delay = sweep_delay(call, frequency_axis(analysis))
+    start = round(centre + side)
+    samples = max(echo_samples(fine, 2.0, float(delay.max())), start + len(waveform))
+    echo = np.zeros((1, samples))
+    echo[0, start : start + len(waveform)] = waveform
+    return spectrogram(echo, fine, 2.0, delay)[0].T[:, :count]
+
+
+def _cropped(
+    row: NDArray[np.float64], call: CallSettings, analysis: SpectrogramSettings
+) -> NDArray[np.float64]:
+    """Return point echoes over their height at their own range, without what is faint all over."""
+    width = row.shape[1]
+    middle = row[:, [(width - 1) // 2, width // 2]].mean(axis=1)
+    window = row / np.maximum(middle, 1e-12 * row.max())[:, None]
+    heard = covered(call, _within(analysis))
+    if not heard.all() and heard.any():
+        window[~heard] = np.minimum(window[~heard], 1.0)  # it has no middle of its own
+    window = np.minimum(window, MOST)
+    loud = np.flatnonzero((window[heard] if heard.any() else window).max(axis=0) >= FAINT)
+    spare = min(int(loud[0]), width - 1 - int(loud[-1]))
+    return window[:, spare : width - spare]
+
+
+def warn_of_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
+    """Log one line for each way in which call and analysis do not suit one another.
+
+    Parameters
+    ----------
+    call : CallSettings
+        What is emitted.
+    analysis : SpectrogramSettings
+        Window and band.
+    """
+    warn_of_band(call, analysis)
+    best = best_window(call, analysis)
+    if analysis.kind == "stft" and not 1.0 / FAR <= best / analysis.window <= FAR:
+        here, there = (
+            1e6 * math.sqrt(np.mean(row_duration(call, chosen, _heard(call, analysis)) ** 2))
+            for chosen in (analysis, analysis.model_copy(update={"window": best}))
+        )
+        longer_fft = f" and spectrogram.fft={2 ** math.ceil(math.log2(best))}"
+        logger.warning(
+            "a point echo lasts %.0f µs in a window of %d samples and %.0f µs in the one that "
+            "suits this call best; set spectrogram.window=%d%s",
+            here,
+            analysis.window,
+            there,
+            best,
+            longer_fft if best > analysis.fft else "",
+        )
+
+
+def warn_of_band(call: CallSettings, analysis: SpectrogramSettings) -> None:
+    """Log one line if a call does not cover the analysed band."""
+    frequency = _within(analysis)
+    silent = ~covered(call, frequency)
+    if silent.any():
+        edges = np.flatnonzero(np.diff(silent, prepend=False, append=False)).reshape(-1, 2)
+        bands = ", ".join(
+            f"{frequency[a] / 1e3:.1f} to {frequency[b - 1] / 1e3:.1f} kHz" for a, b in edges
+        )
+        logger.warning(
+            "the call does not cover %s; these rows hold next to nothing. Narrow "
+            "spectrogram.frequency_min and frequency_max, or widen the call",
+            bands,
+        )

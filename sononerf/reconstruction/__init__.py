@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""From a field to volumes, meshes and numbers."""

@@ -1,0 +1,284 @@
+# SPDX-License-Identifier: MIT
+"""What recordings and settings say together, before anything is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf.echoes.detection import RANK
+from sononerf.errors import InputError, SettingsError
+from sononerf.geometry.poses import Poses
+from sononerf.head.air import speed_in
+from sononerf.head.call import call_content, call_waveform
+from sononerf.head.ears import Ears, ear_tables
+from sononerf.head.reception import Reception, warn_of_band
+from sononerf.head.spectrogram import echo_samples, frequency_axis
+from sononerf.recordings.airsas import read_airsas
+from sononerf.recordings.arrays import read_numpy
+from sononerf.recordings.conventions import to_poses
+from sononerf.recordings.folder import read_folder
+from sononerf.recordings.import_calibration import calibrated
+from sononerf.recordings.import_ranges import reception_of, with_ranges
+from sononerf.recordings.pings import Cutter, check_numbers, clipped_pings, mix
+from sononerf.recordings.recording import Recording
+from sononerf.recordings.sonotrace import read_sononerf_matlab, read_sonotracelab
+from sononerf.recordings.splits import assign_split
+from sononerf.settings.import_schema import ImportSettings, read_import_settings
+from sononerf.settings.schema import (
+    FILE_SECTIONS,
+    HEAD_SECTIONS,
+    CallSettings,
+    Settings,
+    apply_override,
+    read_yaml,
+    validate_settings,
+)
+
+Array = NDArray[np.float64]
+
+READERS: dict[str, Callable[[Path, ImportSettings], Recording]] = {
+    "recordings": read_folder,
+    "numpy": read_numpy,
+    "sonotracelab": read_sonotracelab,
+    "sononerf-matlab": read_sononerf_matlab,
+    "airsas": read_airsas,
+}
+OWN_SETTINGS = "import.yaml"
+
+
+@dataclass(frozen=True, eq=False)
+class Understood:
+    """All that an import knows.
+
+    Attributes
+    ----------
+    form : str
+        Format of the source.
+    recording : Recording
+        All pings that were read.
+    settings : Settings
+        Air, ears, call and analysis, complete.
+    wanted : ImportSettings
+        How it was read.
+    cutter : Cutter
+        Cuts and calibrates pings.
+    ears : Ears
+        Places of emitter and receivers.
+    pings : (P,) int
+        Which of the recording's pings are kept.
+    poses : Poses
+        Of all pings of the recording.
+    split : (P,) int8
+        Of the kept pings.
+    clipped : int
+        How many pings are rejected.
+    level_db : float, dB
+        Loudest echo over the noise, power averaged over frequency; the middle ping of those asked.
+    calibration : dict
+        What was applied, as plain data.
+    notes : tuple of str
+        What may surprise.
+    """
+
+    form: str
+    recording: Recording
+    settings: Settings
+    wanted: ImportSettings
+    cutter: Cutter
+    ears: Ears
+    pings: NDArray[np.int64]
+    poses: Poses
+    split: NDArray[np.int8]
+    clipped: int
+    level_db: float
+    calibration: dict[str, Any]
+    notes: tuple[str, ...]
+
+    @property
+    def reception(self) -> Reception:
+        """Call and analysis."""
+        return reception_of(self.settings)
+
+    @property
+    def speed_of_sound(self) -> float:
+        """Of the air, m/s."""
+        return speed_in(self.settings.air)
+
+
+def understand(
+    form: str,
+    source: Path,
+    output: Path,
+    *,
+    settings_file: Path | None = None,
+    overrides: Iterable[str] = (),
+) -> Understood:
+    """Read recordings and settings, and complete each by the other.
+
+    Parameters
+    ----------
+    form : str
+        A name of :data:`READERS`.
+    source : Path
+        File or folder.
+    output : Path
+        The store to be.
+    settings_file : Path or None
+        Sections ``import``, ``air``, ``ears``, ``call``, ``spectrogram``; ``import.yaml`` beside
+        the recordings where None, if it is there.
+    overrides : iterable of str
+        ``KEY=VALUE``.
+
+    Raises
+    ------
+    SettingsError
+        If a key or value is not allowed, or settings and recordings contradict one another.
+    InputError
+        If recordings or poses are no good.
+    """
+    if form not in READERS:
+        raise SettingsError(f"unknown format {form!r}; known: {', '.join(READERS)}")
+    if not source.exists():
+        raise InputError(f"{source}: no such file or folder")
+    if form != "recordings" and source.is_dir():
+        raise InputError(f"{source}: is a folder; the format {form} is one file")
+    folder = source if source.is_dir() else source.parent
+    where, data = _settings_data(folder, settings_file, overrides)
+    wanted = read_import_settings(data.pop("import", None) or {}, where)
+    recording = READERS[form](source, wanted)
+    settings = _complete(data, recording, wanted, output, where)
+    ears = ear_tables(settings.ears, frequency_axis(settings.spectrogram))
+    places = settings.ears.receivers
+    receivers = len(ears.positions) if places is None else len(places)
+    heard = len(mix(np.zeros((recording.read(0).shape[0], 1)), wanted.channels))
+    if heard != receivers:
+        raise InputError(
+            f"{recording.path}: {heard} channels, and the settings describe {receivers} "
+            "receivers; set ears.receivers to one place for each channel, or choose channels with "
+            "import.channels"
+        )
+    poses = to_poses(recording.columns, wanted)
+    if len(poses) != len(recording):
+        raise InputError(f"{recording.path}: {len(recording)} pings and {len(poses)} poses")
+    cutter, calibration = calibrated(recording, wanted, settings, ears, folder)
+    if wanted.compress:
+        warn_of_band(settings.call, settings.spectrogram)
+        cutter = replace(cutter, call=call_waveform(settings.call, recording.sampling_rate))
+        calibration["compressed"] = call_content(settings.call)
+        settings = settings.model_copy(update={"call": CallSettings()})
+    check_numbers(recording, cutter, 0)
+    settings, power = with_ranges(settings, cutter, recording, data)
+    check_numbers(recording, cutter, reception_of(settings).samples)
+    kept, clipped = _without_clipped(recording, cutter, settings, wanted)
+    split = assign_split(
+        poses[kept],
+        recording.columns.take(kept).split(),
+        validation=wanted.validation,
+        heldout=wanted.heldout,
+        seed=wanted.seed,
+        where=str(recording.path),
+    )
+    noise = np.quantile(power, RANK, axis=-1)
+    ratio = power.max(axis=-1) / np.maximum(noise, 1e-300)
+    return Understood(
+        form=form,
+        recording=recording,
+        settings=settings,
+        wanted=wanted,
+        cutter=cutter,
+        ears=ears,
+        pings=kept,
+        poses=poses,
+        split=split,
+        clipped=clipped,
+        level_db=float(10.0 * np.log10(max(np.median(ratio), 1e-30))),
+        calibration=calibration,
+        notes=recording.notes,
+    )
+
+
+def _settings_data(
+    folder: Path, settings_file: Path | None, overrides: Iterable[str]
+) -> tuple[str, dict[str, Any]]:
+    if settings_file is None and (folder / OWN_SETTINGS).is_file():
+        settings_file = folder / OWN_SETTINGS
+    data = {} if settings_file is None else read_yaml(settings_file)
+    for section in FILE_SECTIONS:  # such paths are relative, like all of the import
+        named = data.get(section)
+        if settings_file is not None and isinstance(named, dict) and named.get("file"):
+            named["file"] = str(settings_file.parent / str(named["file"]))
+    for assignment in overrides:
+        apply_override(data, assignment)
+    where = "command line" if settings_file is None else str(settings_file)
+    unknown = [name for name in data if name not in (*HEAD_SECTIONS, "import")]
+    if unknown:
+        raise SettingsError(
+            f"{where}: {unknown[0]}: no section of an import; known: import, "
+            + ", ".join(HEAD_SECTIONS)
+        )
+    return where, data
+
+
+def _complete(
+    data: dict[str, Any],
+    recording: Recording,
+    wanted: ImportSettings,
+    output: Path,
+    where: str,
+) -> Settings:
+    """Fill what the settings leave out from the recording, and check them as those of a fit."""
+    for section, known in recording.settings.items():
+        own = data.setdefault(section, {})
+        if isinstance(own, dict):
+            data[section] = {**_mixed(known, wanted), **own}
+    analysis = data.setdefault("spectrogram", {})
+    if isinstance(analysis, dict):
+        rate = analysis.setdefault("sampling_rate", recording.sampling_rate)
+        if rate != recording.sampling_rate:
+            raise SettingsError(
+                f"{where}: spectrogram.sampling_rate is {rate}, the recordings have "
+                f"{recording.sampling_rate:g} Hz; leave it out"
+            )
+    settings = validate_settings({**data, "data": {"store": str(output)}}, where)
+    band = {"frequency_min", "frequency_max"}
+    if settings.call.bands and not band & settings.spectrogram.model_fields_set:
+        ends = np.asarray(list(settings.call.bands.values()))
+        data["spectrogram"] |= {
+            "frequency_min": float(ends.min()),
+            "frequency_max": min(float(ends.max()), recording.sampling_rate / 2.0),
+        }
+        settings = validate_settings({**data, "data": {"store": str(output)}}, where)
+    return settings
+
+
+def _mixed(known: dict[str, Any], wanted: ImportSettings) -> dict[str, Any]:
+    """Return what the source says of receivers, for the channels that are chosen."""
+    if "receivers" not in known or wanted.channels is None:
+        return known
+    places = mix(np.asarray(known["receivers"], dtype=np.float64), wanted.channels)
+    return {**known, "receivers": places.tolist()}
+
+
+def _without_clipped(
+    recording: Recording, cutter: Cutter, settings: Settings, wanted: ImportSettings
+) -> tuple[NDArray[np.int64], int]:
+    """Return the pings to keep, and how many are clipped where their echoes are."""
+    if not wanted.reject_clipped:
+        return np.arange(len(recording)), 0
+    analysis, speed = settings.spectrogram, speed_in(settings.air)
+    first = int(analysis.range_min * 2.0 / speed * analysis.sampling_rate - analysis.window / 2.0)
+    last = echo_samples(analysis, speed)
+    found = [cutter.clipped(index, max(first, 0), last) for index in range(len(recording))]
+    bad = clipped_pings(found)
+    if bad.all():
+        raise InputError(
+            f"{recording.path}: all {len(bad)} pings are clipped where echoes are; record with "
+            "less gain, or set import.reject_clipped=false"
+        )
+    return np.flatnonzero(~bad), int(bad.sum())

@@ -1,0 +1,219 @@
+# SPDX-License-Identifier: MIT
+"""Pictures of meshes."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image, ImageDraw, ImageFont
+
+from sononerf.errors import NumericalError
+from sononerf.report.confidence import MANY_POSES, confidence_colours
+from sononerf.report.pictures.figure import png_from_pixels
+from sononerf.report.pictures.shading import (
+    DEFAULT_VIEW,
+    OVERSAMPLING,
+    Camera,
+    averaged,
+    background,
+    camera_for,
+    draw_mesh,
+)
+
+STEEL, CLAY = (0.62, 0.72, 0.84), (0.93, 0.70, 0.52)
+INK = (60, 66, 74)
+
+
+def mesh_png(
+    mesh: trimesh.Trimesh,
+    *,
+    size: tuple[int, int] = (960, 720),
+    view: ArrayLike = DEFAULT_VIEW,
+    colours: ArrayLike | None = None,
+) -> bytes:
+    """Draw a mesh in parallel projection, shaded, with a scale bar.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        Metres; open meshes are seen from both sides.
+    size : (int, int)
+        Width and height in pixels.
+    view : (3,) float
+        Direction from the mesh to the camera, world frame; z is up.
+    colours : (3,) or (V, 3) float, optional
+        Colour in 0 to 1, one for all or one per vertex.
+
+    Returns
+    -------
+    data : bytes
+        A PNG file.
+
+    Raises
+    ------
+    ValueError
+        If size, view or colours have a wrong shape.
+    NumericalError
+        If the mesh is empty or not finite.
+    """
+    _require_drawable(mesh, "the mesh")
+    camera = camera_for(mesh.vertices, size=size, view=view)
+    return png_from_pixels(_picture(mesh, camera, STEEL if colours is None else colours))
+
+
+def side_by_side_png(
+    left: trimesh.Trimesh,
+    right: trimesh.Trimesh,
+    titles: tuple[str, str] = ("truth", "reconstruction"),
+    *,
+    size: tuple[int, int] = (720, 640),
+    view: ArrayLike = DEFAULT_VIEW,
+) -> bytes:
+    """Draw two meshes next to each other through the same camera.
+
+    Parameters
+    ----------
+    left, right : Trimesh
+        Metres, world frame.
+    titles : (str, str)
+        One line above each.
+    size : (int, int)
+        Width and height of each half in pixels.
+    view : (3,) float
+        Direction to the camera, world frame.
+
+    Returns
+    -------
+    data : bytes
+        A PNG file.
+
+    Raises
+    ------
+    ValueError
+        If size or view are wrong.
+    NumericalError
+        If a mesh is empty or not finite.
+    """
+    for mesh, title in zip((left, right), titles, strict=True):
+        _require_drawable(mesh, title or "a mesh")
+    camera = camera_for(np.vstack([left.vertices, right.vertices]), size=size, view=view, fill=0.76)
+    halves = []
+    for mesh, title, colour in zip((left, right), titles, (STEEL, CLAY), strict=True):
+        half = Image.fromarray(_picture(mesh, camera, colour))
+        font = ImageFont.load_default(max(12, size[1] // 28))
+        ImageDraw.Draw(half).text((size[0] / 2, 14), title, fill=INK, font=font, anchor="ma")
+        halves.append(np.asarray(half))
+    gap = np.full((size[1], 4, 3), 255, np.uint8)
+    return png_from_pixels(np.hstack([halves[0], gap, halves[1]]))
+
+
+def confidence_png(
+    mesh: trimesh.Trimesh,
+    counts: ArrayLike,
+    *,
+    size: tuple[int, int] = (960, 720),
+    view: ArrayLike = DEFAULT_VIEW,
+) -> bytes:
+    """Draw a mesh in the colours of its confidence, with a bar that tells what they mean.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        Metres.
+    counts : (V,) int
+        How many poses heard the surface around each vertex.
+    size : (int, int)
+        Width and height in pixels.
+    view : (3,) float
+        Direction from the mesh to the camera, world frame; z is up.
+
+    Returns
+    -------
+    data : bytes
+        A PNG file.
+
+    Raises
+    ------
+    ValueError
+        If size, view or counts have a wrong shape.
+    NumericalError
+        If the mesh is empty or not finite.
+    """
+    _require_drawable(mesh, "the mesh")
+    if np.shape(counts) != (len(mesh.vertices),):
+        raise ValueError(f"counts: shape {np.shape(counts)}, expected one per vertex")
+    camera = camera_for(mesh.vertices, size=size, view=view, fill=0.74)
+    picture = Image.fromarray(_picture(mesh, camera, confidence_colours(counts)))
+    _draw_colour_bar(picture)
+    return png_from_pixels(np.asarray(picture))
+
+
+def _draw_colour_bar(picture: Image.Image) -> None:
+    """Draw what the colours of a confidence mean near the lower left corner, in place."""
+    width, height = picture.size
+    margin, length, thick = height // 24, width // 4, max(6, height // 55)
+    left, bottom = margin, height - margin
+    share = np.linspace(0, 1, length)
+    colours = confidence_colours(np.expm1(share * np.log1p(MANY_POSES)))
+    bar = np.broadcast_to(np.round(255 * colours).astype(np.uint8), (thick, length, 3))
+    draw = ImageDraw.Draw(picture)
+    font = ImageFont.load_default(max(11, height // 40))
+    line = round(1.3 * font.getbbox("0")[3])
+    top = bottom - line - thick
+    picture.paste(Image.fromarray(np.ascontiguousarray(bar)), (left, top))
+    draw.rectangle([(left, top), (left + length - 1, top + thick - 1)], outline=INK)
+    for poses in (0, 3, 10, 30, MANY_POSES):
+        x = left + np.log1p(poses) / np.log1p(MANY_POSES) * (length - 1)
+        draw.line([(x, top + thick), (x, top + thick + 4)], fill=INK, width=1)
+        text = f"{poses}+" if poses == MANY_POSES else str(poses)
+        draw.text((x, bottom), text, fill=INK, font=font, anchor="ms")
+    draw.text((left, top - 6), "poses that heard this place", fill=INK, font=font, anchor="ls")
+
+
+def _require_drawable(mesh: trimesh.Trimesh, name: str) -> None:
+    if not len(mesh.faces):
+        raise NumericalError(f"there is nothing to draw: {name} is empty")
+    if not np.isfinite(mesh.vertices).all():
+        raise NumericalError(f"{name} has vertices that are not finite")
+
+
+def _picture(mesh: trimesh.Trimesh, camera: Camera, colour: ArrayLike) -> NDArray[np.uint8]:
+    base = np.asarray(colour, dtype=np.float64)
+    if base.shape not in ((3,), (len(mesh.vertices), 3)):
+        raise ValueError(f"colours: shape {base.shape}, expected (3,) or one per vertex")
+    fine = oversampled(camera)
+    pixels = background(fine.width, fine.height)
+    draw_mesh(pixels, mesh, fine, base)
+    picture = Image.fromarray(averaged(pixels))
+    draw_scale_bar(picture, camera)
+    return np.asarray(picture)
+
+
+def oversampled(camera: Camera) -> Camera:
+    """Return the same camera with more pixels, to be averaged afterwards."""
+    return dataclasses.replace(
+        camera,
+        width=camera.width * OVERSAMPLING,
+        height=camera.height * OVERSAMPLING,
+        scale=camera.scale * OVERSAMPLING,
+    )
+
+
+def draw_scale_bar(picture: Image.Image, camera: Camera) -> None:
+    """Draw a bar of a round length near the lower right corner, in place."""
+    longest = 0.25 * camera.width / camera.scale
+    power = 10 ** np.floor(np.log10(longest))
+    length = max(step for step in (power, 2 * power, 5 * power) if step <= longest)
+    pixels = length * camera.scale
+    margin = camera.height // 24
+    right, bottom = camera.width - margin, camera.height - margin
+    draw = ImageDraw.Draw(picture)
+    draw.line([(right - pixels, bottom), (right, bottom)], fill=INK, width=3)
+    for x in (right - pixels, right):
+        draw.line([(x, bottom - 5), (x, bottom + 5)], fill=INK, width=2)
+    font = ImageFont.load_default(max(11, camera.height // 40))
+    place = (right - pixels / 2, bottom - 8)
+    draw.text(place, f"{1e3 * length:g} mm", fill=INK, font=font, anchor="ms")

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: MIT
+"""Maximum-intensity projections as pictures."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.errors import NumericalError
+from sononerf.report.mip import maximum_intensity_projections
+from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
+from sononerf.surface.start.volume import Volume
+
+# Reflectivity spans decades; what lies further below the greatest value is drawn black.
+RANGE_DB = 40.0
+COLOUR_MAP = "magma"
+LONGEST_SIDE = 4.6  # inches
+
+Scale = Literal["db", "linear"]
+Extents = tuple[tuple[float, float], tuple[float, float]]
+
+
+def _scaled(projection: ArrayLike, scale: Scale) -> NDArray[np.float64]:
+    """Return decibels below the greatest value, or the values themselves from zero."""
+    values = np.asarray(projection, dtype=np.float64)
+    if values.ndim != 2 or not values.size:
+        raise ValueError(f"projection: shape {values.shape}, expected two axes, neither empty")
+    if not np.isfinite(values).all():
+        raise NumericalError("the projection holds values that are not finite")
+    if scale == "linear":
+        return np.maximum(values, 0)
+    top = float(values.max())
+    if not top > 0:
+        return np.full(values.shape, -RANGE_DB)
+    decibels: NDArray[np.float64] = 10 * np.log10(np.maximum(values / top, 10 ** (-RANGE_DB / 10)))
+    return decibels
+
+
+def _limits(values: NDArray[np.float64], scale: Scale) -> tuple[float, float]:
+    if scale == "db":
+        return -RANGE_DB, 0.0
+    top = float(values.max())
+    return 0.0, top if top > 0 else 1.0
+
+
+def mip_png(
+    projection: ArrayLike,
+    extents: Extents,
+    labels: tuple[str, str],
+    *,
+    title: str = "",
+    scale: Scale = "db",
+) -> bytes:
+    """Draw one projection in millimetres.
+
+    Parameters
+    ----------
+    projection : (A, B) float
+        Greatest energy along the axis that is missing.
+    extents : ((low, high), (low, high)) float, m
+        Outer edges of the first (to the right) and the second axis (upwards).
+    labels : (str, str)
+        Names of the two axes.
+    title : str
+        One line above.
+    scale : {"db", "linear"}
+        Decibels below the greatest value (10 log10, 40 dB shown), or linear from zero.
+
+    Returns
+    -------
+    data : bytes
+        A PNG file.
+
+    Raises
+    ------
+    ValueError
+        If the projection has not two axes.
+    NumericalError
+        If a value is not finite.
+    """
+    values = _scaled(projection, scale)
+    low, high = _limits(values, scale)
+    (left, right), (bottom, top) = extents
+    wide, tall = right - left, top - bottom
+    inch = LONGEST_SIDE / max(wide, tall)
+    # The colour bar takes the picture's height: give a flat one room for its label.
+    width, height = max(1.4, wide * inch) + 1.6, max(2.2, tall * inch) + 0.9
+    with figure(width, height, 130, layout="compressed") as drawn:
+        axes = drawn.subplots()
+        picture = axes.imshow(
+            values.T,
+            cmap=COLOUR_MAP,
+            vmin=low,
+            vmax=high,
+            extent=[1e3 * edge for edge in (left, right, bottom, top)],
+            aspect="equal",
+        )
+        axes.set_xlabel(f"{labels[0]} (mm)")
+        axes.set_ylabel(f"{labels[1]} (mm)")
+        if title:
+            axes.set_title(title)
+        label = "dB below the maximum" if scale == "db" else "value"
+        drawn.colorbar(picture, ax=axes, label=label, pad=0.02)
+        return png_from_pixels(pixels_from_figure(drawn))
+
+
+def mip_image(
+    projection: ArrayLike, *, scale: Scale = "db", longest: int = 384
+) -> NDArray[np.uint8]:
+    """Return one projection as pixels (H, W, 3), second axis upwards, without axes or labels.
+
+    Voxels are repeated a whole number of times, so that the longer side comes near ``longest``.
+
+    Raises
+    ------
+    ValueError
+        If the projection has not two axes.
+    NumericalError
+        If a value is not finite.
+    """
+    from matplotlib import colormaps
+
+    values = _scaled(projection, scale)
+    low, high = _limits(values, scale)
+    colours = colormaps[COLOUR_MAP]((values.T[::-1] - low) / (high - low), bytes=True)[..., :3]
+    repeat = max(1, longest // max(values.shape))
+    pixels: NDArray[np.uint8] = colours.repeat(repeat, axis=0).repeat(repeat, axis=1)
+    return pixels
+
+
+def mip_pngs(volume: Volume, *, scale: Scale = "db") -> dict[str, bytes]:
+    """Draw a volume's three projections, named by the axis looked along: ``"x"``, ``"y"``, ``"z"``.
+
+    Raises
+    ------
+    NumericalError
+        If a value is not finite.
+    """
+    edges = [
+        (float(axis[0] - volume.spacing / 2), float(axis[-1] + volume.spacing / 2))
+        for axis in volume.axes()
+    ]
+    pictures = {}
+    for name, projection in maximum_intensity_projections(volume).items():
+        first, second = (axis for axis in range(3) if "xyz"[axis] != name)
+        pictures[name] = mip_png(
+            projection,
+            (edges[first], edges[second]),
+            ("xyz"[first], "xyz"[second]),
+            title=f"maximum along {name}",
+            scale=scale,
+        )
+    return pictures

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: MIT
+"""Meshes as shaded pixels, seen from far away: no graphics library, the same pixels everywhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from sononerf.errors import NumericalError
+from sononerf.evaluation.layered_depth import crossings
+
+# From the scene's front (+x), a little from the right and from above; z is up.
+DEFAULT_VIEW = (1.0, 0.42, 0.34)
+# Rays per pixel along each side.
+OVERSAMPLING = 2
+# Corners whose normal is further than this from the triangle's are edges, not roundings.
+SMOOTH_COSINE = 0.8
+# Lights in the camera's frame (towards the camera, right, up) and their strengths.
+LIGHTS = (((0.75, -0.35, 0.56), 0.55), ((0.45, 0.85, 0.05), 0.26), ((1.0, 0.0, 0.0), 0.10))
+AMBIENT = 0.27
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A parallel projection.
+
+    Parameters
+    ----------
+    axes : (3, 3) float
+        Rows: towards the camera, to the right, upwards; orthonormal.
+    centre : (3,) float, m
+        What stands in the middle of the picture.
+    width, height : int
+        Pixels.
+    scale : float
+        Pixels per metre.
+    """
+
+    axes: NDArray[np.float64]
+    centre: NDArray[np.float64]
+    width: int
+    height: int
+    scale: float
+
+    def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return pixels (..., 2), x to the right and y down, and nearness (...,) m."""
+        local = (np.asarray(points, dtype=np.float64) - self.centre) @ self.axes.T
+        x = self.width / 2 + self.scale * local[..., 1]
+        y = self.height / 2 - self.scale * local[..., 2]
+        return np.stack([x, y], axis=-1), local[..., 0]
+
+
+def camera_for(
+    points: ArrayLike,
+    *,
+    size: tuple[int, int],
+    view: ArrayLike = DEFAULT_VIEW,
+    fill: float = 0.78,
+) -> Camera:
+    """Place a camera so that points (N, 3) fill a share of a picture (width, height).
+
+    Raises
+    ------
+    ValueError
+        If the view has no direction or the size is not positive.
+    NumericalError
+        If there is no point, or one is not finite.
+    """
+    cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    towards = np.asarray(view, dtype=np.float64)
+    if towards.shape != (3,) or not np.isfinite(towards).all() or not np.any(towards):
+        raise ValueError(f"view: {view!r}, expected three numbers, not all zero")
+    if min(size) < 1:
+        raise ValueError(f"size: {size}, expected a positive width and height in pixels")
+    if not len(cloud):
+        raise NumericalError("there is nothing to draw: the mesh is empty")
+    if not np.isfinite(cloud).all():
+        raise NumericalError("there is a point to draw that is not finite")
+    towards = towards / np.linalg.norm(towards)
+    # Looking straight down, x points down in the picture, as on a map with +x towards the viewer.
+    up = np.array([-1.0, 0, 0]) if abs(towards[2]) > 0.999 else np.array([0, 0, 1.0])
+    right = np.cross(up, towards)
+    right /= np.linalg.norm(right)
+    axes = np.stack([towards, right, np.cross(towards, right)])
+    local = cloud @ axes.T
+    low, high = local.min(axis=0), local.max(axis=0)
+    extent = np.maximum(high - low, 1e-9)
+    scale = fill * min(size[0] / extent[1], size[1] / extent[2])
+    return Camera(axes, (low + high) / 2 @ axes, size[0], size[1], float(scale))
+
+
+def background(width: int, height: int) -> NDArray[np.float64]:
+    """Return a soft vertical gradient, (H, W, 3) in 0 to 1."""
+    fall = np.linspace(0, 1, height)[:, None, None]
+    top, bottom = np.array([0.985, 0.988, 0.992]), np.array([0.86, 0.875, 0.89])
+    return np.broadcast_to(top + (bottom - top) * fall**1.5, (height, width, 3)).copy()
+
+
+def _corner_normals(mesh: trimesh.Trimesh, faces: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return a normal per corner of some triangles, (T, 3, 3); sharp edges stay sharp."""
+    flat = np.asarray(mesh.face_normals)[faces]
+    smooth = np.asarray(mesh.vertex_normals)[np.asarray(mesh.faces)[faces]]
+    sharp = np.einsum("tci,ti->tc", smooth, flat) < SMOOTH_COSINE
+    normals: NDArray[np.float64] = np.where(sharp[..., None], flat[:, None], smooth)
+    return normals
+
+
+def _lit(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the brightness of unit normals (N, 3) in the camera's frame."""
+    brightness = AMBIENT + 0.10 * normals[:, 2]  # more light from the sky than from the ground
+    for direction, strength in LIGHTS:
+        light = np.asarray(direction) / np.linalg.norm(direction)
+        brightness = brightness + strength * np.maximum(normals @ light, 0)
+    return np.maximum(brightness, 0.05)
+
+
+def draw_mesh(
+    pixels: NDArray[np.float64],
+    mesh: trimesh.Trimesh,
+    camera: Camera,
+    colour: ArrayLike,
+) -> NDArray[np.float64]:
+    """Draw a mesh over pixels, in place.
+
+    Parameters
+    ----------
+    pixels : (H, W, 3) float
+        Colours in 0 to 1.
+    mesh : Trimesh
+        Metres.
+    camera : Camera
+        Of the same width and height as the pixels.
+    colour : (3,) or (V, 3) float
+        Colour in 0 to 1, one for all or one per vertex.
+
+    Returns
+    -------
+    nearness : (H, W) float, m
+        Of what was drawn; minus infinity where nothing was.
+    """
+    height, width = pixels.shape[:2]
+    vertices = (np.asarray(mesh.vertices) - camera.centre) @ camera.axes.T
+    # Pixel centres; lines ascend with the picture's up.
+    columns = (np.arange(width) + 0.5 - width / 2) / camera.scale
+    rows = (np.arange(height) + 0.5 - height / 2) / camera.scale
+    shown = np.arange(len(mesh.faces))
+    if mesh.is_watertight:
+        shown = np.flatnonzero(np.asarray(mesh.face_normals) @ camera.axes[0] > 0)
+    # Second coordinate is the row: with it first, a triangle facing the camera runs clockwise.
+    found = crossings(vertices[:, [0, 2, 1]], np.asarray(mesh.faces)[shown], rows, columns)
+    nearness = np.full(height * width, -np.inf)
+    winner = np.full(height * width, -1)
+    order = np.argsort(found.depth, kind="stable")
+    winner[found.line[order]] = order  # the nearest is written last
+    seen = np.flatnonzero(winner >= 0)
+    hit = winner[seen]
+    nearness[seen] = found.depth[hit]
+    face, second, third = shown[found.face[hit]], found.second[hit], found.third[hit]
+    weights = np.stack([1 - second - third, second, third], axis=1)
+    normals = np.einsum("nc,nci->ni", weights, _corner_normals(mesh, face)) @ camera.axes.T
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    # The back of a sheet is lit like its front.
+    normals[np.asarray(mesh.face_normals)[face] @ camera.axes[0] < 0] *= -1
+    base = np.asarray(colour, dtype=np.float64)
+    if base.ndim == 2:
+        base = np.einsum("nc,nci->ni", weights, base[np.asarray(mesh.faces)[face]])
+    image = nearness.reshape(height, width)
+    shade = _lit(normals) * _crevices(image).reshape(-1)[seen]
+    flat = pixels[::-1].reshape(-1, 3)
+    flat[seen] = np.clip(base * shade[:, None], 0, 1)
+    pixels[:] = flat.reshape(height, width, 3)[::-1]
+    return image[::-1]
+
+
+def _crevices(nearness: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return how much light reaches each pixel: less where the surroundings stand nearer."""
+    there = np.isfinite(nearness)
+    if not there.any():
+        return np.ones(nearness.shape)
+    low, high = nearness[there].min(), nearness[there].max()
+    filled = np.where(there, nearness - low, 0).astype(np.float32)
+    # What is blurred this far need not be computed at every pixel.
+    coarse = 4
+    radius = 0.02 * max(nearness.shape) / coarse
+    mask = gaussian_filter(there[::coarse, ::coarse].astype(np.float32), radius)
+    blurred = gaussian_filter(filled[::coarse, ::coarse], radius) / np.maximum(mask, 1e-6)
+    rows, columns = (np.arange(size, dtype=np.float32) / coarse for size in nearness.shape)
+    around = map_coordinates(
+        blurred, np.meshgrid(rows, columns, indexing="ij"), order=1, mode="nearest"
+    )
+    rise = (around - filled) / max(high - low, 1e-9)
+    light: NDArray[np.float64] = 1 - np.clip(1.6 * rise, -0.06, 0.30)
+    return light
+
+
+def averaged(pixels: NDArray[np.float64], factor: int = OVERSAMPLING) -> NDArray[np.uint8]:
+    """Average blocks of pixels (H, W, 3) in 0 to 1 into bytes."""
+    height, width = pixels.shape[0] // factor, pixels.shape[1] // factor
+    blocks = pixels[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
+    result: NDArray[np.uint8] = np.round(255 * blocks.mean(axis=(1, 3))).astype(np.uint8)
+    return result

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: MIT
+"""Spectrograms of the receivers: measured, predicted, and their difference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.errors import NumericalError
+from sononerf.head.decibels import ACTIVE_DB
+from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
+
+MARGIN = 0.02
+"""Range that is shown before the first and after the last active cell, m."""
+LEVEL_MAP, DIFFERENCE_MAP = "magma", "RdBu_r"
+MOST_ROWS = 8  # receivers; of more of them, so many are drawn, evenly chosen
+# Inches: what labels need on each side of the panels, between them, and for a colour bar.
+LEFT, TOP, BOTTOM, GAP = 0.76, 0.48, 0.46, 0.13
+BAR, BAR_GAP, BAR_WIDTH = 0.82, 0.08, 0.19
+# Where a logarithmic axis is marked.
+KHZ_MARKS = [digit * 10.0**power for power in range(-3, 4) for digit in (1, 2, 5)]
+
+
+def spectrogram_png(
+    measured_db: ArrayLike | None,
+    predicted_db: ArrayLike,
+    range_m: ArrayLike,
+    frequency_hz: ArrayLike,
+    title: str = "",
+) -> bytes:
+    """Draw one pose's spectrograms, one row per receiver, of eight at most.
+
+    Parameters
+    ----------
+    measured_db : (E, R, F) float or None, dB
+        0 dB is silence; the prediction alone is drawn where None.
+    predicted_db : (E, R, F) float, dB
+        The same.
+    range_m : (R,) float, m
+        Range axis, ascending; drawn only around what sounds.
+    frequency_hz : (F,) float, Hz
+        Frequency axis, ascending; drawn in kHz.
+    title : str
+        One line above.
+
+    Returns
+    -------
+    data : bytes
+        A PNG file.
+
+    Raises
+    ------
+    ValueError
+        If the shapes do not fit.
+    NumericalError
+        If a value is not finite.
+    """
+    return png_from_pixels(_pixels(measured_db, predicted_db, range_m, frequency_hz, title, 130))
+
+
+def spectrogram_image(
+    measured_db: ArrayLike,
+    predicted_db: ArrayLike,
+    range_m: ArrayLike,
+    frequency_hz: ArrayLike,
+    title: str = "",
+) -> NDArray[np.uint8]:
+    """Return the picture of :func:`spectrogram_png` as pixels (H, W, 3), smaller."""
+    return _pixels(measured_db, predicted_db, range_m, frequency_hz, title, 90)
+
+
+def sounding_slice(spectrograms: NDArray[np.floating], range_m: NDArray[np.float64]) -> slice:
+    """Return the part of the range axis that sounds in any of (..., R, F), with a margin.
+
+    All of it where nothing sounds.
+    """
+    loudest = spectrograms.max(axis=-1).reshape(-1, len(range_m)).max(axis=0)
+    active = np.flatnonzero(loudest >= ACTIVE_DB)
+    if not len(active):
+        return slice(0, len(range_m))
+    low, high = range_m[active[0]] - MARGIN, range_m[active[-1]] + MARGIN
+    return slice(
+        int(np.searchsorted(range_m, low)), int(np.searchsorted(range_m, high, side="right"))
+    )
+
+
+def _checked(
+    measured_db: ArrayLike | None,
+    predicted_db: ArrayLike,
+    range_m: ArrayLike,
+    frequency_hz: ArrayLike,
+) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64], NDArray[np.float64]]:
+    ranges, frequencies = (np.asarray(a, dtype=np.float64) for a in (range_m, frequency_hz))
+    given = {} if measured_db is None else {"measured": measured_db}
+    levels = {
+        name: np.asarray(values, dtype=np.float64)
+        for name, values in {**given, "predicted": predicted_db}.items()
+    }
+    expected = (len(levels["predicted"]), len(ranges), len(frequencies))
+    if any(values.shape != expected or not values.size for values in levels.values()):
+        found = " and ".join(f"{name} {values.shape}" for name, values in levels.items())
+        raise ValueError(
+            f"{found}: expected (E, R, F) with R = {len(ranges)} and F = {len(frequencies)}"
+        )
+    for name, values in levels.items():
+        if not np.isfinite(values).all():
+            raise NumericalError(f"the {name} spectrogram holds values that are not finite")
+    return levels, ranges, frequencies
+
+
+def drawn_receivers(count: int, most: int = MOST_ROWS) -> tuple[NDArray[np.int64], list[str]]:
+    """Return which receivers are drawn, evenly chosen, and their names.
+
+    Parameters
+    ----------
+    count : int
+        How many there are.
+    most : int
+        How many are drawn at most.
+    """
+    chosen = np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
+    if count == 2:
+        return chosen, ["left ear", "right ear"]
+    return chosen, ["receiver" if count == 1 else f"receiver {number}" for number in chosen]
+
+
+def axis_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the outer edges of an axis' first and last cell, so that ticks stand at centres."""
+    half = (axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5
+    return float(axis[0] - half), float(axis[-1] + half)
+
+
+def draw_cells(
+    panel: Any,
+    values: NDArray[np.float64],
+    ranges: NDArray[np.float64],
+    frequencies: NDArray[np.float64],
+    **options: Any,
+) -> Any:
+    """Draw cells (R, F) over range (m) and frequency (Hz, drawn in kHz) and return the picture.
+
+    Where the steps of the frequency axis grow, the axis is logarithmic and each cell as tall as
+    its channel is wide.
+    """
+    steps = np.diff(frequencies)
+    if len(steps) < 2 or np.ptp(steps) <= 1e-6 * steps.mean():
+        extent = (*axis_edges(ranges), *axis_edges(frequencies / 1e3))
+        return panel.imshow(values.T, extent=extent, aspect="auto", **options)
+    levels = np.log(frequencies / 1e3)
+    between = (levels[1:] + levels[:-1]) / 2
+    ends = 2 * levels[[0, -1]] - between[[0, -1]]
+    rows = np.exp(np.concatenate(([ends[0]], between, [ends[1]])))
+    columns = np.linspace(*axis_edges(ranges), len(ranges) + 1)
+    picture = panel.pcolormesh(columns, rows, values.T, rasterized=True, **options)
+    panel.set_yscale("log")
+    marks = [mark for mark in KHZ_MARKS if rows[0] <= mark <= rows[-1]]
+    panel.set_yticks(marks, labels=[f"{mark:g}" for mark in marks])
+    panel.minorticks_off()
+    return picture
+
+
+def _round_up(value: float, step: float) -> float:
+    return max(step, step * float(np.ceil(value / step - 1e-9)))
+
+
+def _pixels(
+    measured_db: ArrayLike | None,
+    predicted_db: ArrayLike,
+    range_m: ArrayLike,
+    frequency_hz: ArrayLike,
+    title: str,
+    dpi: int,
+) -> NDArray[np.uint8]:
+    panels, ranges, frequencies = _checked(measured_db, predicted_db, range_m, frequency_hz)
+    shown = sounding_slice(np.stack([*panels.values()]), ranges)
+    panels, ranges = {name: values[:, shown] for name, values in panels.items()}, ranges[shown]
+    top = _round_up(max(values.max() for values in panels.values()), 5)
+    chosen, names = drawn_receivers(len(panels["predicted"]))
+    panels = {name: values[chosen] for name, values in panels.items()}
+    columns, ears = len(panels), len(chosen)
+    if columns == 2:
+        panels["predicted − measured"] = panels["predicted"] - panels["measured"]
+    width, height = 10.5 * len(panels) / 3 + (len(panels) == 1), 0.9 + 2.3 * ears
+    with figure(width, height, dpi, layout=None) as drawn:
+        axes, bars = _axes(drawn, ears, columns, len(panels))
+        for column, (name, values) in enumerate(panels.items()):
+            options: dict[str, Any] = {"cmap": LEVEL_MAP, "vmin": 0, "vmax": top}
+            if column == 2:
+                # A single odd cell must not bleach all the others.
+                worst = _round_up(float(np.quantile(np.abs(values), 0.998)), 3)
+                options = {"cmap": DIFFERENCE_MAP, "vmin": -worst, "vmax": worst}
+            axes[0][column].set_title(name)
+            axes[-1][column].set_xlabel("range (m)")
+            for row, level in zip(axes, values, strict=True):
+                picture = draw_cells(row[column], level, ranges, frequencies, **options)
+                row[column].locator_params(axis="x", nbins=5)  # more would touch one another
+            if column in bars:
+                label = "difference (dB)" if column == 2 else "level (dB)"
+                drawn.colorbar(picture, cax=bars[column], label=label)
+        for row, name in zip(axes, names, strict=True):
+            row[0].set_ylabel(f"{name}\nfrequency (kHz)")
+        if title:
+            drawn.suptitle(title, fontsize=10, y=1 - 0.06 / height, va="top")
+        return pixels_from_figure(drawn)
+
+
+def _axes(
+    drawn: Any, ears: int, columns: int, panels: int
+) -> tuple[list[list[Any]], dict[int, Any]]:
+    """Return axes by ear and column, and a bar's beside the last level and the difference.
+
+    Where all pictures have the same parts, a layout need not be found for each of them.
+    """
+    width, height = drawn.get_size_inches()
+    last = {columns - 1, panels - 1}  # a bar follows
+    wide = (width - LEFT - len(last) * BAR - (panels - len(last)) * GAP) / panels
+    tall = (height - TOP - BOTTOM - (ears - 1) * GAP) / ears
+
+    def part(x: float, y: float, w: float, h: float) -> Any:
+        return drawn.add_axes((x / width, y / height, w / width, h / height))
+
+    axes: list[list[Any]] = [[] for _ in range(ears)]
+    bars = {}
+    x = LEFT
+    for column in range(panels):
+        for ear, row in enumerate(axes):
+            row.append(part(x, BOTTOM + (ears - 1 - ear) * (tall + GAP), wide, tall))
+            row[-1].tick_params(labelleft=column == 0, labelbottom=ear == ears - 1)
+        x += wide
+        if column in last:
+            bars[column] = part(x + BAR_GAP, BOTTOM, BAR_WIDTH, height - TOP - BOTTOM)
+        x += BAR if column in last else GAP
+    return axes, bars

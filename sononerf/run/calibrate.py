@@ -1,0 +1,326 @@
+# SPDX-License-Identifier: MIT
+"""Self-calibration: errors of a recording are found by a run's surface, and taken off a store."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sononerf import storage
+from sononerf.echoes.sealing import seal
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import IncompatibleError, InputError, SettingsError
+from sononerf.head.air import speed_in
+from sononerf.head.row_filters import row_widths
+from sononerf.progress import Progress
+from sononerf.run.attached import attach
+from sononerf.run.fitted import load_fitted, store_of
+from sononerf.run.reconstruct import read_mesh
+from sononerf.settings.schema import HEAD_SECTIONS, Settings, SpectrogramSettings
+from sononerf.surface.refine.echo_data import Echoes, optics_of
+from sononerf.surface.refine.later_bounces import quiet_scene
+from sononerf.surface.refine.self_calibration import KINDS, Calibration, Calibrator, Estimate, Kind
+
+STEPS = 20
+"""At most so many Gauss-Newton steps; they usually end earlier."""
+SETTLED = 0.1
+"""Steps end when they are shorter than this, standard deviations."""
+DETERMINED = 0.25
+"""Largest uncertainty of a length, range resolutions, at which an error counts as found."""
+DETERMINED_DB = 1.0
+"""The same of a gain, dB."""
+INFORMED = 0.7
+"""Largest uncertainty of a pose over the spread of all poses, no unit, at which the echoes say more
+than the spread does."""
+_DB = 20.0 / math.log(10.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibrated:
+    """A corrected store.
+
+    Attributes
+    ----------
+    store : EnsembleStore
+        Complete; opened for reading.
+    estimate : Estimate
+        What was taken off.
+    lines : list of str
+        What was found, one line each.
+    warnings : list of str
+        What the echoes do not determine.
+    """
+
+    store: EnsembleStore
+    estimate: Estimate
+    lines: list[str]
+    warnings: list[str]
+
+
+def kinds_of(names: Sequence[str]) -> tuple[Kind, ...]:
+    """Return the kinds of errors by name.
+
+    Raises
+    ------
+    SettingsError
+        If a name is unknown, or there is none.
+    """
+    unknown = [name for name in names if name not in KINDS]
+    if unknown or not names:
+        found = f"unknown error {unknown[0]!r}" if unknown else "no error is given"
+        raise SettingsError(f"{found}; known: {', '.join(KINDS)}")
+    return tuple(kind for kind in KINDS if kind in names)
+
+
+def calibrate(
+    run: Path, output: Path, kinds: Sequence[str], *, progress: Progress | None = None
+) -> Calibrated:
+    """Find errors of the recording that a run was fitted to, and write a corrected store.
+
+    Parameters
+    ----------
+    run : Path
+        Folder of a run with a surface.
+    output : Path
+        The corrected store; the run's own store is left as it is.
+    kinds : sequence of str
+        Which errors: ``gain``, ``range_offset``, ``speed_of_sound``, ``position``, ``aim``.
+    progress : Progress or None
+        Where to show it.
+
+    Raises
+    ------
+    SettingsError
+        If a kind is unknown.
+    InputError
+        If the run has no surface, or its echoes are not there.
+    IncompatibleError
+        If there is a store at ``output`` already.
+    """
+    progress = progress or Progress(quiet=True)
+    wanted = kinds_of(kinds)
+    fitted = load_fitted(run)
+    file = run / "reconstruction" / "mesh.ply"
+    if not file.is_file():
+        raise InputError(f"{file}: there is no surface; make one with `sononerf reconstruct`")
+    if output.exists() and any(output.iterdir()):
+        raise IncompatibleError(f"{output}: holds something already; choose another --output")
+    storage.probe_writable(output)
+    store, mesh = store_of(fitted), read_mesh(file)
+    estimate = _estimate(fitted.settings, store, mesh, wanted, progress)
+    corrected = _write(fitted.settings, store, output, estimate.calibration, wanted, progress)
+    lines, warnings = describe(fitted.settings, store, mesh, estimate, wanted)
+    return Calibrated(corrected, estimate, lines, warnings)
+
+
+def _estimate(
+    settings: Settings,
+    store: EnsembleStore,
+    mesh: trimesh.Trimesh,
+    kinds: Sequence[Kind],
+    progress: Progress,
+) -> Estimate:
+    optics = optics_of(settings, quiet_scene(mesh))
+    work = Calibrator(
+        mesh, Echoes.of(store), optics, kinds, dependent=dependent_cells(settings.spectrogram)
+    )
+    with progress.task("calibrating", STEPS * len(work.poses)) as task:
+        for _ in range(STEPS):
+            work.step(task.advance)
+            if work.change < SETTLED:
+                break
+    return work.result()
+
+
+def dependent_cells(analysis: SpectrogramSettings) -> float:
+    """Return how many cells of a spectrogram share their noise, no unit, 1 or more."""
+    frequency = np.linspace(analysis.frequency_min, analysis.frequency_max, 64)
+    duration, bandwidth = (part.mean() for part in row_widths(analysis, frequency))
+    rows = (
+        analysis.channels
+        if analysis.kind == "gammatone"
+        else (analysis.frequency_max - analysis.frequency_min)
+        / (analysis.sampling_rate / analysis.fft)
+    )
+    spacing = (analysis.frequency_max - analysis.frequency_min) / rows
+    slices = duration * analysis.sampling_rate / analysis.hop
+    return max(float(slices * bandwidth / spacing), 1.0)
+
+
+def _write(
+    settings: Settings,
+    store: EnsembleStore,
+    output: Path,
+    found: Calibration,
+    kinds: Sequence[Kind],
+    progress: Progress,
+) -> EnsembleStore:
+    """Write the store without the errors; see :func:`calibrate`."""
+    plain = settings.plain()
+    sections = {name: plain[name] for name in HEAD_SECTIONS}
+    speed = speed_in(settings.air) * math.exp(found.speed_of_sound)
+    axis = np.asarray(store.range, dtype=np.float64)
+    if "speed_of_sound" in kinds:
+        axis = axis * math.exp(found.speed_of_sound)
+        step = axis[1] - axis[0]
+        # The same slices: limits that lie between them do not depend on rounding.
+        limits = {
+            "range_min": float(axis[0] - step / 4.0),
+            "range_max": float(axis[-1] + step / 4.0),
+        }
+        sections["air"] = {**sections["air"], "speed_of_sound": speed}
+        sections["spectrogram"] = {**sections["spectrogram"], **limits}
+    turned = Rotation.from_rotvec(found.aim).as_matrix()
+    earlier = store.attributes
+    kept = ("origin", "source", "licence", "format", "units")
+    with storage.lock(output):
+        made = EnsembleStore.create(
+            output,
+            poses_positions=store.positions + found.position,
+            poses_rotations=turned @ store.rotations,
+            split=store.split,
+            range=axis,
+            frequency=store.frequency,
+            attributes={
+                **{name: earlier[name] for name in kept if name in earlier},
+                "echo_hash": f"{earlier['echo_hash']}-{_fingerprint(found)}",
+                "settings": sections,
+                "speed_of_sound": speed,
+                "calibration": {
+                    **(earlier.get("calibration") or {}),
+                    "self_calibration": {
+                        "of": str(store.path),
+                        "gain_db": (found.gain * _DB).tolist(),
+                        "range_offset_m": found.range_offset,
+                        "speed_of_sound": speed,
+                    },
+                },
+            },
+            receivers=store.receivers,
+        )
+        attach(settings, output)
+        factor = np.exp(-found.gain)[:, None, None]
+        with progress.task("writing", len(store)) as task:
+            for index in made.missing():
+                heard = moved(store.read_pose(index), np.asarray(store.range), found.range_offset)
+                made.write_pose(index, (factor * heard).astype(np.float32))
+                task.advance()
+        seal(made, {}, silent=f"{output}: no pose heard anything")
+    return EnsembleStore.open(output)
+
+
+def moved(
+    magnitude: NDArray[np.floating], axis: NDArray[np.floating], offset: float
+) -> NDArray[np.float64]:
+    """Return magnitudes (E, R, F) that are heard so much nearer (m), between slices linearly."""
+    if offset == 0.0:
+        return np.asarray(magnitude, dtype=np.float64)
+    at = (axis + offset - axis[0]) / (axis[1] - axis[0])
+    first = np.floor(at).astype(int)
+    part = (at - first)[:, None]
+    last = len(axis) - 1
+    low, high = (magnitude[:, np.clip(first + more, 0, last)] for more in (0, 1))
+    return np.asarray((1.0 - part) * low + part * high, dtype=np.float64)
+
+
+def _fingerprint(found: Calibration) -> str:
+    values = np.concatenate(
+        [
+            found.gain,
+            [found.range_offset, found.speed_of_sound],
+            found.position.ravel(),
+            found.aim.ravel(),
+        ]
+    )
+    return hashlib.sha256(np.round(values, 9).astype("<f8").tobytes()).hexdigest()[:12]
+
+
+def describe(
+    settings: Settings,
+    store: EnsembleStore,
+    mesh: trimesh.Trimesh,
+    estimate: Estimate,
+    kinds: Sequence[Kind],
+) -> tuple[list[str], list[str]]:
+    """Return what was found and what is not determined, one line each.
+
+    Parameters
+    ----------
+    settings, store, mesh
+        Of the run.
+    estimate : Estimate
+        What was found.
+    kinds : sequence of str
+        What was looked for.
+    """
+    found, deviation = estimate.calibration, estimate.deviation
+    train = store.indices("train")
+    reach = float(np.linalg.norm(store.positions[train] - mesh.centroid, axis=1).mean())
+    resolution = optics_of(settings, quiet_scene(mesh)).resolution
+    speed = speed_in(settings.air)
+    error = estimate.error_db
+    lines = [
+        f"error:          {error[0]:.2f} dB before, {error[-1]:.2f} dB after {len(error)} steps"
+    ]
+    warnings = []
+    if "gain" in kinds:
+        gains = ", ".join(f"{_DB * value:+.2f}" for value in found.gain)
+        lines.append(f"gain:           {gains} dB, each ± {_DB * deviation['gain']:.2f} dB")
+        if _DB * deviation["gain"] > DETERMINED_DB:
+            warnings.append("gain: the echoes do not determine it")
+    if "range_offset" in kinds:
+        off, uncertain = 1e3 * found.range_offset, deviation["range_offset"]
+        lines.append(f"range offset:   {off:+.2f} ± {1e3 * uncertain:.2f} mm")
+        if uncertain > DETERMINED * resolution:
+            warnings.append(
+                "range_offset: the echoes do not separate it from the size of the object"
+            )
+    if {"gain", "range_offset"} <= set(kinds):
+        warnings.append(
+            "gain and range_offset together: a larger object is louder and nearer, so both may be "
+            "wrong together; calibrate one of them by a reference target (import.reference)"
+        )
+    if "speed_of_sound" in kinds:
+        uncertain = deviation["speed_of_sound"]
+        lines.append(
+            f"speed of sound: {speed * math.exp(found.speed_of_sound):.2f} "
+            f"± {speed * uncertain:.2f} m/s"
+        )
+        if uncertain * reach > DETERMINED * resolution or _one_distance(store, mesh, resolution):
+            warnings.append(
+                "speed_of_sound: all poses are at one distance, so it cannot be separated from "
+                "the size of the object; record from several distances"
+            )
+    for kind, name, factor, unit in (
+        ("position", "position", 1e3, "mm"),
+        ("aim", "aim", math.degrees(1.0), "degrees"),
+    ):
+        if kind not in kinds:
+            continue
+        values = getattr(found, kind)[train]
+        usual = math.sqrt(float(np.square(values).mean()))
+        uncertain = deviation[kind]
+        spread = math.hypot(usual, uncertain)
+        lines.append(
+            f"{name + ':':15s} {factor * usual:.2f} {unit} per axis, each ± "
+            f"{factor * uncertain:.2f} {unit}"
+        )
+        if uncertain > INFORMED * spread:
+            warnings.append(
+                f"{kind}: the echoes hardly determine it; the poses stay about as they were"
+            )
+    return lines, warnings
+
+
+def _one_distance(store: EnsembleStore, mesh: trimesh.Trimesh, resolution: float) -> bool:
+    """Whether all training poses are at one distance, as far as ranges can be resolved."""
+    away = np.linalg.norm(store.positions[store.indices("train")] - mesh.centroid, axis=1)
+    return float(np.std(away)) < resolution

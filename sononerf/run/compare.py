@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: MIT
+"""Two runs side by side: what is heard in one and not in the other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+from sononerf import storage
+from sononerf.errors import IncompatibleError, SettingsError
+from sononerf.evaluation.baseline import backprojection
+from sononerf.evaluation.difference_of_runs import added_part, compare
+from sononerf.field.range_slices import WholePoses
+from sononerf.geometry.poses import Poses
+from sononerf.head.decibels import compress
+from sononerf.progress import Progress
+from sononerf.report.pictures.difference_picture import difference_pngs, overlay_png
+from sononerf.run.build import acquisition
+from sononerf.run.fitted import Fitted, all_poses, load_fitted, render_poses
+from sononerf.run.run_folder import differing_keys, results_folder
+from sononerf.run.truth import true_mesh
+from sononerf.simulation.ensemble import TRAIN
+from sononerf.surface.start.volume import Volume, vti_bytes
+
+HEARING = ("air", "ears", "call", "spectrogram")
+"""Sections in which two runs must not differ: else what differs is who listens."""
+VOXELS = 80
+"""Along the longest side."""
+WRONG_WAY = 2.0
+"""So many times what the first has more the second must have more, for the order to look wrong."""
+MOST_POSES = 400
+
+
+def compare_runs(
+    first: Path,
+    second: Path,
+    *,
+    output: Path | None = None,
+    accelerator: str = "auto",
+    progress: Progress | None = None,
+) -> Path:
+    """Compare what two fitted fields are heard to send back, place by place.
+
+    Both are rendered for the same poses, those that either was trained on, and their levels (dB,
+    0 is silence) are projected back to where they can have come from. In decibels a few loud
+    flashes of a smooth face do not drown what answers more faintly in all directions. The places
+    of the two fields themselves are not compared: two fits of one scene place the same sound some
+    millimetres apart.
+
+    Parameters
+    ----------
+    first, second : Path
+        Fitted runs; the difference is the first without the second.
+    output : Path or None
+        Folder of the results; ``FIRST/compare-<name of SECOND>`` where None.
+    accelerator : {"auto", "cpu", "gpu"}
+        What to render on.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    folder : Path
+        With ``comparison.json``; both volumes over their common maximum and their difference as
+        VTI; projections of all three; and the difference on the first's true surface, where that
+        is known.
+
+    Raises
+    ------
+    InputError
+        If one is no fitted run.
+    SettingsError
+        If both are the same folder.
+    IncompatibleError
+        If the two hear differently.
+    NumericalError
+        If both are silent.
+    """
+    progress = progress or Progress(quiet=True)
+    runs = [load_fitted(path) for path in (first, second)]
+    if first.resolve() == second.resolve():
+        raise SettingsError(
+            f"{first} and {second} are the same run; give as the second a run without what is "
+            "looked for"
+        )
+    differing = [
+        key
+        for key in differing_keys(*(run.settings for run in runs))
+        if key.split(".")[0] in HEARING
+    ]
+    if differing:
+        raise IncompatibleError(
+            f"{first} and {second} hear differently ({', '.join(differing)}); fit both alike"
+        )
+    folder = output or first / f"compare-{second.resolve().name}"
+    with results_folder(folder):
+        corners = np.array([run.module.field.region.double().cpu().numpy() for run in runs])
+        box = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+        reference = max(run.module.reference for run in runs)
+        poses = _common_poses(runs)
+        one, other = (_heard(run, poses, reference, *box, accelerator, progress) for run in runs)
+        found = compare(one, other)
+        surfaces = [true_mesh(run.settings) for run in runs]
+        truth = _added(*surfaces)
+        names = first.resolve().name, second.resolve().name
+        missing = -float(found.difference.values.min())
+        if missing > WRONG_WAY * found.score:
+            progress.say(
+                f"{names[1]} has up to {missing:.2f} of the maximum that {names[0]} has not; "
+                "what is looked for belongs into the first run"
+            )
+        for name in ("first", "second", "difference"):
+            storage.commit_bytes(folder / f"{name}.vti", vti_bytes(getattr(found, name), "level"))
+        for axis, picture in difference_pngs(found, names, truth=truth).items():
+            storage.commit_bytes(folder / f"mip_{axis}.png", picture)
+        if surfaces[0] is not None:
+            storage.commit_bytes(folder / "overlay.png", overlay_png(surfaces[0], found))
+        place = found.strongest
+        distance: float | None = None
+        if place is not None and truth is not None:
+            distance = float(np.linalg.norm(place - truth))
+        storage.commit_json(
+            folder / "comparison.json",
+            {
+                "first": names[0],
+                "second": names[1],
+                "poses": len(poses.positions),
+                "score": found.score,
+                "strongest_m": None if place is None else place.tolist(),
+                "added_m": None if truth is None else truth.tolist(),
+                "distance_m": distance,
+            },
+        )
+    return folder
+
+
+def _common_poses(runs: list[Fitted]) -> Poses:
+    """Return the poses that either run was trained on, each once, evenly thinned out."""
+    table = []
+    for run in runs:
+        poses, split = all_poses(run)
+        rows = np.concatenate([poses.positions, poses.rotations.reshape(-1, 9)], axis=1)
+        table.append(rows[split == TRAIN])
+    _, index = np.unique(np.concatenate(table).round(9), axis=0, return_index=True)
+    rows = np.concatenate(table)[np.sort(index)]
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_POSES)).astype(int)]
+    return Poses(rows[:, :3], rows[:, 3:].reshape(-1, 3, 3))
+
+
+def _heard(
+    run: Fitted,
+    poses: Poses,
+    reference: float,
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    accelerator: str,
+    progress: Progress,
+) -> Volume:
+    """Return the mean level that is heard from each place's range."""
+    renderer = run.module.renderer
+    whole = WholePoses(
+        torch.as_tensor(poses.positions),
+        torch.as_tensor(poses.rotations),
+        len(renderer.range),
+        len(renderer.frequency),
+    )
+    rendered = render_poses(run, whole, accelerator=accelerator, progress=progress)
+    known = acquisition(run.settings)
+    # Delay-and-sum adds squares; the square of this is the level.
+    roots = (np.sqrt(compress(spectrogram, reference)) for spectrogram in rendered)
+    return backprojection(
+        roots,
+        poses.positions,
+        poses.rotations,
+        renderer.range.double().cpu().numpy(),
+        lower,
+        upper,
+        float((upper - lower).max()) / VOXELS,
+        emitter_offset=known.emitter.double().numpy(),
+        ear_offsets=known.ear_positions.double().numpy(),
+    )
+
+
+def _added(
+    first: trimesh.Trimesh | None, second: trimesh.Trimesh | None
+) -> NDArray[np.float64] | None:
+    """Return the middle of what the first true surface has and the second has not, (3,) m."""
+    if first is None or second is None:
+        return None
+    added = added_part(first, second)
+    if added is None:
+        return None
+    weights = added.area_faces
+    return np.asarray(weights @ added.triangles_center / weights.sum(), dtype=np.float64)

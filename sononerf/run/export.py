@@ -1,0 +1,196 @@
+# SPDX-License-Identifier: MIT
+"""Echoes, predictions, volumes and points of a surface, as files that other programs read."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyvista
+from numpy.typing import NDArray
+
+from sononerf import __version__, storage
+from sononerf.echoes.named_arrays import FileType, Named, file_bytes
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import InputError, SettingsError
+from sononerf.geometry.poses import Poses, write_pose_csv
+from sononerf.run.reconstruct import read_mesh
+from sononerf.run.store_settings import complete_store
+
+What = Literal["auto", "echoes", "prediction", "volume", "points"]
+
+ARRAYS: dict[str, FileType] = {".mat": "mat", ".h5": "h5", ".hdf5": "h5", ".nc": "nc"}
+FRAME = "world frame, right-handed, z up, metres"
+
+
+def export(source: Path, output: Path, *, what: What = "auto") -> Path:
+    """Write a part of a store or a run as a file of another format, which its suffix names.
+
+    =========== =================================== ==========================================
+    what        formats                             content
+    =========== =================================== ==========================================
+    echoes      ``.mat .h5 .nc``, ``.csv``          spectrograms, poses, axes; poses alone
+    prediction  ``.mat .h5 .nc``                    predicted and measured spectrograms
+    volume      ``.mat .h5 .nc``                    summed reflectivity on a grid
+    points      ``.csv``, ``.mat .h5 .nc``          vertices, normals, poses that heard them
+    =========== =================================== ==========================================
+
+    Parameters
+    ----------
+    source : Path
+        A store, or the folder of a run.
+    output : Path
+        The file.
+    what : {"auto", "echoes", "prediction", "volume", "points"}
+        Which part. ``auto``: echoes of a store; of a run the points for ``.csv``, else the
+        prediction.
+
+    Returns
+    -------
+    output : Path
+        The file that was written.
+
+    Raises
+    ------
+    SettingsError
+        If the suffix is unknown or does not suit the part.
+    InputError
+        If the source is neither a store nor a run, or lacks the part.
+    ResourceError
+        If an array is too large for the format.
+    StorageError
+        If the file cannot be written.
+    """
+    suffix = output.suffix.lower()
+    if suffix not in (*ARRAYS, ".csv"):
+        raise SettingsError(f"{output}: expected a suffix of {', '.join([*ARRAYS, '.csv'])}")
+    is_store = (source / "zarr.json").is_file()
+    if what == "auto":
+        what = "echoes" if is_store else "points" if suffix == ".csv" else "prediction"
+    if is_store != (what == "echoes"):
+        kind = "a store" if is_store else "no store"
+        raise InputError(
+            f"{source}: is {kind}; echoes come from a store, prediction, volume and points from "
+            "the folder of a run"
+        )
+    if suffix == ".csv":
+        storage.commit_text(output, _csv(source, what))
+        return output
+    parts = {"echoes": _echoes, "prediction": _prediction, "volume": _volume, "points": _points}
+    arrays, attributes = parts[what](source)
+    plain = {"software": f"sononerf {__version__}", "frame": FRAME, **attributes}
+    storage.commit_bytes(output, file_bytes(ARRAYS[suffix], arrays, plain))
+    return output
+
+
+Part = tuple[dict[str, Named], dict[str, str]]
+
+
+def _csv(source: Path, what: What) -> str:
+    if what == "echoes":
+        store = EnsembleStore.open(source)
+        return write_pose_csv(Poses(store.positions, store.rotations))
+    if what != "points":
+        raise SettingsError(f"{what}: a .csv file holds poses or points; choose .mat, .h5 or .nc")
+    arrays, _ = _points(source)
+    columns = [arrays["position"].values, arrays["normal"].values, arrays["poses"].values[:, None]]
+    rows = (",".join(f"{value:.9g}" for value in row) for row in np.hstack(columns))
+    return "\n".join(["x,y,z,nx,ny,nz,poses", *rows]) + "\n"
+
+
+def _axes(range_m: NDArray[Any], frequency: NDArray[Any]) -> dict[str, Named]:
+    return {
+        "range": Named(range_m, ("range",), "m", "half of the path from emitter to receiver"),
+        "frequency": Named(frequency, ("frequency",), "Hz", "centre of the frequency bin"),
+    }
+
+
+def _poses(position: NDArray[Any], rotation: NDArray[Any]) -> dict[str, Named]:
+    return {
+        "position": Named(position, ("pose", "world"), "m", "position of the head"),
+        "rotation": Named(rotation, ("pose", "world", "head"), "", "rotation from head to world"),
+    }
+
+
+def _echoes(source: Path) -> Part:
+    store = complete_store(source)
+    loud = np.stack([store.read_pose(index) for index in range(len(store))])
+    known = store.attributes
+    units = str((known.get("units") or {}).get("spectrogram", "linear magnitude"))
+    arrays = {
+        "spectrogram": Named(loud, ("pose", "ear", "range", "frequency"), "1", units),
+        **_poses(store.positions, store.rotations),
+        "split": Named(store.split, ("pose",), "", "0 train, 1 validation, 2 test"),
+        **_axes(store.range, store.frequency),
+    }
+    said = ("origin", "source", "licence", "speed_of_sound", "reference", "settings")
+    text = {name: known[name] for name in said if known.get(name) is not None}
+    return arrays, {
+        name: value if isinstance(value, str) else storage.to_json(value)
+        for name, value in text.items()
+    }
+
+
+def _prediction(source: Path) -> Part:
+    file = source / "prediction" / "spectrograms.npz"
+    if not file.is_file():
+        raise InputError(f"{file}: missing; make it with `sononerf predict {source}`")
+    try:
+        with np.load(file, allow_pickle=False) as opened:
+            found = {name: np.asarray(opened[name]) for name in opened.files}
+        arrays = {
+            name: Named(
+                found[name], ("pose", "ear", "range", "frequency"), "1", f"{name} linear magnitude"
+            )
+            for name in ("predicted", "measured")
+            if name in found
+        }
+        arrays["number"] = Named(found["pose"], ("pose",), "", "number of the pose in the store")
+        arrays |= _poses(found["position"], found["rotation"])
+        arrays |= _axes(found["range_m"], found["frequency_hz"])
+        return arrays, {"reference": repr(float(found["reference"]))}
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise InputError(f"{file}: damaged ({error}); predict again") from error
+
+
+def _volume(source: Path) -> Part:
+    file = _reconstructed(source, "volume.vti")
+    try:
+        image = pyvista.ImageData(file)
+        size = image.dimensions
+        flat = np.asarray(image.point_data["reflectivity"], dtype=np.float32)
+        values = flat.reshape(size, order="F")
+    except (KeyError, ValueError, TypeError) as error:
+        raise InputError(f"{file}: damaged ({error}); reconstruct again") from error
+    axes = {
+        name: Named(
+            start + step * np.arange(count), (name,), "m", f"centre of the voxel along {name}"
+        )
+        for name, start, step, count in zip("xyz", image.origin, image.spacing, size, strict=True)
+    }
+    meaning = "reflectivity summed over directions and frequencies"
+    return {"reflectivity": Named(values, ("x", "y", "z"), "1", meaning), **axes}, {}
+
+
+def _points(source: Path) -> Part:
+    mesh = read_mesh(_reconstructed(source, "mesh.ply"))
+    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    count = len(mesh.vertices)
+    heard = np.zeros(count, np.int32)
+    if raw is not None and "poses" in (raw.dtype.names or ()) and len(raw) == count:
+        heard = np.asarray(raw["poses"], dtype=np.int32)
+    return {
+        "position": Named(np.asarray(mesh.vertices), ("point", "world"), "m", "vertex of the mesh"),
+        "normal": Named(
+            np.asarray(mesh.vertex_normals), ("point", "world"), "", "outward unit normal"
+        ),
+        "poses": Named(heard, ("point",), "", "number of poses that heard the surface around it"),
+    }, {}
+
+
+def _reconstructed(source: Path, name: str) -> Path:
+    file = source / "reconstruction" / name
+    if not file.is_file():
+        raise InputError(f"{file}: missing; make it with `sononerf reconstruct {source}`")
+    return file

@@ -1,0 +1,340 @@
+# SPDX-License-Identifier: MIT
+"""Fit a field to an ensemble; go on where an interrupted fit stopped."""
+
+from __future__ import annotations
+
+import logging
+import resource
+import sys
+import time
+import warnings
+from dataclasses import fields
+from pathlib import Path
+
+import lightning
+import numpy as np
+import torch
+from lightning.fabric.utilities.rank_zero import rank_zero_only
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from sononerf import storage
+from sononerf.callbacks.checkpoint import CheckpointCallback
+from sononerf.callbacks.preview import PreviewCallback
+from sononerf.callbacks.progress_bar import ProgressCallback
+from sononerf.callbacks.spectrogram_images import SpectrogramImages
+from sononerf.callbacks.threads import ThreadsCallback
+from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.onsets import find_onsets
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import NumericalError, ResourceError, StoppedError
+from sononerf.field.checkpoint_io import DurableCheckpointIO
+from sononerf.field.datamodule import EchoDataModule
+from sononerf.field.module import EchoModule
+from sononerf.field.weights import save_weights
+from sononerf.progress import Progress
+from sononerf.run.build import (
+    check_plugins,
+    data_for,
+    echo_hull,
+    echo_region,
+    field_and_renderer,
+    module_for,
+    point_echo,
+)
+from sononerf.run.run_folder import RunFolder
+from sononerf.run.simulate import (
+    background_path,
+    ensemble,
+    open_ensemble,
+    store_path,
+)
+from sononerf.run.store_settings import with_store
+from sononerf.settings.schema import Settings
+
+WAIT_SECONDS = 0.5
+LEAST_STEPS = 60
+"""A pass over few poses takes fewer steps than a field needs: an epoch is then several."""
+
+LINE = (
+    "all training poses lie on a straight line: the echoes do not tell the angle around it, so the "
+    "surface may be drawn out around the line; fly another way as well"
+)
+
+
+def quiet_lightning() -> None:
+    """Leave out Lightning's advertising and hints about what we do on purpose."""
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
+    for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
+        logging.getLogger(name).setLevel(logging.ERROR)
+    for pattern in (
+        r".*does not have many workers.*",  # the ensemble lies in memory
+        r".*GPU available but not used.*",  # the user chose
+        r".*resumed from a checkpoint that ended before the epoch.*",  # ours go by the step
+        r".*\.*Checkpoint directory .* exists and is not empty.*",
+        r".*`max_epochs` was not set.*",
+        r".*treespec, LeafSpec.* is deprecated.*",  # Lightning's own call of torch
+    ):
+        warnings.filterwarnings("ignore", message=pattern)
+
+
+def require_accelerator(accelerator: str) -> None:
+    """Refuse a GPU that is not there.
+
+    Raises
+    ------
+    ResourceError
+        If ``gpu`` was asked for and there is none.
+    """
+    if accelerator == "gpu" and not (
+        torch.cuda.is_available() or torch.backends.mps.is_available()
+    ):
+        raise ResourceError("no GPU that torch can use; take --accelerator cpu, or auto")
+
+
+def follows() -> bool:
+    """Return whether this process is one of several that fit together, and not the first."""
+    return int(getattr(rank_zero_only, "rank", 0)) > 0
+
+
+def _wait_for_store(settings: Settings) -> EnsembleStore:
+    """Open the ensemble once the first process has sealed it."""
+    path = store_path(settings, None, None)
+    background = background_path(settings)
+    while not all(_is_sealed(part) for part in (path, background) if part is not None):
+        time.sleep(WAIT_SECONDS)
+    return open_ensemble(settings, path)
+
+
+def _is_sealed(path: Path) -> bool:
+    if not (path / "zarr.json").is_file():
+        return False
+    store = EnsembleStore.open(path)
+    return "reference" in store.attributes and not store.missing()
+
+
+def fit(
+    settings: Settings,
+    path: Path,
+    *,
+    accelerator: str = "auto",
+    devices: int | str = "auto",
+    num_nodes: int = 1,
+    overwrite: bool = False,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> RunFolder:
+    """Simulate where needed, or open the store of ``data.store``; fit, and keep the fitted field.
+
+    The same call goes on where an interrupted one stopped; a finished run is left as it is.
+
+    Parameters
+    ----------
+    settings : Settings
+        The experiment.
+    path : Path
+        The run's folder.
+    accelerator : {"auto", "cpu", "gpu"}
+        What to fit on.
+    devices : int or "auto"
+        How many.
+    num_nodes : int
+        How many machines.
+    overwrite : bool
+        Move a folder that is there aside.
+    workers : int or None
+        Processes that simulate.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    run : RunFolder
+        With ``model.safetensors`` and ``model.json``.
+
+    Raises
+    ------
+    SonoNerfError
+        Each kind as its name says; :class:`StoppedError` after a signal, with all saved.
+    """
+    progress = progress or Progress(quiet=True)
+    run = RunFolder(path)
+    require_accelerator(accelerator)
+    settings = with_store(settings)
+    check_plugins(settings)
+    if follows():
+        # The first process holds the lock, simulates and writes; the others only compute.
+        store = _wait_for_store(settings)
+        _fit(settings, run, store, accelerator, devices, num_nodes, Progress(quiet=True))
+        return run
+    if overwrite:
+        aside = run.move_aside()
+        if aside:
+            progress.say(f"moved the old run to {aside}")
+    created = storage.probe_writable(path)
+    try:
+        with storage.lock(path):
+            run.check(settings)
+            if run.is_fitted:
+                return run
+            started = time.monotonic()
+            store = ensemble(settings, workers=workers, progress=progress)
+            simulated = time.monotonic() - started
+            run.begin(settings)
+            run.write_provenance(
+                echo_hash=store.attributes["echo_hash"], threads=torch.get_num_threads()
+            )
+            if "simulate_s" not in run.read_metrics().get("cost", {}):
+                run.write_metrics("cost", {"simulate_s": simulated}, merge=True)
+            _fit(settings, run, store, accelerator, devices, num_nodes, progress)
+    finally:
+        storage.remove_if_empty(created)  # those stay that something came of
+    return run
+
+
+def _length(settings: Settings, per_pass: int) -> tuple[int, int]:
+    """Return steps per epoch and steps in all."""
+    steps = settings.fit.steps_per_epoch
+    per_epoch = max(per_pass, LEAST_STEPS) if steps == "auto" else steps
+    total = per_epoch * settings.fit.epochs
+    if settings.fit.max_steps is not None:
+        total = min(total, settings.fit.max_steps)
+    return min(per_epoch, total), total
+
+
+def _fit(
+    settings: Settings,
+    run: RunFolder,
+    store: EnsembleStore,
+    accelerator: str,
+    devices: int | str,
+    num_nodes: int,
+    progress: Progress,
+) -> None:
+    quiet_lightning()
+    keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
+    echo = point_echo(settings)
+    heard = find_onsets(store, echo)
+    hull = echo_hull(settings, store, heard)
+    region, possible = echo_region(settings, store, hull, heard)
+    corners = (1000 * region).round().int().tolist()
+    progress.say(f"region {corners[0]} to {corners[1]} mm")
+    if hull.width < echo.resolution:
+        progress.say(LINE)
+    field, renderer = field_and_renderer(settings, region)
+    options = settings.fit
+    data = data_for(settings, store, renderer)
+    per_epoch, total = _length(settings, data.stream().batches_per_pass)
+    module = module_for(
+        settings,
+        field,
+        renderer,
+        reference=float(store.attributes["reference"]),
+        possible=possible,
+        total_steps=total,
+        steps_per_epoch=per_epoch,
+    )
+    resumed = _resume(run, data)
+    if not resumed and not follows():
+        run.clear_previews()
+    with progress.task("fitting", total) as task, keeper.watching():
+        trainer = lightning.Trainer(
+            accelerator=accelerator,
+            devices=devices,
+            num_nodes=num_nodes,
+            max_epochs=-1,
+            max_steps=total,
+            val_check_interval=per_epoch,
+            check_val_every_n_epoch=None,
+            limit_val_batches=1.0 if len(store.indices("val")) else 0,
+            num_sanity_val_steps=0,
+            gradient_clip_val=options.gradient_clip,
+            logger=TensorBoardLogger(run.path, name="tensorboard", version=""),
+            callbacks=[
+                ProgressCallback(task),
+                ThreadsCallback(),
+                PreviewCallback(
+                    run.path,
+                    every_epochs=settings.preview.every_epochs,
+                    voxels=settings.preview.voxels,
+                    directions=settings.reconstruction.directions,
+                ),
+                SpectrogramImages(data.whole("val"), renderer.range, renderer.frequency),
+                keeper,
+            ],
+            plugins=[DurableCheckpointIO()],
+            enable_checkpointing=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            use_distributed_sampler=False,
+            log_every_n_steps=5,
+            default_root_dir=run.path,
+        )
+        trainer.fit(module, data, ckpt_path=run.checkpoint if resumed else None, weights_only=True)
+        _finish(settings, run, store, hull, module, keeper.elapsed, trainer)
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        # What follows is for the first process alone; metrics would wait for the others.
+        torch.distributed.destroy_process_group()
+    if keeper.stopped_by is not None:
+        raise StoppedError(
+            keeper.stopped_by, "stopped after the last step; the same command goes on"
+        )
+
+
+def _resume(run: RunFolder, data: EchoDataModule) -> bool:
+    previous = run.checkpoint.with_name(f"{run.checkpoint.name}.previous")
+    if not run.checkpoint.is_file() and not previous.is_file():
+        return False
+    step = DurableCheckpointIO().load_checkpoint(run.checkpoint)["global_step"]
+    data.sampler.start = int(step)
+    return True
+
+
+def _finish(
+    settings: Settings,
+    run: RunFolder,
+    store: EnsembleStore,
+    hull: EchoHull,
+    module: EchoModule,
+    seconds: float,
+    trainer: lightning.Trainer,
+) -> None:
+    bad = [n for n, p in module.named_parameters() if not bool(p.isfinite().all())]
+    if bad:
+        raise NumericalError(f"the fitted {bad[0]} is not finite; lower fit.learning_rate")
+    if not trainer.is_global_zero:
+        return
+    state = {f"field.{k}": v for k, v in module.field.state_dict().items()}
+    state |= {f"renderer.{k}": v for k, v in module.renderer.state_dict().items()}
+    state |= {f"hull.{f.name}": _double(getattr(hull, f.name)) for f in fields(hull)}
+    run.write_metrics(
+        "cost",
+        {
+            "fit_s": seconds,
+            "steps": trainer.global_step,
+            "points_evaluated": int(module.renderer.points_evaluated),
+            "parameters": sum(p.numel() for p in module.parameters()),
+            "device": str(trainer.strategy.root_device.type),
+            "peak_memory_bytes": peak_memory_bytes(),
+        },
+        merge=True,
+    )
+    save_weights(
+        run.path,
+        state,
+        {
+            "settings": settings.plain(),
+            "reference": float(store.attributes["reference"]),
+            "echo_hash": store.attributes["echo_hash"],
+        },
+    )
+
+
+def _double(values: object) -> torch.Tensor:
+    return torch.as_tensor(np.asarray(values, dtype=np.float64))
+
+
+def peak_memory_bytes() -> int:
+    """Return the greatest resident memory of this process so far."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return int(peak if sys.platform == "darwin" else peak * 1024)

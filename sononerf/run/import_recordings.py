@@ -1,0 +1,289 @@
+# SPDX-License-Identifier: MIT
+"""From recordings to a sealed ensemble of echoes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+import tempfile
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf import __version__, storage
+from sononerf.echoes.onsets import PointEcho, find_onsets
+from sononerf.echoes.sealing import seal
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import IncompatibleError
+from sononerf.head.reception import warn_of_call
+from sononerf.head.spectrogram import frequency_axis, range_axis
+from sononerf.progress import Progress
+from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses
+from sononerf.recordings.splits import repeats
+from sononerf.recordings.understand import Understood, understand
+from sononerf.report.pictures.ping_picture import pings_png
+from sononerf.run.attached import attach
+from sononerf.settings.schema import HEAD_SECTIONS, CallSettings
+
+logger = logging.getLogger("sononerf")
+
+SHOWN = 3  # pings in a picture
+NOT_HASHED = ("source", "licence")
+"""What does not change the echoes."""
+COARSER = 1.5
+"""Range resolution over that of an impulse, no unit, from which on pulse compression is proposed:
+less would hardly be seen."""
+
+
+def echo_hash(understood: Understood) -> str:
+    """Return a hash of all that the echoes come from: samples, poses, settings."""
+    plain = understood.settings.plain()
+    digest = hashlib.sha256(f"recordings {understood.form}".encode())
+    given = understood.wanted.model_dump(mode="json", exclude=set(NOT_HASHED))
+    sections = {name: plain[name] for name in HEAD_SECTIONS}
+    digest.update(json.dumps([given, sections, understood.calibration], sort_keys=True).encode())
+    poses = understood.poses[understood.pings]
+    for values in (poses.positions, poses.rotations):
+        digest.update((np.round(values, 9) + 0.0).astype("<f8").tobytes())
+    digest.update(understood.split.tobytes())
+    digest.update(understood.pings.astype("<i8").tobytes())
+    digest.update(np.round(understood.recording.emission, 12).astype("<f8").tobytes())
+    digest.update(understood.cutter.digest(understood.reception.samples))
+    if understood.cutter.background is not None:
+        digest.update(np.round(understood.cutter.background, 9).astype("<f8").tobytes())
+    return digest.hexdigest()
+
+
+def spectrogram_of(understood: Understood, ping: int) -> NDArray[np.float32]:
+    """Return what the receivers heard of one ping of the recording, (E, R, F)."""
+    reception = understood.reception
+    echo = understood.cutter.echo(ping, reception.samples)
+    return reception.analyse(echo).astype(np.float32)
+
+
+def import_recordings(
+    form: str,
+    source: Path,
+    output: Path,
+    *,
+    settings_file: Path | None = None,
+    overrides: Iterable[str] = (),
+    progress: Progress | None = None,
+) -> tuple[EnsembleStore, Verdict]:
+    """Make an ensemble of recordings, or open it if it is there already.
+
+    Parameters
+    ----------
+    form : str
+        ``recordings``, ``numpy``, ``sonotracelab``, ``sononerf-matlab`` or ``airsas``.
+    source : Path
+        File or folder.
+    output : Path
+        The store.
+    settings_file : Path or None
+        Settings of the import; ``import.yaml`` beside the recordings where None.
+    overrides : iterable of str
+        ``KEY=VALUE``.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    store : EnsembleStore
+        Complete; opened for reading.
+    verdict : Verdict
+        What the first echoes say of the poses.
+
+    Raises
+    ------
+    SettingsError, InputError
+        If settings, recordings or poses are no good; nothing is written then.
+    NumericalError
+        If no pose hears anything.
+    StorageError
+        If the store cannot be written.
+    IncompatibleError
+        If the folder holds another ensemble.
+    """
+    known = understand(form, source, output, settings_file=settings_file, overrides=overrides)
+    return import_understood(known, output, progress=progress)
+
+
+def import_understood(
+    known: Understood, output: Path, *, progress: Progress | None = None
+) -> tuple[EnsembleStore, Verdict]:
+    """Write what was understood; see :func:`import_recordings`."""
+    progress = progress or Progress(quiet=True)
+    wanted = echo_hash(known)
+    if (output / "zarr.json").is_file():
+        store = EnsembleStore.open(output)
+        if store.attributes.get("echo_hash") != wanted:
+            raise IncompatibleError(f"{output}: holds other echoes; choose another --output")
+        if "reference" in store.attributes and not store.missing():
+            return store, verdict(known, store)
+    warn_of_call(known.settings.call, known.settings.spectrogram)
+    poses = known.poses[known.pings]
+    storage.probe_writable(output)
+    with storage.lock(output):
+        store = EnsembleStore.create(
+            output,
+            poses_positions=poses.positions,
+            poses_rotations=poses.rotations,
+            split=known.split,
+            range=range_axis(known.settings.spectrogram, known.speed_of_sound),
+            frequency=frequency_axis(known.settings.spectrogram),
+            attributes=_attributes(known, wanted),
+            receivers=_receivers(known),
+        )
+        attach(known.settings, output)
+        missing = store.missing()
+        with progress.task("importing", len(missing)) as task:
+            for index in missing:
+                store.write_pose(index, spectrogram_of(known, int(known.pings[index])))
+                task.advance()
+        pairs = repeats(poses, known.split)
+        again = {index: store.read_pose(other) for index, other in pairs.items()}
+        seal(store, again, silent=f"{output}: all recordings are silent; check the channels")
+    store = EnsembleStore.open(output)
+    return store, verdict(known, store)
+
+
+def _receivers(known: Understood) -> int:
+    places = known.settings.ears.receivers
+    return len(known.ears.positions) if places is None else len(places)
+
+
+def _attributes(known: Understood, wanted: str) -> dict[str, Any]:
+    plain = known.settings.plain()
+    return {
+        "echo_hash": wanted,
+        "origin": "recorded",
+        "format": known.form,
+        "source": known.wanted.source or known.recording.path.name,
+        "licence": known.wanted.licence,
+        "settings": {name: plain[name] for name in HEAD_SECTIONS},
+        "import": known.wanted.model_dump(mode="json"),
+        "calibration": known.calibration,
+        "rejected_clipped": known.clipped,
+        "speed_of_sound": known.speed_of_sound,
+        "units": {
+            "spectrogram": "linear magnitude, sound pressure over that of the call at 1 m"
+            if known.wanted.reference is not None
+            else "linear magnitude, unit of the recording",
+            "position": "m",
+            "range": "m",
+            "frequency": "Hz",
+        },
+        "sononerf": __version__,
+    }
+
+
+def verdict(known: Understood, store: EnsembleStore) -> Verdict:
+    """Return what the first echoes of the training poses say of the conventions of poses."""
+    echo = PointEcho.of(known.settings.call, known.settings.spectrogram, known.speed_of_sound)
+    heard = find_onsets(store, echo)
+    columns = known.recording.columns.take(known.pings[heard.poses])
+    places = known.settings.ears.receivers
+    return check_poses(
+        heard.first,
+        known.poses[known.pings[heard.poses]],
+        alternatives(columns, known.wanted),
+        emitter=known.ears.emitter,
+        receivers=known.ears.positions if places is None else np.asarray(places, dtype=np.float64),
+        resolution=echo.resolution,
+    )
+
+
+def check_before(known: Understood, *, progress: Progress | None = None) -> Verdict:
+    """Return the verdict on the poses without making a store.
+
+    Raises
+    ------
+    NumericalError
+        If no pose hears anything.
+    StorageError
+        If the folder of temporary files cannot be written.
+    """
+    train = np.flatnonzero(known.split == 0)
+    chosen = train[np.linspace(0, len(train) - 1, min(MOST, len(train))).round().astype(int)]
+    part = replace(known, pings=known.pings[chosen], split=known.split[chosen])
+    with tempfile.TemporaryDirectory() as folder:
+        return import_understood(part, Path(folder) / "store", progress=progress)[1]
+
+
+def describe(known: Understood) -> list[str]:
+    """Return what was understood, one line each."""
+    settings, analysis = known.settings, known.settings.spectrogram
+    poses = known.poses[known.pings]
+    lower, upper = poses.positions.min(axis=0), poses.positions.max(axis=0)
+    axis = range_axis(analysis, known.speed_of_sound)
+    frequency = frequency_axis(analysis)
+    units = known.recording.columns.units
+    said = ", ".join(sorted({f"{kind} in {unit}" for kind, unit in _kinds(units).items()}))
+    counts = np.bincount(known.split, minlength=3)
+    call = settings.call
+    bands = ", ".join(f"{a / 1e3:g} to {b / 1e3:g} kHz" for a, b in call.bands.values())
+    frame = "turntable" if known.wanted.turntable is not None else known.wanted.frame
+    lines = [
+        f"source:     {known.recording.path} ({known.form}), {known.recording.sampling_rate:g} Hz",
+        f"pings:      {len(known.recording)} read, {known.clipped} clipped and rejected; "
+        f"{counts[0]} train, {counts[1]} validation, {counts[2]} test",
+        f"receivers:  {_receivers(known)}, {settings.ears.directivity}",
+        f"poses:      frame {frame}{'; ' + said if said else ''}; x {lower[0]:.3f} to "
+        f"{upper[0]:.3f}, y {lower[1]:.3f} to {upper[1]:.3f}, z {lower[2]:.3f} to "
+        f"{upper[2]:.3f} m",
+        f"call:       {call.kind}{', ' + bands if bands else ''}"
+        f"{', by pulse compression' if known.wanted.compress else ''}",
+        f"air:        {known.speed_of_sound:.1f} m/s",
+        f"range:      {axis[0]:.3f} to {axis[-1]:.3f} m in {len(axis)} slices of "
+        f"{1e3 * (axis[1] - axis[0]) if len(axis) > 1 else 0.0:.2f} mm",
+        f"frequency:  {frequency[0] / 1e3:.1f} to {frequency[-1] / 1e3:.1f} kHz in "
+        f"{len(frequency)} bins (window {analysis.window}, hop {analysis.hop}, fft {analysis.fft})",
+        f"noise:      the loudest echo of a ping is {known.level_db:.0f} dB above the quietest "
+        "tenth of its ranges",
+    ]
+    here, there = (
+        1e3 * PointEcho.of(each, analysis, known.speed_of_sound).resolution
+        for each in (call, CallSettings())
+    )
+    if here > COARSER * there:
+        lines.append(
+            f"note:       ranges are resolved to {here:.0f} mm; import.compress=true resolves "
+            f"them to {there:.0f} mm"
+        )
+    applied = {k: v for k, v in known.calibration.items() if v not in (0.0, 1.0)}
+    if applied:
+        lines.append(f"calibration: {json.dumps(applied)}")
+    return [*lines, *(f"note:       {note}" for note in known.notes)]
+
+
+def _kinds(units: dict[str, str]) -> dict[str, str]:
+    return {("angles" if unit in ("deg", "rad") else "lengths"): unit for unit in units.values()}
+
+
+def draw(known: Understood, folder: Path) -> Path:
+    """Draw poses, and waveforms and spectrograms of the first pings, into a folder.
+
+    Raises
+    ------
+    StorageError
+        If it cannot be written.
+    """
+    reception = known.reception
+    pings = [int(ping) for ping in known.pings[:SHOWN]]
+    picture = pings_png(
+        [known.cutter.echo(ping, reception.samples) for ping in pings],
+        [spectrogram_of(known, ping) for ping in pings],
+        [known.recording.labels[ping] for ping in pings],
+        sampling_rate=known.settings.spectrogram.sampling_rate,
+        range_m=range_axis(known.settings.spectrogram, known.speed_of_sound),
+        frequency_hz=frequency_axis(known.settings.spectrogram),
+        poses=known.poses[known.pings],
+    )
+    storage.commit_bytes(folder / "pings.png", picture)
+    return folder / "pings.png"

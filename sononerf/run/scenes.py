@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: MIT
+"""What scenes there are, and how they look."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from pathlib import Path
+from typing import Any
+
+from sononerf import storage
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import InputError, SonoNerfError
+from sononerf.head.decibels import compress
+from sononerf.report.pictures.echo_picture import echo_png
+from sononerf.report.pictures.mesh_picture import mesh_png
+from sononerf.report.pictures.scene_picture import scene_png
+from sononerf.run.simulate import scene_of
+from sononerf.scene.scene import list_scenes, load_scene
+from sononerf.settings import plugins
+from sononerf.settings.schema import Settings
+from sononerf.simulation.ensemble import pose_seed
+from sononerf.simulation.simulator import Simulator
+
+
+def describe_scenes() -> list[dict[str, Any]]:
+    """Return what there is to know of every scene, built as it is without options.
+
+    Returns
+    -------
+    rows : list of dict
+        Plain data. ``needs`` are the options without a default; where there are any, ``size_m``
+        and ``triangles`` are None. A broken scene says in its ``summary`` why, and hurts no other.
+    """
+    rows = []
+    for plugin in list_scenes():
+        row: dict[str, Any] = {
+            "name": plugin.name,
+            "distribution": plugin.distribution,
+            "version": plugin.version,
+            "broken": False,
+            "options": [],
+            "needs": [],
+            "size_m": None,
+            "triangles": None,
+        }
+        try:
+            with _quietly():
+                factory = plugins.load(plugins.SCENES, plugin.name)
+                row["summary"] = (inspect.getdoc(factory) or "").partition("\n")[0]
+                row["options"], row["needs"] = _options(factory)
+                if not row["needs"]:
+                    mesh = load_scene(plugin.name).mesh
+                    row["size_m"] = [float(length) for length in mesh.extents]
+                    row["triangles"] = len(mesh.faces)
+        except SonoNerfError as error:
+            row["summary"] = "broken: " + " ".join(str(error).split())
+            row["broken"] = True
+        rows.append(row)
+    return rows
+
+
+def scene_table(rows: list[dict[str, Any]]) -> list[str]:
+    """Return the rows as lines of an aligned table under a head; sizes in millimetres."""
+    table = [["name", "from", "size (mm)", "triangles", ""]]
+    for row in rows:
+        size = " x ".join(f"{1e3 * length:.4g}" for length in row["size_m"] or [])
+        needs = f"needs {', '.join(row['needs'])}" if row["needs"] else "-"
+        count = "-" if row["triangles"] is None else str(row["triangles"])
+        origin = f"{row['distribution']} {row['version']}"
+        table.append([row["name"], origin, size or needs, count, row["summary"]])
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    return [
+        f"{name:{widths[0]}}  {origin:{widths[1]}}  {size:{widths[2]}}  {count:>{widths[3]}}  "
+        f"{summary}".rstrip()
+        for name, origin, size, count, summary in table
+    ]
+
+
+def describe_scene(name: str) -> dict[str, Any]:
+    """Return what one scene is, and what may be set of it.
+
+    Returns
+    -------
+    scene : dict
+        ``name``, ``description``, all of it but what is returned and raised, and ``options``, as
+        :func:`sononerf.settings.plugins.describe_options` has them.
+
+    Raises
+    ------
+    SettingsError
+        If there is no such scene.
+    InputError
+        If it is broken.
+    """
+    with _quietly():
+        factory = plugins.load(plugins.SCENES, name)
+        return {
+            "name": name,
+            "description": (inspect.getdoc(factory) or "").partition("\n\nReturns\n")[0],
+            "options": plugins.describe_options(factory),
+        }
+
+
+def option_table(scene: dict[str, Any]) -> list[str]:
+    """Return a scene's description and its options as lines."""
+    table = [("scene.options.", "default", "allowed")]
+    for row in scene["options"]:
+        default = "needed" if row["needed"] else _plain(row["default"])
+        table.append((row["name"], default, row["allowed"]))
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    lines = [f"{a:{widths[0]}}  {b:{widths[1]}}  {c}".rstrip() for a, b, c in table]
+    return [*scene["description"].splitlines(), "", *lines]
+
+
+def _plain(value: object) -> str:
+    return json.dumps(value) if isinstance(value, bool) else "none" if value is None else str(value)
+
+
+def _options(factory: Callable[..., Any]) -> tuple[list[str], list[str]]:
+    """Return the names of a factory's options, and of those that have no default."""
+    try:
+        given = inspect.signature(factory).parameters.values()
+    except (TypeError, ValueError) as error:
+        raise InputError(f"its arguments cannot be read: {error}") from None
+    named = [p for p in given if p.kind not in (p.VAR_POSITIONAL, p.VAR_KEYWORD)]
+    return [p.name for p in named], [p.name for p in named if p.default is p.empty]
+
+
+@contextmanager
+def _quietly() -> Iterator[None]:
+    """Keep what factories print off our output, and warnings of meshes nobody asked for."""
+
+    def drop(record: logging.LogRecord) -> bool:
+        del record
+        return False
+
+    logger = logging.getLogger("sononerf")
+    logger.addFilter(drop)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        logger.removeFilter(drop)
+
+
+def draw_scenes(folder: Path) -> tuple[list[Path], list[str]]:
+    """Draw every scene that needs no options.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the pictures, ``NAME.png`` each.
+
+    Returns
+    -------
+    written : list of Path
+        The pictures.
+    skipped : list of str
+        Each other scene, and why it is not drawn.
+
+    Raises
+    ------
+    StorageError
+        If the folder cannot be written, before anything is drawn.
+    """
+    storage.probe_writable(folder)
+    written, skipped = [], []
+    for plugin in list_scenes():
+        try:
+            with _quietly():
+                needs = _options(plugins.load(plugins.SCENES, plugin.name))[1]
+                picture = None if needs else mesh_png(load_scene(plugin.name).mesh)
+        except SonoNerfError as error:
+            skipped.append(f"{plugin.name}: " + " ".join(str(error).split()))
+            continue
+        if picture is None:
+            skipped.append(f"{plugin.name}: needs scene.options.{', '.join(needs)}")
+            continue
+        path = folder / f"{plugin.name}.png"
+        storage.commit_bytes(path, picture)
+        written.append(path)
+    return written, skipped
+
+
+def draw_ensemble(settings: Settings, store: EnsembleStore, folder: Path) -> list[Path]:
+    """Draw a scene with the poses of its ensemble, and the echo of the first test pose.
+
+    The first pose of all where none is for the test.
+
+    Parameters
+    ----------
+    settings : Settings
+        Of the ensemble.
+    store : EnsembleStore
+        Complete.
+    folder : Path
+        Of the pictures.
+
+    Returns
+    -------
+    written : list of Path
+        ``scene.png`` and ``pose_0000.png``, numbered as in the store.
+
+    Raises
+    ------
+    StorageError
+        If a picture cannot be written.
+    """
+    with _quietly():  # who simulated it has been warned
+        scene = scene_of(settings)
+    name = "" if settings.scene is None else settings.scene.name
+    written = [folder / "scene.png"]
+    forward = store.rotations[:, :, 0]
+    storage.commit_bytes(
+        written[0], scene_png(scene.mesh, store.positions, forward, split=store.split)
+    )
+    index = int([*store.indices("test"), 0][0])
+    written.append(folder / f"pose_{index:04d}.png")
+    simulator = Simulator.from_settings(scene, settings)
+    pose = store.positions[index], store.rotations[index]
+    seed = pose_seed(settings.simulation.seed, index)
+    points, level_db = simulator.hits(*pose, seed=seed)
+    picture = echo_png(
+        scene.mesh,
+        points,
+        level_db,
+        *pose,
+        simulator.receive(*pose, seed=seed)[0],
+        settings.spectrogram.sampling_rate,
+        compress(store.read_pose(index), store.attributes["reference"]),
+        store.range,
+        store.frequency,
+        speed_of_sound=simulator.speed_of_sound,
+        title=f"{name}, pose {index}",
+    )
+    storage.commit_bytes(written[1], picture)
+    return written

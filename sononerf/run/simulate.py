@@ -1,0 +1,349 @@
+# SPDX-License-Identifier: MIT
+"""From settings to a sealed ensemble of echoes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf import __version__, storage
+from sononerf.echoes.sealing import seal
+from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.subtracted import SubtractedStore
+from sononerf.errors import IncompatibleError, SettingsError
+from sononerf.geometry.poses import Poses
+from sononerf.head.call import call_content
+from sononerf.head.ears import directivity_content
+from sononerf.head.reception import warn_of_call
+from sononerf.progress import Progress
+from sononerf.run.attached import attach
+from sononerf.run.store_settings import complete_store
+from sononerf.scene.scene import Scene, load_scene
+from sononerf.settings.schema import Settings
+from sononerf.simulation.ensemble import (
+    check_poses,
+    check_reach,
+    deaf,
+    ensemble_poses,
+    simulate_ensemble,
+)
+from sononerf.simulation.simulator import VERSION, Simulator
+from sononerf.simulation.validity import expected_error_db
+
+HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")
+MOST_WORKERS = 8
+WORTH_WORKERS = 64
+"""Fewer poses than this are simulated before other processes have even started."""
+
+
+def echo_hash(settings: Settings, scene: Scene) -> str:
+    """Return a hash of all that the echoes depend on.
+
+    Poses count as what they are, not as how they were asked for: a changed table at the same
+    place is another ensemble, the same table at another place is not.
+    """
+    plain = _heard_settings(settings)
+    digest = hashlib.sha256(f"simulator {VERSION}".encode())
+    digest.update(json.dumps([plain[name] for name in HASHED_SECTIONS], sort_keys=True).encode())
+    poses, split = ensemble_poses(settings)
+    for values in (poses.positions, poses.rotations):
+        # The last bits of a sine are the processor's own; adding zero makes -0 the same as 0.
+        digest.update((np.round(values, 9) + 0.0).astype("<f8").tobytes())
+    digest.update(split.tobytes())
+    digest.update(np.ascontiguousarray(scene.mesh.vertices, dtype="<f8").tobytes())
+    digest.update(np.ascontiguousarray(scene.mesh.faces, dtype="<i8").tobytes())
+    digest.update(repr(scene.material).encode())
+    if scene.part is not None:
+        digest.update(scene.part.astype("<i8").tobytes())
+    return digest.hexdigest()
+
+
+def _heard_settings(settings: Settings) -> dict[str, Any]:
+    """Return the settings that the echoes depend on, without optional keys that do not apply."""
+    plain = {**settings.plain(), "call": call_content(settings.call)}
+    ears, air, analysis = plain["ears"], plain["air"], plain["spectrogram"]
+    if analysis["kind"] == "stft":
+        for key in ("kind", "channels", "q"):
+            del analysis[key]
+    if ears["directivity"] != "piston":
+        del ears["piston_radius"]
+    for section, key, default in (
+        (air, "speed_of_sound", None),
+        (ears, "receivers", None),
+        (ears, "file", None),
+        (ears, "directivity", "ear"),
+    ):
+        if section[key] == default:
+            del section[key]
+    if "file" in ears:
+        # A measured directivity counts as what it is, not as where it lies.
+        ears["file"] = directivity_content(settings.ears)
+    return plain
+
+
+def scene_of(settings: Settings) -> Scene:
+    """Return the scene that settings name.
+
+    Raises
+    ------
+    SettingsError
+        If they name none: their echoes come from a store.
+    InputError
+        If the scene is unknown or broken.
+    """
+    if settings.scene is None:
+        raise SettingsError("scene: missing; set scene.name to simulate echoes")
+    return load_scene(settings.scene.name, settings.scene.options, source=settings.source)
+
+
+def store_path(settings: Settings, scene: Scene | None, output: Path | None) -> Path:
+    """Return where the ensemble lies: as asked for, as set, or by its hash under ``data/``."""
+    chosen = output or settings.data.store
+    if chosen is not None:
+        return chosen
+    return default_store(settings, echo_hash(settings, scene or scene_of(settings)))
+
+
+def default_store(settings: Settings, echoes: str) -> Path:
+    """Return where the ensemble of a hash lies when nobody says where."""
+    name = "recorded" if settings.scene is None else settings.scene.name
+    return Path("data") / f"{name}-{echoes[:12]}"
+
+
+def background_path(settings: Settings) -> Path | None:
+    """Return where the ensemble of the surroundings alone lies; None where none is taken off.
+
+    Raises
+    ------
+    SettingsError
+        If the scene's own are asked for, and it marks none.
+    """
+    chosen = settings.data.background
+    return _own_background(settings)[0] if chosen == "scene" else chosen
+
+
+def _own_background(settings: Settings) -> tuple[Path, Scene]:
+    alone = scene_of(settings).surroundings()
+    name = settings.scene.name if settings.scene else ""
+    if alone is None:
+        raise SettingsError(
+            f"data.background: the scene {name!r} marks no background; give the "
+            "ensemble of the surroundings alone, or leave it out"
+        )
+    path = default_store(settings, echo_hash(settings, alone))
+    return path.with_name(f"{path.name}-background"), alone
+
+
+def open_ensemble(settings: Settings, path: Path) -> EnsembleStore:
+    """Open a simulated ensemble, less its surroundings where that is asked for."""
+    background = background_path(settings)
+    return EnsembleStore.open(path) if background is None else SubtractedStore(path, background)
+
+
+def ensemble(
+    settings: Settings, *, workers: int | None = None, progress: Progress | None = None
+) -> EnsembleStore:
+    """Open or simulate the echoes, and take the surroundings off where that is asked for.
+
+    As :func:`simulate`, whose errors it raises.
+    """
+    # What is wrong with the background is told before minutes of simulation.
+    background = background_path(settings)
+    if background is not None and settings.data.background != "scene":
+        EnsembleStore.open(background)
+    if settings.scene is None and settings.data.store is not None:
+        store = complete_store(settings.data.store)
+    else:
+        store = simulate(settings, workers=workers, progress=progress)
+    if settings.data.background == "scene":
+        alone = _own_background(settings)[1]
+        simulate(settings, scene=alone, output=background, workers=workers, progress=progress)
+    return store if background is None else SubtractedStore(store.path, background)
+
+
+def simulate(
+    settings: Settings,
+    *,
+    scene: Scene | None = None,
+    output: Path | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> EnsembleStore:
+    """Simulate what is missing of an ensemble, and seal it.
+
+    Parameters
+    ----------
+    settings : Settings
+        The experiment.
+    scene : Scene or None
+        Another one than the settings'.
+    output : Path or None
+        The store; ``data/<scene>-<hash>`` where None.
+    workers : int or None
+        Processes; as many as there are cores, at most 8, where None.
+    scheduler : str or None
+        Address of a Dask scheduler to use instead.
+    progress : Progress or None
+        Where to show it.
+
+    Returns
+    -------
+    store : EnsembleStore
+        Complete; opened for reading.
+
+    Raises
+    ------
+    InputError
+        If scene or poses are no good.
+    NumericalError
+        If no pose hears anything.
+    StorageError
+        If the store cannot be written.
+    IncompatibleError
+        If the folder holds another ensemble.
+    """
+    progress = progress or Progress(quiet=True)
+    if scene is None:
+        scene = scene_of(settings)
+    path = store_path(settings, scene, output)
+    wanted = echo_hash(settings, scene)
+    if (path / "zarr.json").is_file():
+        store = EnsembleStore.open(path)
+        if store.attributes.get("echo_hash") != wanted:
+            raise IncompatibleError(
+                f"{path}: holds echoes of other settings; choose another --output, or leave the "
+                "scene out of the settings to take the echoes as they are"
+            )
+        if "reference" in store.attributes and not store.missing():
+            return store
+    poses, split = ensemble_poses(settings)
+    warn_of_call(settings.call, settings.spectrogram)
+    simulator = Simulator.from_settings(scene, settings)
+    head = np.concatenate((simulator.ears.emitter[None], simulator.ears.positions))
+    check_poses(scene, poses, offsets=head)
+    check_reach(
+        scene,
+        poses,
+        bounces=settings.simulation.bounces,
+        range_min=settings.spectrogram.range_min,
+        range_max=settings.spectrogram.range_max,
+    )
+    storage.probe_writable(path)
+    if simulator.engine.note:
+        progress.say(f"echoes: {simulator.engine.note}")
+    with storage.lock(path):
+        store = EnsembleStore.create(
+            path,
+            poses_positions=poses.positions,
+            poses_rotations=poses.rotations,
+            split=split,
+            range=simulator.range,
+            frequency=simulator.frequency,
+            attributes=_attributes(settings, wanted, simulator),
+            receivers=len(simulator.ears.positions),
+        )
+        attach(settings, path)
+        _fill(store, simulator, poses, settings, workers, scheduler, progress)
+    return EnsembleStore.open(path)
+
+
+def _attributes(settings: Settings, wanted: str, simulator: Simulator) -> dict[str, object]:
+    plain = settings.plain()
+    engine = simulator.engine
+    error = expected_error_db(engine, engine.scene, simulator.frequency)
+    return {
+        "echo_hash": wanted,
+        "origin": "simulated",
+        "scene": plain["scene"],
+        "settings": {name: plain[name] for name in ("poses", *HASHED_SECTIONS)},
+        "speed_of_sound": simulator.speed_of_sound,
+        "expected_error_db": None
+        if error is None
+        else [round(value, 2) for value in error.tolist()],
+        "units": {
+            "spectrogram": "linear magnitude, sound pressure over that of the call at 1 m",
+            "position": "m",
+            "range": "m",
+            "frequency": "Hz",
+        },
+        "sononerf": __version__,
+    }
+
+
+def _fill(
+    store: EnsembleStore,
+    simulator: Simulator,
+    poses: Poses,
+    settings: Settings,
+    workers: int | None,
+    scheduler: str | None,
+    progress: Progress,
+) -> None:
+    missing = store.missing()
+    if workers is None:
+        cores = min(len(os.sched_getaffinity(0)), MOST_WORKERS)
+        alone = simulator.engine.prepares or len(missing) < WORTH_WORKERS
+        workers = 1 if alone else cores
+    test = store.indices("test")[: settings.simulation.noise_floor_poses]
+    again: dict[int, NDArray[np.float32]] = {}
+    seed = settings.simulation.seed
+    wanted = [*missing, *test]
+    prepare(simulator, poses.positions[wanted], poses.rotations[wanted], progress)
+    with progress.task("simulating", len(missing) + len(test)) as task:
+        # The second simulation of the test poses goes first where it can share the processes.
+        def keep(index: int, spectrogram: NDArray[np.float32]) -> None:
+            if index < len(poses):
+                store.write_pose(index, spectrogram)
+            else:
+                again[int(test[index - len(poses)])] = spectrogram
+            task.advance()
+
+        both = Poses(
+            np.concatenate((poses.positions, poses.positions[test])),
+            np.concatenate((poses.rotations, poses.rotations[test])),
+        )
+        # A pose's seed is a function of its number, so the second time has other rays.
+        extra = range(len(poses), len(poses) + len(test))
+        simulate_ensemble(
+            simulator,
+            both,
+            [*missing, *extra],
+            keep,
+            seed=seed,
+            workers=workers,
+            scheduler=scheduler,
+        )
+    limits = settings.spectrogram.range_min, settings.spectrogram.range_max
+    seal(store, {int(i): again[int(i)] for i in test}, silent=deaf(*limits))
+
+
+def prepare(
+    simulator: Simulator,
+    positions: NDArray[np.float64],
+    rotations: NDArray[np.float64],
+    progress: Progress,
+) -> None:
+    """Let the engine do what it does for all poses at once, and show how far it is.
+
+    Parameters
+    ----------
+    simulator : Simulator
+        Scene and head.
+    positions : (P, 3) float64, m
+        Of the head, world frame.
+    rotations : (P, 3, 3) float64
+        Head to world.
+    progress : Progress
+        Where to show it.
+    """
+    engine = simulator.engine
+    if len(positions) and engine.parts:
+        with progress.task("solving", engine.parts) as task:
+            engine.prepare(positions, rotations, lambda *_: task.advance())

@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: MIT
+"""What is ensonified: surfaces, materials and compositions; the public names for scene plugins."""
+
+from sononerf.scene.composition import Part, compose
+from sononerf.scene.material import Material
+from sononerf.scene.scene import (
+    MATERIALS,
+    MaterialName,
+    Scene,
+    SurfaceSizeError,
+    check_surface,
+    list_scenes,
+    load_scene,
+)
+
+__all__ = [
+    "MATERIALS",
+    "Material",
+    "MaterialName",
+    "Part",
+    "Scene",
+    "SurfaceSizeError",
+    "check_surface",
+    "compose",
+    "list_scenes",
+    "load_scene",
+]

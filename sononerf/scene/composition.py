@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: MIT
+"""Scenes put together into one."""
+
+from __future__ import annotations
+
+import itertools
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import trimesh
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.errors import SettingsError
+from sononerf.geometry.crossing import surfaces_cross
+from sononerf.scene.material import Material
+from sononerf.scene.scene import Scene
+
+logger = logging.getLogger("sononerf")
+
+LARGEST_SCALE = 1000.0
+"""As much as there is between the units in which meshes are drawn, mm and m."""
+SQUARE = 1e-6
+"""By so much the columns of a rotation may miss being unit vectors square to one another."""
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A scene and its place among others: scaled, then turned, then moved.
+
+    Attributes
+    ----------
+    scene : Scene
+        Stays as it is.
+    position : (3,) float, m
+        Where its origin comes to lie.
+    rotation : (3, 3) float
+        From its own frame to the world's.
+    scale : float, 1
+        Above 0, at most 1000.
+    material : Material or None
+        For all of it; its own where None.
+    background : bool
+        Whether all of it is surroundings and not the target.
+    name : str
+        For messages; may be empty.
+    """
+
+    scene: Scene
+    position: ArrayLike = (0.0, 0.0, 0.0)
+    rotation: ArrayLike = field(default_factory=lambda: np.eye(3))
+    scale: float = 1.0
+    material: Material | None = None
+    background: bool = False
+    name: str = ""
+
+
+def compose(parts: Sequence[Part], *, may_cross: bool = False) -> Scene:
+    """Put scenes together into one.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        At least one; their triangles follow one another in this order.
+    may_cross : bool
+        Whether it is meant that parts cut through one another. Otherwise it is warned of.
+
+    Returns
+    -------
+    scene : Scene
+        Materials that are alike share a number; one that all parts have stands alone.
+
+    Raises
+    ------
+    SettingsError
+        If there are no parts or nothing but background, or a position, rotation or scale is none.
+    """
+    if not parts:
+        raise SettingsError("parts: found none; give at least one")
+    meshes = [_placed(part, f"parts.{number}") for number, part in enumerate(parts)]
+    if not may_cross:
+        _warn_of_crossings(parts, meshes)
+    counts = [len(mesh.vertices) for mesh in meshes]
+    firsts = np.cumsum([0, *counts[:-1]])
+    mesh = trimesh.Trimesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.faces + first for mesh, first in zip(meshes, firsts, strict=True)]),
+        process=False,
+        validate=False,
+    )
+    background = np.concatenate([_background(part) for part in parts])
+    if background.all():
+        raise SettingsError("parts: all are background; leave one that is the target")
+    materials, of = _merged(parts)
+    several = len(materials) > 1
+    return Scene(
+        mesh,
+        materials if several else materials[0],
+        of if several else None,
+        background if background.any() else None,
+    )
+
+
+def _placed(part: Part, where: str) -> trimesh.Trimesh:
+    rotation, position = np.asarray(part.rotation, float), np.asarray(part.position, float)
+    if rotation.shape != (3, 3) or not np.isfinite(rotation).all():
+        raise SettingsError(f"{where}.rotation: found no 3 by 3 finite numbers; give a matrix")
+    if not np.abs(rotation.T @ rotation - np.eye(3)).max() <= SQUARE:
+        raise SettingsError(
+            f"{where}.rotation: found a matrix that is not orthonormal; its columns must be unit "
+            "vectors square to one another"
+        )
+    if np.linalg.det(rotation) < 0.0:
+        raise SettingsError(
+            f"{where}.rotation: found a reflection, of determinant -1; a rotation has +1"
+        )
+    if not 0.0 < part.scale <= LARGEST_SCALE:
+        raise SettingsError(
+            f"{where}.scale: found {part.scale:g}; must lie above 0, at most {LARGEST_SCALE:g}"
+        )
+    if position.shape != (3,) or not np.isfinite(position).all():
+        raise SettingsError(f"{where}.position: found no three finite numbers; give x, y, z in m")
+    vertices = np.asarray(part.scene.mesh.vertices) * part.scale
+    # What is not turned keeps its coordinates to the last bit.
+    if not np.array_equal(rotation, np.eye(3)):
+        vertices = vertices @ rotation.T
+    faces = np.asarray(part.scene.mesh.faces)
+    return trimesh.Trimesh(vertices + position, faces, process=False, validate=False)
+
+
+def _background(part: Part) -> NDArray[np.bool_]:
+    own = part.scene.background
+    if part.background or own is None:
+        return np.full(len(part.scene.mesh.faces), part.background)
+    return own
+
+
+def _merged(parts: Sequence[Part]) -> tuple[tuple[Material, ...], NDArray[np.int64]]:
+    """Return the materials of all parts, each once, and which one each triangle is of, (T,)."""
+    numbers: dict[Material, int] = {}
+    of = []
+    for part in parts:
+        scene, count = part.scene, len(part.scene.mesh.faces)
+        own = scene.materials if part.material is None else (part.material,)
+        which = np.zeros(count, np.int64)
+        if part.material is None and scene.part is not None:
+            which = scene.part
+        # A material that no triangle is of is left out.
+        used, which = np.unique(which, return_inverse=True)
+        shared = [numbers.setdefault(own[index], len(numbers)) for index in used]
+        of.append(np.asarray(shared, np.int64)[which])
+    return tuple(numbers), np.concatenate(of)
+
+
+def _warn_of_crossings(parts: Sequence[Part], meshes: Sequence[trimesh.Trimesh]) -> None:
+    titles = [
+        f"{number} ({part.name})" if part.name else str(number) for number, part in enumerate(parts)
+    ]
+    pairs = [
+        f"{titles[one]} and {titles[other]}"
+        for one, other in itertools.combinations(range(len(parts)), 2)
+        if surfaces_cross(meshes[one], meshes[other])
+    ]
+    if pairs:
+        logger.warning(
+            "surfaces of parts cut through one another: %s; the union of the bodies is simulated, "
+            "what lies inside another body is never heard",
+            ", ".join(pairs),
+        )

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: MIT
+"""What is ensonified: a surface, and how it reflects."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from sononerf.errors import InputError, SettingsError, SonoNerfError
+from sononerf.geometry.faults import surface_faults
+from sononerf.scene.material import MATERIALS, RIGID, Material, MaterialName
+from sononerf.settings import plugins
+from sononerf.settings.schema import faults_of
+
+__all__ = [
+    "MATERIALS",
+    "Material",
+    "MaterialName",
+    "Scene",
+    "SurfaceSizeError",
+    "check_surface",
+    "list_scenes",
+    "load_scene",
+]
+
+logger = logging.getLogger("sononerf")
+
+LARGEST = 100.0  # m
+SMALLEST = 1e-3  # m
+LARGE, SMALL = 5.0, 5e-3  # m, beyond which a mistaken unit is likelier than such a scene
+
+
+class SurfaceSizeError(InputError):
+    """A surface far larger or smaller than any scene.
+
+    Parameters
+    ----------
+    size : float, m
+        Along its longest side.
+    """
+
+    def __init__(self, size: float) -> None:
+        super().__init__(f"the mesh is {size:.3g} m large, expected {SMALLEST:g} to {LARGEST:g} m")
+        self.is_too_large = size > LARGEST
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A surface and its material.
+
+    Attributes
+    ----------
+    mesh : trimesh.Trimesh
+        Metres, world frame; bodies may overlap.
+    material : Material or tuple of Material
+        One for all of it, or one for each of its parts.
+    part : (T,) int, optional
+        Which of the materials each triangle is of, where there are several.
+    background : (T,) bool, optional
+        True where a triangle is surroundings and not the target. It sounds all the same.
+
+    Raises
+    ------
+    ValueError
+        If materials, parts or background do not fit, or if nothing is left to be the target.
+    InputError
+        If the mesh has no triangles, a vertex that is no finite number, or an index to no vertex.
+    SurfaceSizeError
+        If it is far too large or too small.
+    """
+
+    mesh: trimesh.Trimesh
+    material: Material | tuple[Material, ...] = RIGID
+    part: NDArray[np.int64] | None = None
+    background: NDArray[np.bool_] | None = None
+
+    def __post_init__(self) -> None:
+        several = isinstance(self.material, tuple)
+        if several != (self.part is not None):
+            raise ValueError("several materials and the parts they are of are given together")
+        if self.part is not None:
+            part = np.asarray(self.part)
+            if part.shape != (len(self.mesh.faces),):
+                raise ValueError(
+                    f"part has shape {part.shape}, expected one number for each of the "
+                    f"{len(self.mesh.faces)} triangles"
+                )
+            if part.dtype.kind not in "iu" or part.min() < 0 or part.max() >= len(self.materials):
+                raise ValueError(f"part names no material, expected 0 to {len(self.materials) - 1}")
+            object.__setattr__(self, "part", part.astype(np.int64))
+        if self.background is not None:
+            object.__setattr__(self, "background", self._checked(self.background))
+        check_surface(self.mesh)
+        _warn_of_faults(self.mesh)
+
+    def _checked(self, background: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        background = np.asarray(background)
+        if background.shape != (len(self.mesh.faces),) or background.dtype != np.bool_:
+            raise ValueError(
+                f"background is {background.dtype} of shape {background.shape}, expected one bool "
+                f"for each of the {len(self.mesh.faces)} triangles"
+            )
+        if len(background) and background.all():
+            raise ValueError("all triangles are background; leave the target out of it")
+        return background
+
+    @property
+    def materials(self) -> tuple[Material, ...]:
+        """All of them; ``part`` counts through them."""
+        return self.material if isinstance(self.material, tuple) else (self.material,)
+
+    def surface(self, *, background: bool) -> trimesh.Trimesh | None:
+        """Return the surroundings alone, or the target alone; None where there is none of it."""
+        faces = np.asarray(self.mesh.faces)
+        marked = np.zeros(len(faces), bool) if self.background is None else self.background
+        faces = faces[marked == background]
+        if not len(faces):
+            return None
+        alone = trimesh.Trimesh(self.mesh.vertices, faces, process=False)
+        alone.remove_unreferenced_vertices()
+        return alone
+
+    def surroundings(self) -> Scene | None:
+        """Return what is background as a scene of its own; None where nothing is."""
+        mesh = self.surface(background=True)
+        if mesh is None or self.background is None:
+            return None
+        part = None if self.part is None else self.part[self.background]
+        return Scene(mesh, self.material, part)
+
+
+def check_surface(mesh: trimesh.Trimesh) -> None:
+    """Refuse a mesh that is no surface of a sensible size in metres.
+
+    Raises
+    ------
+    InputError, SurfaceSizeError
+        As :class:`Scene` says.
+    """
+    faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices)
+    if len(faces) == 0:
+        raise InputError("the mesh has no triangles; give a surface")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise InputError(f"a triangle of the mesh names no vertex ({len(vertices)} vertices)")
+    bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+    if len(bad):
+        raise InputError(f"vertex {bad[0]} of the mesh is {vertices[bad[0]]}; mend the mesh")
+    size = _size(mesh)
+    if not SMALLEST <= size <= LARGEST:
+        raise SurfaceSizeError(size)
+    if not (mesh.area_faces > 0).any():
+        raise InputError("no triangle of the mesh has an area; give a surface")
+
+
+def _size(mesh: trimesh.Trimesh) -> float:
+    used = np.zeros(len(mesh.vertices), dtype=bool)
+    used[np.asarray(mesh.faces)] = True
+    return float(np.ptp(np.asarray(mesh.vertices)[used], axis=0).max())
+
+
+def _warn_of_faults(mesh: trimesh.Trimesh) -> None:
+    size = _size(mesh)
+    if size > LARGE:
+        logger.warning(
+            "the mesh is %.3g m large; were millimetres taken for metres? It would be %.3g mm",
+            *(size, size),
+        )
+    elif size < SMALL:
+        logger.warning(
+            "the mesh is %.3g mm large; were metres taken for millimetres? It would be %.3g m",
+            *(1e3 * size, 1e3 * size),
+        )
+    for line in surface_faults(mesh.vertices, mesh.faces):
+        logger.warning("%s", line)
+
+
+def list_scenes() -> list[plugins.Plugin]:
+    """Return the registered scenes, sorted by name; imports none."""
+    return plugins.registered(plugins.SCENES)
+
+
+def load_scene(
+    name: str, options: Mapping[str, Any] | None = None, *, source: str | None = None
+) -> Scene:
+    """Build a scene by its name.
+
+    Parameters
+    ----------
+    name : str
+        Of an entry point of the group ``sononerf.scenes``.
+    options : mapping
+        Keyword arguments of its factory.
+    source : str, optional
+        Where the settings were read from, for messages.
+
+    Returns
+    -------
+    scene : Scene
+        Checked.
+
+    Raises
+    ------
+    SettingsError
+        If the name is unknown or claimed twice, an option is not allowed, or options make a
+        surface that is far too large or too small.
+    InputError
+        If the plugin cannot be imported, fails, or returns no scene.
+    """
+    with faults_of(source):
+        factory = plugins.load(plugins.SCENES, name)
+        plugin = next(plugin for plugin in list_scenes() if plugin.name == name)
+        owner = f"scene {name!r} of {plugin.distribution} {plugin.version}"
+        try:
+            arguments = plugins.check_options(factory, options or {}, where="scene.options")
+        except InputError as error:
+            raise InputError(f"{owner}: {error}") from None
+        try:
+            return _built(owner, factory, arguments)
+        except SurfaceSizeError as error:
+            if options:
+                raise SettingsError(f"scene.options: {error}") from None
+            raise InputError(f"{owner}: {error}") from None
+        except InputError as error:
+            # Ours name the file that they read; of what others make only they can say more.
+            if plugin.distribution == "sononerf" or str(error).startswith(owner):
+                raise
+            raise InputError(f"{owner}: {error}") from None
+
+
+def _built(owner: str, factory: Callable[..., Any], arguments: dict[str, Any]) -> Scene:
+    try:
+        scene = factory(**arguments)
+    except SonoNerfError:
+        raise  # says itself what is wrong, in one line
+    except (Exception, SystemExit) as error:
+        text = " ".join(str(error).split())
+        raise InputError(f"{owner} failed: {type(error).__name__}: {text}") from error
+    if not isinstance(scene, Scene):
+        raise InputError(f"{owner} returned {type(scene).__name__}, expected a Scene")
+    return scene

@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: MIT
+"""Entry points: scenes, fields and renderers, ours and everyone's, through one door.
+
+A plugin is imported only when it is asked for by name, so a broken one hurts nobody else.
+"""
+
+from __future__ import annotations
+
+import difflib
+import inspect
+import typing
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, entry_points
+from typing import Annotated, Any
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create_model
+from pydantic.errors import PydanticUserError
+from pydantic_core import to_jsonable_python
+
+from sononerf.errors import InputError, SettingsError
+from sononerf.settings.schema import describe_faults, refuse_truths
+
+SCENES = "sononerf.scenes"
+FIELDS = "sononerf.fields"
+RENDERERS = "sononerf.renderers"
+
+
+@dataclass(frozen=True)
+class Plugin:
+    """One registered name: where it comes from, not yet imported."""
+
+    name: str
+    distribution: str
+    version: str
+    entry_point: EntryPoint
+
+
+def registered(group: str) -> list[Plugin]:
+    """Return what is registered under a group, sorted by name; imports nothing."""
+    found: dict[tuple[str, str, str], Plugin] = {}
+    for entry in entry_points(group=group):
+        distribution = entry.dist.name if entry.dist else "unknown"
+        version = entry.dist.version if entry.dist else "unknown"
+        # An editable install may be listed twice on sys.path; the same claim counts once.
+        found[entry.name, distribution, entry.value] = Plugin(
+            entry.name, distribution, version, entry
+        )
+    return sorted(found.values(), key=lambda plugin: (plugin.name, plugin.distribution))
+
+
+def load(group: str, name: str) -> Callable[..., Any]:
+    """Import the one plugin that is asked for.
+
+    Raises
+    ------
+    SettingsError
+        If the name is unknown, or two distributions claim it.
+    InputError
+        If the plugin cannot be imported, or is no factory.
+    """
+    kind = group.rpartition(".")[2].removesuffix("s")
+    plugins = registered(group)
+    claims = [plugin for plugin in plugins if plugin.name == name]
+    if not claims:
+        names = sorted({plugin.name for plugin in plugins})
+        near = difflib.get_close_matches(name, names, n=1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise SettingsError(f"unknown {kind} {name!r}; {hint}there are: {', '.join(names)}")
+    if len(claims) > 1:
+        owners = " and ".join(f"{plugin.distribution} {plugin.version}" for plugin in claims)
+        raise SettingsError(
+            f"{kind} {name!r} is claimed by {owners}; uninstall one, or rename its entry point"
+        )
+    plugin = claims[0]
+    owner = f"{kind} {name!r} of {plugin.distribution} {plugin.version}"
+    try:
+        factory = plugin.entry_point.load()
+    except (Exception, SystemExit) as error:
+        raise InputError(
+            f"{owner} cannot be loaded: {type(error).__name__}: {error}; mend or uninstall it"
+        ) from error
+    if not callable(factory):
+        raise InputError(f"{owner} is {type(factory).__name__}, expected a function or class")
+    return typing.cast(Callable[..., Any], factory)
+
+
+def check_options(
+    factory: Callable[..., Any], options: Mapping[str, Any], *, where: str, given: int = 0
+) -> dict[str, Any]:
+    """Check options against a factory's keyword arguments and fill in its defaults.
+
+    Parameters
+    ----------
+    factory : callable
+        Its annotated keyword arguments are what may be set.
+    options : mapping
+        What the settings say.
+    where : str
+        Dotted key of the options, for messages.
+    given : int
+        How many leading arguments the caller passes itself.
+
+    Returns
+    -------
+    options : dict
+        Every argument with its value, converted to its annotation.
+
+    Raises
+    ------
+    SettingsError
+        If a key is unknown, missing, or its value is not allowed.
+    InputError
+        If the factory's annotations cannot be read.
+    """
+    model = _options_model(factory, where, given)
+    try:
+        checked = model.model_validate(dict(options))
+    except ValidationError as error:
+        raise SettingsError(describe_faults(error, model, None, where)) from None
+    refuse_truths(options, checked, prefix=where)
+    return {name: getattr(checked, name) for name in model.model_fields}
+
+
+def describe_options(factory: Callable[..., Any], *, given: int = 0) -> list[dict[str, Any]]:
+    """Return what may be set of a factory's keyword arguments.
+
+    Parameters
+    ----------
+    factory : callable
+        Its annotated keyword arguments are what may be set.
+    given : int
+        How many leading arguments the caller passes itself.
+
+    Returns
+    -------
+    rows : list of dict
+        ``name``; ``default``, plain data, or None where there is none; ``needed``, where it has
+        to be set; ``allowed``, in words.
+
+    Raises
+    ------
+    InputError
+        If the factory's annotations cannot be read.
+    """
+    rows = []
+    for name, field in _options_model(factory, "options", given).model_fields.items():
+        needed = field.is_required()
+        default = None if needed else to_jsonable_python(field.default, fallback=str)
+        kind: Any = (
+            Annotated[field.annotation, *field.metadata] if field.metadata else field.annotation
+        )
+        try:
+            schema = TypeAdapter(kind).json_schema()
+        except PydanticUserError:  # a type of the plugin's own, which has no schema
+            schema = {}
+        rows.append(
+            {"name": name, "default": default, "needed": needed, "allowed": _allowed(schema)}
+        )
+    return rows
+
+
+NUMBERS = {"number": "a number", "integer": "a whole number"}
+KINDS = {
+    **NUMBERS, "string": "text", "boolean": "true or false", "null": "none", "object": "a section",
+}  # fmt: skip
+
+
+def _allowed(schema: Mapping[str, Any]) -> str:
+    """Put a JSON schema into words."""
+    if "anyOf" in schema:
+        return " or ".join(dict.fromkeys(_allowed(part) for part in schema["anyOf"]))
+    if "enum" in schema or "const" in schema:
+        return ", ".join(str(value) for value in schema.get("enum", [schema.get("const")]))
+    if schema.get("type") == "array":
+        count = schema.get("minItems")
+        fixed = count is not None and count == schema.get("maxItems")
+        each = _allowed((schema.get("prefixItems") or [schema.get("items") or {}])[0])
+        return f"{count} of: {each}" if fixed else f"a list of: {each}"
+    kind = "a section" if "$ref" in schema else KINDS.get(str(schema.get("type")), "see the source")
+    if schema.get("type") not in NUMBERS:
+        return kind
+    least, most = schema.get("minimum"), schema.get("maximum")
+    above, below = schema.get("exclusiveMinimum"), schema.get("exclusiveMaximum")
+    bounds = (("from", least), ("above", above), ("to", most), ("below", below))
+    return " ".join([kind, *(f"{word} {bound}" for word, bound in bounds if bound is not None)])
+
+
+def _options_model(factory: Callable[..., Any], where: str, given: int) -> type[BaseModel]:
+    try:
+        signature = inspect.signature(factory)
+        target = factory.__init__ if inspect.isclass(factory) else factory
+        hints = typing.get_type_hints(target, include_extras=True)
+    except (TypeError, ValueError, NameError) as error:
+        raise InputError(f"{where}: the factory's annotations cannot be read: {error}") from None
+    fields: dict[str, Any] = {}
+    parameters = list(signature.parameters.values())[given:]
+    for parameter in parameters:
+        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+            continue
+        default = ... if parameter.default is parameter.empty else parameter.default
+        fields[parameter.name] = (hints.get(parameter.name, Any), default)
+    config = ConfigDict(
+        extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False, protected_namespaces=()
+    )
+    model: type[BaseModel] = create_model("Options", __config__=config, **fields)
+    return model

@@ -1,0 +1,742 @@
+# SPDX-License-Identifier: MIT
+"""Typed settings: every name, its unit, its bounds, and the only home of its default.
+
+Precedence: default < YAML file < ``KEY=VALUE`` < a named option of the command line.
+SI units and radians inside; another unit is in the name.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import typing
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from sononerf.errors import SettingsError
+from sononerf.settings.call_presets import CALL_PRESETS
+
+MAX_SETTINGS_BYTES = 1_000_000
+MAX_SETTINGS_DEPTH = 50
+HEAD_SECTIONS = ("air", "ears", "call", "spectrogram")
+"""Sections that describe the head: a store and an import state them."""
+FILE_SECTIONS = ("ears", "call")
+"""Sections whose key ``file`` names a file."""
+PLUGIN_NAMES = (("scene", "name"), ("field", "kind"), ("renderer", "kind"))
+"""Keys whose value decides what the options beside it mean."""
+
+Vector = tuple[float, float, float]
+Name = Annotated[str, Field(min_length=1)]
+Positive = Annotated[float, Field(gt=0)]
+Spacing = Annotated[float, Field(gt=0, le=0.1)]  # m; more were millimetres taken for metres
+Level = Annotated[float, Field(ge=0)]
+Decibels = Annotated[float, Field(ge=-100, le=200)]
+Count = Annotated[int, Field(ge=1)]
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
+
+
+class _Section(BaseModel):
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False
+    )
+
+
+class SceneSettings(_Section):
+    """What is ensonified: a scene's name and what its factory takes."""
+
+    name: Name
+    options: dict[str, Any] = {}
+
+
+class PoseSettings(_Section):
+    """Where the calls are made from; both test sets are drawn apart from the training poses.
+
+    On a ``sphere`` about the origin, on a ``cap`` of it about an axis, in a ``volume`` between
+    two radii (within the cap, where an angle is set), or along a ``path``: the rows of a table
+    ``x,y,z,yaw,pitch,roll``. Of a path's rows those for validation and test are drawn at random
+    and all others train; number, radius, axis and jitter do not apply to it.
+    """
+
+    arrangement: Literal["sphere", "cap", "volume", "path"] = "sphere"
+    count: Count = 400
+    validation: Annotated[int, Field(ge=0)] = 10
+    heldout: Annotated[int, Field(ge=0)] = 20
+    radius: Positive = 0.4
+    radius_max: Positive | None = None
+    axis: Vector = (1.0, 0.0, 0.0)
+    half_angle_deg: Annotated[float, Field(gt=0, le=180)] | None = None
+    path: Path | None = None
+    aim_jitter_deg: Annotated[float, Field(ge=0, le=90)] = 15.0
+    seed: Seed = 0
+
+    @model_validator(mode="after")
+    def _arranged(self) -> PoseSettings:
+        # What is set for another arrangement would be passed over without a word.
+        for name, needed, allowed in (
+            ("half_angle_deg", "cap", ("cap", "volume")),
+            ("radius_max", "volume", ("volume",)),
+            ("path", "path", ("path",)),
+        ):
+            there = getattr(self, name) is not None
+            if there and self.arrangement not in allowed:
+                raise ValueError(
+                    f"{name} is of the arrangement {' or '.join(allowed)}, "
+                    f"not of {self.arrangement}; set arrangement, or leave it out"
+                )
+            if not there and self.arrangement == needed:
+                raise ValueError(f"the arrangement {needed} needs {name}")
+        if not 1e-6 <= max(abs(part) for part in self.axis) <= 1e6:
+            raise ValueError("axis gives no direction; expected one such as [1, 0, 0]")
+        if self.radius_max is not None and self.radius >= self.radius_max:
+            raise ValueError("radius must lie below radius_max")
+        return self
+
+
+class SimulationSettings(_Section):
+    """The echo simulator: rays per pose (after aiming), bounces, and the turn of the pattern.
+
+    The engine ``hybrid`` solves the wave equation of small bodies at low frequencies, with up to
+    ``sources`` unknowns, and traces rays at high ones. The engines ``spheres`` and ``bem`` solve
+    it up to ``frequency_max``. It may be half the sampling rate at most; where it is not set, the
+    analysis decides.
+    """
+
+    engine: Literal["hybrid", "rays", "kirchhoff", "spheres", "bem"] = "hybrid"
+    rays: Annotated[int, Field(ge=100, le=100_000_000)] = 300_000
+    bounces: Annotated[int, Field(ge=1, le=10)] = 3
+    diffraction_points: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
+    sources: Annotated[int, Field(ge=10, le=20_000)] = 1000
+    frequency_max: Positive | None = None  # Hz
+    seed: Seed = 0
+    noise_floor_poses: Annotated[int, Field(ge=0)] = 20
+
+
+class AirSettings(_Section):
+    """The medium; the speed of sound is 343 m/s unless a temperature or the speed itself is set."""
+
+    speed_of_sound: Annotated[float, Field(ge=100, le=10_000)] | None = None  # m/s
+    temperature_c: Annotated[float, Field(ge=-20, le=50)] | None = None
+    relative_humidity: Annotated[float, Field(ge=0, le=1)] = 0.5
+    pressure_pa: Annotated[float, Field(ge=20_000, le=200_000)] = 101_325.0
+
+
+class EarSettings(_Section):
+    """Emitter and receivers in the head frame (x forward, y left, z up).
+
+    Two ears by default, at ``left`` and its mirror image. ``receivers`` gives other places, from
+    one on. The directivity is that of a synthetic ear, of a circular piston of ``piston_radius``
+    that looks ahead, the same in all directions, or measured: read from ``file``, with the
+    receivers' places and the emitter's beam where it has them. A synthetic ear looks to its own
+    side: ``azimuth_deg`` has the sign of its y, and is 0 where y is 0.
+    """
+
+    emitter: Vector = (0.0, 0.0, -0.010)
+    left: Vector = (-0.010, 0.010, 0.005)  # the right ear is its mirror image
+    receivers: Annotated[tuple[Vector, ...], Field(min_length=1, max_length=256)] | None = None
+    directivity: Literal["ear", "omnidirectional", "piston", "file"] = "ear"
+    piston_radius: Positive = 0.003
+    file: Path | None = None
+    beam_radius: Annotated[float, Field(ge=0)] = 0.003
+    azimuth_deg: Annotated[float, Field(ge=-90, le=90)] = 25.0
+    elevation_deg: Annotated[float, Field(ge=-90, le=90)] = 10.0
+    width_deg: Annotated[float, Field(ge=5, le=180)] = 45.0
+    notch_depth: Annotated[float, Field(ge=0, lt=1)] = 0.8
+
+    @model_validator(mode="after")
+    def _file_is_of_its_directivity(self) -> EarSettings:
+        if self.directivity == "file" and self.file is None:
+            raise ValueError("the directivity file needs ears.file")
+        if self.directivity != "file" and self.file is not None:
+            raise ValueError(
+                f"file is of the directivity file, not of {self.directivity}; set directivity, or "
+                "leave it out"
+            )
+        return self
+
+
+class CallSettings(_Section):
+    """What is emitted: an impulse, a sweep of frequency with its harmonics, or a ``file``.
+
+    A ``preset`` fills the other keys with those of a published call; what is set beside it wins.
+    The file is a WAV of one channel that holds one call from the start of the emission on.
+    """
+
+    preset: str | None = None
+    kind: Literal["impulse", "linear", "hyperbolic", "file"] = "impulse"
+    file: Path | None = None
+    duration: Annotated[float, Field(ge=1e-5, le=0.1)] = 0.4e-3
+    frequency_start: Positive = 150e3
+    frequency_end: Positive = 40e3
+    harmonics: Annotated[tuple[Level, ...], Field(min_length=1, max_length=10)] = (1.0,)
+    taper: Annotated[float, Field(ge=0, le=1)] = 0.1  # of the duration, half at either end
+
+    @model_validator(mode="before")
+    @classmethod
+    def _preset_fills_what_is_not_set(cls, given: Any) -> Any:
+        if not isinstance(given, Mapping) or given.get("preset") is None:
+            return given
+        name = given["preset"]
+        if not isinstance(name, str) or name not in CALL_PRESETS:
+            near = difflib.get_close_matches(str(name), CALL_PRESETS, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(CALL_PRESETS)}"
+            raise ValueError(f"preset: found {name!r}; {hint}")
+        return {**CALL_PRESETS[name].keys, **given}
+
+    @model_validator(mode="after")
+    def _sweeps(self) -> CallSettings:
+        if self.frequency_start == self.frequency_end:
+            raise ValueError("frequency_start and frequency_end must differ")
+        if not any(self.harmonics):
+            raise ValueError("one of the harmonics at least must be above 0")
+        if (self.file is None) == (self.kind == "file"):
+            raise ValueError(
+                "kind file needs file, the WAV of one call"
+                if self.file is None
+                else f"file is of the kind file, not of {self.kind}; set kind, or leave it out"
+            )
+        return self
+
+    @property
+    def bands(self) -> dict[int, tuple[float, float]]:
+        """Lowest and highest frequency (Hz) of each harmonic that is emitted, of sweeps alone.
+
+        Harmonics count from 1, the fundamental.
+        """
+        if self.kind in ("impulse", "file"):
+            return {}
+        low, high = sorted((self.frequency_start, self.frequency_end))
+        return {h: (h * low, h * high) for h, a in enumerate(self.harmonics, start=1) if a > 0.0}
+
+
+def _window_of(analysis: dict[str, Any]) -> int:
+    """Return the power of two, in samples, that is nearest to 6.4 periods of the highest frequency.
+
+    It gives 64 at 1 MHz for up to 100 kHz.
+    """
+    if not {"sampling_rate", "frequency_max"} <= analysis.keys():  # told as a fault of its own
+        return 64
+    periods = 6.4 * analysis["sampling_rate"] / analysis["frequency_max"]
+    return int(2 ** max(round(math.log2(periods)), 3))
+
+
+def _hop_of(analysis: dict[str, Any]) -> int:
+    """Return a sixteenth of the window that suits the band, in samples."""
+    return max(_window_of(analysis) // 16, 1)
+
+
+def _fft_of(analysis: dict[str, Any]) -> int:
+    """Return eight times the window that suits the band, and more if a longer one is set."""
+    longest = max(8 * _window_of(analysis), analysis.get("window", 8))
+    return int(2 ** math.ceil(math.log2(longest)))
+
+
+class SpectrogramSettings(_Section):
+    """The analysis: filters of equal or of growing width, a hop, and a crop in range.
+
+    Of the kind ``stft`` a symmetric Hamming ``window`` and a padded ``fft``; of ``gammatone`` a
+    bank of ``channels`` on a logarithmic frequency axis, each ``q`` times as high as it is wide.
+    Window, hop and FFT follow from the band where they are not set.
+    """
+
+    sampling_rate: Positive = 1e6
+    frequency_min: Positive = 10e3
+    frequency_max: Positive = 100e3
+    window: Annotated[int, Field(ge=8)] = Field(default_factory=_window_of)
+    hop: Count = Field(default_factory=_hop_of)
+    fft: Annotated[int, Field(ge=8)] = Field(default_factory=_fft_of)
+    range_min: Positive = 0.15
+    range_max: Positive = 0.75
+    dynamic_range_db: Annotated[float, Field(gt=0, le=200)] = 60.0
+    kind: Literal["stft", "gammatone"] = "stft"
+    channels: Annotated[int, Field(ge=2, le=512)] = 48
+    q: Annotated[float, Field(ge=1, le=50)] = 3.0  # centre over equivalent rectangular bandwidth
+
+    @model_validator(mode="after")
+    def _ordered(self) -> SpectrogramSettings:
+        if self.frequency_min >= self.frequency_max:
+            raise ValueError("frequency_min must lie below frequency_max")
+        if self.frequency_max > self.sampling_rate / 2:
+            raise ValueError("frequency_max must not exceed half the sampling_rate")
+        if self.range_min >= self.range_max:
+            raise ValueError("range_min must lie below range_max")
+        if self.fft < self.window:
+            raise ValueError("fft must be at least window")
+        return self
+
+
+class NoiseSettings(_Section):
+    """White noise of the ears; what the ratio is measured by stands in ``acoustics.noise``."""
+
+    snr_db: Decibels | tuple[Decibels, Decibels] | None = None  # none, both ears, (left, right)
+    relative_to: Literal["target", "pose"] = "target"
+    target_strength_db: Decibels = -46.0  # of a rigid sphere 2 cm across
+    target_distance: Positive = 0.4
+
+
+class DataSettings(_Section):
+    """Where the ensemble lies and how it is streamed."""
+
+    store: Path | None = None
+    background: Literal["scene"] | Path | None = None  # taken off as power; scene: what it marks
+    workers: Annotated[int, Field(ge=0, le=64)] = 0
+    memory_bytes: Count = 2_000_000_000
+
+
+class RegionSettings(_Section):
+    """The box that is fitted and read out; found from the echoes where it is not set."""
+
+    lower: Vector | None = None
+    upper: Vector | None = None
+
+    @model_validator(mode="after")
+    def _box(self) -> RegionSettings:
+        if (self.lower is None) != (self.upper is None):
+            raise ValueError("lower and upper are set together or not at all")
+        if self.lower is not None and self.upper is not None:
+            if not all(a < b for a, b in zip(self.lower, self.upper, strict=True)):
+                raise ValueError("lower must lie below upper on every axis")
+        return self
+
+
+class FieldSettings(_Section):
+    """The reflectivity field by the name of its entry point, and what its factory takes."""
+
+    kind: Name = "grid"
+    options: dict[str, Any] = {}
+
+
+class RendererSettings(_Section):
+    """The renderer by the name of its entry point, and what its factory takes."""
+
+    kind: Name = "profile"
+    options: dict[str, Any] = {}
+
+
+class FitSettings(_Section):
+    """The fit: how long, on what, how fast."""
+
+    epochs: Count = 20
+    steps_per_epoch: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"
+    max_steps: Count | None = None
+    batch_poses: Count = 6
+    batch_slices: Count = 512
+    batch_frequencies: Annotated[int, Field(ge=1)] | Literal["all"] = 6
+    learning_rate: Positive | None = None  # the field's own where it is not set
+    schedule: Literal["cool", "staircase"] = "cool"
+    final_rate_factor: Annotated[float, Field(gt=0, le=1)] = 0.1
+    staircase_factor: Annotated[float, Field(gt=0, le=1)] = 0.97
+    staircase_epochs: Count = 20
+    loss: Literal["l1", "l2", "l1_4l2"] = "l1"
+    early_range_db: Annotated[float, Field(gt=0, le=200)] = 30.0  # second bounces lie below it
+    early_share: Annotated[float, Field(ge=0, le=1)] = 0.75
+    silent_weight: Annotated[float, Field(ge=0)] = 1.0
+    silent_share: Annotated[float, Field(ge=0, le=1)] = 1.0  # of the slices in which nothing sounds
+    gradient_clip: Positive | None = None
+    seed: Seed = 0
+    checkpoint_seconds: Positive = 60.0
+
+
+class PreviewSettings(_Section):
+    """The coarse mesh and projections that each epoch leaves."""
+
+    every_epochs: Count = 1
+    voxels: Annotated[int, Field(ge=8, le=512)] = 48  # along the region's longest side
+
+
+class PredictionSettings(_Section):
+    """What a prediction is made of, beside the rendered field."""
+
+    traced: Literal["auto", "off"] = "auto"  # echoes off the mesh, as far as validation bears out
+
+
+class ReconstructionSettings(_Section):
+    """The read-out of the finished field."""
+
+    spacing: Spacing | None = None  # from the field's own resolution where it is not set
+    level: Annotated[float, Field(ge=0)] | Literal["auto"] = "auto"  # of an iso-surface
+    method: Literal["auto", "open", "filled", "hull", "sheet", "isosurface"] = "auto"
+    refine: bool = True  # fit the surface to the echoes by physical optics
+    directions: Annotated[int, Field(ge=6)] = 100
+    smoothing: Annotated[float, Field(ge=0, le=1)] = 0.0  # side of a box over the volume, m
+
+    @model_validator(mode="after")
+    def _level_is_of_an_isosurface(self) -> ReconstructionSettings:
+        if self.level != "auto" and self.method not in ("auto", "isosurface"):
+            raise ValueError(
+                f"level is of the method isosurface, not of {self.method}; set method, or leave "
+                "it out"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _smooths_what_is_cut(self) -> ReconstructionSettings:
+        if self.smoothing and self.method != "isosurface":
+            raise ValueError(
+                f"smoothing is of the method isosurface, not of {self.method}; set method, or "
+                "leave it out"
+            )
+        return self
+
+
+class EvaluationSettings(_Section):
+    """The true surface that a reconstruction is compared with; metrics alone use it.
+
+    Without ``truth`` it is the scene's own. A ``rigid`` registration turns and moves the result
+    onto it, a ``similarity`` scales it too.
+    """
+
+    truth: Path | None = None
+    registration: Literal["none", "rigid", "similarity"] = "none"
+
+
+class Settings(_Section):
+    """One experiment, whole. Echoes come from a scene or from ``data.store``."""
+
+    scene: SceneSettings | None = None
+    poses: PoseSettings = PoseSettings()
+    simulation: SimulationSettings = SimulationSettings()
+    air: AirSettings = AirSettings()
+    ears: EarSettings = EarSettings()
+    call: CallSettings = CallSettings()
+    spectrogram: SpectrogramSettings = SpectrogramSettings()
+    noise: NoiseSettings = NoiseSettings()
+    data: DataSettings = DataSettings()
+    region: RegionSettings = RegionSettings()
+    field: FieldSettings = FieldSettings()
+    renderer: RendererSettings = RendererSettings()
+    fit: FitSettings = FitSettings()
+    preview: PreviewSettings = PreviewSettings()
+    prediction: PredictionSettings = PredictionSettings()
+    reconstruction: ReconstructionSettings = ReconstructionSettings()
+    evaluation: EvaluationSettings = EvaluationSettings()
+
+    @model_validator(mode="after")
+    def _echoes_come_from_somewhere(self) -> Settings:
+        if self.scene is None and self.data.store is None:
+            raise ValueError("scene: missing; set scene.name, or data.store for recorded echoes")
+        return self
+
+    @model_validator(mode="after")
+    def _noise_is_of_each_receiver(self) -> Settings:
+        places, level = self.ears.receivers, self.noise.snr_db
+        if places is not None and len(places) != 2 and isinstance(level, tuple):
+            raise ValueError(
+                f"noise.snr_db: gives 2 levels for {len(places)} ears.receivers; give one level "
+                "for all"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _solved_frequencies_are_sampled(self) -> Settings:
+        highest, half = self.simulation.frequency_max, self.spectrogram.sampling_rate / 2
+        if highest is not None and highest > half:
+            raise ValueError(
+                f"simulation.frequency_max is {highest:g} Hz, above half of "
+                f"spectrogram.sampling_rate ({half:g} Hz); lower it"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _call_is_sampled_and_heard(self) -> Settings:
+        bands, analysis = self.call.bands, self.spectrogram
+        half = analysis.sampling_rate / 2
+        for number, (_, high) in bands.items():
+            if high > half:
+                raise ValueError(
+                    f"call: harmonic {number} reaches {high:g} Hz, above half of "
+                    f"spectrogram.sampling_rate ({half:g} Hz); lower the call's frequencies, leave "
+                    "the harmonic out (amplitude 0) or raise the rate"
+                )
+        low, high = analysis.frequency_min, analysis.frequency_max
+        if bands and not any(lo <= high and hi >= low for lo, hi in bands.values()):
+            swept = ", ".join(f"{lo:g} to {hi:g} Hz" for lo, hi in bands.values())
+            raise ValueError(
+                f"call: sweeps {swept}, all outside spectrogram.frequency_min to frequency_max "
+                f"({low:g} to {high:g} Hz); nothing would be heard"
+            )
+        return self
+
+    @cached_property
+    def source(self) -> str | None:
+        """The file they were read from, for messages; no part of the settings, nor compared."""
+        return None
+
+    def plain(self) -> dict[str, Any]:
+        """Return the settings as plain data, ready for YAML, JSON and checkpoints."""
+        return self.model_dump(mode="json")
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """YAML that refuses duplicate keys and reads ``3e-3`` as the number it is."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen: set[Any] = set()
+        for key_node, _ in node.value:
+            key = self.construct_object(key_node, deep=True)
+            if not isinstance(key, str):
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} is no text", key_node.start_mark
+                )
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"the key {key!r} stands twice", key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep=deep)
+
+
+# YAML 1.1 reads 3e-3 as text, 010 as eight, 12:30 as 750 and `on` as true; YAML 1.2's core
+# schema does not.
+_StrictLoader.yaml_implicit_resolvers = {}
+for _tag, _pattern, _first in (
+    ("null", r"^(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
+    ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", list("tTfF")),
+    ("int", r"^[-+]?(?:0|[1-9][0-9]*)$", list("-+0123456789")),
+    (
+        "float",
+        r"^[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$",
+        list("-+0123456789."),
+    ),
+):
+    _StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
+
+
+def _parse_yaml(text: str, where: str) -> Any:
+    depth = 0
+    try:
+        for event in yaml.parse(text, Loader=_StrictLoader):
+            if isinstance(event, yaml.AliasEvent):
+                raise SettingsError(f"{where}: YAML aliases are not accepted; write the value out")
+            if isinstance(event, yaml.CollectionStartEvent):
+                depth += 1
+                if depth > MAX_SETTINGS_DEPTH:
+                    raise SettingsError(f"{where}: nested deeper than {MAX_SETTINGS_DEPTH} levels")
+            elif isinstance(event, yaml.CollectionEndEvent):
+                depth -= 1
+        return yaml.load(text, Loader=_StrictLoader)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"{where}:{mark.line + 1}:{mark.column + 1}" if mark else where
+        problem = getattr(error, "problem", None) or "is no YAML"
+        raise SettingsError(f"{place}: {problem}") from None
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read one settings file as plain data.
+
+    Raises
+    ------
+    SettingsError
+        If the file is missing, not UTF-8, too large, or no YAML mapping.
+    """
+    try:
+        if path.stat().st_size > MAX_SETTINGS_BYTES:
+            raise SettingsError(f"{path}: larger than {MAX_SETTINGS_BYTES} bytes; no settings file")
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        near = difflib.get_close_matches(
+            path.name, [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
+        )
+        hint = f"; did you mean {path.parent / near[0]}?" if near else ""
+        raise SettingsError(f"{path}: no such settings file{hint}") from None
+    except UnicodeDecodeError:
+        raise SettingsError(f"{path}: not UTF-8 text; save it as UTF-8") from None
+    except OSError as error:
+        raise SettingsError(f"{path}: cannot be read ({error.strerror})") from None
+    data = _parse_yaml(text, str(path))
+    if data is None:
+        data = {}
+    if not isinstance(data, dict):
+        raise SettingsError(f"{path}: holds {type(data).__name__}, expected `section:` lines")
+    return data
+
+
+def apply_override(data: dict[str, Any], assignment: str) -> None:
+    """Set one dotted ``KEY=VALUE`` in ``data``, in place.
+
+    Raises
+    ------
+    SettingsError
+        If the text is no assignment or runs through a value that is no section.
+    """
+    key, equals, value = assignment.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        raise SettingsError(
+            f"{assignment!r}: expected KEY=VALUE with a dotted key, such as fit.epochs=5"
+        )
+    node = data
+    for part in parts[:-1]:
+        child = node.setdefault(part, {})
+        if not isinstance(child, dict):
+            raise SettingsError(f"{key}: {part} is a value, not a section")
+        node = child
+    node[parts[-1]] = _parse_yaml(value, key)
+
+
+def _drop_options_of_another(data: dict[str, Any], assignment: str) -> None:
+    """Leave out the file's options where the command line names another scene than the file."""
+    key, _, value = assignment.partition("=")
+    section, _, name = key.strip().partition(".")
+    if (section, name) not in PLUGIN_NAMES or not isinstance(data.get(section), dict):
+        return
+    if data[section].get(name) != value.strip():
+        data[section].pop("options", None)
+
+
+def _model_at(model: type[BaseModel], path: Iterable[str | int]) -> type[BaseModel] | None:
+    for part in path:
+        if isinstance(part, int):  # in a list of models, each of them
+            continue
+        info = model.model_fields.get(part)
+        found = info.annotation if info else None
+        if typing.get_origin(found) is list:
+            found = typing.get_args(found)[0]
+        if not (isinstance(found, type) and issubclass(found, BaseModel)):
+            return None
+        model = found
+    return model
+
+
+def describe_faults(
+    error: ValidationError, model: type[BaseModel], source: str | None, prefix: str = ""
+) -> str:
+    """Turn pydantic's faults into one line each: source, dotted key, what is wrong, a way out."""
+    head = "" if source is None else f"{source}: "
+    lines: dict[str, None] = {}
+    for fault in error.errors():
+        if fault["type"] == "default_factory_not_called":
+            continue  # it follows from a key that is at fault itself
+        location = [
+            part
+            for part in fault["loc"]
+            if not (isinstance(part, str) and re.search(r"constrained|literal|\[", part))
+        ]
+        # A union reports one fault per member, with the member's type as last part.
+        if location and location[-1] in ("int", "float", "none", "str"):
+            location = location[:-1]
+        key = ".".join([*([prefix] if prefix else []), *(str(part) for part in location)])
+        if fault["type"] == "extra_forbidden":
+            parent = _model_at(model, location[:-1])
+            known = list(parent.model_fields) if parent else []
+            near = difflib.get_close_matches(str(location[-1]), known, n=1)
+            listed = f"known here: {', '.join(known)}" if known else "there is none to set here"
+            hint = f"did you mean {near[0]}?" if near else listed
+            lines[f"{head}{key}: unknown key; {hint}"] = None
+        elif fault["type"] == "missing" and isinstance(location[-1], int):
+            # One fault for each value that a list is short of; the last one tells the length.
+            short = ".".join([*([prefix] if prefix else []), *map(str, location[:-1])])
+            end = f"found {fault['input']!r}; give {location[-1] + 1} values"
+            lines = {line: None for line in lines if not line.startswith(f"{head}{short}: found")}
+            lines[f"{head}{short}: {end}"] = None
+        elif fault["type"] == "missing":
+            lines[f"{head}{key}: missing; set it, e.g. {key}=..."] = None
+        elif fault["type"] == "value_error":
+            message = fault["msg"].removeprefix("Value error, ")
+            lines[f"{head}{key + ': ' if key else ''}{message}"] = None
+        else:
+            message = fault["msg"][0].lower() + fault["msg"][1:]
+            found = repr(fault["input"])
+            found = found if len(found) < 80 else found[:77] + "..."
+            lines[f"{head}{key}: found {found}; {message}"] = None
+    return "\n".join(lines)
+
+
+def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
+    """Check plain data against the settings.
+
+    Raises
+    ------
+    SettingsError
+        One line per fault, naming ``source``, the dotted key and what is allowed.
+    """
+    try:
+        settings = Settings.model_validate(dict(data))
+    except ValidationError as error:
+        raise SettingsError(describe_faults(error, Settings, source)) from None
+    refuse_truths(data, settings, source=source)
+    settings.__dict__["source"] = source
+    return settings
+
+
+def refuse_truths(
+    given: Mapping[str, Any], taken: BaseModel, *, source: str | None = None, prefix: str = ""
+) -> None:
+    """Refuse yes and no where a number is meant; pydantic takes them for 1 and 0.
+
+    Parameters
+    ----------
+    given : mapping
+        What the settings say.
+    taken : BaseModel
+        What pydantic made of it.
+    source, prefix : str
+        Where it was read from, and the dotted key of all of it, for messages.
+
+    Raises
+    ------
+    SettingsError
+        One line for each.
+    """
+    head = "" if source is None else f"{source}: "
+    keys = [".".join([*([prefix] if prefix else []), *key]) for key in _truths(given, taken)]
+    if keys:
+        raise SettingsError("\n".join(f"{head}{key}: give a number, not yes or no" for key in keys))
+
+
+def _truths(given: Any, taken: Any) -> Iterator[tuple[str, ...]]:
+    if isinstance(given, bool):
+        if isinstance(taken, int | float) and not isinstance(taken, bool):
+            yield ()
+        return
+    pairs: Iterable[tuple[str, Any, Any]] = ()
+    if isinstance(given, Mapping) and isinstance(taken, BaseModel):
+        pairs = ((str(k), v, getattr(taken, k, None)) for k, v in given.items())
+    elif isinstance(given, list | tuple) and isinstance(taken, list | tuple):
+        pairs = ((str(n), *both) for n, both in enumerate(zip(given, taken, strict=False)))
+    for key, one, other in pairs:
+        yield from ((key, *rest) for rest in _truths(one, other))
+
+
+@contextmanager
+def faults_of(source: str | None) -> Iterator[None]:
+    """Name the file, where it is known, in faults of settings that are checked later on."""
+    try:
+        yield
+    except SettingsError as error:
+        if source is None:
+            raise
+        lines = [f"{source}: {line}" for line in str(error).splitlines()]
+        raise SettingsError("\n".join(lines)) from None
+
+
+def load_settings(path: Path, overrides: Iterable[str] = ()) -> Settings:
+    """Read a settings file and lay ``KEY=VALUE`` assignments over it.
+
+    An assignment that names another scene, field or renderer than the file does takes the file's
+    options for the old one away.
+
+    Raises
+    ------
+    SettingsError
+        If the file cannot be read or any key or value is not allowed.
+    """
+    data = read_yaml(path)
+    overrides = list(overrides)
+    for assignment in overrides:
+        _drop_options_of_another(data, assignment)
+    for assignment in overrides:
+        apply_override(data, assignment)
+    return validate_settings(data, str(path))
+
+
+def dump_yaml(settings: Settings) -> str:
+    """Return the settings, whole, as YAML text that :func:`load_settings` reads back."""
+    return str(yaml.safe_dump(settings.plain(), sort_keys=False, allow_unicode=True))

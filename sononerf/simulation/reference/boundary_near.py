@@ -1,0 +1,201 @@
+# SPDX-License-Identifier: MIT
+"""Integrals over near triangles, in closed form where the kernel is not smooth.
+
+The kernel is :math:`e^{-jkR} / R`. Its terms :math:`1 / R` and :math:`-k^2 R / 2`, and those of its
+normal derivative, are integrated over a triangle in closed form [1]_ [2]_. What is left is smooth
+and does not depend on how near the triangles are. So one table serves all frequencies.
+
+References
+----------
+.. [1] D. R. Wilton, S. M. Rao, A. W. Glisson, D. H. Schaubert, O. M. Al-Bundak and C. M. Butler,
+   "Potential integrals for uniform and linear source distributions on polygonal and polyhedral
+   domains", IEEE Transactions on Antennas and Propagation 32, 1984.
+.. [2] R. D. Graglia, "On the numerical integration of the linear shape functions times the 3-D
+   Green's function or its gradient on a plane triangle", the same journal 41, 1993.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array, csr_array
+from scipy.spatial import cKDTree
+
+from sononerf.simulation.reference.boundary_panels import Panels, Reals
+
+NEAR = 2.0  # distance of middles over the sum of both radii, below which a pair is near
+PAIRS = 1 << 13  # near pairs at a time
+# Seven points, exact to degree five (J. Radon 1948): barycentric coordinates and weights.
+_A, _B = (6.0 - math.sqrt(15.0)) / 21.0, (6.0 + math.sqrt(15.0)) / 21.0
+POINTS = np.array(
+    [[1.0 / 3.0] * 3]
+    + [np.roll([1.0 - 2.0 * a, a, a], turn).tolist() for a in (_A, _B) for turn in range(3)]
+)
+WEIGHTS = np.array(
+    [9.0 / 40.0]
+    + [(155.0 - math.sqrt(15.0)) / 1200.0] * 3
+    + [(155.0 + math.sqrt(15.0)) / 1200.0] * 3
+)
+# The middles of the edges, exact to degree two; row k lies opposite to corner k.
+MIDDLES = 0.5 * (1.0 - np.eye(3))
+
+
+def potentials(corners: Reals, normals: Reals, slopes: Reals, points: Reals) -> Reals:
+    r"""Integrate linear functions over triangles, times what is not smooth in the kernel.
+
+    With :math:`R` the distance of a point to a place on the triangle and :math:`z` its height
+    above the triangle's plane, the functions of the three corners are integrated times
+    :math:`1/R`, :math:`R`, :math:`z/R^3` and :math:`z/R`. In the plane itself the third is 0.
+
+    Parameters
+    ----------
+    corners : (N, 3, 3) float64, m
+        Of the triangles.
+    normals : (N, 3) float64
+        Unit vectors.
+    slopes : (N, 3, 3) float64, 1/m
+        Gradients of the corners' functions.
+    points : (N, K, 3) float64, m
+        On none of the edges.
+
+    Returns
+    -------
+    found : (4, N, K, 3) float64
+        In m, m3, 1 and m2, for each corner.
+    """
+    away = corners[:, None] - points[:, :, None]  # (N, K, 3, 3): to the corners
+    far = np.sqrt(_dot(away, away))
+    height = -_dot(away[:, :, 0], normals[:, None])
+    edges = corners[:, [1, 2, 0]] - corners
+    length = np.sqrt(_dot(edges, edges))
+    along = edges / length[:, :, None]
+    out = np.cross(along, normals[:, None])  # in the plane, away from the triangle
+    start = _dot(away, along[:, None])
+    end = start + length[:, None]
+    off = _dot(away, out[:, None])
+    near, beyond = far, far[:, :, [1, 2, 0]]
+    square = off**2 + height[..., None] ** 2
+    # Of ln((R1 + l1) / (R0 + l0)) the form without cancellation.
+    back = end + start < 0.0
+    upper = np.where(back, near - start, beyond + end)
+    lower = np.where(back, beyond - end, near + start)
+    logs = np.log(upper / np.maximum(lower, 1e-300))
+    first = 0.5 * (end * beyond - start * near + square * logs)  # of R along the edge
+    third = 0.25 * (end * beyond**3 - start * near**3 + 3.0 * square * first)
+    # van Oosterom and Strackee 1983; the sign is that of the height.
+    a, b, c = (away[:, :, corner] for corner in range(3))
+    below = far.prod(axis=2) + sum(
+        _dot(*(away[:, :, other] for other in range(3) if other != corner)) * far[:, :, corner]
+        for corner in range(3)
+    )
+    angle = -2.0 * np.arctan2(_dot(a, np.cross(b, c)), below)
+    scale = length.max(axis=1)[:, None]
+    angle = np.where(np.abs(height) < 1e-9 * scale, 0.0, angle)
+    whole = (off * logs).sum(axis=2) - height * angle
+    ways = (height**2 * whole + (off * first).sum(axis=2)) / 3.0
+    # The corners' functions below the point, and what their slopes add.
+    foot = 1.0 / 3.0 + _dot(slopes[:, None], -away.mean(axis=2)[:, :, None])
+
+    def slope(over: Reals) -> Reals:
+        added: Reals = np.einsum("nkd,ncd->nkc", np.einsum("nke,ned->nkd", over, out), slopes)
+        return added
+
+    inverse = foot * whole[..., None] + slope(first)
+    return np.stack(
+        [
+            inverse,
+            foot * ways[..., None] + slope(third) / 3.0,
+            foot * angle[..., None] - height[..., None] * slope(logs),
+            height[..., None] * inverse,
+        ]
+    )
+
+
+def _dot(a: Reals, b: Reals) -> Reals:
+    product: Reals = np.einsum("...d,...d->...", a, b)
+    return product
+
+
+def near_pairs(panels: Panels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the pairs (N,), (N,) of triangles that are near each other, themselves included."""
+    corners = panels.vertices[panels.faces]
+    middles = corners.mean(axis=1)
+    radius = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
+    tree = cKDTree(middles)
+    # Larger ones look for smaller ones, so that one long triangle does not find all.
+    found = tree.query_ball_point(middles, 2.0 * NEAR * radius, return_sorted=False)
+    count = np.array([len(some) for some in found])
+    one = np.repeat(np.arange(len(found)), count)
+    other = np.concatenate(found).astype(np.int64)
+    apart = np.linalg.norm(middles[one] - middles[other], axis=1)
+    kept = (radius[other] <= radius[one]) & (apart <= NEAR * (radius[one] + radius[other]))
+    one, other = one[kept], other[kept]
+    key = np.unique(np.concatenate([one * len(found) + other, other * len(found) + one]))
+    first, second = np.divmod(key, len(found))
+    return first, second
+
+
+def corrections(panels: Panels) -> tuple[csr_array, ...]:
+    r"""Integrate what the middles of edges leave out between near triangles.
+
+    Returns
+    -------
+    found : five of (V, V)
+        Of the hypersingular operator the terms in :math:`k^0`, :math:`k^2` and :math:`k^4`, then
+        those of the double layer in :math:`k^0` and :math:`k^2`, times :math:`4 \pi`.
+    """
+    one, other = near_pairs(panels)
+    sums: list[Any] = [0.0] * 5
+    shape = len(panels.vertices), len(panels.vertices)
+    for start in range(0, len(one), PAIRS):
+        some, of = one[start : start + PAIRS], other[start : start + PAIRS]
+        kernels = _missing(panels, some, of)  # (4, N, 3, 3)
+        curl = [
+            np.cross(panels.normals[which][:, None], panels.slopes[which]) for which in (some, of)
+        ]
+        curls = np.einsum("nad,nbd->nab", *curl)
+        cosine = _dot(panels.normals[some], panels.normals[of])[:, None, None]
+        inverse, ways = kernels[0], kernels[1]
+        terms = (
+            -curls * inverse.sum(axis=(1, 2))[:, None, None],
+            0.5 * curls * ways.sum(axis=(1, 2))[:, None, None] + cosine * inverse,
+            -0.5 * cosine * ways,
+            kernels[2],
+            0.5 * kernels[3],
+        )
+        rows = np.repeat(panels.faces[some][:, :, None], 3, axis=2).ravel()
+        columns = np.repeat(panels.faces[of][:, None, :], 3, axis=1).ravel()
+        for index, term in enumerate(terms):
+            sums[index] = sums[index] + csr_array(
+                coo_array((term.ravel(), (rows, columns)), shape=shape)
+            )
+    # The hypersingular operator is symmetric; its quadrature is not quite.
+    return tuple(
+        csr_array(0.5 * (part + part.T)) if index < 3 else csr_array(part)
+        for index, part in enumerate(sums)
+    )
+
+
+def _missing(panels: Panels, one: NDArray[np.int64], other: NDArray[np.int64]) -> Reals:
+    """Integrals over pairs of triangles, less those by the middles of edges (4, N, 3, 3)."""
+    corners = panels.vertices[panels.faces[one]]
+    theirs = panels.vertices[panels.faces[other]]
+    normals = panels.normals[other]
+    points = np.einsum("kc,ncd->nkd", POINTS, corners)
+    inner = potentials(theirs, normals, panels.slopes[other], points)
+    weights = POINTS * WEIGHTS[:, None]
+    exact = np.einsum("ka,jnkb->jnab", weights, inner) * panels.area[one][:, None, None]
+    mine = np.einsum("kc,ncd->nkd", MIDDLES, corners)
+    away = mine[:, :, None] - np.einsum("kc,ncd->nkd", MIDDLES, theirs)[:, None]
+    distance = np.sqrt(_dot(away, away))
+    apart = panels.sides[one][:, :, None] != panels.sides[other][:, None, :]
+    inverse = np.where(apart, 1.0 / np.where(apart, distance, 1.0), 0.0)
+    height = _dot(away, normals[:, None, None])
+    kernels = np.stack([inverse, distance, height * inverse**3, height * inverse])
+    both = (panels.area[one] * panels.area[other] / 9.0)[:, None, None]
+    rough = np.einsum("ka,jnkl,lb->jnab", MIDDLES, kernels, MIDDLES, optimize=True) * both
+    found: Reals = exact - rough
+    return found

@@ -1,0 +1,736 @@
+# SPDX-License-Identifier: MIT
+"""The engine for rigid spheres: their multiple scattering, exactly, by partial waves."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh_tridiagonal
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.special import spherical_jn
+
+from sononerf.errors import InputError, NumericalError
+from sononerf.head.ears import Ears
+from sononerf.scene.material import Material
+from sononerf.scene.scene import Scene
+from sononerf.simulation.hearing import Hearing
+from sononerf.simulation.solved import Heads, Solved
+
+ROUND = 1e-3  # of the radius, by which vertices may lie beside the sphere
+TWICE = 1e-8  # of the scene's size, within which vertices stand at the same place
+FILLED = 0.95  # of the sphere's volume, that the mesh encloses at least
+APART = 0.01  # of the smaller radius, between any two spheres at least
+DIGITS = 4.0  # of the partial waves' truncation
+TOLERANCE = 1e-4  # of the pressure on the spheres
+MOST_ITERATIONS = 60
+MOST_WAVES = 300_000  # partial waves of all spheres together
+BATCH_BYTES = 500e6  # for the waves of all poses of a batch
+KEPT = 30  # arrays of the waves' size, while a batch is solved
+SPEED = 6e9  # operations per second of one core
+
+Array = NDArray[np.complex128]
+
+
+@dataclass(frozen=True, eq=False)
+class Ball:
+    """A sphere.
+
+    Attributes
+    ----------
+    centre : (3,) float64, m
+        World frame.
+    radius : float, m
+        Of its surface.
+    """
+
+    centre: NDArray[np.float64]
+    radius: float
+
+
+class Spheres(Solved):
+    r"""Echoes of rigid spheres by multiple scattering.
+
+    The pressure that sphere :math:`i` scatters is
+
+    .. math:: \sum_{n m} f^i_{n m}\, \frac{h_n(k r_i)}{h_n(k a_i)}\, Y_{n m}(\vartheta_i, \varphi_i)
+
+    with :math:`h_n` the outgoing spherical Hankel function (of the second kind), :math:`a_i` the
+    radius and :math:`r_i, \vartheta_i, \varphi_i` coordinates about the centre. The normal
+    velocity on sphere :math:`l` vanishes if
+
+    .. math:: f^l_{n m} = -\frac{h_n(k a_l)}{k h_n'(k a_l)} \int \frac{\partial}{\partial r_l}
+        \Bigl(p_0 + \sum_{i \neq l} p_i\Bigr) Y^*_{n m}\, d\Omega_l
+
+    with :math:`p_0` the emission [1]_ and :math:`p_i` what the other spheres scatter. To project
+    :math:`p_i` on the harmonics of sphere :math:`l`, the waves are turned to the axis between both
+    centres, translated along it, and turned back [2]_. The translation along the axis is a
+    Gauss-Legendre integral of the condition over the target's polar angle for each order
+    :math:`m`. It needs no recursion, and no division by Bessel functions near their zeros. The
+    turns are Wigner's matrices by the eigenvectors of the angular momentum [3]_.
+
+    The coefficients follow by minimal residuals (GCR [4]_) over the orders of scattering, for
+    all poses at once, until what is left is below 1e-4 of what the emission causes. The degrees go
+    up to :math:`k a + 1.8\, d^{2/3} (k a)^{1/3}` for :math:`d = 4` digits [2]_, and higher where
+    another sphere or the head is close: a sphere near by is mirrored in others at points that no
+    fewer degrees than :math:`d \ln(10) / \mu` describe, with :math:`\mu` the sphere's bispherical
+    coordinate.
+
+    Beam and ears are taken towards the centres of the spheres.
+
+    Parameters
+    ----------
+    scene : Scene
+        Rigid spheres that do not touch, as closed meshes.
+    hearing : Hearing
+        Head and air.
+    gains, absorption, frequency_max
+        See :class:`Solved`.
+    orders : int, optional
+        Sum orders of scattering up to this one and solve nothing: 1 leaves out what one sphere
+        sends to another. For diagnosis.
+
+    Attributes
+    ----------
+    balls : list of Ball
+        The spheres of the scene.
+
+    Raises
+    ------
+    InputError
+        If the scene has anything else than rigid spheres, if two of them touch, or if they need
+        too many partial waves.
+
+    References
+    ----------
+    .. [1] NIST Digital Library of Mathematical Functions, 10.60.1 and 10.60.2.
+    .. [2] N. A. Gumerov and R. Duraiswami, "Fast Multipole Methods for the Helmholtz Equation in
+       Three Dimensions", Elsevier 2004; the same, "Computation of scattering from N spheres using
+       multipole reexpansion", Journal of the Acoustical Society of America 112, 2002.
+    .. [3] X. M. Feng, P. Wang, W. Yang and G. R. Jin, "High-precision evaluation of Wigner's d
+       matrix by exact diagonalization", Physical Review E 92, 043307, 2015.
+    .. [4] S. C. Eisenstat, H. C. Elman and M. H. Schultz, "Variational iterative methods for
+       nonsymmetric systems of linear equations", SIAM Journal on Numerical Analysis 20, 1983.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        hearing: Hearing,
+        *,
+        gains: Callable[[NDArray[np.float64]], Ears],
+        absorption: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+        frequency_max: float,
+        orders: int | None = None,
+    ) -> None:
+        for material in scene.materials:
+            _refuse_soft(material)
+        self.balls = find_balls(scene)
+        self.orders = orders
+        super().__init__(
+            scene, hearing, gains=gains, absorption=absorption, frequency_max=frequency_max
+        )
+        _refuse_close(self.balls)
+        self._links = list(_links(self.balls))
+        highest = 2.0 * math.pi * self.frequency[-1] / hearing.speed_of_sound
+        _refuse_many(self.degrees(highest, math.inf), self.frequency[-1])
+        self._turns: list[list[NDArray[np.float64]]] = []
+
+    def degrees(self, wavenumber: float, nearest: float) -> list[int]:
+        """Highest degree of each sphere's partial waves.
+
+        Parameters
+        ----------
+        wavenumber : float, 1/m
+            Of sound in air.
+        nearest : float
+            Distance of the nearest emitter or ear from a sphere's centre, over its radius.
+        """
+        found = []
+        for index, ball in enumerate(self.balls):
+            size = wavenumber * ball.radius
+            excess = 1.8 * DIGITS ** (2.0 / 3.0) * np.cbrt(size)
+            close = math.log(10.0) * DIGITS / math.log(nearest)
+            for other in self.balls[:index] + self.balls[index + 1 :]:
+                apart = float(np.linalg.norm(other.centre - ball.centre))
+                cosine = (apart**2 + ball.radius**2 - other.radius**2) / (2 * apart * ball.radius)
+                close = max(close, math.log(10.0) * DIGITS / math.acosh(cosine))
+            found.append(math.ceil(size + max(excess, close)))
+        return found
+
+    def estimate(self, poses: int) -> tuple[float, float]:
+        """Memory (bytes) and time (s); see :meth:`Solved.estimate`."""
+        wavenumbers = 2.0 * math.pi * self.frequency / self.hearing.speed_of_sound
+        seconds, linked = 0.0, max(len(self.balls) - 1, 0)
+        for wavenumber in wavenumbers[:: max(1, len(wavenumbers) // 20)]:
+            cubes = sum((degree + 1.0) ** 3 for degree in self.degrees(wavenumber, math.inf))
+            # Two turns and a translation of complex waves; six orders.
+            seconds += 6.0 * linked * cubes * (32.0 / 3.0 + 16.0 / 3.0) * poses / SPEED
+        degrees = self.degrees(float(wavenumbers[-1]), math.inf)
+        turns = len(self._links) * 8.0 * 4.0 / 3.0 * (max(degrees) + 1.0) ** 3
+        moves = 2 * len(self._links) * 16.0 / 3.0 * (max(degrees) + 1.0) ** 3
+        return turns + moves + BATCH_BYTES, seconds * max(1, len(wavenumbers) // 20)
+
+    def respond(self, wavenumber: complex, poses: Heads) -> Array:
+        """Scattered pressure at the ears; see :meth:`Solved.respond`."""
+        coupling = self._coupling(
+            wavenumber, np.vstack([poses.emitters, poses.ears.reshape(-1, 3)])
+        )
+        size = 16.0 * KEPT * coupling.rows[-1].stop
+        batch = max(1, int(BATCH_BYTES / size))
+        parts = [
+            self._respond(coupling, poses[start : start + batch])
+            for start in range(0, len(poses), batch)
+        ]
+        return np.concatenate(parts)
+
+    def field(
+        self, wavenumber: complex, emitter: NDArray[np.float64], points: NDArray[np.float64]
+    ) -> Array:
+        """Scattered pressure at points, of an emitter that sends alike in all directions.
+
+        Parameters
+        ----------
+        wavenumber : complex, 1/m
+            Of sound in air; its imaginary part is not positive.
+        emitter : (3,) float64, m
+            World frame; its pressure is 1 at 1 m.
+        points : (X, 3) float64, m
+            World frame, outside the spheres or on them.
+
+        Returns
+        -------
+        pressure : (X,) complex128
+            Without the emission itself.
+        """
+        coupling = self._coupling(wavenumber, emitter[None])
+        waves = self._scattered(coupling, coupling.emitted(emitter[None]))
+        parts = [coupling.heard(index, waves, points) for index in range(len(self.balls))]
+        return np.sum(parts, axis=0)
+
+    def _coupling(self, wavenumber: complex, places: NDArray[np.float64]) -> Coupling:
+        """Return what the spheres send to one another, in degrees that suit heads at places."""
+        nearest = min(
+            float(np.linalg.norm(places - ball.centre, axis=1).min()) / ball.radius
+            for ball in self.balls
+        )
+        if nearest <= 1.0:
+            raise InputError("an emitter or an ear lies inside a sphere; move the poses")
+        degrees = self.degrees(wavenumber.real, nearest)
+        _refuse_many(degrees, wavenumber.real * self.hearing.speed_of_sound / (2.0 * math.pi))
+        return Coupling(self.balls, degrees, wavenumber, self._links, self._all_turns(degrees))
+
+    def _all_turns(self, degrees: list[int]) -> list[list[NDArray[np.float64]]]:
+        """Return Wigner's matrices of each link, by degree."""
+        wanted = max(degrees)
+        if not self._turns and self._links:
+            self._turns = [[] for _ in self._links]
+        if self._links and len(self._turns[0]) <= wanted:
+            for degree in range(len(self._turns[0]), wanted + 1):
+                matrices = wigner(degree, [link.polar for link in self._links])
+                for known, matrix in zip(self._turns, matrices, strict=True):
+                    known.append(matrix)
+        return self._turns
+
+    def _respond(self, coupling: Coupling, poses: Heads) -> Array:
+        waves = coupling.emitted(poses.emitters)
+        for ball, rows in zip(self.balls, coupling.rows, strict=True):
+            waves[rows] *= poses.beam(ball.centre[None]).T
+        waves = self._scattered(coupling, waves)
+        ears = int(poses.ears.shape[1])
+        heard = np.zeros((len(poses), ears), dtype=np.complex128)
+        for ear in range(ears):
+            for index, ball in enumerate(self.balls):
+                gain = poses.gain(ear, ball.centre[None])[:, 0]
+                heard[:, ear] += gain * coupling.heard(index, waves, poses.ears[:, ear])
+        return heard
+
+    def _scattered(self, coupling: Coupling, first: Array) -> Array:
+        if self.orders is None:
+            return self._solved(coupling, first)
+        waves = first
+        for _ in range(self.orders - 1):
+            waves = first + coupling.apply(waves)
+        return waves
+
+    def _solved(self, coupling: Coupling, first: Array) -> Array:
+        """Solve ``waves - coupling(waves) = first`` for each column by GCR."""
+        residual, waves = first.copy(), np.zeros_like(first)
+        scale = np.maximum(np.sqrt(_product(first, first).real), 1e-300)
+        basis: list[tuple[Array, Array]] = []
+        for _ in range(MOST_ITERATIONS):
+            if (np.sqrt(_product(residual, residual).real) <= TOLERANCE * scale).all():
+                return waves
+            if len(basis) == (KEPT - 8) // 2:
+                basis.clear()
+            step = residual.copy()
+            image = step - coupling.apply(step)
+            for known, known_image in basis:
+                part = _product(known_image, image)
+                step -= part * known
+                image -= part * known_image
+            length = np.maximum(np.sqrt(_product(image, image).real), 1e-300)
+            step /= length
+            image /= length
+            basis.append((step, image))
+            part = _product(image, residual)
+            waves += part * step
+            residual -= part * image
+        left = float((np.sqrt(_product(residual, residual).real) / scale).max())
+        frequency = coupling.wavenumber.real * self.hearing.speed_of_sound / (2.0 * math.pi)
+        raise NumericalError(
+            f"the spheres' scattering at {frequency / 1e3:.4g} kHz did not converge: after "
+            f"{MOST_ITERATIONS} steps {left:.1e} is left, at most {TOLERANCE:.0e} is allowed; move "
+            "the spheres farther apart"
+        )
+
+
+@dataclass(frozen=True)
+class Link:
+    """The axis between two spheres.
+
+    Attributes
+    ----------
+    one, two : int
+        Numbers of the spheres; the axis points from the first to the second.
+    length : float, m
+        Between the centres.
+    polar, azimuth : float, rad
+        Of the axis.
+    """
+
+    one: int
+    two: int
+    length: float
+    polar: float
+    azimuth: float
+
+
+class Coupling:
+    """What spheres send to one another at one wavenumber.
+
+    Waves are arrays (K, P): for each sphere the harmonics ``n, m`` at row ``n (n + 1) + m`` of its
+    rows, each relative to its Hankel function on the sphere; P poses.
+
+    Parameters
+    ----------
+    balls : list of Ball
+        The spheres.
+    degrees : list of int
+        Highest degree of each.
+    wavenumber : complex, 1/m
+        Of sound in air.
+    links : list of Link
+        The axes between them.
+    turns : list of list of (2 n + 1, 2 n + 1) float64
+        Wigner's matrices of each link by degree.
+    """
+
+    def __init__(
+        self,
+        balls: list[Ball],
+        degrees: list[int],
+        wavenumber: complex,
+        links: list[Link],
+        turns: list[list[NDArray[np.float64]]],
+    ) -> None:
+        self.balls, self.degrees, self.wavenumber = balls, degrees, wavenumber
+        self.links, self.turns = links, turns
+        ends = np.cumsum([0, *((degree + 1) ** 2 for degree in degrees)])
+        self.rows = [slice(start, end) for start, end in itertools.pairwise(ends.tolist())]
+        self.on_ball = [
+            log_outgoing(degree, np.array([wavenumber * ball.radius]))
+            for ball, degree in zip(balls, degrees, strict=True)
+        ]
+        known: dict[tuple[float, ...], list[Array]] = {}
+        self._moves: list[tuple[list[Array], list[Array]]] = []
+        for link in links:
+            both = []
+            for source, target in ((link.one, link.two), (link.two, link.one)):
+                key = (
+                    *(balls[source].radius, degrees[source]),
+                    *(balls[target].radius, degrees[target], link.length),
+                )
+                if key not in known:
+                    known[key] = self._along(source, target, link.length)
+                both.append(known[key])
+            self._moves.append((both[0], both[1]))
+
+    def emitted(self, emitters: NDArray[np.float64]) -> Array:
+        """Return what the emission alone causes on the spheres (K, P), from (P, 3) m."""
+        waves = np.zeros((self.rows[-1].stop, len(emitters)), dtype=np.complex128)
+        for index, (ball, degree) in enumerate(zip(self.balls, self.degrees, strict=True)):
+            distance, around = _seen(emitters - ball.centre, degree)
+            at_head = log_outgoing(
+                degree, np.asarray(self.wavenumber * distance, dtype=np.complex128)
+            )[0]
+            radial = np.exp(at_head - self.on_ball[index][0])  # (N + 1, P)
+            slope = self.wavenumber * _slopes(self.wavenumber * ball.radius, self.on_ball[index][0])
+            share = -1j * self.wavenumber * 4.0 * math.pi * slope * self._answer(index)
+            radial *= share[:, None]
+            order = 2 * np.arange(degree + 1) + 1
+            waves[self.rows[index]] = around.conj() * np.repeat(radial, order, axis=0)
+        return waves
+
+    def heard(self, index: int, waves: Array, ears: NDArray[np.float64]) -> Array:
+        """Return the pressure (P,) that a sphere scatters, at a place (P, 3) m for each pose."""
+        degree = self.degrees[index]
+        distance, around = _seen(ears - self.balls[index].centre, degree)
+        at_ear = log_outgoing(degree, np.asarray(self.wavenumber * distance, dtype=np.complex128))[
+            0
+        ]
+        ratio = np.exp(at_ear - self.on_ball[index][0])
+        order = 2 * np.arange(degree + 1) + 1
+        around = around * waves[self.rows[index]]
+        around *= np.repeat(ratio, order, axis=0)
+        pressure: Array = around.sum(axis=0)
+        return pressure
+
+    def apply(self, waves: Array) -> Array:
+        """Return what waves (K, P) of each sphere cause on all others."""
+        caused = np.zeros_like(waves)
+        for link, turns, moves in zip(self.links, self.turns, self._moves, strict=True):
+            one, two = self.rows[link.one], self.rows[link.two]
+            forward = _into_axis(waves[one], link.azimuth, turns)
+            back = _into_axis(waves[two], link.azimuth, turns)
+            _mirror(back)
+            moved = _move(moves[0], forward, self.degrees[link.two])
+            caused[two] += _out_of_axis(moved, link.azimuth, turns)
+            moved = _move(moves[1], back, self.degrees[link.one])
+            _mirror(moved)
+            caused[one] += _out_of_axis(moved, link.azimuth, turns)
+        return caused
+
+    def _answer(self, index: int) -> Array:
+        """Return the waves (N,) that a slope of pressure on a sphere causes, m."""
+        slope = self.wavenumber * self.on_ball[index][1][:, 0]
+        answer: Array = -1.0 / slope
+        return answer
+
+    def _along(self, source: int, target: int, length: float) -> list[Array]:
+        """Return the matrices (L - m + 1, N - m + 1) that translate along +z, by order m."""
+        given, wanted = self.degrees[source], self.degrees[target]
+        radius = self.balls[target].radius
+        node, weight = np.polynomial.legendre.leggauss(given + wanted + 8)
+        height, across = length + radius * node, radius * np.sqrt(1.0 - node**2)
+        distance = np.hypot(height, across)
+        log_h, slope = log_outgoing(given, self.wavenumber * distance)
+        ratio = np.exp(log_h - self.on_ball[source][0])  # (N, Q)
+        n = np.arange(given + 1)[:, None]
+        bend = length / (radius * distance)  # of the polar angle, over its sine's ratio
+        own = self.wavenumber * slope * ((radius + length * node) / distance)
+        own = ratio * (own + n * (bend * height / distance))
+        below = ratio * bend
+        here = legendre(wanted, node) * (2.0 * math.pi * weight)
+        there = legendre(given, height / distance)
+        answer = self._answer(target)
+        moves = []
+        for m in range(min(given, wanted) + 1):
+            degree = np.arange(m, given + 1)
+            factor = np.sqrt((2 * degree + 1) / np.maximum(2 * degree - 1, 1) * (degree**2 - m**2))
+            field = own[m:] * there[m, m:]
+            field[1:] -= factor[1:, None] * below[m + 1 :] * there[m, m:-1]
+            real = here[m, m:] @ np.ascontiguousarray(field.real.T)
+            imaginary = here[m, m:] @ np.ascontiguousarray(field.imag.T)
+            moves.append(answer[m:, None] * (real + 1j * imaginary))
+        return moves
+
+
+def find_balls(scene: Scene) -> list[Ball]:
+    """Recognise the spheres of a scene.
+
+    Parameters
+    ----------
+    scene : Scene
+        Closed meshes.
+
+    Returns
+    -------
+    balls : list of Ball
+        One for each connected part of the mesh.
+
+    Raises
+    ------
+    InputError
+        If a part is no sphere, is open, inside out or too coarse.
+    """
+    vertices = np.asarray(scene.mesh.vertices, dtype=np.float64)
+    same = np.round(vertices / (TWICE * np.ptp(vertices, axis=0).max()))
+    _, first, index = np.unique(same, axis=0, return_index=True, return_inverse=True)
+    places, faces = vertices[first], index.reshape(-1)[np.asarray(scene.mesh.faces)]
+    # By edges: spheres that touch may share a vertex.
+    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    edge = np.unique(edges, axis=0, return_inverse=True)[1].reshape(-1)
+    triangle = np.tile(np.arange(len(faces)), 3)
+    join = coo_array((np.ones(len(edge)), (triangle, edge)), shape=(len(faces), edge.max() + 1))
+    part = connected_components(join @ join.T, directed=False)[1]
+    return [
+        _ball(places, faces[part == number], name) for name, number in enumerate(np.unique(part))
+    ]
+
+
+def _ball(places: NDArray[np.float64], faces: NDArray[np.int64], name: int) -> Ball:
+    points = places[np.unique(faces)]
+    middle = points.mean(axis=0)
+    # |x|^2 = 2 c x + (r^2 - c^2) is linear in the centre.
+    away = points - middle
+    system = np.column_stack([2.0 * away, np.ones(len(away))])
+    centre = middle + np.linalg.lstsq(system, (away**2).sum(axis=1), rcond=None)[0][:3]
+    distance = np.linalg.norm(points - centre, axis=1)
+    radius = float(distance.mean())
+    what = f"simulation.engine=spheres: body {name} of the mesh"
+    worst = float(np.abs(distance / radius - 1.0).max())
+    if worst > ROUND:
+        raise InputError(
+            f"{what} is no sphere: its vertices are up to {100 * worst:.2g} % of the radius off, "
+            f"at most {100 * ROUND:g} % is allowed; take simulation.engine=rays"
+        )
+    edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    once = len(np.unique(edges, axis=0)) == len(edges)
+    if not once or set(map(tuple, edges.tolist())) != set(map(tuple, edges[:, ::-1].tolist())):
+        raise InputError(f"{what} is not closed; mend the mesh")
+    corners = places[faces] - centre
+    volume = np.einsum("td,td->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6.0
+    filled = float(volume / (4.0 / 3.0 * math.pi * radius**3))
+    if filled < 0.0:
+        raise InputError(f"{what} is inside out; turn its triangles round")
+    if filled < FILLED:
+        raise InputError(
+            f"{what} encloses {100 * filled:.0f} % of the sphere through its vertices, at least "
+            f"{100 * FILLED:.0f} % is needed; give a finer mesh, or take simulation.engine=rays"
+        )
+    return Ball(centre, radius)
+
+
+def _refuse_soft(material: Material) -> None:
+    """Refuse what is not rigid."""
+    if not material.rigid:
+        least = min((*material.strength, *material.reflection))
+        raise InputError(
+            "simulation.engine=spheres solves for rigid surfaces alone, and a material of the "
+            f"scene has lobes or a strength of {least:.3g}; take the material rigid, or "
+            "simulation.engine=rays"
+        )
+
+
+def _refuse_close(balls: list[Ball]) -> None:
+    for (i, one), (j, two) in itertools.combinations(enumerate(balls), 2):
+        gap = float(np.linalg.norm(two.centre - one.centre)) - one.radius - two.radius
+        least = APART * min(one.radius, two.radius)
+        if gap < least:
+            how = "overlap or enclose one another" if gap < 0.0 else "are too close"
+            raise InputError(
+                f"simulation.engine=spheres: bodies {i} and {j} {how}: {1e3 * gap:.3g} mm lie "
+                f"between them, at least {1e3 * least:.3g} mm are needed; move them apart"
+            )
+
+
+def _refuse_many(degrees: list[int], frequency: float) -> None:
+    waves = sum((degree + 1) ** 2 for degree in degrees)
+    if waves > MOST_WAVES:
+        raise InputError(
+            f"simulation.engine=spheres: {len(degrees)} spheres need {waves} partial waves at "
+            f"{frequency / 1e3:.3g} kHz, at most {MOST_WAVES} can be solved for; lower "
+            "simulation.frequency_max, take fewer spheres, or move the poses away from them"
+        )
+
+
+def _links(balls: list[Ball]) -> Iterator[Link]:
+    for one, two in itertools.combinations(range(len(balls)), 2):
+        axis = balls[two].centre - balls[one].centre
+        across = math.hypot(axis[0], axis[1])
+        yield Link(
+            *(one, two, float(np.linalg.norm(axis))),
+            *(math.atan2(across, axis[2]), math.atan2(axis[1], axis[0])),
+        )
+
+
+def log_outgoing(degree: int, argument: Array) -> tuple[Array, Array]:
+    """Spherical Hankel functions of the second kind, as logarithms.
+
+    The ratio of neighbours follows by the recurrence upwards, which is stable for them
+    (DLMF 10.51.1); functions of degrees far above the argument do not overflow.
+
+    Parameters
+    ----------
+    degree : int
+        Highest, N.
+    argument : (X,) complex128
+        Not zero.
+
+    Returns
+    -------
+    logarithm : (N + 1, X) complex128
+        Of the function, up to multiples of 2 pi j.
+    slope : (N + 1, X) complex128
+        Derivative over function.
+    """
+    logarithm = np.zeros((degree + 1, len(argument)), dtype=np.complex128)
+    slope = np.zeros_like(logarithm)
+    logarithm[0] = np.log(1j / argument) - 1j * argument
+    slope[0] = -1j - 1.0 / argument
+    ratio = 1.0 / argument + 1j
+    for n in range(1, degree + 1):
+        logarithm[n] = logarithm[n - 1] + np.log(ratio)
+        slope[n] = 1.0 / ratio - (n + 1) / argument
+        ratio = (2 * n + 1) / argument - 1.0 / ratio
+    return logarithm, slope
+
+
+def legendre(degree: int, cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Associated Legendre functions, normalised for spherical harmonics, with (-1)^m in them.
+
+    Parameters
+    ----------
+    degree : int
+        Highest, N.
+    cosine : (X,) float64
+        Of the polar angle.
+
+    Returns
+    -------
+    values : (N + 1, N + 1, X) float64
+        By order m, then by degree n; zero where n < m. Times exp(j m phi) they are orthonormal.
+    """
+    values = np.zeros((degree + 1, degree + 1, len(cosine)))
+    sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
+    values[0, 0] = math.sqrt(0.25 / math.pi)
+    for m in range(1, degree + 1):
+        values[m, m] = -math.sqrt((2 * m + 1) / (2 * m)) * sine * values[m - 1, m - 1]
+    for n in range(1, degree + 1):
+        below = np.arange(n)[:, None]
+        values[:n, n] = np.sqrt((4 * n**2 - 1) / (n**2 - below**2)) * cosine * values[:n, n - 1]
+        if n > 1:
+            below = below[: n - 1]
+            before = (2 * n + 1) / (2 * n - 3) * ((n - 1) ** 2 - below**2) / (n**2 - below**2)
+            values[: n - 1, n] -= np.sqrt(before) * values[: n - 1, n - 2]
+    return values
+
+
+def harmonics(degree: int, directions: NDArray[np.float64]) -> Array:
+    """Orthonormal spherical harmonics.
+
+    Parameters
+    ----------
+    degree : int
+        Highest, N.
+    directions : (X, 3) float64
+        Unit vectors.
+
+    Returns
+    -------
+    values : ((N + 1)^2, X) complex128
+        At row n (n + 1) + m.
+    """
+    table = legendre(degree, np.clip(directions[:, 2], -1.0, 1.0))
+    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
+    turn = np.exp(1j * np.arange(degree + 1)[:, None] * azimuth)
+    values = np.zeros(((degree + 1) ** 2, len(directions)), dtype=np.complex128)
+    for n in range(degree + 1):
+        right = table[: n + 1, n] * turn[: n + 1]
+        middle = n * (n + 1)
+        values[middle : middle + n + 1] = right
+        sign = np.where(np.arange(1, n + 1) % 2, -1.0, 1.0)[:, None]
+        values[middle - n : middle] = (sign * right[1:].conj())[::-1]
+    return values
+
+
+def wigner(degree: int, angles: list[float]) -> list[NDArray[np.float64]]:
+    """Matrices of one degree n that turn spherical harmonics about y.
+
+    Parameters
+    ----------
+    degree : int
+        n.
+    angles : list of float, rad
+        Of the turns.
+
+    Returns
+    -------
+    matrices : list of (2 n + 1, 2 n + 1) float64
+        Of exp(-j angle J_y), orders ascending.
+    """
+    m = np.arange(-degree, degree + 1)
+    off = 0.5 * np.sqrt(degree * (degree + 1) - m[:-1] * (m[:-1] + 1.0))
+    values, vectors = eigh_tridiagonal(np.zeros(len(m)), off)
+    # J_y is J_x, which is real, turned by a quarter about z.
+    turned = (1j ** (-(m % 4)))[:, None] * vectors
+    values = np.round(values)
+    return [
+        np.ascontiguousarray(((turned * np.exp(-1j * angle * values)) @ turned.conj().T).real)
+        for angle in angles
+    ]
+
+
+def _slopes(size: complex, log_h: Array) -> Array:
+    """Return derivatives of Bessel functions times Hankel functions (N + 1,) at one argument."""
+    n = np.arange(len(log_h))
+    product: Array = 1j * n / ((2 * n + 1) * size**2)  # their limit far above the argument
+    plain = log_h[:, 0].real < 600.0
+    product[plain] = spherical_jn(n[plain], size, derivative=True) * np.exp(log_h[plain, 0])
+    return product
+
+
+def _seen(away: NDArray[np.float64], degree: int) -> tuple[NDArray[np.float64], Array]:
+    """Distance (P,) of places from a centre, and the harmonics ((N + 1)^2, P) towards them."""
+    distance = np.linalg.norm(away, axis=1)
+    return distance, harmonics(degree, away / distance[:, None])
+
+
+def _orders(degree: int) -> NDArray[np.int64]:
+    """Order m of each row of waves."""
+    return np.concatenate([np.arange(-n, n + 1) for n in range(degree + 1)])
+
+
+def _degree(waves: Array) -> int:
+    return math.isqrt(len(waves)) - 1
+
+
+def _into_axis(waves: Array, azimuth: float, turns: list[NDArray[np.float64]]) -> Array:
+    """Turn waves into the frame whose z is the axis."""
+    turned = np.exp(1j * azimuth * _orders(_degree(waves)))[:, None] * waves
+    return _turned(turned, turns, back=False)
+
+
+def _out_of_axis(waves: Array, azimuth: float, turns: list[NDArray[np.float64]]) -> Array:
+    turned = _turned(waves, turns, back=True)
+    turned *= np.exp(-1j * azimuth * _orders(_degree(waves)))[:, None]
+    return turned
+
+
+def _turned(waves: Array, turns: list[NDArray[np.float64]], *, back: bool) -> Array:
+    turned = np.zeros_like(waves)
+    for n in range(_degree(waves) + 1):
+        rows = slice(n**2, (n + 1) ** 2)
+        matrix = turns[n] if back else turns[n].T
+        # Real and imaginary parts side by side: the matrix is real.
+        np.matmul(matrix, waves[rows].view(np.float64), out=turned[rows].view(np.float64))
+    return turned
+
+
+def _mirror(waves: Array) -> None:
+    """Turn z round, up to the sign of the order, which translations along z leave alone."""
+    for n in range(1, _degree(waves) + 1, 2):
+        waves[n**2 : (n + 1) ** 2] *= -1.0
+
+
+def _move(moves: list[Array], waves: Array, wanted: int) -> Array:
+    """Translate waves of one sphere along the axis to those that they cause on another."""
+    given = _degree(waves)
+    moved = np.zeros(((wanted + 1) ** 2, waves.shape[1]), dtype=np.complex128)
+    for m, matrix in enumerate(moves):
+        source, target = np.arange(m, given + 1), np.arange(m, wanted + 1)
+        for order in {m, -m}:
+            moved[target * (target + 1) + order] = matrix @ waves[source * (source + 1) + order]
+    return moved
+
+
+def _product(one: Array, two: Array) -> Array:
+    """Scalar product (P,) of the columns of two arrays (K, P)."""
+    product: Array = np.einsum("kp,kp->p", one.conj(), two)
+    return product

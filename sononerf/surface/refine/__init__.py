@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Refinement of a surface against the measured spectrograms."""

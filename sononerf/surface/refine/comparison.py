@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+"""How badly a surface explains poses that it was not fitted to."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+from sononerf.errors import SonoNerfError
+from sononerf.head.decibels import ACTIVE_DB
+from sononerf.surface.refine.descent import ONSETS
+from sononerf.surface.refine.echo_data import Echoes
+from sononerf.surface.refine.later_bounces import Tracer
+from sononerf.surface.refine.objective import FLOOR_DB, Level
+from sononerf.surface.refine.onset_ranges import OnsetRanges
+from sononerf.surface.refine.optics import Optics
+from sononerf.surface.refine.remesh import finer
+
+ASKED = 24
+"""At most so many validation poses compare surfaces."""
+RAYS = 30_000
+"""Per validation pose; off three spheres they give what 300,000 give to 0.2 dB."""
+_DB = 20.0 / math.log(10.0)
+
+
+class Comparison:
+    """Compare surfaces by the validation poses and the onsets.
+
+    The mean error of validation poses, traced off the surface by the simulator's rays, and the
+    misfit of the onsets as in the descent. A pose counts by the square root of its loudest cell:
+    quiet poses hear edges, whose echoes change by decibels where one is rounded by a tenth of a
+    wavelength. Physical optics instead of rays ranks surfaces with edges badly.
+
+    Parameters
+    ----------
+    echoes : Echoes
+        What was measured.
+    optics : Optics
+        The head.
+    onsets : OnsetRanges or None
+        Onsets of the training poses.
+    seed : int
+        Of the rays.
+    calibrated : bool
+        Whether the measured level is absolute. If it is not, each surface gets one gain first.
+    """
+
+    def __init__(
+        self,
+        echoes: Echoes,
+        optics: Optics,
+        onsets: OnsetRanges | None,
+        seed: int,
+        *,
+        calibrated: bool = True,
+    ) -> None:
+        self.echoes, self.optics, self.onsets, self.seed = echoes, optics, onsets, seed
+        self.calibrated = calibrated
+        chosen = np.linspace(0, len(echoes.validation) - 1, min(ASKED, len(echoes.validation)))
+        self.poses = echoes.validation[chosen.astype(np.int64)]
+
+    def objective(self, mesh: trimesh.Trimesh, level: Level, *, smooth: bool) -> float:
+        """Return how badly a surface explains what was heard, dB; infinite if it cannot be traced.
+
+        Parameters
+        ----------
+        mesh : Trimesh
+            m.
+        level : Level
+            Its gains are applied.
+        smooth : bool
+            Whether the vertices lie on a smooth surface, and coarse triangles may be divided.
+        """
+        gain = level.gain.exp().cpu().numpy()[:, None]
+        positions, rotations = self.echoes.positions, self.echoes.rotations
+        try:
+            if smooth:
+                mesh, _ = finer(mesh, np.zeros(len(mesh.vertices)), self.optics.wavelength)
+            tracer = Tracer(self.optics, mesh, rays=RAYS, seed=self.seed)
+            rendered = [
+                gain * tracer.spectrogram(positions[pose], rotations[pose])
+                for pose in self.poses.tolist()
+            ]
+        except SonoNerfError:
+            return math.inf
+        heard = [self.echoes.magnitude(pose).numpy() for pose in self.poses.tolist()]
+        weights = [math.sqrt(float(one.max())) for one in heard]
+        if not sum(weights) > 0:
+            return math.inf
+        common = 1.0 if self.calibrated else _common_gain(heard, rendered)
+        errors = [_difference(a, common * b) for a, b in zip(heard, rendered, strict=True)]
+        found = float(np.average(errors, weights=weights))
+        if self.onsets is not None:
+            vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
+            found += ONSETS * self.onsets.misfit(vertices)
+        return found
+
+
+def _common_gain(heard: list[NDArray[np.float32]], rendered: list[NDArray[np.float32]]) -> float:
+    """Median over poses and ears of the loudest heard over the loudest rendered magnitude."""
+    a, b = (np.stack(part).max(axis=(2, 3)) for part in (heard, rendered))
+    both = (a > 0) & (b > 0)
+    return float(np.median(a[both] / b[both])) if both.any() else 1.0
+
+
+def _difference(heard: NDArray[np.float32], rendered: NDArray[np.float32]) -> float:
+    """Mean difference of spectrograms (E, R, F) over the active cells, compressed decibels."""
+    reference = max(float(heard.max()) * 10.0 ** (-FLOOR_DB / 20.0), 1e-30)
+    a, b = (_DB * np.log1p(part / reference) for part in (heard, rendered))
+    active = (a >= ACTIVE_DB) | (b >= ACTIVE_DB)
+    return float(np.abs(a - b)[active].mean()) if active.any() else 0.0

@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: MIT
+"""Move the vertices of one mesh along their normals until it sounds as measured."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from sononerf.geometry.raycast import Occlusion
+from sononerf.surface.refine.correction import Correction
+from sononerf.surface.refine.echo_data import Echoes
+from sononerf.surface.refine.later_bounces import LaterBounces
+from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
+from sononerf.surface.refine.objective import Level, measured, mismatch
+from sononerf.surface.refine.onset_ranges import OnsetRanges
+from sononerf.surface.refine.optics import Heard, Optics
+from sononerf.surface.refine.sides import APART, Sides
+from sononerf.surface.refine.visibility import listen
+
+POSES = 8
+"""Per step."""
+ONSETS = 3.0
+"""Weight of the misfit of onsets beside the mismatch, dB. Without it the edges of a box are cut
+off; with 30 the surface follows the errors of the onsets."""
+LAST = 0.2
+"""That of the last ones, as part of the first; between them a cosine."""
+MOMENTUM = 0.8
+"""Part of the last direction that stays."""
+MEMORY = 0.95
+"""Part of the running square of the gradient that stays."""
+LOCAL = 0.1
+"""Floor of the local square, as part of its mean: where little is heard steps stay small."""
+TANGENT = 0.2
+"""Part of the way to the neighbours' mean along the surface, each step; keeps triangles even."""
+SIGHT = 4
+"""Steps for which the search structure of visibility is kept."""
+NEAR = 0.5
+"""A pose supports a vertex whose fade and spread at the lowest frequency are above this."""
+
+
+class Descent:
+    """Preconditioned descent on one connectivity.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        Start, m.
+    echoes, optics, level
+        What was measured, what hears, and gains, which are brought up to date.
+    smoothing : float, m
+        Length over which steps are smoothed.
+    rate : float
+        Length of the first steps over the length of smoothing: how much the surface may tilt.
+    later : LaterBounces or None
+        To be added as power.
+    correction : Correction or None
+        Of the start, by the simulator.
+    onsets : OnsetRanges or None
+        Where the surface must begin.
+    sheet : bool
+        Whether it is a sheet, whose sides are kept apart.
+    seed : int
+        Of poses and rays.
+    """
+
+    def __init__(
+        self,
+        mesh: trimesh.Trimesh,
+        echoes: Echoes,
+        optics: Optics,
+        level: Level,
+        *,
+        smoothing: float,
+        rate: float,
+        later: LaterBounces | None = None,
+        correction: Correction | None = None,
+        onsets: OnsetRanges | None = None,
+        sheet: bool = False,
+        seed: int,
+    ) -> None:
+        self.echoes, self.optics, self.level, self.seed = echoes, optics, level, seed
+        like = optics.get_buffer("wavenumber")
+        self.faces = np.array(mesh.faces, dtype=np.int64)
+        self.operators = MeshOperators(
+            torch.as_tensor(self.faces).to(like.device), len(mesh.vertices)
+        )
+        self.vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
+        edge = self.operators.edge_length(self.vertices)
+        self.smoothing = smoothing
+        self.strength = smoothing**2 / (1.5 * edge**2)
+        self.passes = smoothing_passes(optics.wavelength, edge)
+        self.direction = torch.zeros(len(self.vertices), 1, dtype=torch.float64).to(like.device)
+        self.square = torch.zeros_like(self.direction)
+        self.count = 0
+        self._start = self._seen = self.vertices
+        self._sight: Occlusion | None = None
+        self._later, self._correction, self._onsets = later, correction, onsets
+        self.rate = rate
+        self._sides = Sides(mesh, APART * optics.wavelength) if sheet else None
+
+    def mesh(self) -> trimesh.Trimesh:
+        """Return the surface as it is now."""
+        return trimesh.Trimesh(self.vertices.cpu().numpy().copy(), self.faces, process=False)
+
+    def step(self, number: int, part: float) -> float:
+        """Do one step.
+
+        Parameters
+        ----------
+        number : int
+            Of the step, counted from the first of all stages: it decides the poses.
+        part : float
+            Of the stage that is behind us, 0 to 1.
+
+        Returns
+        -------
+        mismatch : float, dB
+            Mean over the poses, before the step.
+        """
+        normals = unit(self.operators.areas(self.vertices))
+        gradient, error = self._gradient(number, normals)
+        if gradient is None:
+            return error
+        self.count += 1
+        smooth = self.operators.smoothed(gradient, self.strength)
+        self.direction = MOMENTUM * self.direction + (1 - MOMENTUM) * smooth
+        self.square = MEMORY * self.square + (1 - MEMORY) * smooth.square()
+        usual = self.operators.smoothed(self.square, 2.0 * self.strength).clamp_min(0.0)
+        usual = usual / (1 - MEMORY**self.count)
+        usual = torch.sqrt(usual + LOCAL * usual.mean()).clamp_min(1e-300)
+        rate = self.rate * self.smoothing
+        rate *= LAST + (1 - LAST) * 0.5 * (1 + math.cos(math.pi * part))
+        move = self.direction / (1 - MOMENTUM**self.count) / usual
+        move = self.operators.smoothed(move, self.strength)
+        self.vertices = self.vertices - rate * move.clamp(-4.0, 4.0) * normals
+        self.vertices = self.operators.relaxed(self.vertices, normals, TANGENT)
+        if self._sides is not None:
+            self.vertices = self._sides.apart(self.vertices, normals)
+        return error
+
+    def render(self, numbers: list[int]) -> tuple[Heard | None, Tensor, Tensor]:
+        """Render poses of the surface as it is now.
+
+        Returns
+        -------
+        heard : Heard or None
+            None where no pose hears any of it.
+        points, areas : (V, 3) float32
+            Leaves that gradients run to, about the middle of the surface.
+        """
+        area = self.operators.areas(self.vertices)
+        bending = self.operators.bending(self.vertices, unit(area), self.passes)
+        moved = self._seen is not self.vertices
+        if self._sight is None or (moved and self.count % SIGHT == 0):
+            self._seen = self.vertices
+            self._sight = Occlusion(self._seen.cpu().numpy(), self.faces)
+        places = torch.as_tensor(self.echoes.positions[numbers]).to(self.vertices)
+        turns = torch.as_tensor(self.echoes.rotations[numbers]).to(self.vertices)
+        pieces, heads, middle = listen(
+            self.optics, self.operators, self.vertices, area, bending, self._sight, places, turns
+        )
+        points = (self.vertices - middle).float().requires_grad_(True)
+        areas = area.float().requires_grad_(True)
+        if not len(pieces.pose):
+            return None, points, areas
+        return self.optics.render(points, areas, pieces, heads), points, areas
+
+    def _gradient(self, number: int, normals: Tensor) -> tuple[Tensor | None, float]:
+        """Gradient along the normals (V, 1), and the mean mismatch in dB."""
+        source = self._correction or self.echoes
+        numbers = source.batch(self.seed, number, POSES).tolist()
+        heard, points, areas = self.render(numbers)
+        if heard is None:
+            return None, math.inf
+        later = None if self._later is None else self._later.power(numbers, heard)
+        found = measured(self.echoes, numbers, heard)
+        corrected = None
+        if self._correction is not None:
+            corrected = self._correction.magnitudes(numbers, heard)
+        errors = mismatch(heard, later, found, self.level, corrected=corrected, learn=True)
+        errors.mean().backward()
+        moved = self.vertices.clone().requires_grad_(True)
+        to_points, to_areas = points.grad, areas.grad
+        assert to_points is not None
+        assert to_areas is not None
+        (through,) = torch.autograd.grad(self.operators.areas(moved), moved, to_areas.double())
+        total = through + to_points.double()
+        if self._onsets is not None:
+            total = total + ONSETS * self._onsets.gradient(self.vertices, number)
+        return (total * normals).sum(1, keepdim=True), float(errors.detach().mean())
+
+    def state(self) -> dict[str, Tensor]:
+        """Return everything that changes, and the mesh it began with, as plain tensors."""
+        return {
+            "start": self._start.cpu(),
+            "faces": torch.as_tensor(self.faces),
+            "vertices": self.vertices.cpu(),
+            "seen": self._seen.cpu(),
+            "direction": self.direction.cpu(),
+            "square": self.square.cpu(),
+            "count": torch.tensor(self.count),
+        }
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Take over a state of a descent on the same mesh."""
+        self.vertices, self._seen, self.direction, self.square = (
+            state[name].to(self.vertices) for name in ("vertices", "seen", "direction", "square")
+        )
+        self.count = int(state["count"])
+        self._sight = Occlusion(self._seen.cpu().numpy(), self.faces)
+
+
+def poses_that_hear(mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics) -> Tensor:
+    """How many training poses see each vertex near the direction of a mirror, (V,)."""
+    like = optics.get_buffer("wavenumber")
+    faces = np.array(mesh.faces, dtype=np.int64)
+    vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
+    operators = MeshOperators(torch.as_tensor(faces).to(like.device), len(vertices))
+    area = operators.areas(vertices)
+    passes = smoothing_passes(optics.wavelength, operators.edge_length(vertices))
+    bending = operators.bending(vertices, unit(area), passes)
+    sight = Occlusion(vertices.cpu().numpy(), faces)
+    count = torch.zeros(len(area), device=area.device)
+    for first in range(0, len(echoes.training), POSES):
+        some = echoes.training[first : first + POSES]
+        places = torch.as_tensor(echoes.positions[some]).to(area)
+        turns = torch.as_tensor(echoes.rotations[some]).to(area)
+        pieces, _, _ = listen(optics, operators, vertices, area, bending, sight, places, turns)
+        near = (pieces.reach.amax(1) > NEAR).float()
+        count.index_add_(0, pieces.vertex, near)
+    return count

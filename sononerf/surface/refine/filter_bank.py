@@ -1,0 +1,204 @@
+# SPDX-License-Identifier: MIT
+"""From echoes with a strength per frequency node to the power in the rows of a spectrogram.
+
+Echoes are laid into time bins per node; the bins' spectra, each with the part of the spectrum that
+its node stands for, are added up; each row of the spectrogram is a filter of that, with its own,
+call and dechirp in it, and is transformed back at the rate of its frames. For any call this equals
+:func:`sononerf.head.spectrogram.spectrogram` of the simulator's echo.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import scipy.fft
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from sononerf.head.reception import Reception
+from sononerf.head.row_filters import row_filters
+from sononerf.simulation.impulse_response import between
+
+FINE = 5.0
+"""Least time bins per period of the highest frequency; quadratic splines between them err by
+0.3 %."""
+
+
+class FilterBank:
+    """Filters of one call and analysis, made when a length is first asked for.
+
+    Parameters
+    ----------
+    reception : Reception
+        Call and analysis.
+    nodes : (N,) float64, Hz
+        Of the synthesis: odd multiples of half their spacing.
+    soft : float, Hz
+        Frequency below which the fade of smooth surfaces falls no further.
+
+    Attributes
+    ----------
+    kept_nodes : (N',) int64
+        Which of the nodes matter for the analysed band.
+    finer : int
+        Time bins per sample.
+    spacing : float, Hz
+        Of the nodes.
+    """
+
+    def __init__(self, reception: Reception, nodes: NDArray[np.float64], soft: float) -> None:
+        self.reception, self.analysis, self.nodes, self.soft = (
+            reception, reception.analysis, nodes, soft,
+        )  # fmt: skip
+        self.filters = row_filters(self.analysis)
+        rate = self.analysis.sampling_rate
+        self._band = self.filters.band
+        self.spacing = 2.0 * float(nodes[0])
+        self._top = self.spacing * len(nodes)
+        # Interpolation uses nodes on both sides; the ones beyond the band hardly count.
+        self.kept_nodes: NDArray[np.int64] = np.flatnonzero(nodes <= self._band[1] + self.spacing)
+        self.finer = max(1, math.ceil(FINE * self._band[1] / rate))
+        self._filters: dict[tuple[int, str], tuple[Tensor, Tensor]] = {}
+
+    def power(
+        self,
+        strength: Tensor,
+        at: Tensor,
+        weight: Tensor,
+        receiver: Tensor,
+        *,
+        receivers: int,
+        frames: int,
+    ) -> Tensor:
+        """Power of echoes in each frame and row.
+
+        Parameters
+        ----------
+        strength : (Q,) float32
+            Of the echoes.
+        at : (Q,) float32
+            When they come, in samples from the start of the first frame.
+        weight : (Q, N') float32
+            At the kept nodes.
+        receiver : (Q,) int64
+            Who hears them.
+        receivers, frames : int
+            How many there are.
+
+        Returns
+        -------
+        power : (receivers, frames, F) float32
+            Gradients run to strength and time.
+        """
+        length = frames * self.analysis.hop * self.finer
+        bins = _Deposit.apply(
+            strength, at * self.finer, weight, receiver * length, (receivers, length)
+        )
+        return self._analysed(bins, frames)
+
+    def _filter(self, frames: int, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the nodes' spectra (N, K) and the rows' filters (F, K'), complex64."""
+        key = (frames, str(like.device))
+        if key not in self._filters:
+            self._filters[key] = self._make_filter(frames, like)
+        return self._filters[key]
+
+    def _make_filter(self, frames: int, like: Tensor) -> tuple[Tensor, Tensor]:
+        analysis, rate = self.analysis, self.analysis.sampling_rate
+        length = frames * analysis.hop
+        step = rate / length
+        most = min(math.floor(self._band[1] / step), length // 2)
+        least = max(math.ceil(self._band[0] / step), -most)
+        low = max(0, -least)
+        number = np.arange(-low, most + 1)
+        frequency = number * step
+        absolute = np.abs(frequency[low:])
+        hats = between(np.minimum(absolute, self._top), self.nodes)[0][:, self.kept_nodes]
+        fine = self.finer * rate
+        level = absolute * 1j + np.hypot(absolute, self.soft)
+        level = level / np.sinc(absolute / fine) ** 3
+        basis = (hats * level[:, None]).T
+        filters = self.filters
+        time = np.arange(filters.envelope.shape[1]) + filters.origin
+        rows = np.stack(
+            [
+                np.exp(2j * np.pi / rate * np.outer(frequency - row, time)) @ envelope
+                for row, envelope in zip(filters.frequency, filters.envelope, strict=True)
+            ]
+        )
+        call = self.reception.waveform
+        rows = rows * (
+            np.exp(-2j * np.pi / rate * np.outer(frequency, np.arange(len(call)))) @ call
+        )
+        rows = rows * np.exp(2j * np.pi * np.outer(self.reception.delay, frequency))
+        rows = rows / analysis.hop
+        made = [torch.as_tensor(part.astype(np.complex64)) for part in (basis, rows)]
+        return made[0].to(like.device), made[1].to(like.device)
+
+    def _analysed(self, bins: Tensor, frames: int) -> Tensor:
+        """Power (Q, W, F) of time bins (Q, B, N)."""
+        basis, rows = self._filter(frames, bins)
+        kept = basis.shape[1]
+        spectrum = torch.fft.rfft(bins.transpose(1, 2))[..., :kept]
+        return self._rows((spectrum * basis).sum(1), rows, frames)
+
+    def _rows(self, spectrum: Tensor, rows: Tensor, frames: int) -> Tensor:
+        """Power (Q, W, F) in each row, of spectra (Q, K) from frequency zero on."""
+        low = rows.shape[1] - self._positive(frames)
+        whole = torch.cat([spectrum[:, 1 : low + 1].flip(1).conj(), spectrum], dim=1)
+        whole = whole[:, : rows.shape[1]]
+        filtered = whole[:, None] * rows[:, : whole.shape[1]]
+        short = -filtered.shape[2] % frames
+        filtered = nn.functional.pad(torch.view_as_real(filtered), (0, 0, 0, short))
+        folded = torch.view_as_complex(filtered.contiguous()).unflatten(2, (-1, frames)).sum(2)
+        # A shift of the spectrum turns the phase alone.
+        echo = torch.fft.ifft(folded)
+        return (echo.real.square() + echo.imag.square()).transpose(1, 2)
+
+    def _positive(self, frames: int) -> int:
+        step = self.analysis.sampling_rate / (frames * self.analysis.hop)
+        return min(math.floor(self._band[1] / step), frames * self.analysis.hop // 2) + 1
+
+
+class _Deposit(torch.autograd.Function):
+    """Lay echoes into time bins by quadratic splines; weights and bins have no gradient path."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, strength: Tensor, at: Tensor, weight: Tensor, first: Tensor, size: tuple[int, int]
+    ) -> Tensor:
+        near = torch.round(at).clamp(1, size[1] - 2)
+        off = at - near
+        rows = first + near.long()
+        value = strength[:, None] * weight
+        bins = torch.zeros(size[0] * size[1], weight.shape[1], dtype=at.dtype, device=at.device)
+        parts = (0.5 * (0.5 - off) ** 2, 0.75 - off**2, 0.5 * (0.5 + off) ** 2)
+        for shift, part in zip((-1, 0, 1), parts, strict=True):
+            bins.index_add_(0, rows + shift, value * part[:, None])
+        ctx.save_for_backward(strength, off, weight, rows)
+        return bins.view(*size, -1)
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
+        strength, off, weight, rows = ctx.saved_tensors
+        flat = grads[0].reshape(-1, weight.shape[1])
+        low, middle, high = (
+            torch.einsum("qn,qn->q", flat[rows + shift], weight) for shift in (-1, 0, 1)
+        )
+        parts = (0.5 * (0.5 - off) ** 2, 0.75 - off**2, 0.5 * (0.5 + off) ** 2)
+        to_strength = low * parts[0] + middle * parts[1] + high * parts[2]
+        to_place = strength * ((off - 0.5) * low - 2.0 * off * middle + (off + 0.5) * high)
+        return to_strength, to_place, None, None, None
+
+
+def fast_length(count: int) -> int:
+    """Return a length of a quick transform; few different ones, since filters are kept."""
+    power = 2 ** max(math.floor(math.log2(count)), 3)
+    return next(
+        int(scipy.fft.next_fast_len(power * part // 4))
+        for part in (4, 5, 6, 7, 8)
+        if power * part // 4 >= count
+    )

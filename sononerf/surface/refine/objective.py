@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: MIT
+"""How far rendered spectrograms are from the measured ones, and what is learned of the level."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from sononerf.head.decibels import ACTIVE_DB
+from sononerf.surface.refine.echo_data import Echoes, on_rows
+from sononerf.surface.refine.optics import Heard
+
+FLOOR_DB = 20.0
+"""What counts lies within this of a pose's loudest cell; fainter ones are later bounces."""
+CORRECTED_FLOOR_DB = 30.0
+"""The same where the simulator adds what physical optics lacks, such as later bounces."""
+ALIKE_DB = 3.0
+"""Where the simulator differs by this from physical optics, a cell has half the weight."""
+LOUD_DB = 16.0
+"""Cells within this of a pose's loudest tell the gain."""
+LEARNING = 0.05
+"""Part of a step's finding that goes into the running gain and error."""
+TRUST = 4.0
+"""Power of the usual error by which a frequency counts less. Where physical optics is wrong (ka
+below 10) the error stays large, and even a little of it biases the surface."""
+_DB = 20.0 / math.log(10.0)
+
+
+class Level:
+    """Running estimates on the training poses: gain, and error per ear and frequency.
+
+    Parameters
+    ----------
+    ears, rows : int
+        E and F.
+    like : Tensor
+        Whose device they lie on.
+
+    Attributes
+    ----------
+    gain : (E, F) float32
+        Logarithm of measured over rendered magnitude.
+    error : (E, F) float32, dB
+        Mean over active cells.
+    steps : int
+        How often they were brought up to date.
+    learns : {"none", "each"}
+        No gain, or one for each ear and frequency.
+    """
+
+    def __init__(self, ears: int, rows: int, like: Tensor) -> None:
+        self.gain = torch.zeros(ears, rows, device=like.device)
+        self.error = torch.full((ears, rows), 4.0, device=like.device)
+        self.steps = 0
+        self.learns: Literal["none", "each"] = "each"
+
+    def reset(self) -> None:
+        """Forget everything that was learned."""
+        self.gain, self.error = torch.zeros_like(self.gain), torch.full_like(self.error, 4.0)
+        self.steps = 0
+
+    def state(self) -> dict[str, Tensor]:
+        """Return everything as plain tensors."""
+        return {"gain": self.gain, "error": self.error, "steps": torch.tensor(self.steps)}
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Take a state over."""
+        self.gain, self.error = state["gain"].to(self.gain), state["error"].to(self.error)
+        self.steps = int(state["steps"])
+
+    @property
+    def weight(self) -> Tensor:
+        """How much ears and frequencies count (E, F): by the usual error, the smaller the more."""
+        weight = self.error.clamp_min(0.25 * float(self.error.median())) ** -TRUST
+        return weight / weight.mean()
+
+
+def measured(echoes: Echoes, numbers: list[int], heard: Heard) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what poses measured on the rows that were rendered.
+
+    Returns
+    -------
+    magnitude : (P, E, W, F) float32
+        Zero beyond the axis.
+    inside : (P, 1, W, 1) bool
+        Rows on the axis.
+    loudest : (P,) float32
+        Of each whole pose.
+    """
+    wholes = [echoes.magnitude(number) for number in numbers]
+    width, count = heard.power.shape[2], wholes[0].shape[1]
+    place = heard.row[:, None] + torch.arange(width, device=heard.row.device)
+    inside = (place >= 0) & (place < count)
+    loudest = torch.stack([whole.max() for whole in wholes])
+    like = heard.power
+    return (
+        on_rows(wholes, heard.row, like),
+        inside[:, None, :, None].to(like.device),
+        loudest.to(like.device),
+    )
+
+
+def mismatch(
+    heard: Heard,
+    later: Tensor | None,
+    found: tuple[Tensor, Tensor, Tensor],
+    level: Level,
+    *,
+    corrected: tuple[Tensor, Tensor] | None = None,
+    learn: bool,
+) -> Tensor:
+    """Mean absolute difference in compressed decibels over the active cells of each pose (P,).
+
+    Parameters
+    ----------
+    heard : Heard
+        What was rendered of the first bounce.
+    later : (P, E, W, F) float32, optional
+        Power of the later bounces.
+    found : tuple
+        From :func:`measured`.
+    level : Level
+        Gains and weights.
+    corrected : simulated, rendered, both (P, E, W, F) float32, optional
+        Of a surface nearby: their difference in decibels is added to what is rendered. Cells count
+        less, the larger it is; the frequencies' weights are not needed then.
+    learn : bool
+        Whether gains and errors are brought up to date.
+    """
+    magnitude, inside, loudest = found
+    power = heard.power if later is None else heard.power + later
+    tiny = (1e-6 * loudest.clamp_min(1e-30)).square()[:, None, None, None]
+    gain = level.gain.exp()[:, None]
+    rendered = torch.sqrt(power + tiny) * gain
+    floor = FLOOR_DB if corrected is None else CORRECTED_FLOOR_DB
+    reference = (loudest * 10.0 ** (-floor / 20.0)).clamp_min(1e-30)[:, None, None, None]
+    a = _DB * torch.log1p(magnitude / reference)
+    b = _DB * torch.log1p(rendered / reference)
+    weight = level.weight[:, None]
+    if corrected is not None:
+        simulated, before = (_DB * torch.log1p(gain * part / reference) for part in corrected)
+        b = b + (simulated - before)
+        weight = 1.0 / (1.0 + (simulated - before).abs() / ALIKE_DB)
+        rendered = reference * torch.expm1(b.detach().clamp_min(0.0) / _DB)
+    with torch.no_grad():
+        active = inside & ((a >= ACTIVE_DB) | (b >= ACTIVE_DB))
+        if learn:
+            _learn(level, magnitude, rendered, a, b, active, loudest)
+        weight = active * weight
+        weight = weight / weight.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
+    return ((a - b).abs() * weight).sum((1, 2, 3))
+
+
+def _learn(
+    level: Level,
+    magnitude: Tensor,
+    rendered: Tensor,
+    a: Tensor,
+    b: Tensor,
+    active: Tensor,
+    loudest: Tensor,
+) -> None:
+    rate = max(LEARNING, 1.0 / (level.steps + 2))
+    level.steps += 1
+    count = active.sum((0, 2))
+    error = ((a - b).abs() * active).sum((0, 2)) / count.clamp_min(1)
+    some = count > 0
+    level.error = torch.where(some, level.error.lerp(error, rate), level.error)
+    if level.learns == "none":
+        return
+    least = (loudest * 10.0 ** (-LOUD_DB / 20.0))[:, None, None, None]
+    loud = (magnitude > least) & (rendered > 0.5 * least)
+    ratio = torch.log(magnitude.clamp_min(1e-30) / rendered.clamp_min(1e-30))
+    ratio = torch.where(loud, ratio, torch.nan)
+    step = ratio.movedim(1, 0).movedim(3, 1).flatten(2).nanmedian(dim=2).values
+    level.gain = level.gain + rate * torch.nan_to_num(step)

@@ -1,0 +1,373 @@
+# SPDX-License-Identifier: MIT
+r"""Spectrograms of a surface by physical optics, with gradients for its vertices.
+
+Each vertex stands for a small piece of surface with the vector area **a** (outward). An ear hears
+
+.. math::
+    p(f) = \sum \frac{j f (1 - j \epsilon)}{c}\,
+    \frac{\cos\vartheta_1 + \cos\vartheta_2}{2}\, \frac{a}{d_1 d_2}\, v\, B\, E\,
+    e^{-\alpha (d_1 + d_2)}\, e^{-(k s)^2 / 2}\, e^{-\epsilon k \delta}\,
+    e^{-j k (d_1 + d_2)}
+
+with the distances :math:`d_1, d_2` from the emitter and to the ear, the visibility v, the gains
+B, E of beam and ear, the absorption :math:`\alpha`, the standard deviation s of the path's length
+over the piece, and the fade over the detour :math:`\delta` against the local mirror path, as in
+the simulator (:mod:`sononerf.simulation.reflection`). Everything between path and spectrogram is
+linear and fixed but the last magnitude.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from sononerf.head.reception import Reception
+from sononerf.head.row_filters import row_filters
+from sononerf.head.spectrogram import frequency_axis, range_axis
+from sononerf.simulation.hearing import Hearing
+from sononerf.surface.refine.filter_bank import FilterBank, fast_length
+from sononerf.surface.refine.mesh_operators import tangents
+
+FADE_FREQUENCY = 0.25
+"""Below this part of the highest analysed frequency the fade falls no further; as in the
+simulator, 25 of 100 kHz."""
+SILENT = 3.0
+"""Exponent of fade and spread at the lowest analysed frequency, beyond which a piece is left out:
+26 dB down; pieces there extinguish each other."""
+SPREAD = 5.0 / 52.0
+"""Variance of the path over a piece of area 1 and slope 1: between a hexagon and triangles."""
+
+
+@dataclass(frozen=True, eq=False)
+class Heard:
+    """Rendered spectrograms of some poses, over the ranges at which there is anything.
+
+    Attributes
+    ----------
+    power : (P, E, W, F) float32
+        Squared magnitude; gradients flow through it.
+    row : (P,) int64
+        Index of the first range slice on the store's axis; may be below zero.
+    """
+
+    power: Tensor
+    row: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """What some poses hear of a surface, one row per pose and vertex.
+
+    Attributes
+    ----------
+    pose, vertex : (Q,) int64
+        Which of the poses, which vertex.
+    weight : (Q, E, N) float32
+        Gains, absorption, spread, fade and visibility at the nodes.
+    reach : (Q, E) float32
+        Fade and spread at the lowest analysed frequency, 0 to 1: how near a piece is to its
+        mirror point.
+    """
+
+    pose: Tensor
+    vertex: Tensor
+    weight: Tensor
+    reach: Tensor
+
+
+class Optics(nn.Module):
+    """Physical optics of one head, call and analysis; constant tensors move with the module.
+
+    Parameters
+    ----------
+    hearing : Hearing
+        Head and air, as the simulator has them.
+    reception : Reception
+        Call and analysis.
+    window : (F, W) float
+        How a point echo looks in each row, :func:`sononerf.head.reception.effective_window`.
+
+    Attributes
+    ----------
+    wavelength : float, m
+        The shortest of the analysed band.
+    resolution : float, m
+        In range: half of the analysis window's length, of a gammatone's that of a Hamming window
+        which is as wide as its rows are on the mean.
+    rows, ears : int
+        Range slices of a spectrogram, R, and ears, E.
+    kept_nodes : (N,) int64
+        Which of the synthesis' nodes matter for the band.
+    """
+
+    def __init__(self, hearing: Hearing, reception: Reception, window: NDArray[Any]) -> None:
+        super().__init__()
+        analysis = reception.analysis
+        self.hearing, self.reception, self.analysis = hearing, reception, analysis
+        self.speed_of_sound = hearing.speed_of_sound
+        rate = analysis.sampling_rate
+        rows = frequency_axis(analysis)
+        self.frequencies = rows
+        self.ears = len(hearing.ears.positions)
+        axis = range_axis(analysis, self.speed_of_sound)
+        self.rows = len(axis)
+        filters = row_filters(analysis)
+        start = axis[0] * 2.0 * rate / self.speed_of_sound - filters.centre
+        self._first = round(start / analysis.hop)
+        self.wavelength = self.speed_of_sound / float(rows[-1])
+        self.resolution = self.speed_of_sound * filters.length / rate / 2.0
+        self._reads = filters.envelope.shape[1]
+        self._soft = FADE_FREQUENCY * float(rows[-1])
+        self.bank = FilterBank(reception, hearing.synthesis.nodes, self._soft)
+        self.kept_nodes = self.bank.kept_nodes
+        ring = rate / self.bank.spacing + max(0, window.shape[1] - self._reads) / 2.0
+        self._pad = math.ceil(ring)
+        nodes = hearing.synthesis.nodes[self.kept_nodes]
+        turn = 2.0 * math.pi / self.speed_of_sound
+        decay = hearing.absorption[self.kept_nodes] * (math.log(10.0) / 20.0)
+        tables = hearing.ears._by_direction[:, :, self.kept_nodes]
+        self._grid = (len(hearing.ears.elevation), len(hearing.ears.azimuth))
+        lowest = float(rows[0])
+        for name, values in (
+            ("wavenumber", turn * nodes),
+            ("fade", turn * np.hypot(nodes, self._soft)),
+            ("decay", decay),
+            ("tables", tables),
+            ("emitter", hearing.ears.emitter),
+            ("places", hearing.ears.positions),
+        ):
+            self.register_buffer(name, torch.as_tensor(np.ascontiguousarray(values)).float())
+        self._lowest = (turn * lowest, turn * math.hypot(lowest, self._soft))
+
+    def heads(self, positions: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
+        """Return emitters (P, 3) and ears (P, E, 3), m, of heads (P, 3), (P, 3, 3), float64."""
+        emitter = self.get_buffer("emitter").to(positions.dtype)
+        places = self.get_buffer("places").to(positions.dtype)
+        return (
+            positions + rotations @ emitter,
+            positions[:, None] + torch.einsum("pij,ej->pei", rotations, places),
+        )
+
+    def near_mirror(
+        self, points: Tensor, area: Tensor, bending: Tensor, emitters: Tensor, ears: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """Return which pieces send sound towards an ear, and what dims them.
+
+        Parameters
+        ----------
+        points, area : (..., 3) float
+            Places (m) and vector areas (m²).
+        bending : (..., 6) float, 1/m
+            Of the smooth surface.
+        emitters, ears : (..., 3) float, m
+            Where the sound comes from, where it is heard.
+
+        Returns
+        -------
+        facing : (...,) bool
+            Both are above the surface.
+        spread, detour, path, exponent : (...,) float
+            Variance of the path's length (m²), detour (m), path (m), and what fade and spread
+            together have as exponent at the lowest analysed frequency.
+        """
+        size = area.norm(dim=-1)
+        normal = area / size.clamp_min(1e-30)[..., None]
+        u, v = points - emitters, points - ears
+        d1, d2 = u.norm(dim=-1), v.norm(dim=-1)
+        u, v = u / d1[..., None], v / d2[..., None]
+        rise, back = -(u * normal).sum(-1), -(v * normal).sum(-1)
+        shape = normal.shape[:-1]
+        first, second = (t.reshape(*shape, 3) for t in tangents(normal.reshape(-1, 3)))
+        u1, u2 = (u * first).sum(-1), (u * second).sum(-1)
+        v1, v2 = (v * first).sum(-1), (v * second).sum(-1)
+        g1, g2 = u1 + v1, u2 + v2
+        xx, yy, zz, xy, xz, yz = bending.unbind(-1)
+
+        def bent(a: Tensor, b: Tensor) -> Tensor:
+            a1, a2, a3 = a.unbind(-1)
+            b1, b2, b3 = b.unbind(-1)
+            found = a1 * b1 * xx + a2 * b2 * yy + a3 * b3 * zz + (a1 * b2 + a2 * b1) * xy
+            return found + (a1 * b3 + a3 * b1) * xz + (a2 * b3 + a3 * b2) * yz
+
+        both = rise + back
+        h11 = (1 - u1 * u1) / d1 + (1 - v1 * v1) / d2 + both * bent(first, first)
+        h22 = (1 - u2 * u2) / d1 + (1 - v2 * v2) / d2 + both * bent(second, second)
+        h12 = -u1 * u2 / d1 - v1 * v2 / d2 + both * bent(first, second)
+        # |H|^-1 = a I + b H, such that both eigenvalues fit; none softer than a flat surface.
+        least = rise.square().clamp_min(1e-4) / d1 + back.square().clamp_min(1e-4) / d2
+        middle, half = 0.5 * (h11 + h22), torch.hypot(0.5 * (h11 - h22), h12)
+        high = 1.0 / torch.maximum((middle + half).abs(), least)
+        low = 1.0 / torch.maximum((middle - half).abs(), least)
+        b = (high - low) / (2.0 * half).clamp_min(1e-6 * least)
+        a = high - b * (middle + half)
+        slope = g1 * g1 + g2 * g2
+        detour = 0.5 * (a * slope + b * (h11 * g1 * g1 + h22 * g2 * g2 + 2.0 * h12 * g1 * g2))
+        detour = detour.clamp_min(0.0)
+        spread = SPREAD * slope * size
+        k, fade = self._lowest
+        exponent = 0.5 * k * k * spread + fade * detour
+        return (rise > 0) & (back > 0), spread, detour, d1 + d2, exponent
+
+    def gains(self, table: Tensor, directions: Tensor, rotations: Tensor) -> Tensor:
+        """Gain (Q, N) of tables (Q,) towards world directions (Q, 3); 0 is the beam, then ears."""
+        head = torch.einsum("qi,qij->qj", directions, rotations)
+        x, y, z = head.unbind(1)
+        rows, columns = self._grid
+        across = (torch.atan2(y, x) / (2.0 * math.pi) + 0.5) * (columns - 1)
+        upward = (torch.atan2(z, torch.hypot(x, y)) / math.pi + 0.5) * (rows - 1)
+        column = across.long().clamp(0, columns - 2)
+        row = upward.long().clamp(0, rows - 2)
+        s, t = across - column, upward - row
+        corner = (table * rows + row) * columns + column
+        corners = torch.stack([corner, corner + 1, corner + columns, corner + columns + 1], dim=1)
+        weights = torch.stack([(1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t], dim=1)
+        flat = self.get_buffer("tables").flatten(0, 1)
+        found: Tensor = nn.functional.embedding_bag(
+            corners, flat, per_sample_weights=weights, mode="sum"
+        )
+        return found
+
+    def pieces(
+        self,
+        points: Tensor,
+        area: Tensor,
+        bending: Tensor,
+        pose: Tensor,
+        vertex: Tensor,
+        visible: Tensor,
+        heads: tuple[Tensor, Tensor, Tensor],
+    ) -> Pieces:
+        """Weigh pieces: everything of the sum but path, obliquity and area.
+
+        Parameters
+        ----------
+        points, area, bending : (V, 3), (V, 3), (V, 6) float32
+            The surface.
+        pose, vertex : (Q,) int64
+            Which pieces which pose hears.
+        visible : (Q, E) float32
+            How far emitter and ear see them, 0 to 1.
+        heads : emitters (P, 3), ears (P, E, 3), rotations (P, 3, 3), float32
+            Of the poses.
+        """
+        emitters, ears, rotations = heads
+        place, normal, bent = points[vertex], area[vertex], bending[vertex]
+        out = place - emitters[pose]
+        out = out / out.norm(dim=1, keepdim=True)
+        turned = rotations[pose]
+        beam = self.gains(torch.zeros_like(pose), out, turned)
+        weights, reaches = [], []
+        wavenumber, fade, decay = (
+            self.get_buffer(name) for name in ("wavenumber", "fade", "decay")
+        )
+        half = 0.5 * wavenumber.square()
+        for ear in range(self.ears):
+            to = ears[pose, ear]
+            facing, spread, detour, path, exponent = self.near_mirror(
+                place, normal, bent, emitters[pose], to
+            )
+            back = place - to
+            back = back / back.norm(dim=1, keepdim=True)
+            loss = torch.addr(spread[:, None] * half, detour, fade)
+            loss = torch.addr(loss, path, decay)
+            gain = self.gains(torch.full_like(pose, 1 + ear), back, turned) * beam
+            seen = visible[:, ear] * facing
+            weights.append(gain * torch.exp(-loss) * seen[:, None])
+            reaches.append(torch.exp(-exponent) * seen)
+        return Pieces(pose, vertex, torch.stack(weights, 1), torch.stack(reaches, 1))
+
+    def render(
+        self,
+        points: Tensor,
+        area: Tensor,
+        pieces: Pieces,
+        heads: tuple[Tensor, Tensor, Tensor],
+        *,
+        stretch: Tensor | None = None,
+        late: Tensor | None = None,
+    ) -> Heard:
+        """Return the spectrograms of poses; gradients run to points and areas (V, 3) float32.
+
+        The paths of a pose are multiplied by ``stretch`` (P,) and lengthened by ``late`` (P,), m.
+        """
+        emitters, ears, _ = heads
+        place, normal = points[pieces.vertex], area[pieces.vertex]
+        u = place - emitters[pieces.pose]
+        v = place[:, None] - ears[pieces.pose]
+        d1, d2 = u.norm(dim=1), v.norm(dim=2)
+        both = (u / d1[:, None])[:, None] + v / d2[:, :, None]
+        strength = -(both * normal[:, None]).sum(2) * 0.5 / (self.speed_of_sound * d1[:, None] * d2)
+        rate = self.analysis.sampling_rate
+        path = d1[:, None] + d2
+        if stretch is not None:
+            path = path * stretch[pieces.pose][:, None]
+        if late is not None:
+            path = path + late[pieces.pose][:, None]
+        path = path * (rate / self.speed_of_sound)  # samples
+        frames, row = self._span(path.detach(), pieces, len(emitters))
+        hop = self.analysis.hop
+        origin = ((row + self._first) * hop).to(path.dtype)
+        at = path - origin[pieces.pose][:, None]
+        receiver = pieces.pose[:, None] * self.ears + torch.arange(self.ears, device=at.device)
+        power = self.bank.power(
+            strength.reshape(-1),
+            at.reshape(-1),
+            pieces.weight.flatten(0, 1),
+            receiver.reshape(-1),
+            receivers=len(emitters) * self.ears,
+            frames=frames,
+        )
+        return Heard(power.unflatten(0, (len(emitters), self.ears)), row)
+
+    def later_power(
+        self, pose: Tensor, ear: Tensor, delay: Tensor, weight: Tensor, like: Heard
+    ) -> Tensor:
+        """Power (P, E, W, F) of single echoes, on the rows of others.
+
+        Parameters
+        ----------
+        pose, ear : (N,) int64
+            Who hears them.
+        delay : (N,) float64, s
+            From the emission.
+        weight : (N, N') float32
+            At the nodes.
+        like : Heard
+            Rows are the same.
+        """
+        poses, _, frames, _ = like.power.shape
+        start = ((like.row + self._first) * self.analysis.hop).to(delay.dtype)
+        at = delay * self.analysis.sampling_rate - start[pose]
+        last = frames * self.analysis.hop - self._pad
+        inside = torch.nonzero((at > self._pad) & (at < last))[:, 0]
+        at = at[inside].float()
+        power = self.bank.power(
+            torch.ones_like(at),
+            at,
+            weight[inside],
+            (pose * self.ears + ear)[inside],
+            receivers=poses * self.ears,
+            frames=frames,
+        )
+        return power.unflatten(0, (poses, self.ears))
+
+    def _span(self, path: Tensor, pieces: Pieces, poses: int) -> tuple[int, Tensor]:
+        """Return how many frames hold all echoes of any pose, and the first of each pose."""
+        hop, window = self.analysis.hop, self._reads
+        late, early = path.amax(1), path.amin(1)
+        huge = torch.full((poses,), torch.inf, device=path.device, dtype=path.dtype)
+        nearest = huge.scatter_reduce(0, pieces.pose, early, "amin")
+        farthest = (-huge).scatter_reduce(0, pieces.pose, late, "amax")
+        empty = torch.isinf(nearest)
+        nearest = torch.where(empty, torch.zeros_like(nearest), nearest)
+        farthest = torch.where(empty, torch.zeros_like(farthest), farthest)
+        row = torch.floor((nearest - self._pad - window) / hop).long()
+        span = float((farthest - row * hop).max()) + self._pad + window
+        frames = fast_length(max(math.ceil(span / hop), 8))
+        return frames, row - self._first

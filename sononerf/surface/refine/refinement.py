@@ -1,0 +1,339 @@
+# SPDX-License-Identifier: MIT
+"""Refine a surface against measured spectrograms: stages from coarse to fine, the best is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sononerf.echoes.free_space import EchoHull
+from sononerf.errors import SonoNerfError
+from sononerf.simulation.simulator import Simulator
+from sononerf.surface.refine.comparison import Comparison
+from sononerf.surface.refine.correction import Correction
+from sononerf.surface.refine.descent import Descent, poses_that_hear
+from sononerf.surface.refine.echo_data import Echoes
+from sononerf.surface.refine.later_bounces import LaterBounces
+from sononerf.surface.refine.objective import Level
+from sononerf.surface.refine.onset_ranges import OnsetRanges
+from sononerf.surface.refine.optics import Optics
+from sononerf.surface.refine.remesh import finer, remesh
+from sononerf.surface.refine.stages import SHARP, STAGES, Stage
+
+SIMULATED = 96
+"""Training poses for which a surface is simulated; each is drawn about three times."""
+Simulate = Callable[[trimesh.Trimesh], Simulator]
+TOLERATED = 1.15
+"""Objectives of validation poses that differ by less than this factor differ by chance. A later
+stage, and a sheet, are preferred up to it."""
+Way = Literal["blurred", "sharp", "sheet"]
+"""How a surface goes through the stages: with the blur and the edges of each stage; without blur on
+fine triangles; or as a sheet, whose triangles stay as they are because a signed distance on voxels
+would tear it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A refined surface.
+
+    Attributes
+    ----------
+    mesh : Trimesh
+        m.
+    gain : (E, F) float64
+        What rendered magnitudes are multiplied by, learned on training poses.
+    support : (V,) float64
+        How many training poses see each vertex near the direction of a mirror.
+    start : str
+        Name of the start that was refined.
+    kept : bool
+        True where the refined surface explains the validation poses better than the start.
+    error_db : float
+        Objective on validation poses, see :class:`~sononerf.surface.refine.comparison.Comparison`.
+    history : list of dict
+        Per stage: its number, its way, the mismatch of its last step, and the objective on
+        validation poses after it.
+    """
+
+    mesh: trimesh.Trimesh
+    gain: NDArray[np.float64]
+    support: NDArray[np.float64]
+    start: str
+    kept: bool
+    error_db: float
+    history: list[dict[str, Any]]
+
+
+class Refinement:
+    """Refine step by step; between any two steps it can be stopped, saved and taken up again.
+
+    Parameters
+    ----------
+    meshes : mapping of str to Trimesh
+        Where to start, m; of several the one that explains the validation poses best. One that is
+        called ``sheet`` is a sheet: it takes part in the first stage beside the best of the others.
+    echoes : Echoes
+        What was measured.
+    optics : Optics
+        The head; its device is that of the computation.
+    hull : EchoHull or None
+        Onsets of the training poses; the surface must begin there.
+    simulate : callable
+        Makes the simulator of a surface, for the stages that are corrected by it.
+    seed : int
+        Of the order of poses and of traced rays.
+    stages : tuple of Stage
+        From coarse to fine.
+    calibrated : bool
+        Whether the measured level is absolute, as the simulator's is. Then gains are learned in
+        the last stage alone: a rough surface is too faint, and a gain would excuse it. The level of
+        a recording differs by frequency as well, so there they are learned from the first stage on.
+    """
+
+    def __init__(
+        self,
+        meshes: Mapping[str, trimesh.Trimesh],
+        echoes: Echoes,
+        optics: Optics,
+        *,
+        hull: EchoHull | None = None,
+        simulate: Simulate,
+        seed: int,
+        stages: tuple[Stage, ...] = STAGES,
+        calibrated: bool = True,
+    ) -> None:
+        self.simulate = simulate
+        self.calibrated = calibrated
+        self.echoes, self.optics, self.seed, self.stages = echoes, optics, seed, stages
+        like = optics.get_buffer("wavenumber")
+        self.level = Level(optics.ears, len(optics.frequencies), like)
+        self.onsets = None if hull is None else OnsetRanges(hull, optics.resolution, seed)
+        self.starts = {name: _plain(mesh) for name, mesh in meshes.items()}
+        self.candidates: list[trimesh.Trimesh] = []
+        self.objectives: list[float] = []
+        self.start: str | None = None
+        self.stage, self.step, self.drawn = 0, 0, 0
+        ways: list[Way] = ["blurred", "sharp"] if set(meshes) - {"sheet"} else []
+        self.ways: list[Way] = [*ways, "sheet"] if "sheet" in meshes else ways
+        self.way = self.ways[0]
+        self.history: list[dict[str, Any]] = []
+        self._rivals: list[trimesh.Trimesh] = []  # what the first stage made in each way
+        self._descent: Descent | None = None
+        self._later: LaterBounces | None = None
+        self._source = 0  # the candidate whose later bounces are added
+        self.comparison = Comparison(echoes, optics, self.onsets, seed, calibrated=calibrated)
+
+    @property
+    def total(self) -> int:
+        """Number of steps of all stages."""
+        repeated = (len(self.ways) - 1) * self.stages[0].steps
+        return repeated + sum(stage.steps for stage in self.stages)
+
+    @property
+    def done(self) -> bool:
+        """Whether nothing is left to do."""
+        return self.stage >= len(self.stages)
+
+    def advance(self) -> float:
+        """Do one step; return its mismatch, dB."""
+        stage = self.stages[self.stage]
+        if self.start is None:
+            self._choose()
+        if self._descent is None:
+            if stage.beyond == "trace":
+                self._source = len(self.candidates) - 1
+            self._descent = self._descend(self._prepared())
+        mismatch = self._descent.step(self.drawn, self.step / stage.steps)
+        self.step += 1
+        self.drawn += 1
+        if self.step == stage.steps:
+            self._finish(mismatch)
+        return mismatch
+
+    def _prepared(self) -> trimesh.Trimesh:
+        """Return the surface that a stage begins with."""
+        stage, unit = self.stages[self.stage], self.optics.wavelength
+        if self.way == "sheet":
+            return self.starts["sheet"] if self.stage == 0 else self.candidates[-1]
+        edge, blur = (SHARP, 0.0) if self.way == "sharp" else (stage.edge, stage.blur)
+        made = remesh(self.candidates[-1], min(edge, stage.edge) * unit, blur * unit)
+        return self.candidates[-1] if made is None else made
+
+    def _finish(self, mismatch: float) -> None:
+        """End a stage; the first one is done in each way."""
+        assert self._descent is not None
+        mesh, self._descent, self.step = self._descent.mesh(), None, 0
+        objective = self.comparison.objective(mesh, self.level, smooth=True)
+        self.history.append(
+            {
+                "stage": self.stage,
+                "way": self.way,
+                "mismatch_db": mismatch,
+                "objective_db": objective,
+            }
+        )
+        if self.stage == 0:
+            self._rivals.append(mesh)
+            if len(self._rivals) < len(self.ways):
+                self.way = self.ways[len(self._rivals)]
+                self.level.reset()
+                return
+            mesh, objective = self._best_way()
+        self.candidates.append(mesh)
+        self.objectives.append(objective)
+        self.stage += 1
+
+    def _best_way(self) -> tuple[trimesh.Trimesh, float]:
+        """Go on in the best way; return what the first stage made in it, and its objective."""
+        found = [one["objective_db"] for one in self.history]
+        best = int(np.argmin(found))
+        if self.ways[-1] == "sheet" and found[-1] <= TOLERATED * found[best]:
+            best = len(found) - 1
+            if self.start != "sheet":
+                self._begin({"sheet": self.starts["sheet"]})
+        self.way = self.ways[best]
+        return self._rivals[best], found[best]
+
+    def _choose(self) -> None:
+        """Begin with the start that explains the validation poses best."""
+        bodies = {name: mesh for name, mesh in self.starts.items() if name != "sheet"}
+        self._begin(bodies or self.starts)
+
+    def _begin(self, starts: dict[str, trimesh.Trimesh]) -> None:
+        objectives = {
+            name: self.comparison.objective(mesh, self.level, smooth=False)
+            for name, mesh in starts.items()
+        }
+        self.start = min(objectives, key=lambda name: objectives[name])
+        self.candidates, self.objectives = [starts[self.start]], [objectives[self.start]]
+
+    def _descend(self, mesh: trimesh.Trimesh) -> Descent:
+        stage = self.stages[self.stage]
+        last = self.stage == len(self.stages) - 1
+        self.level.learns = "none" if self.calibrated and not last else "each"
+        correction = None
+        if stage.beyond == "simulate":
+            self._later, correction = None, self._correction(mesh)
+        elif stage.beyond == "none":
+            self._later = None
+        elif stage.beyond == "trace" or self._later is None:
+            source = self.candidates[self._source]
+            self._later = LaterBounces(self.optics, source, self.echoes, seed=self.seed)
+        return Descent(
+            mesh,
+            self.echoes,
+            self.optics,
+            self.level,
+            smoothing=stage.smoothing * self.optics.wavelength,
+            rate=stage.rate,
+            later=self._later,
+            correction=correction,
+            # The simulator's correction is more exact than the onsets.
+            onsets=None if correction is not None else self.onsets,
+            sheet=self.way == "sheet",
+            seed=self.seed,
+        )
+
+    def _correction(self, mesh: trimesh.Trimesh) -> Correction | None:
+        """Return the correction on a surface; None where it cannot be simulated."""
+        training = self.echoes.training
+        rng = np.random.default_rng([self.seed, self.stage])
+        numbers = rng.choice(training, min(SIMULATED, len(training)), replace=False)
+        fine, _ = finer(mesh, np.zeros(len(mesh.vertices)), self.optics.wavelength)
+        try:
+            simulator = self.simulate(fine)
+            return Correction(self.optics, mesh, simulator, self.echoes, numbers, seed=self.seed)
+        except SonoNerfError:
+            return None
+
+    def state(self) -> dict[str, Tensor]:
+        """Return all that is needed to go on, as plain tensors."""
+        start = -1 if self.start is None else list(self.starts).index(self.start)
+        way = self.ways.index(self.way)
+        found = {
+            "progress": torch.tensor([self.stage, self.step, self.drawn, start, way, self._source]),
+            "objectives": torch.tensor(self.objectives, dtype=torch.float64),
+            "history": torch.tensor(
+                [
+                    (one["stage"], self.ways.index(one["way"]), *list(one.values())[2:])
+                    for one in self.history
+                ],
+                dtype=torch.float64,
+            ).reshape(-1, 4),
+            **{f"level.{name}": part for name, part in self.level.state().items()},
+        }
+        meshes = {f"candidate.{number}": mesh for number, mesh in enumerate(self.candidates)}
+        meshes.update({f"rival.{number}": mesh for number, mesh in enumerate(self._rivals)})
+        for name, mesh in meshes.items():
+            found[f"{name}.vertices"] = torch.as_tensor(np.array(mesh.vertices))
+            found[f"{name}.faces"] = torch.as_tensor(np.array(mesh.faces))
+        if self._descent is not None:
+            parts = self._descent.state()
+            found.update({f"descent.{name}": part for name, part in parts.items()})
+        return found
+
+    def load(self, state: dict[str, Tensor]) -> None:
+        """Go on from a state; meshes, echoes, optics, seed and stages must be the same."""
+        self.stage, self.step, self.drawn, start, way, self._source = (
+            int(part) for part in state["progress"]
+        )
+        self.start = None if start < 0 else list(self.starts)[start]
+        self.way = self.ways[way]
+        self.objectives = state["objectives"].tolist()
+        self.history = [
+            {
+                "stage": int(stage),
+                "way": self.ways[int(way)],
+                "mismatch_db": mismatch,
+                "objective_db": objective,
+            }
+            for stage, way, mismatch, objective in state["history"].tolist()
+        ]
+        self.level.load({name: state[f"level.{name}"] for name in self.level.state()})
+        self.candidates, self._rivals = _meshes(state, "candidate"), _meshes(state, "rival")
+        self._later, self._descent = None, None
+        parts = {k.removeprefix("descent."): v for k, v in state.items() if k[:8] == "descent."}
+        if parts:
+            begun = trimesh.Trimesh(parts["start"].numpy(), parts["faces"].numpy(), process=False)
+            self._descent = self._descend(begun)
+            self._descent.load(parts)
+
+    def result(self) -> Refined:
+        """Return the best surface so far; the start where none explains more."""
+        if self.start is None:
+            self._choose()
+        good = TOLERATED * min(self.objectives)
+        better = [n for n, found in enumerate(self.objectives) if found < self.objectives[0]]
+        best = max([n for n in better if self.objectives[n] <= good], default=0)
+        mesh = self.candidates[best]
+        support = poses_that_hear(mesh, self.echoes, self.optics).double().cpu().numpy()
+        if best:
+            mesh, support = finer(mesh, support, self.optics.wavelength)
+        gain = self.level.gain.exp().double().cpu().numpy()
+        assert self.start is not None
+        error = self.objectives[best]
+        return Refined(mesh, gain, support, self.start, best > 0, error, self.history)
+
+
+def _meshes(state: dict[str, Tensor], name: str) -> list[trimesh.Trimesh]:
+    """Return the meshes ``name.0``, ``name.1`` and so on of a state."""
+    found: list[trimesh.Trimesh] = []
+    while f"{name}.{len(found)}.vertices" in state:
+        parts = (state[f"{name}.{len(found)}.{part}"].numpy() for part in ("vertices", "faces"))
+        found.append(trimesh.Trimesh(*parts, process=False))
+    return found
+
+
+def _plain(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    return trimesh.Trimesh(
+        np.array(mesh.vertices, dtype=np.float64),
+        np.array(mesh.faces, dtype=np.int64),
+        process=False,
+    )

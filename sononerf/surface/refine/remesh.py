@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: MIT
+"""A closed surface made anew from its signed distance: even triangles, pieces split and merged."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import cKDTree
+from skimage.measure import marching_cubes
+
+from sononerf.surface.refine.mesh_operators import MeshOperators, unit
+
+CELL = 1.1
+"""Voxels' side over the wanted edge: marching cubes leave as many vertices as even triangles of
+that edge have."""
+BAND = 2
+"""Voxels on each side of the surface in which distances are taken."""
+RELAXING = 8
+"""Steps of tangential relaxation; marching cubes leave slivers."""
+RELAXED = 0.7
+"""Part of the way to the neighbours' mean in one of these steps."""
+LEAST = 1.5
+"""Side of the cube whose volume the smallest piece has that is kept, edges. Torn films leave crumbs
+below it."""
+LOST = 0.01
+"""Part of the old surface that may be missing from the new one, unless it is blurred; a sheet that
+is thinner than a voxel would be lost."""
+
+CHORD = 0.005
+"""Depth of the middles of edges below the smooth surface, shortest wavelengths, above which
+triangles are divided."""
+
+Array = NDArray[np.float64]
+
+
+def remesh(mesh: trimesh.Trimesh, edge: float, blur: float = 0.0) -> trimesh.Trimesh | None:
+    """Return a surface with even triangles.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        A closed surface, m; what overlaps becomes one.
+    edge : float, m
+        Mean length of the edges.
+    blur : float, m
+        Standard deviation of a Gaussian over the signed distance; it removes dents, bumps and
+        necks of this size.
+
+    Returns
+    -------
+    surface : Trimesh or None
+        None where the mesh is open or would lose thin parts, or nothing is left.
+    """
+    if not mesh.is_watertight or not len(mesh.faces):
+        return None
+    spacing = CELL * edge
+    lower, distance = signed_distance(mesh, spacing, margin=2 * BAND + round(2 * blur / spacing))
+    if blur:
+        distance = ndimage.gaussian_filter(distance, blur / spacing)
+    if not (distance < 0).any():
+        return None
+    vertices, faces, _, _ = marching_cubes(
+        distance.astype(np.float32), 0.0, gradient_direction="ascent", allow_degenerate=False
+    )
+    found = trimesh.Trimesh(lower + spacing * vertices, faces, process=True)
+    found.merge_vertices()
+    if _volume(found) < 0.0:
+        found.invert()
+    pieces = found.split(only_watertight=False)
+    pieces = [piece for piece in pieces if abs(_volume(piece)) >= (LEAST * edge) ** 3]
+    if not pieces:
+        return None
+    found = trimesh.util.concatenate(pieces) if len(pieces) > 1 else pieces[0]
+    if not blur:
+        old = np.asarray(mesh.vertices)
+        at = ((old - lower) / spacing).T
+        buried = ndimage.map_coordinates(distance, at, order=1) < -0.5 * spacing
+        near = cKDTree(found.vertices).query(old, distance_upper_bound=1.5 * edge)[0]
+        if (np.isinf(near) & ~buried).mean() > LOST:
+            return None
+    return relaxed(found)
+
+
+def relaxed(mesh: trimesh.Trimesh, steps: int = RELAXING) -> trimesh.Trimesh:
+    """Return the mesh with its vertices spread evenly along the surface."""
+    faces = np.array(mesh.faces, dtype=np.int64)
+    places = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
+    operators = MeshOperators(torch.as_tensor(faces), len(places))
+    for _ in range(steps):
+        places = operators.relaxed(places, unit(operators.areas(places)), RELAXED)
+    return trimesh.Trimesh(places.numpy(), faces, process=False)
+
+
+def finer(mesh: trimesh.Trimesh, values: Array, wavelength: float) -> tuple[trimesh.Trimesh, Array]:
+    """Return a finer mesh of the same smooth surface where triangles cut too deep below it.
+
+    Each triangle becomes four. The middle of an edge is put where a curve runs that is square to
+    the normals at both ends [1]_.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        Its vertices lie on the smooth surface.
+    values : (V,) float64
+        Per vertex; new ones get the mean of both ends.
+    wavelength : float, m
+        The shortest.
+
+    Returns
+    -------
+    finer : Trimesh
+        The mesh itself where its edges' middles lie deep by less than :data:`CHORD` on average.
+    values : (V',) float64
+        Of its vertices.
+
+    References
+    ----------
+    .. [1] A. Vlachos et al., "Curved PN triangles", I3D 2001.
+    """
+    places, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
+    edges, of = np.asarray(mesh.edges_unique), np.asarray(mesh.edges_unique_inverse)
+    a, b = edges.T
+    way = places[b] - places[a]
+    to_a = (way * normals[a]).sum(1, keepdims=True)
+    to_b = (way * normals[b]).sum(1, keepdims=True)
+    depth = (to_b * normals[b] - to_a * normals[a]) / 8.0
+    if np.linalg.norm(depth, axis=1).mean() < CHORD * wavelength:
+        return mesh, values
+    vertices = np.concatenate([places, (places[a] + places[b]) / 2.0 + depth])
+    faces = np.asarray(mesh.faces)
+    ab, bc, ca = (len(places) + of.reshape(-1, 3)).T
+    first, second, third = faces.T
+    whole = np.concatenate(
+        [
+            np.stack(part, axis=1)
+            for part in ((first, ab, ca), (ab, second, bc), (ca, bc, third), (ab, bc, ca))
+        ]
+    )
+    found = trimesh.Trimesh(vertices, whole, process=False)
+    return found, np.concatenate([values, (values[a] + values[b]) / 2.0])
+
+
+def signed_distance(
+    mesh: trimesh.Trimesh, spacing: float, *, margin: int
+) -> tuple[Array, NDArray[np.float32]]:
+    """Signed distance near closed bodies on a lattice, positive outside of all of them.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        Closed bodies, which may overlap; cavities are filled.
+    spacing : float, m
+        Of the lattice.
+    margin : int
+        Voxels around the surface.
+
+    Returns
+    -------
+    lower : (3,) float64, m
+        The lattice's first place.
+    distance : (X, Y, Z) float32, m
+        Exact near the surface, elsewhere no more than the width of the band.
+    """
+    bounds = np.asarray(mesh.bounds)
+    lower = bounds[0] - margin * spacing
+    shape = np.ceil((bounds[1] - bounds[0]) / spacing).astype(int) + 2 * margin + 1
+    distance = np.full(tuple(shape), (BAND + 0.5) * spacing, dtype=np.float32)
+    for body in mesh.split(only_watertight=False):
+        if _volume(body) <= 0.0:
+            continue
+        first = np.floor((body.bounds[0] - lower) / spacing).astype(int) - BAND - 1
+        last = np.ceil((body.bounds[1] - lower) / spacing).astype(int) + BAND + 2
+        part = tuple(slice(a, b) for a, b in zip(first, last, strict=True))
+        found = _of_body(body, lower + first * spacing, tuple(last - first), spacing)
+        distance[part] = np.minimum(distance[part], found)
+    return lower, distance
+
+
+def _volume(mesh: trimesh.Trimesh) -> float:
+    """Signed volume, m³; unlike the mesh's own it may be zero."""
+    corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+    return float(np.linalg.det(corners - corners.mean(axis=(0, 1))).sum() / 6.0)
+
+
+def _of_body(
+    body: trimesh.Trimesh, lower: Array, shape: tuple[int, ...], spacing: float
+) -> NDArray[np.float32]:
+    """Signed distance of one closed body on a lattice around it."""
+    points, normals = _samples(body, 0.5 * spacing)
+    near = np.zeros(shape, dtype=bool)
+    near[tuple(np.rint((points - lower) / spacing).astype(np.int64).T)] = True
+    near = ndimage.binary_dilation(near, iterations=BAND)
+    places = lower + spacing * np.argwhere(near)
+    away, nearest = cKDTree(points, balanced_tree=False, compact_nodes=False).query(places)
+    height = ((places - points[nearest]) * normals[nearest]).sum(axis=1)
+    # Beside the edge of the nearest piece of surface its plane says too little.
+    aside = np.sqrt(np.maximum(away**2 - height**2, 0.0)) > spacing
+    height = np.where(aside, np.copysign(away, height), height)
+    farthest = (BAND + 0.5) * spacing
+    distance = np.full(shape, farthest, dtype=np.float32)
+    distance[near] = np.clip(height, -farthest, farthest)
+    # What cannot be reached from the outside is inside.
+    labels, _ = ndimage.label(distance > 0)
+    enclosed = (distance > 0) & (labels != labels[0, 0, 0])
+    distance[enclosed] = -distance[enclosed]
+    return distance
+
+
+def _samples(mesh: trimesh.Trimesh, spacing: float) -> tuple[Array, Array]:
+    """Points on a mesh about a spacing apart, and smooth normals there."""
+    corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+    normals = np.asarray(mesh.vertex_normals)[np.asarray(mesh.faces)]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    parts = np.clip(np.ceil(longest / spacing).astype(int), 1, 64)
+    points, directions = [np.asarray(mesh.vertices)], [np.asarray(mesh.vertex_normals)]
+    for count in np.unique(parts):
+        some = parts == count
+        i, j = np.meshgrid(np.arange(count), np.arange(count), indexing="ij")
+        kept = i + j < count
+        first, second = (i[kept] + 1 / 3) / count, (j[kept] + 1 / 3) / count
+        weights = np.stack([1 - first - second, first, second], axis=1)
+        points.append(np.einsum("wc,tcd->twd", weights, corners[some]).reshape(-1, 3))
+        directions.append(np.einsum("wc,tcd->twd", weights, normals[some]).reshape(-1, 3))
+    found = np.concatenate(directions)
+    length = np.linalg.norm(found, axis=1, keepdims=True)
+    return np.concatenate(points), found / np.maximum(length, 1e-12)

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: MIT
+"""What of a surface the emitter and the ears of poses see, and how that is rendered."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from sononerf.geometry.raycast import Occlusion
+from sononerf.surface.refine.mesh_operators import MeshOperators
+from sononerf.surface.refine.optics import SILENT, Optics, Pieces
+
+FREE = 0.25
+"""Shortest wavelengths in front of a piece in which nothing hides it: what is so close throws no
+shadow, and the other side of a thin sheet that was pushed through must not."""
+
+
+def seen(
+    sight: Occlusion, points: NDArray[np.float64], target: NDArray[np.float64], *, free: float
+) -> NDArray[np.bool_]:
+    """Which points (N, 3) on the surface are seen from targets (N, 3), m.
+
+    Parameters
+    ----------
+    sight : Occlusion
+        Of the surface.
+    points, target : (N, 3) float64, m
+        World frame.
+    free : float, m
+        So much of the way, from the point on, cannot be blocked.
+    """
+    span = target - points
+    distance = np.sqrt(np.einsum("nd,nd->n", span, span))[:, None]
+    part = np.minimum(free / np.maximum(distance, 1e-300), 0.5)
+    return ~sight.blocked(points + part * span, target)
+
+
+def listen(
+    optics: Optics,
+    operators: MeshOperators,
+    vertices: Tensor,
+    area: Tensor,
+    bending: Tensor,
+    sight: Occlusion,
+    positions: Tensor,
+    rotations: Tensor,
+) -> tuple[Pieces, tuple[Tensor, Tensor, Tensor], Tensor]:
+    """Find what poses hear of a surface.
+
+    Parameters
+    ----------
+    optics : Optics
+        The head.
+    operators : MeshOperators
+        Of the surface.
+    vertices, area, bending : (V, 3), (V, 3), (V, 6) float64
+        Places, vector areas and curvature.
+    sight : Occlusion
+        Of the same surface, or of one a little earlier.
+    positions, rotations : (P, 3), (P, 3, 3) float64
+        Of the heads.
+
+    Returns
+    -------
+    pieces : Pieces
+        What is heard.
+    heads : emitters (P, 3), ears (P, E, 3), rotations (P, 3, 3), float32
+        About the middle of the surface, as :meth:`Optics.render` wants them.
+    middle : (3,) float64, m
+        To be taken off the vertices before they are rendered.
+    """
+    middle = 0.5 * (vertices.amin(0) + vertices.amax(0))
+    emitters, ears = optics.heads(positions, rotations)
+    heads = ((emitters - middle).float(), (ears - middle).float(), rotations.float())
+    points, areas, bent = (vertices - middle).float(), area.float(), bending.float()
+    pose, vertex = _candidates(optics, points, areas, bent, heads)
+    visible = _visible(optics, operators, vertices, sight, pose, vertex, emitters, ears)
+    kept = visible.amax(1) > 0.0
+    pose, vertex, visible = pose[kept], vertex[kept], visible[kept]
+    return optics.pieces(points, areas, bent, pose, vertex, visible, heads), heads, middle
+
+
+def _candidates(
+    optics: Optics,
+    points: Tensor,
+    area: Tensor,
+    bending: Tensor,
+    heads: tuple[Tensor, Tensor, Tensor],
+) -> tuple[Tensor, Tensor]:
+    """Which poses could hear which vertices (Q,), (Q,), if nothing stood in between."""
+    found = []
+    for number, (emitter, places) in enumerate(zip(heads[0], heads[1], strict=True)):
+        middle = places.mean(0)
+        towards = 0.5 * (emitter + middle)
+        some = torch.nonzero(((towards - points) * area).sum(1) > 0.0)[:, 0]
+        exponent = optics.near_mirror(points[some], area[some], bending[some], emitter, middle)[4]
+        some = some[exponent < SILENT]
+        found.append((torch.full_like(some, number), some))
+    pose, vertex = zip(*found, strict=True)
+    return torch.cat(pose), torch.cat(vertex)
+
+
+def _visible(
+    optics: Optics,
+    operators: MeshOperators,
+    vertices: Tensor,
+    sight: Occlusion,
+    pose: Tensor,
+    vertex: Tensor,
+    emitters: Tensor,
+    ears: Tensor,
+) -> Tensor:
+    """How far emitter and each ear see the candidates, (Q, E) float32, softened by neighbours."""
+    free = FREE * optics.wavelength
+    points = vertices[vertex].detach().cpu().numpy()
+    of = pose.cpu().numpy()
+    sources, places = emitters.detach().cpu().numpy(), ears.detach().cpu().numpy()
+    lit = np.flatnonzero(seen(sight, points, sources[of], free=free))
+    clear = np.zeros((len(points), optics.ears), dtype=np.float32)
+    for ear in range(optics.ears):
+        clear[lit, ear] = seen(sight, points[lit], places[of[lit], ear], free=free)
+    found = torch.as_tensor(clear).to(vertices.device)
+    shape = (operators.count, len(emitters), 1 + optics.ears)
+    spread = torch.zeros(shape, dtype=torch.float32, device=vertices.device)
+    spread[vertex, pose, 0] = 1.0
+    spread[vertex, pose, 1:] = found
+    near = operators.averaged(spread.flatten(1)).unflatten(1, shape[1:])[vertex, pose]
+    return near[:, 1:] / near[:, :1].clamp_min(1e-6)

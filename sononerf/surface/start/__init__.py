@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Start surfaces, from the field, the onsets and the free space."""

@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: MIT
+r"""Estimate where the body is from the onsets and the fitted field, and extract its surface.
+
+Three kinds of evidence meet in one signed distance, see :mod:`sononerf.surface.start.distance`:
+
+- *oriented points*: the field's sound, put at its range on the line of sight of each pose, weighted
+  by how well other poses and the onsets agree with it;
+- *free space*: what lies in front of an onset is empty, and with no other evidence the body reaches
+  as far as the onsets let it;
+- *winding number*: where that of the oriented points is negative, mostly backs of surfaces are
+  seen. Such a place is outside, even if the onsets allow a body there (a hollow, a gap).
+
+Few poses face a flat side, so the winding number may be wrong about it; and a field that is fitted
+badly is wrong everywhere. How much of this is believed is the ``Belief``; the caller chooses it by
+what explains the echoes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from scipy import ndimage
+from skimage.measure import marching_cubes
+
+from sononerf.echoes.free_space import EchoHull
+from sononerf.errors import NumericalError
+from sononerf.field.field import Field
+from sononerf.geometry.lattice import MARGIN, Grid, Lattice
+from sononerf.surface.start.bounds import clearance_grid
+from sononerf.surface.start.distance import signed_distance
+from sononerf.surface.start.evidence import Evidence, locate_sound
+from sononerf.surface.start.evidence_grids import planes, thinness, winding_of
+from sononerf.surface.start.reliability import reliability
+
+Array = NDArray[np.float64]
+Belief = Literal["open", "filled", "hull"]
+"""How far the field's sound is believed. ``open``: the winding number opens hollows and gaps that
+the onsets leave closed. ``filled``: it does not. ``hull``: the onsets alone give the surface, which
+is exact for a convex body."""
+QUIET = 0.12
+"""Weight below which evidence is left out, no unit: -37 dB beside the loudest of a usual pose.
+What is quieter is mostly placed at random by the fit."""
+SPAN = {"open": 2.4, "filled": 1.0}
+"""Range resolutions over which oriented points outweigh the onsets' bound, for each belief: over a
+gap that is wider the bound stays, if the winding number does not open it."""
+BACKS = (0.02, 0.06)
+"""Negative winding number from which a place counts as outside, and the range over which its weight
+rises to the full one."""
+OPENING = 0.03
+"""Full weight of a place that is outside by its winding number; evidence has 1 at its point."""
+UNHEARD = 0.03
+"""A part is left out if its evidence per area is below this fraction of that of the part with most
+evidence."""
+_THICKER = 1.5  # voxels that each side of a thin part is moved outward, and the surface moved back:
+# two sides closer than the blur of their planes would cancel
+_BENDING = 1.0  # of a voxel; evidence at its point has 1: it sets the unit of all weights
+_NEGLIGIBLE = 1e-3  # weight of a point that is left out of the planes, to save time
+_LEAST = 30  # voxels of the smallest surface
+_RESOLVED = 8  # voxels of the smallest part
+_CONTRADICTED = 4.0  # range resolutions; if every place lies so far in front, the onsets are wrong
+
+
+@dataclass(frozen=True, eq=False)
+class Occupancy:
+    """A body, its surface, and the evidence for it.
+
+    Attributes
+    ----------
+    mesh : Trimesh
+        Closed, m, normals outward.
+    distance : (X, Y, Z) float, m
+        Signed distance, positive outside.
+    lattice : Lattice
+        Its voxels.
+    evidence : Evidence
+        The oriented points.
+    hull : EchoHull
+        The free space.
+    """
+
+    mesh: trimesh.Trimesh
+    distance: Grid
+    lattice: Lattice
+    evidence: Evidence
+    hull: EchoHull
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """All evidence, on one lattice; a surface of it is found by :func:`estimate_occupancy`.
+
+    Attributes
+    ----------
+    evidence : Evidence
+        The oriented points.
+    weight : (G,) float
+        How far they are believed, from 0 to 1: their own weight times their reliability.
+    points : (G, 3) float, m
+        Where they stand on the lattice: moved outward where the body is thin.
+    lattice : Lattice
+        The voxels.
+    thin : (X, Y, Z) float
+        How far the body is thin, from 0 to 1.
+    bound : (X, Y, Z) float, voxels
+        Signed distance of the boundary of free space; no body lies below it.
+    hull : EchoHull
+        The free space.
+    resolution : float, m
+        Range resolution.
+    """
+
+    evidence: Evidence
+    weight: Array
+    points: Array
+    lattice: Lattice
+    thin: Grid
+    bound: Grid
+    hull: EchoHull
+    resolution: float
+
+
+def gather_evidence(
+    field: Field,
+    places: torch.Tensor,
+    hull: EchoHull,
+    lower: Array,
+    upper: Array,
+    spacing: float,
+    resolution: float,
+) -> Gathered:
+    """Return what the field and the onsets tell about a region.
+
+    Parameters
+    ----------
+    field : Field
+        What was fitted.
+    places : (N, 3) float, m
+        Where it is not silent.
+    hull : EchoHull
+        Free space in front of the onsets.
+    lower, upper : (3,) float, m
+        The region.
+    spacing : float, m
+        Of the voxels.
+    resolution : float, m
+        Range resolution of the analysis.
+
+    Raises
+    ------
+    NumericalError
+        If nothing was heard.
+    """
+    evidence = locate_sound(field, places, hull.sources, resolution=resolution)
+    evidence = evidence.where(evidence.weight > QUIET)
+    if not len(evidence.points) and not np.isfinite(hull.trusted).any():
+        raise NumericalError("no surface: no pose heard an echo from inside the region")
+    lattice = Lattice.over(lower, upper, spacing)
+    weight = evidence.weight * reliability(evidence, hull, resolution)
+    thin = thinness(lattice, evidence.points, evidence.normals, weight)
+    move = _THICKER * lattice.read(thin, evidence.points).clip(0, 1)
+    points = evidence.points + spacing * move[:, None] * evidence.normals
+    farthest = max(lattice.shape)
+    bound = (-clearance_grid(hull, lattice) / spacing).clip(-farthest, farthest)
+    bound = _walled(bound.astype(np.float32))
+    return Gathered(evidence, weight, points, lattice, thin, bound, hull, resolution)
+
+
+def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> Occupancy:
+    """Return where the body is.
+
+    Parameters
+    ----------
+    known : Gathered
+        The evidence.
+    belief : {"open", "filled", "hull"}
+        How far the field's sound is believed, see ``Belief``.
+
+    Raises
+    ------
+    NumericalError
+        If the onsets contradict one another: no place is left by nearly all of them. With the
+        belief ``hull`` also if there is no onset.
+    """
+    lattice, spacing = known.lattice, known.lattice.spacing
+    if not (known.bound < _CONTRADICTED * known.resolution / spacing).any():
+        raise NumericalError(
+            "no surface: the first echoes leave no room for a body; check poses and speed of sound"
+        )
+    if belief == "hull":
+        if not np.isfinite(known.hull.trusted).any():
+            raise NumericalError("no surface: no pose has a first echo")
+        distance = known.bound
+    else:
+        distance = _by_all_evidence(known, belief)
+    if not (distance < 0).any():
+        # The body is thinner than a voxel: the most likely places are taken, however few.
+        inner = distance[(slice(MARGIN, -MARGIN),) * 3]
+        most = np.partition(inner.ravel(), min(_LEAST, inner.size - 1))[: _LEAST + 1].max()
+        distance = distance - most - np.float32(0.5)
+    distance = _without_hollows(_walled(distance))
+    distance = _without_parts(distance, None if belief == "hull" else known)
+    mesh = _surface(distance, lattice)
+    if belief != "hull":
+        back = _THICKER * spacing * lattice.read(known.thin, np.asarray(mesh.vertices)).clip(0, 1)
+        mesh.vertices = mesh.vertices - back[:, None] * mesh.vertex_normals
+    return Occupancy(mesh, spacing * distance, lattice, known.evidence, known.hull)
+
+
+def _by_all_evidence(known: Gathered, belief: Literal["open", "filled"]) -> Grid:
+    """Return the signed distance, voxels, with thin parts too thick."""
+    lattice, normals = known.lattice, known.evidence.normals
+    bound = _walled(known.bound - np.float32(_THICKER) * known.thin)
+    used = known.weight > _NEGLIGIBLE
+    weight, target = planes(lattice, known.points[used], normals[used], known.weight[used])
+    empty = np.zeros_like(bound)
+    if belief == "open" and len(known.points):
+        winding = winding_of(lattice, known.points, normals, known.evidence.weight)
+        backs = (-winding - np.float32(BACKS[0])) / np.float32(BACKS[1])
+        empty = np.float32(OPENING) * backs.clip(0, 1)
+    span = SPAN[belief] * known.resolution / lattice.spacing
+    return signed_distance(weight, target, bound, span**-4, empty, _BENDING)
+
+
+def _walled(distance: Grid) -> Grid:
+    """Return it with air all around the region."""
+    walled = np.maximum(distance, 1.0)
+    inner = (slice(MARGIN - 1, 1 - MARGIN),) * 3
+    walled[inner] = distance[inner]
+    return walled
+
+
+def _without_hollows(distance: Grid) -> Grid:
+    """Fill hollows: no sound comes out of them."""
+    labels, _ = ndimage.label(distance > 0)
+    hollow = (labels != labels[0, 0, 0]) & (distance > 0)
+    return np.where(hollow, -distance, distance).astype(np.float32)
+
+
+def _without_parts(distance: Grid, known: Gathered | None) -> Grid:
+    """Leave out parts that the lattice does not resolve and, by the evidence, unheard ones."""
+    labels, count = ndimage.label(distance < 0)
+    if not count:
+        return distance
+    size = np.bincount(labels.ravel(), minlength=count + 1)[1:]
+    kept, best = size >= _RESOLVED, size
+    if known is not None:
+        lattice = known.lattice
+        inside = known.points - 1.5 * lattice.spacing * known.evidence.normals
+        at = np.rint(lattice.coordinates(inside)).astype(np.intp)
+        at = at.clip(0, np.asarray(lattice.shape) - 1)
+        heard = np.bincount(labels[tuple(at.T)], known.weight, count + 1)[1:]
+        dense = heard / size ** (2 / 3)
+        kept &= dense >= UNHEARD * dense[heard.argmax()]
+        best = heard if heard.any() else size
+    if not kept.any():
+        kept[best.argmax()] = True
+    dropped = np.concatenate(([False], ~kept))[labels]
+    return np.where(dropped, np.float32(1.0), distance).astype(np.float32)
+
+
+def _surface(distance: Grid, lattice: Lattice) -> trimesh.Trimesh:
+    # A voxel on the surface itself would be wrapped in triangles without area.
+    near = np.abs(distance) < 1e-3
+    off = np.where(near, np.where(distance < 0, -1e-3, 1e-3), distance)
+    vertices, faces, _, _ = marching_cubes(
+        off.astype(np.float32), 0.0, gradient_direction="ascent", allow_degenerate=False
+    )
+    vertices = lattice.origin + lattice.spacing * np.asarray(vertices, dtype=np.float64)
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh

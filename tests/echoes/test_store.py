@@ -1,0 +1,376 @@
+# SPDX-License-Identifier: MIT
+"""The ensemble: each pose whole or missing, whatever kills the process; bytes that repeat."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+import random
+import signal
+import time
+
+import numpy as np
+import pytest
+import zarr
+
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import IncompatibleError, InputError, NumericalError, StorageError
+
+POSES, RANGES, FREQUENCIES = 9, 7, 5
+
+
+def axes(**changes):
+    generator = np.random.default_rng(0)
+    return {
+        "poses_positions": generator.normal(size=(POSES, 3)),
+        "poses_rotations": np.tile(np.eye(3), (POSES, 1, 1)),
+        "split": np.arange(POSES) % 3,
+        "range": np.linspace(0.15, 0.75, RANGES),
+        "frequency": np.linspace(10e3, 100e3, FREQUENCIES),
+        "attributes": {"echo_hash": "a1", "units": {"range": "m"}, "speed_of_sound": 343.0},
+        **changes,
+    }
+
+
+def spectrogram(index, shape=(2, RANGES, FREQUENCIES)):
+    return np.random.default_rng([7, index]).random(shape, dtype=np.float32)
+
+
+def filled(path, order=range(POSES)):
+    store = EnsembleStore.create(path, **axes())
+    for index in order:
+        store.write_pose(index, spectrogram(index))
+    store.seal()
+    return store
+
+
+def tree(path):
+    files = sorted(p for p in path.rglob("*") if p.is_file())
+    return {str(p.relative_to(path)): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def chunk(path, index):
+    return path / "spectrogram" / f"c.{index}.0.0.0"
+
+
+def test_what_is_written_is_read(tmp_path):
+    filled(tmp_path / "s")
+    store = EnsembleStore.open(tmp_path / "s")
+    wanted = axes()
+    assert len(store) == POSES
+    np.testing.assert_array_equal(store.positions, wanted["poses_positions"])
+    np.testing.assert_array_equal(store.rotations, wanted["poses_rotations"])
+    np.testing.assert_array_equal(store.split, wanted["split"])
+    np.testing.assert_array_equal(store.range, wanted["range"])
+    np.testing.assert_array_equal(store.frequency, wanted["frequency"])
+    assert store.attributes == wanted["attributes"]
+    for index in range(POSES):
+        values = store.read_pose(index)
+        assert values.dtype == np.float32
+        assert values.flags.writeable
+        np.testing.assert_array_equal(values, spectrogram(index))
+    assert store.missing() == []
+    assert store.check() == []
+    np.testing.assert_array_equal(store.indices("val"), [1, 4, 7])
+    with pytest.raises(InputError, match="train, val, test"):
+        store.indices("validation")
+
+
+def test_zarr_alone_reads_it_and_names_its_dimensions(tmp_path):
+    EnsembleStore.create(tmp_path / "s", **axes()).write_pose(1, spectrogram(1))
+    array = zarr.open_array(tmp_path / "s", path="spectrogram", mode="r")
+    assert array.metadata.dimension_names == ("pose", "ear", "range", "frequency")
+    np.testing.assert_array_equal(array[1], spectrogram(1))
+    assert np.isnan(array[0]).all()  # a missing pose is no silence
+    range_axis = zarr.open_array(tmp_path / "s", path="range", mode="r")
+    assert range_axis.metadata.dimension_names == ("range",)
+
+
+def test_bytes_know_no_order_of_writing(tmp_path):
+    filled(tmp_path / "a").update_attributes(reference=1e-3, noise_floor=0.5)
+    other = filled(tmp_path / "b", order=reversed(range(POSES)))
+    other.update_attributes(noise_floor=0.5)
+    other.update_attributes(reference=np.float64(1e-3))
+    assert tree(tmp_path / "a") == tree(tmp_path / "b")
+    assert "manifest.jsonl" not in tree(tmp_path / "a")
+
+
+def test_every_write_is_committed(tmp_path, monkeypatch):
+    committed = []
+    real = os.replace
+    monkeypatch.setattr(os, "replace", lambda a, b: (committed.append(str(b)), real(a, b)))
+    filled(tmp_path / "s")
+    assert {str(tmp_path / "s" / name) for name in tree(tmp_path / "s")} == set(committed)
+
+
+def test_a_missing_pose_is_named_never_silent(tmp_path):
+    store = filled(tmp_path / "s")
+    chunk(tmp_path / "s", 3).unlink()
+    assert store.missing() == [3]
+    with pytest.raises(InputError, match="pose 3 is missing"):
+        store.read_pose(3)
+    assert [line for line in store.check() if "pose 3 is missing" in line]
+
+
+def test_a_pose_in_the_place_of_another_is_refused(tmp_path):
+    store = filled(tmp_path / "s")
+    chunk(tmp_path / "s", 2).write_bytes(chunk(tmp_path / "s", 3).read_bytes())
+    with pytest.raises(InputError, match=r"pose 2 is damaged \(SHA-256\)"):
+        store.read_pose(2)
+
+
+def test_a_chunk_without_its_record_counts_as_missing(tmp_path):
+    store = EnsembleStore.create(tmp_path / "s", **axes())
+    store.write_pose(0, spectrogram(0))
+    (tmp_path / "s" / "manifest.jsonl").unlink()
+    assert store.missing() == list(range(POSES))
+    with pytest.raises(InputError, match="pose 0 is missing"):
+        EnsembleStore.open(tmp_path / "s").read_pose(0)
+
+
+def test_a_truncated_pose_is_missing_and_written_anew(tmp_path):
+    store = filled(tmp_path / "s")
+    before = tree(tmp_path / "s")
+    chunk(tmp_path / "s", 2).write_bytes(chunk(tmp_path / "s", 2).read_bytes()[:-9])
+    assert store.missing() == [2]
+    store.write_pose(2, spectrogram(2))
+    store.seal()
+    assert tree(tmp_path / "s") == before
+
+
+def test_poses_of_another_process_are_found(tmp_path):
+    reader = EnsembleStore.create(tmp_path / "s", **axes())
+    EnsembleStore.open(tmp_path / "s", mode="r+").write_pose(4, spectrogram(4))
+    np.testing.assert_array_equal(reader.read_pose(4), spectrogram(4))
+    assert 4 not in reader.missing()
+
+
+def test_a_torn_journal_loses_the_torn_pose_only(tmp_path):
+    store = EnsembleStore.create(tmp_path / "s", **axes())
+    for index in range(3):
+        store.write_pose(index, spectrogram(index))
+    journal = tmp_path / "s" / "manifest.jsonl"
+    journal.write_bytes(journal.read_bytes()[:-20])
+    store = EnsembleStore.open(tmp_path / "s", mode="r+")
+    assert store.missing() == list(range(2, POSES))
+    store.write_pose(5, spectrogram(5))
+    assert store.missing() == [2, 3, 4, 6, 7, 8]
+
+
+def test_every_flipped_bit_is_found(tmp_path):
+    """One random bit of every byte in turn, over a sample of every file."""
+    path = tmp_path / "s"
+    store = filled(path)
+    generator = random.Random(0)
+    silent = []
+    for name in sorted(tree(path)):
+        file = path / name
+        whole = file.read_bytes()
+        for offset in generator.sample(range(len(whole)), min(len(whole), 12)):
+            damaged = bytearray(whole)
+            damaged[offset] ^= 1 << generator.randrange(8)
+            file.write_bytes(damaged)
+            if not store.check():
+                silent.append((name, offset, json_differs(whole, bytes(damaged))))
+            file.write_bytes(whole)
+    # What passes must be without meaning: space between JSON's words, or a field nobody reads.
+    assert [entry for entry in silent if entry[2]] == []
+
+
+def json_differs(whole, damaged):
+    try:
+        return significant(json.loads(whole)) != significant(json.loads(damaged))
+    except ValueError:
+        return True
+
+
+def significant(data):
+    if isinstance(data, dict) and data.get("node_type") == "array":
+        # Neither is read by us: other names, other kinds of nothing, another compression level.
+        ignored = ("attributes", "storage_transformers", "codecs")
+        return {key: value for key, value in data.items() if key not in ignored}
+    return data
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_numbers_that_are_none_are_refused(tmp_path, bad):
+    store = EnsembleStore.create(tmp_path / "s", **axes())
+    values = spectrogram(0)
+    values[1, 2, 3] = bad
+    with pytest.raises(NumericalError, match="pose 0"):
+        store.write_pose(0, values)
+    assert 0 in store.missing()
+    with pytest.raises(NumericalError, match="attribute"):
+        store.update_attributes(reference=bad)
+    with pytest.raises(NumericalError, match="range"):
+        EnsembleStore.create(tmp_path / "t", **axes(range=np.full(RANGES, bad)))
+    assert not (tmp_path / "t").exists()
+
+
+def test_wrong_shapes_and_numbers_are_refused(tmp_path):
+    store = EnsembleStore.create(tmp_path / "s", **axes())
+    with pytest.raises(InputError, match="shape"):
+        store.write_pose(0, spectrogram(0)[:, :-1])
+    for index in (-1, POSES):
+        with pytest.raises(InputError, match=f"no pose {index}; there are 0 to {POSES - 1}"):
+            store.write_pose(index, spectrogram(0))
+        with pytest.raises(InputError, match="no pose"):
+            store.read_pose(index)
+    for changes, message in [
+        ({"poses_positions": np.zeros((POSES, 2))}, "position: shape"),
+        ({"poses_rotations": np.zeros((POSES - 1, 3, 3))}, "differ in length"),
+        ({"split": np.full(POSES, 3)}, "split: expected 0"),
+        ({"range": []}, "range: shape"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            EnsembleStore.create(tmp_path / "t", **axes(**changes))
+
+
+def test_reading_refuses_writing(tmp_path):
+    filled(tmp_path / "s")
+    store = EnsembleStore.open(tmp_path / "s")
+    for call in (lambda: store.write_pose(0, spectrogram(0)), store.seal, store.update_attributes):
+        with pytest.raises(InputError, match="opened for reading"):
+            call()
+
+
+def test_create_opens_the_same_and_refuses_another(tmp_path):
+    filled(tmp_path / "s")
+    assert EnsembleStore.create(tmp_path / "s", **axes()).missing() == []
+    with pytest.raises(IncompatibleError, match="other settings"):
+        EnsembleStore.create(tmp_path / "s", **axes(attributes={"echo_hash": "b2"}))
+    moved = axes()["poses_positions"] + 1.0
+    with pytest.raises(IncompatibleError, match="position differs"):
+        EnsembleStore.create(tmp_path / "s", **axes(poses_positions=moved))
+
+
+def test_create_refuses_a_folder_of_something_else(tmp_path):
+    (tmp_path / "s").mkdir()
+    (tmp_path / "s" / "thesis.tex").write_text("")
+    with pytest.raises(InputError, match=r"thesis\.tex"):
+        EnsembleStore.create(tmp_path / "s", **axes())
+    with pytest.raises(InputError, match="is a file"):
+        EnsembleStore.create(tmp_path / "s" / "thesis.tex", **axes())
+
+
+def test_a_half_made_store_is_none_and_is_made_again(tmp_path, monkeypatch):
+    def fail(*_):
+        raise StorageError("the disk is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("sononerf.echoes.store.write_group", fail)
+        with pytest.raises(StorageError):
+            EnsembleStore.create(tmp_path / "a", **axes(range=np.arange(1.0, 4.0)))
+    with pytest.raises(InputError, match="no ensemble store"):
+        EnsembleStore.open(tmp_path / "a")
+    filled(tmp_path / "a")
+    filled(tmp_path / "b")
+    assert tree(tmp_path / "a") == tree(tmp_path / "b")
+
+
+def edited(path, change):
+    data = json.loads(path.read_text())
+    change(data)
+    path.write_text(json.dumps(data))
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "error", "message"),
+    [
+        ("zarr.json", lambda d: d["attributes"].update(schema_version=2), IncompatibleError, "2"),
+        ("zarr.json", lambda d: d["attributes"].pop("format"), InputError, "no ensemble of"),
+        ("zarr.json", lambda d: d["attributes"].update(echo_hash="x"), InputError, "checksum"),
+        ("zarr.json", lambda d: d.pop("node_type"), InputError, "damaged"),
+        ("manifest.json", lambda d: d.update(schema_version=2), IncompatibleError, "2"),
+        ("manifest.json", lambda d: d["poses"].pop("3"), InputError, "damaged"),
+        ("spectrogram/zarr.json", lambda d: d["codecs"].pop(), InputError, "codecs"),
+        ("spectrogram/zarr.json", lambda d: d.update(fill_value=0), InputError, "fill value"),
+        ("position/zarr.json", lambda d: d["shape"].insert(0, 9), InputError, "position"),
+        ("range/zarr.json", lambda d: d.update(shape=[10**12]), InputError, "range"),
+    ],
+)
+def test_damaged_or_foreign_stores_are_refused_in_one_line(tmp_path, name, change, error, message):
+    filled(tmp_path / "s")
+    edited(tmp_path / "s" / name, change)
+    with pytest.raises(error, match=message) as caught:
+        EnsembleStore.open(tmp_path / "s")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["position", "rotation", "split", "range", "frequency"])
+def test_a_lost_axis_is_refused(tmp_path, name):
+    filled(tmp_path / "s")
+    for file in (tmp_path / "s" / name).glob("c.*"):
+        file.unlink()
+    with pytest.raises(InputError, match=name):
+        EnsembleStore.open(tmp_path / "s")
+
+
+def test_nothing_there(tmp_path):
+    with pytest.raises(InputError, match="no ensemble store"):
+        EnsembleStore.open(tmp_path / "none")
+
+
+def test_a_store_travels_to_another_process(tmp_path):
+    store = pickle.loads(pickle.dumps(filled(tmp_path / "s")))
+    np.testing.assert_array_equal(store.read_pose(2), spectrogram(2))
+
+
+KILL_POSES, KILL_SHAPE = 30, (2, 40, 16)
+
+
+def simulate(path):
+    """What a worker does: open, add what is missing, seal."""
+    store = EnsembleStore.create(
+        path,
+        poses_positions=np.zeros((KILL_POSES, 3)),
+        poses_rotations=np.tile(np.eye(3), (KILL_POSES, 1, 1)),
+        split=np.zeros(KILL_POSES),
+        range=np.arange(1.0, 1.0 + KILL_SHAPE[1]),
+        frequency=np.arange(1.0, 1.0 + KILL_SHAPE[2]),
+        attributes={"echo_hash": "k"},
+    )
+    for index in store.missing():
+        store.write_pose(index, spectrogram(index, KILL_SHAPE))
+    store.seal()
+
+
+# The child uses nothing that a thread of its parent may hold.
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
+def test_kills_at_random_moments_lose_nothing_and_change_nothing(tmp_path):
+    simulate(tmp_path / "whole")
+    started = time.monotonic()
+    simulate(tmp_path / "timed")
+    usual = time.monotonic() - started
+    generator = random.Random(0)
+    kills = killed_midway = 0
+    path = tmp_path / "killed-0"
+    while kills < 30:
+        pid = os.fork()
+        if pid == 0:
+            try:
+                simulate(path)
+            finally:
+                os._exit(0)
+        time.sleep(generator.uniform(0, usual / 2))
+        os.kill(pid, signal.SIGKILL)
+        os.waitpid(pid, 0)
+        kills += 1
+        if not (path / "zarr.json").exists():
+            continue
+        store = EnsembleStore.open(path)
+        missing = store.missing()
+        killed_midway += 0 < len(missing) < KILL_POSES
+        for index in set(range(KILL_POSES)) - set(missing):
+            np.testing.assert_array_equal(
+                store.read_pose(index), spectrogram(index, KILL_SHAPE), strict=True
+            )
+        if not missing:
+            simulate(path)
+            assert tree(path) == tree(tmp_path / "whole")
+            path = tmp_path / f"killed-{kills}"
+    simulate(path)
+    assert tree(path) == tree(tmp_path / "whole")
+    assert killed_midway >= 5  # else the kills came where nothing was to be lost

@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: MIT
+import numpy as np
+import pytest
+import trimesh
+
+from sononerf.errors import NumericalError
+from sononerf.evaluation.baseline import (
+    backprojection,
+    best_level_surface,
+    coherent_backprojection,
+)
+from sononerf.head.call import call_waveform, emit
+from sononerf.settings.schema import CallSettings
+from sononerf.surface.start.volume import grid_over, volume_from_function
+
+EMITTER = np.array([0.0, 0.0, -0.01])
+EARS = np.array([[-0.01, 0.01, 0.005], [-0.01, -0.01, 0.005]])
+RANGES = np.linspace(0.2, 0.6, 200)
+TARGET = np.array([0.01, -0.02, 0.015])
+BOX = [-0.05] * 3, [0.05] * 3, 0.005
+
+
+def poses(count=40, seed=0):
+    generator = np.random.default_rng(seed)
+    positions = generator.normal(size=(count, 3))
+    positions *= 0.4 / np.linalg.norm(positions, axis=1, keepdims=True)
+    rotations = np.linalg.qr(generator.normal(size=(count, 3, 3)))[0]
+    return positions, rotations
+
+
+def echoes(positions, rotations):
+    """Half-way ranges of the echo of one point, by a slow loop, as narrow pulses."""
+    for position, rotation in zip(positions, rotations, strict=True):
+        out = np.linalg.norm(TARGET - (position + rotation @ EMITTER))
+        spectrogram = np.zeros((2, len(RANGES), 3))
+        for ear in range(2):
+            back = np.linalg.norm(TARGET - (position + rotation @ EARS[ear]))
+            pulse = np.exp(-(((RANGES - (out + back) / 2) / 0.003) ** 2))
+            spectrogram[ear] = pulse[:, None] * [1.0, 2.0, 0.5]
+        yield spectrogram
+
+
+def run(spectrograms, positions, rotations, ranges=RANGES):
+    return backprojection(
+        spectrograms, positions, rotations, ranges, *BOX, emitter_offset=EMITTER, ear_offsets=EARS
+    )
+
+
+def test_a_point_is_found_where_it_is_with_its_energy():
+    positions, rotations = poses()
+    volume = run(echoes(positions, rotations), positions, rotations)
+    peak = volume.points()[volume.values.argmax()]
+    np.testing.assert_allclose(peak, TARGET, atol=BOX[2] / 2 + 1e-9)
+    # Both ears hear 1 + 4 + 1/4 there; linear interpolation on 2 mm flattens the pulse a little.
+    assert volume.values.max() == pytest.approx(2 * 5.25, rel=0.15)
+
+
+def test_one_ear_and_silence():
+    positions, rotations = poses(3)
+    volume = backprojection(
+        np.zeros((3, 1, 200, 4)),
+        positions,
+        rotations,
+        RANGES,
+        *BOX,
+        emitter_offset=EMITTER,
+        ear_offsets=EARS[:1],
+    )
+    assert (volume.values == 0).all()
+
+
+def test_what_lies_beyond_the_recording_adds_nothing():
+    positions, rotations = poses(3)
+    beyond = np.linspace(2.0, 3.0, 50)
+    volume = run(np.ones((3, 2, 50, 1)), positions, rotations, beyond)
+    assert (volume.values == 0).all()
+
+
+def test_wrong_input_is_refused():
+    positions, rotations = poses(3)
+    with pytest.raises(ValueError, match="evenly spaced"):
+        run(np.zeros((3, 2, 3, 1)), positions, rotations, [0.1, 0.2, 0.4])
+    with pytest.raises(ValueError, match="one for each of 3 poses"):
+        run(np.zeros((2, 2, 200, 1)), positions, rotations)
+    with pytest.raises(ValueError, match="spectrogram 0"):
+        run(np.zeros((3, 2, 199, 1)), positions, rotations)
+    with pytest.raises(ValueError, match=r"\(P, 3\)"):
+        run(np.zeros((3, 2, 200, 1)), positions[:2], rotations)
+    with pytest.raises(NumericalError, match="pose 0"):
+        run(np.full((3, 2, 200, 1), np.nan), positions, rotations)
+
+
+def test_the_best_level_is_that_of_the_true_surface():
+    truth = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
+    volume = volume_from_function(lambda x: np.exp(-np.linalg.norm(x, axis=1) / 0.02), *BOX)
+    mesh, level = best_level_surface(volume, truth)
+    # Any level within 5 mm of the surface scores full marks.
+    assert 0.025 < np.linalg.norm(mesh.vertices, axis=1).mean() < 0.035
+    assert np.exp(-0.035 / 0.02) < level < np.exp(-0.025 / 0.02)
+
+
+def test_a_constant_volume_has_no_best_level():
+    with pytest.raises(NumericalError, match="no level"):
+        best_level_surface(grid_over(*BOX), trimesh.creation.box())
+
+
+SWEEP = call_waveform(CallSettings(kind="linear", frequency_start=90e3, duration=1e-3), 1e6)
+PHASED = {
+    "call": SWEEP,
+    "sampling_rate": 1e6,
+    "speed_of_sound": 343.0,
+    "emitter_offset": EMITTER,
+    "ear_offsets": EARS,
+}
+
+
+def recordings(positions, rotations, gain=0.25):
+    """Sweep's echo of one point, delayed between samples too, at both ears."""
+    frequency = np.fft.rfftfreq(8192, 1e-6)
+    for position, rotation in zip(positions, rotations, strict=True):
+        out = np.linalg.norm(TARGET - (position + rotation @ EMITTER))
+        back = np.linalg.norm(TARGET - (position + EARS @ rotation.T), axis=1)
+        turn = np.exp(-2j * np.pi * frequency * (out + back)[:, None] / 343.0)
+        yield emit(gain * np.fft.irfft(turn, 8192), SWEEP)[:, :6000]
+
+
+def test_with_phase_a_point_is_found_to_a_fraction_of_a_wavelength():
+    positions, rotations = poses()
+    box = TARGET - 0.011, TARGET + 0.011, 0.001
+    heard = recordings(positions, rotations)
+    volume = coherent_backprojection(heard, positions, rotations, *box, **PHASED)
+    peak = volume.points()[volume.values.argmax()]
+    np.testing.assert_allclose(peak, TARGET, atol=1e-9)
+    assert volume.values.max() == pytest.approx(0.25, rel=0.03)
+    away = np.linalg.norm(volume.points() - TARGET, axis=1) > 0.004  # half of the mean wavelength
+    assert volume.values.ravel()[away].max() < 0.5 * 0.25
+
+
+def test_the_coherent_sum_refuses_wrong_input():
+    positions, rotations = poses(2)
+    heard = np.zeros((2, 2, 300))
+
+    def told(error, waveforms, **changes):
+        with pytest.raises(error) as caught:
+            coherent_backprojection(waveforms, positions, rotations, *BOX, **{**PHASED, **changes})
+        return str(caught.value)
+
+    assert "one for each of 2 poses" in told(ValueError, heard[:1])
+    assert "recording 0: shape (1, 300)" in told(ValueError, heard[:, :1])
+    assert "pose 1 is not finite" in told(NumericalError, [heard[0], heard[1] + np.nan])
+    assert "not silent" in told(ValueError, heard, call=np.zeros(4))

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: MIT
+import itertools
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from sononerf.echoes.store import EnsembleStore
+from sononerf.field.datamodule import EchoDataModule, StepSampler
+
+POSES, RANGES, FREQUENCIES = 12, 5, 4
+SPLIT = np.array([0, 0, 1, 0, 2, 0, 0, 2, 0, 1, 0, 0])
+
+
+def make(path, split=SPLIT):
+    store = EnsembleStore.create(
+        path,
+        poses_positions=np.random.default_rng(0).normal(size=(POSES, 3)),
+        poses_rotations=np.tile(np.eye(3), (POSES, 1, 1)),
+        split=split,
+        range=0.2 + 0.01 * np.arange(RANGES),
+        frequency=1e4 * (1 + np.arange(FREQUENCIES)),
+        attributes={"echo_hash": "a"},
+    )
+    for pose in range(POSES):
+        values = np.random.default_rng(pose).random((2, RANGES, FREQUENCIES))
+        store.write_pose(pose, values)
+    store.seal()
+    return EnsembleStore.open(path)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return make(tmp_path_factory.mktemp("data") / "store")
+
+
+def module(store, **options):
+    given = {"whole_poses": True, "batch": 3, "batch_frequencies": 2, "seed": 4, **options}
+    return EchoDataModule(store, **given)
+
+
+def first(loader, count):
+    return list(itertools.islice(iter(loader), count))
+
+
+def assert_same(one, two):
+    assert len(one) == len(two)
+    for a, b in zip(one, two, strict=True):
+        for x, y in zip(a, b, strict=True):
+            assert torch.equal(x, y)
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_workers_change_nothing(store, whole):
+    found = [
+        first(module(store, whole_poses=whole, workers=workers).train_dataloader(), 7)
+        for workers in (0, 2)
+    ]
+    assert_same(*found)
+    stream = module(store, whole_poses=whole).stream()
+    assert_same(found[0], [stream[step] for step in range(7)])
+
+
+def test_an_interrupted_fit_goes_on_where_it_stopped(store):
+    whole = first(module(store).train_dataloader(), 9)
+    resumed = module(store)
+    resumed.sampler.start = 5
+    assert_same(first(resumed.train_dataloader(), 4), whole[5:])
+
+
+def test_the_sampler_counts_without_end():
+    sampler = StepSampler()
+    assert list(itertools.islice(sampler, 3)) == [0, 1, 2]
+    sampler.start = 1000
+    assert list(itertools.islice(sampler, 2)) == [1000, 1001]
+
+
+def test_splits_are_by_pose_and_never_mixed(store):
+    data = module(store)
+    trained = {int(p) for batch in first(data.train_dataloader(), 30) for p in batch.pose}
+    assert trained == set(np.flatnonzero(SPLIT == 0))
+    for loader, number in (
+        (data.val_dataloader(), 1), (data.test_dataloader(), 2), (data.predict_dataloader(), 2)
+    ):  # fmt: skip
+        found = list(loader)
+        poses = [int(batch.pose) for batch in found]
+        assert poses == np.flatnonzero(SPLIT == number).tolist()
+        for batch, pose in zip(found, poses, strict=True):
+            np.testing.assert_array_equal(batch.spectrum[0], store.read_pose(pose))
+            np.testing.assert_allclose(batch.position[0], store.positions[pose], rtol=1e-6)
+            assert batch.rows.tolist() == [list(range(RANGES))]
+            assert batch.bins.tolist() == list(range(FREQUENCIES))
+
+
+def test_without_validation_poses_there_is_no_loader(tmp_path):
+    data = module(make(tmp_path / "store", np.zeros(POSES, int)))
+    assert data.val_dataloader() == []
+
+
+def test_each_device_gets_its_share(store):
+    alone = module(store, batch=6).stream()
+    poses = []
+    for rank in (0, 1):
+        data = module(store, batch=6)
+        data.trainer = SimpleNamespace(global_rank=rank, world_size=2)
+        poses.append(data.stream()[3].pose)
+    assert torch.equal(torch.stack(poses, 1).reshape(-1), alone[3].pose)
+
+
+def test_a_batch_goes_to_the_device_and_stays_as_it_is_on_a_cpu(store):
+    found = module(store)
+    given = found.stream()[0]
+    assert found.transfer_batch_to_device(given, torch.device("cpu"), 0) is given
+    moved = found.transfer_batch_to_device(given, torch.device("meta"), 0)
+    assert {part.device.type for part in moved} == {"meta"}

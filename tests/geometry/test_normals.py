@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: MIT
+import numpy as np
+import pytest
+import trimesh
+
+from sononerf.geometry.normals import (
+    bodies,
+    corner_normals,
+    enclosing_balls,
+    total_curvature,
+    weight_gradients,
+)
+
+
+@pytest.mark.parametrize("subdivisions", [1, 3])
+def test_normals_of_a_sphere_are_exact(subdivisions):
+    mesh = trimesh.creation.icosphere(subdivisions=subdivisions, radius=0.02)
+    mesh.apply_translation([1.0, 2.0, 3.0])
+    expected = (mesh.triangles - [1.0, 2.0, 3.0]) / 0.02
+    # Subdivision 1 has 18 degrees between triangles, below the crease.
+    np.testing.assert_allclose(corner_normals(mesh), expected, atol=1e-6)
+
+
+def test_a_box_keeps_its_edges():
+    mesh = trimesh.creation.box((1.0, 2.0, 3.0))
+    expected = np.repeat(mesh.face_normals[:, None], 3, axis=1)
+    np.testing.assert_allclose(corner_normals(mesh), expected, atol=1e-12)
+
+
+def test_the_crease_decides():
+    mesh = trimesh.creation.box((1.0, 1.0, 1.0))
+    rounded = corner_normals(mesh, crease=np.radians(100))
+    np.testing.assert_allclose(rounded, np.sign(mesh.triangles) / np.sqrt(3), atol=1e-12)
+
+
+def test_a_triangle_without_area_spoils_nothing():
+    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0, 0]]
+    mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [0, 3, 1]], process=False)
+    normals = corner_normals(mesh)
+    assert np.isfinite(normals).all()
+    np.testing.assert_allclose(normals[0], [[0, 0, 1]] * 3, atol=1e-12)
+
+
+def curvature(mesh):
+    return total_curvature(mesh, corner_normals(mesh))
+
+
+@pytest.mark.parametrize("radius", [0.002, 0.015, 15.0])  # the same ball in m, or taken for mm
+def test_curvature_of_a_sphere_is_root_two_over_its_radius(radius):
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=radius)
+    mesh.apply_translation([3.0 * radius, 0.0, 0.0])
+    # A triangle is flatter than the sphere between its corners: chords, up to 0.2 %.
+    np.testing.assert_allclose(curvature(mesh), np.sqrt(2) / radius, rtol=2e-3)
+
+
+def test_curvature_of_a_cylinder_is_one_over_its_radius_and_none_at_its_ends():
+    mesh = trimesh.creation.cylinder(radius=0.02, height=0.1, sections=90)
+    found = curvature(mesh)
+    side = np.abs(mesh.face_normals[:, 2]) < 0.5
+    # 90 flat strips of 4 degrees: the chord is shorter than the arc by 2e-4.
+    np.testing.assert_allclose(found[side], 1 / 0.02, rtol=1e-3)
+    np.testing.assert_allclose(found[~side], 0.0, atol=1e-6)
+
+
+def test_edges_of_a_box_are_no_curvature():
+    np.testing.assert_allclose(curvature(trimesh.creation.box((0.1, 0.2, 0.3))), 0.0, atol=1e-9)
+
+
+def test_curvature_knows_no_inside():
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
+    turned = trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1])
+    np.testing.assert_allclose(curvature(turned), curvature(mesh), rtol=1e-9)
+
+
+def test_weight_gradients_give_the_barycentric_weights():
+    corners = np.random.default_rng(0).normal(size=(50, 3, 3))
+    second, third = weight_gradients(corners)
+    for corner, weights in enumerate([(0, 0), (1, 0), (0, 1)]):
+        away = corners[:, corner] - corners[:, 0]
+        np.testing.assert_allclose(np.einsum("td,td->t", second, away), weights[0], atol=1e-9)
+        np.testing.assert_allclose(np.einsum("td,td->t", third, away), weights[1], atol=1e-9)
+    # In the triangle's plane: going off it changes nothing.
+    sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    for gradient in (second, third):
+        np.testing.assert_allclose(np.einsum("td,td->t", gradient, sides), 0.0, atol=1e-9)
+
+
+def test_a_triangle_without_area_has_no_gradients_and_no_curvature():
+    vertices = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.5, 0, 0]]
+    mesh = trimesh.Trimesh(vertices, [[0, 1, 2], [0, 3, 1]], process=False)
+    for gradient in weight_gradients(mesh.triangles.view(np.ndarray)):
+        np.testing.assert_array_equal(gradient[1], 0.0)
+    assert np.isfinite(curvature(mesh)).all()
+    assert curvature(mesh)[1] == 0.0
+
+
+def spheres_in_a_row(count):
+    parts = [trimesh.creation.icosphere(subdivisions=2, radius=0.5) for _ in range(count)]
+    for number, part in enumerate(parts):
+        part.apply_translation([float(number), 0.0, 0.0])
+    return trimesh.util.concatenate(parts)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 32])
+def test_balls_hold_every_corner(count):
+    for mesh in (spheres_in_a_row(3), trimesh.creation.box((0.01, 1.0, 2.0)).subdivide()):
+        centres, radii = enclosing_balls(mesh.triangles, bodies(mesh), count)
+        assert len(radii) <= count
+        away = np.linalg.norm(np.asarray(mesh.vertices)[:, None] - centres, axis=2)
+        assert (away <= radii * (1 + 1e-12)).any(axis=1).all()
+
+
+def test_a_ball_is_no_larger_than_its_body():
+    mesh = spheres_in_a_row(3)
+    assert len(np.unique(bodies(mesh))) == 3
+    centres, radii = enclosing_balls(mesh.triangles, bodies(mesh), 32)
+    np.testing.assert_allclose(radii, 0.5, rtol=1e-6)
+    np.testing.assert_allclose(np.sort(centres[:, 0]), [0.0, 1.0, 2.0], atol=1e-6)
+
+
+def test_a_plate_is_held_by_many_small_balls():
+    mesh = trimesh.creation.box((0.01, 1.0, 1.0)).subdivide().subdivide().subdivide()
+    _, radii = enclosing_balls(mesh.triangles, bodies(mesh), 32)
+    assert len(radii) > 8
+    assert radii.max() < 0.4

@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: MIT
+import logging
+
+import numpy as np
+import pytest
+import scipy.signal
+
+from sononerf.head.call import sweep_delay
+from sononerf.head.reception import (
+    Reception,
+    best_window,
+    effective_window,
+    row_duration,
+    warn_of_call,
+)
+from sononerf.head.spectrogram import echo_samples, frequency_axis, range_axis, spectrogram
+from sononerf.settings.schema import CallSettings, NoiseSettings, SpectrogramSettings
+
+SPEED = 343.0
+ANALYSIS = SpectrogramSettings(frequency_min=40e3)
+HOP = 4e-6  # s
+SWEEPS = [(kind, length) for kind in ("linear", "hyperbolic") for length in (0.2e-3, 1e-3, 3e-3)]
+
+
+def analysis(**changes):
+    return SpectrogramSettings.model_validate({**ANALYSIS.model_dump(), **changes})
+
+
+def reception(call=None, noise=None, **changes):
+    return Reception(
+        call or CallSettings(),
+        analysis(**changes),
+        noise or NoiseSettings(),
+        speed_of_sound=SPEED,
+    )
+
+
+def impulse(found, at=2500, height=1.0):
+    echo = np.zeros((2, found.samples))
+    echo[:, at] = height
+    return echo
+
+
+def point_echo(call, delay, samples):
+    """Sweep from `delay` on, between two samples too; SciPy's, under a cosine-tapered envelope."""
+    time = np.arange(samples) / 1e6 - delay
+    flank = call.taper * call.duration / 2
+    inside = np.clip(np.minimum(time, call.duration - time) / flank, 0.0, 1.0)
+    ends = call.frequency_start, call.duration, call.frequency_end
+    swept = scipy.signal.chirp(np.clip(time, 0.0, call.duration), *ends, method=call.kind)
+    return swept * np.sin(np.pi / 2 * inside) ** 2
+
+
+def peak_and_width(time, row):
+    """Where a row is greatest, and for how long it is above half of that.
+
+    A row's top is so flat that the sweep's mirror image at negative frequencies, 40 dB below,
+    moves the very greatest value by microseconds; the vertex of a parabola through the top's
+    decibels is not moved.
+    """
+    level = 20 * np.log10(row / row.max())
+    top = level > -0.3
+    bend, slope, _ = np.polyfit(time[top] - time[row.argmax()], level[top], 2)
+    above = np.flatnonzero(row >= row.max() / 2)
+    first, last = above[0], above[-1]
+    half = row.max() / 2
+    start = np.interp(half, row[first - 1 : first + 1], time[first - 1 : first + 1])
+    end = np.interp(-half, -row[last : last + 2], time[last : last + 2])
+    return time[row.argmax()] - slope / bend / 2, end - start
+
+
+def measured(call, window, delay=3000.37e-6):
+    """Peak's offset and duration (s) of a point echo in the rows that the sweep fills, and theirs.
+
+    Those are the frequencies whose main lobe lies within what is emitted at full height.
+    """
+    found = reception(call, window=window, hop=1, range_min=0.25, range_max=0.9)
+    echo = point_echo(call, delay, found.samples)[None]
+    magnitude = spectrogram(echo, found.analysis, SPEED, found.delay)[0]
+    time = 2 * range_axis(found.analysis, SPEED) / SPEED
+    frequency = frequency_axis(found.analysis)
+    lobe = 2 * found.analysis.sampling_rate / window
+    swept = np.linspace(40e3, 150e3, 5000)
+    from_end = call.duration / 2 - abs(sweep_delay(call, swept) - call.duration / 2)
+    swept = swept[from_end > call.taper * call.duration / 2]
+    filled = (frequency - lobe > swept.min()) & (frequency + lobe < swept.max())
+    assert filled.sum() > 10
+    peak, duration = np.transpose([peak_and_width(time, row) for row in magnitude.T[filled]])
+    return peak - delay, duration, frequency[filled]
+
+
+@pytest.mark.parametrize("best", [False, True])
+@pytest.mark.parametrize("ends", [(150e3, 40e3), (40e3, 150e3)])
+@pytest.mark.parametrize(("kind", "duration"), SWEEPS)
+def test_a_point_echo_is_dechirped(kind, duration, ends, best):
+    """It peaks at its own delay in every row, and lasts as briefly as window and sweep allow."""
+    call = CallSettings(
+        kind=kind, duration=duration, frequency_start=ends[0], frequency_end=ends[1]
+    )
+    window = best_window(call, ANALYSIS) if best else 64
+    offset, lasts, frequency = measured(call, window)
+    assert abs(offset).max() < HOP
+    expected = row_duration(call, analysis(window=window), frequency)
+    assert (lasts / expected).max() < 1.1
+    assert (lasts / expected).min() > 0.9
+
+
+def test_a_windows_own_duration_is_counted_as_a_rows_is():
+    _, lasts = peak_and_width(np.arange(64) * 1e-6, np.hamming(64))
+    assert row_duration(CallSettings(), ANALYSIS, [50e3])[0] == pytest.approx(lasts, rel=0.03)
+
+
+@pytest.mark.parametrize(("kind", "duration"), SWEEPS)
+def test_the_best_window_keeps_a_point_echo_shortest(kind, duration):
+    call = CallSettings(kind=kind, duration=duration)
+    best = best_window(call, ANALYSIS)
+    frequency = np.maximum(frequency_axis(ANALYSIS), 40e3)  # the first bin lies a little below
+
+    def lasts(window):
+        rows = row_duration(call, analysis(window=window, fft=1024), frequency)
+        return np.sqrt(np.mean(rows**2))
+
+    assert min(range(16, 600), key=lasts) == pytest.approx(best, abs=1)
+
+
+def test_the_best_window_is_best_when_measured():
+    call = CallSettings(kind="linear", duration=1e-3)
+    best = best_window(call, ANALYSIS)
+    at_best, shorter, longer = (
+        measured(call, window)[1].mean() for window in (best, best // 2, best * 2)
+    )
+    assert at_best < 0.9 * min(shorter, longer)
+
+
+def test_rows_that_the_call_does_not_cover_have_no_say_in_the_best_window():
+    call = CallSettings(kind="hyperbolic", duration=3e-3)
+    assert best_window(call, SpectrogramSettings()) == pytest.approx(
+        best_window(call, ANALYSIS), rel=0.05
+    )
+
+
+def test_a_call_between_two_rows_has_a_best_window_too():
+    ends = {"frequency_start": 61e3, "frequency_end": 60.8e3}  # rows at 60.5 and 62.5 kHz
+    assert best_window(CallSettings(kind="linear", duration=1e-3, **ends), ANALYSIS) > 1000
+
+
+def test_an_impulse_without_noise_is_analysed_to_the_bit_as_it_came():
+    found = reception()
+    echo = np.random.default_rng(0).normal(size=(2, found.samples))
+    waveform, magnitude = found.receive(echo, seed=1)
+    np.testing.assert_array_equal(waveform, echo)
+    np.testing.assert_array_equal(magnitude, spectrogram(echo, found.analysis, SPEED))
+
+
+def test_a_sweep_is_emitted_and_dechirped():
+    call = CallSettings(kind="hyperbolic", duration=1e-3)
+    found = reception(call, window=237)
+    waveform, magnitude = found.receive(impulse(found), seed=1)
+    np.testing.assert_allclose(waveform[0], point_echo(call, 2500e-6, found.samples), atol=1e-9)
+    assert found.samples == echo_samples(found.analysis, SPEED, found.delay.max())
+    peaks = range_axis(found.analysis, SPEED)[magnitude[1].argmax(axis=0)]
+    # Within two hops: the greatest value of a flat top is not its middle. The first row lies
+    # on the sweep's end.
+    assert abs(peaks - 2500e-6 * SPEED / 2)[4:].max() < 2 * HOP * SPEED / 2
+
+
+def test_responses_that_end_with_an_impulses_last_frame_suffice():
+    found = reception(CallSettings(kind="linear", duration=1.0005e-3), range_max=0.5)
+    short = np.zeros((2, echo_samples(found.analysis, SPEED)))
+    assert found.receive(short, seed=0)[0].shape == (2, found.samples)
+    with pytest.raises(ValueError, match="the last frame needs"):
+        found.receive(short[:, :-50], seed=0)
+
+
+def test_noise_is_relative_to_the_target():
+    # An impulse's share of energy in the band equals white noise's, so over one window of 64
+    # the noise is that much below the target's echo of height 0.01 / 0.5**2.
+    noise = NoiseSettings(snr_db=(20.0, 0.0), target_strength_db=-40.0, target_distance=0.5)
+    found = reception(noise=noise, frequency_min=10e3)
+    waveform, _ = found.receive(np.zeros((2, found.samples)), seed=5)
+    height = 0.01 / 0.5**2 / np.sqrt(64)
+    np.testing.assert_allclose(waveform.std(axis=1), [height / 10, height], rtol=0.04)
+
+
+def test_noise_is_as_loud_for_a_sweep_as_its_echo_is():
+    noise = NoiseSettings(snr_db=0.0, target_strength_db=-40.0)
+    call = CallSettings(kind="linear", frequency_start=95e3, taper=1.0)
+    found = reception(call, noise)
+    height = 0.01 / 0.4**2  # of the sweep; under a Hann window its mean power is 3/16 of its square
+    waveform, _ = found.receive(np.zeros((2, found.samples)), seed=5)
+    within_band = waveform.var(axis=1) * (100e3 - 40e3) / 500e3
+    np.testing.assert_allclose(within_band, height**2 * 3 / 16, rtol=0.06)
+
+
+def test_noise_relative_to_the_pose_follows_its_echo():
+    noise = NoiseSettings(snr_db=10.0, relative_to="pose")
+    found = reception(noise=noise)
+    echo = impulse(found)
+    echo[1] *= 0.0
+    one, silent = found.receive(echo, seed=5)[0] - echo
+    ten = found.receive(10 * echo, seed=5)[0][0] - 10 * echo[0]
+    np.testing.assert_allclose(ten, 10 * one, rtol=1e-6)
+    np.testing.assert_array_equal(silent, 0.0)
+    assert one.std() == pytest.approx(np.sqrt(0.1 / 64), rel=0.05)
+    assert abs(one[2500]) < 0.3  # the echo, of height 1, is there too
+
+
+def test_noise_depends_on_the_seed_alone():
+    found = reception(noise=NoiseSettings(snr_db=0.0))
+    one = found.receive(impulse(found), seed=1)[1]
+    found.receive(impulse(found), seed=2)
+    np.testing.assert_array_equal(found.receive(impulse(found), seed=1)[1], one)
+    assert abs(found.receive(impulse(found), seed=3)[1] - one).max() > 0
+
+
+def test_the_effective_window_of_an_impulse_is_the_window():
+    found = effective_window(CallSettings(), ANALYSIS)
+    np.testing.assert_array_equal(found, np.tile(np.hamming(64), (32, 1)))
+
+
+@pytest.mark.parametrize(("kind", "window"), [("linear", 177), ("hyperbolic", 237), ("linear", 64)])
+def test_the_effective_window_is_a_point_echos_row(kind, window):
+    call = CallSettings(kind=kind, duration=1e-3)
+    found = effective_window(call, analysis(window=window))
+    count = found.shape[1]
+    np.testing.assert_allclose(found, found[:, ::-1])
+    np.testing.assert_allclose(found[:, [(count - 1) // 2, count // 2]], 1.0)
+    heard = reception(call, window=window, hop=1)
+    rows = heard.receive(impulse(heard), seed=0)[1][0]
+    time = 2 * range_axis(heard.analysis, SPEED) / SPEED - 2500e-6
+    offset = (np.arange(count) - (count - 1) / 2) / 1e6
+    for row in (16, 20):  # 70 and 78 kHz
+        there = np.interp(offset, time, rows[:, row])
+        there = np.sqrt((there**2 + there[::-1] ** 2) / 2)
+        np.testing.assert_allclose(found[row], there / there[count // 2], atol=2e-3)
+        assert found[row, 0] < 0.1
+
+
+def test_a_call_that_suits_its_analysis_is_not_remarked_upon(caplog):
+    warn_of_call(CallSettings(), SpectrogramSettings())
+    warn_of_call(CallSettings(kind="linear"), ANALYSIS)
+    assert caplog.records == []
+
+
+def test_a_slow_sweep_wants_a_longer_window(caplog):
+    call = CallSettings(kind="linear", duration=3e-3)
+    warn_of_call(call, ANALYSIS)
+    (record,) = caplog.records
+    assert (record.name, record.levelno) == ("sononerf", logging.WARNING)
+    message = record.getMessage()
+    assert "lasts 772 µs in a window of 64 samples and 228 µs" in message
+    assert message.endswith("set spectrogram.window=306")
+    caplog.clear()
+    warn_of_call(call.model_copy(update={"duration": 20e-3}), ANALYSIS)
+    assert caplog.records[0].getMessage().endswith("window=789 and spectrogram.fft=1024")
+
+
+def test_a_window_that_is_far_too_long_is_told_too(caplog):
+    warn_of_call(CallSettings(kind="linear", duration=0.2e-3), analysis(window=200))
+    assert caplog.records[0].getMessage().endswith("set spectrogram.window=79")
+
+
+def test_bands_that_the_call_does_not_cover_are_named(caplog):
+    call = CallSettings(
+        kind="linear", frequency_start=45e3, frequency_end=30e3, harmonics=(1.0, 1.0)
+    )
+    warn_of_call(call, SpectrogramSettings(window=160))
+    (record,) = caplog.records
+    message = record.getMessage()
+    assert message.startswith("the call does not cover 10.0 to 29.3 kHz, 46.9 to 58.6 kHz, 91.8")
+
+
+@pytest.mark.parametrize("ends", [(90e3, 25e3), (25e3, 90e3)])
+def test_the_effective_window_has_the_other_harmonics_echo(ends):
+    """Where two harmonics pass a frequency, a point is heard at two ranges of its row."""
+    call = CallSettings(
+        kind="linear",
+        duration=1e-3,
+        frequency_start=ends[0],
+        frequency_end=ends[1],
+        harmonics=(1.0, 0.5),
+    )
+    found = effective_window(call, analysis(window=160))
+    heard = reception(call, window=160, hop=1, range_max=0.9)
+    rows = heard.receive(impulse(heard), seed=0)[1][0]
+    time = 2 * range_axis(heard.analysis, SPEED) / SPEED - 2500e-6
+    offset = (np.arange(found.shape[1]) - (found.shape[1] - 1) / 2) / 1e6
+    for row in (8, 16):  # 55 and 70 kHz
+        there = np.interp(offset, time, rows[:, row], left=0.0, right=0.0)
+        expected = there / there[len(there) // 2]
+        np.testing.assert_allclose(found[row], expected, rtol=0.01, atol=5e-3)
+        # Half as loud and twice as fast: by a root of two less where a window is longer than both.
+        frequency = frequency_axis(heard.analysis)[row]
+        apart = frequency / 2 / abs(ends[1] - ends[0]) * 1e-3
+        ghost = found[row][np.abs(offset - apart) < 50e-6].max()
+        assert 0.25 < (ghost if ends[1] < ends[0] else 1.0 / ghost) < 0.5
+        assert found[row][np.abs(offset + apart) < 50e-6].max() < 0.2  # behind, not in front

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+import numpy as np
+import pytest
+import scipy.signal
+
+from sononerf.head.decibels import compress
+from sononerf.head.spectrogram import echo_samples, frequency_axis, range_axis, spectrogram
+from sononerf.settings.schema import SpectrogramSettings
+
+DEFAULT = SpectrogramSettings()
+
+
+def test_default_axes_are_the_papers():
+    frequency, ranges = frequency_axis(DEFAULT), range_axis(DEFAULT, 343.0)
+    assert len(frequency) == 47
+    np.testing.assert_allclose(frequency[[0, -1]], [9765.625, 99609.375])
+    assert len(ranges) == 875
+    np.testing.assert_allclose(np.diff(ranges), 4e-6 * 343.0 / 2)
+    assert 0.15 <= ranges[0] < 0.15 + 0.000686
+    assert 0.75 - 0.000686 < ranges[-1] <= 0.75
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        DEFAULT,
+        SpectrogramSettings(window=100, hop=7, fft=128, range_min=0.001, range_max=0.3),
+        SpectrogramSettings(sampling_rate=450e3, frequency_min=20e3, frequency_max=85e3),
+    ],
+)
+def test_equals_scipys(settings):
+    echo = np.random.default_rng(0).normal(size=(2, echo_samples(settings, 343.0) + 50))
+    frequency, time, expected = scipy.signal.spectrogram(
+        echo,
+        settings.sampling_rate,
+        window=scipy.signal.windows.hamming(settings.window, sym=True),
+        noverlap=settings.window - settings.hop,
+        nfft=settings.fft,
+        detrend=False,
+        mode="magnitude",
+        scaling="spectrum",
+    )
+    window_sum = scipy.signal.windows.hamming(settings.window, sym=True).sum()
+    # SciPy's frame times are window / 2, ours the centre between the samples.
+    ranges = (time - 0.5 / settings.sampling_rate) * 343.0 / 2
+    kept = (ranges >= settings.range_min) & (ranges <= settings.range_max)
+    np.testing.assert_allclose(ranges[kept], range_axis(settings, 343.0), rtol=1e-12)
+    bins = [np.abs(frequency - f).argmin() for f in frequency_axis(settings)]
+    expected = np.moveaxis(expected[:, bins], 1, 2)[:, kept] * window_sum
+    np.testing.assert_allclose(spectrogram(echo, settings, 343.0), expected, atol=1e-12)
+
+
+def test_a_sample_peaks_at_its_range_in_all_frequencies_alike():
+    echo = np.zeros((1, echo_samples(DEFAULT, 343.0)))
+    echo[0, 2000] = 3.0
+    found = spectrogram(echo, DEFAULT, 343.0)[0]
+    ranges = range_axis(DEFAULT, 343.0)
+    # The range of sample 2000 is 0.343 m; frames stand half a hop off it at most.
+    assert abs(ranges[found[:, 20].argmax()] - 0.343) <= 0.000343
+    np.testing.assert_allclose(found.max(axis=0), 3.0, rtol=0.01)
+    assert found[np.abs(ranges - 0.343) > 0.0056].max() == 0.0
+
+
+def test_speed_of_sound_scales_the_ranges():
+    np.testing.assert_allclose(np.diff(range_axis(DEFAULT, 1500.0)), 4e-6 * 750.0)
+
+
+def test_short_echo_is_refused():
+    needed = echo_samples(DEFAULT, 343.0)
+    assert spectrogram(np.zeros((2, needed)), DEFAULT, 343.0).shape == (2, 875, 47)
+    with pytest.raises(ValueError, match=f"needs {needed}"):
+        spectrogram(np.zeros((2, needed - 1)), DEFAULT, 343.0)
+
+
+def test_no_frame_between_the_ranges_is_refused():
+    with pytest.raises(ValueError, match="no analysis frame"):
+        range_axis(SpectrogramSettings(hop=1000, range_min=0.2, range_max=0.21), 343.0)
+
+
+def test_a_row_is_advanced_by_its_own_delay():
+    delay = np.arange(47) * 3e-6  # whole samples, not whole hops
+    needed = echo_samples(DEFAULT, 343.0, delay[-1])
+    assert needed == echo_samples(DEFAULT, 343.0) + 138
+    echo = np.random.default_rng(0).normal(size=(2, needed))
+    found = spectrogram(echo, DEFAULT, 343.0, delay)
+    for row, advance in enumerate(3 * np.arange(47)):
+        expected = spectrogram(echo[:, advance:], DEFAULT, 343.0)
+        np.testing.assert_allclose(found[..., row], expected[..., row], atol=1e-11)
+
+
+def test_a_row_is_advanced_between_two_samples():
+    half = np.full(47, 0.5e-6)
+    time = np.arange(2 * echo_samples(DEFAULT, 343.0, 0.5e-6) + 2) / 2e6
+    fine = np.exp(-0.5 * ((time - 2.1e-3) / 5e-6) ** 2) * np.cos(2 * np.pi * 60e3 * time)
+    between = spectrogram(fine[None, 1::2], DEFAULT, 343.0)
+    found = spectrogram(fine[None, ::2], DEFAULT, 343.0, half)
+    np.testing.assert_allclose(found, between, atol=1e-9 * between.max())
+    assert abs(spectrogram(fine[None, ::2], DEFAULT, 343.0) - between).max() > 0.01 * between.max()
+
+
+def test_no_delay_is_no_change_to_the_bit():
+    echo = np.random.default_rng(0).normal(size=(2, echo_samples(DEFAULT, 343.0)))
+    expected = spectrogram(echo, DEFAULT, 343.0)
+    np.testing.assert_array_equal(spectrogram(echo, DEFAULT, 343.0, np.zeros(47)), expected)
+
+
+def test_wrong_delays_are_refused():
+    echo = np.zeros((2, echo_samples(DEFAULT, 343.0, 1e-3) - 1))
+    with pytest.raises(ValueError, match=f"needs {echo.shape[1] + 1}"):
+        spectrogram(echo, DEFAULT, 343.0, np.full(47, 1e-3))
+    with pytest.raises(ValueError, match="negative"):
+        spectrogram(echo, DEFAULT, 343.0, np.full(47, -1e-6))
+
+
+def test_compression_on_paper():
+    np.testing.assert_allclose(
+        compress([0.0, 1e-3, 9e-3, 0.999], 1e-3), [0.0, 6.0206, 20.0, 60.0], atol=1e-4
+    )
+    with pytest.raises(ValueError, match="reference"):
+        compress(1.0, 0.0)

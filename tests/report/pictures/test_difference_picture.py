@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: MIT
+import dataclasses
+import io
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from sononerf.evaluation.difference_of_runs import compare
+from sononerf.report.pictures import difference_picture as difference_module
+from sononerf.report.pictures.difference_picture import SILENT, difference_pngs, overlay_png
+from sononerf.surface.start.volume import grid_over
+
+GRID = grid_over([-0.03, -0.02, -0.05], [0.03, 0.02, 0.05], 0.005)
+MORE, LESS = np.array([0.02, -0.01, 0.03]), np.array([-0.02, 0.01, -0.03])
+
+
+def bump(place):
+    distance = np.linalg.norm(GRID.points() - place, axis=1)
+    return np.exp(-0.5 * (distance / 0.008) ** 2).reshape(GRID.shape)
+
+
+@pytest.fixture(scope="module")
+def comparison():
+    return compare(GRID.with_values(bump(MORE)), GRID.with_values(0.6 * bump(LESS)))
+
+
+def pixels(data):
+    with Image.open(io.BytesIO(data)) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+def test_one_picture_along_each_axis(comparison):
+    drawn = difference_pngs(comparison, ("with", "without"))
+    assert list(drawn) == ["x", "y", "z"]
+    # Three panels, each as high as it is wide in metres.
+    shapes = {name: pixels(data).shape for name, data in drawn.items()}
+    assert shapes["x"][0] > shapes["z"][0]
+    assert drawn == difference_pngs(comparison, ("with", "without"))
+
+
+def test_more_is_red_and_less_is_blue_where_they_are(comparison):
+    """Seen along x: more to the left (y = -10 mm) and above, less to the right and below."""
+    picture = pixels(difference_pngs(comparison, ("with", "without"))["x"])
+    panel = picture[:, 2 * picture.shape[1] // 3 :]
+    red = np.argwhere((panel[..., 0] - panel[..., 2] > 60) & (panel[..., 1] < 160))
+    blue = np.argwhere((panel[..., 2] - panel[..., 0] > 40) & (panel[..., 1] < 200))
+    bar = panel.shape[1] // 2  # to the right of it stands the colour bar
+    red, blue = red[red[:, 1] < bar].mean(axis=0), blue[blue[:, 1] < bar].mean(axis=0)
+    assert red[0] < blue[0] - 20
+    assert red[1] < blue[1] - 5
+
+
+def test_where_something_was_truly_added_is_marked(comparison):
+    without = difference_pngs(comparison, ("with", "without"))
+    marked = difference_pngs(comparison, ("with", "without"), truth=LESS)
+    assert all(marked[name] != without[name] for name in "xyz")
+
+
+def test_where_nothing_is_stronger_there_is_no_ring(comparison, recwarn):
+    none = dataclasses.replace(comparison, strongest=None)
+    ringed = difference_pngs(comparison, ("with", "without"))
+    plain = difference_pngs(none, ("with", "without"))
+    assert all(plain[name] != ringed[name] for name in "xyz")
+    marked = difference_pngs(none, ("with", "without"), truth=LESS)
+    assert all(marked[name] != plain[name] for name in "xyz")
+    assert not recwarn  # of a legend of nothing
+
+
+def test_a_surface_is_red_where_the_first_has_more_and_grey_where_neither(comparison, monkeypatch):
+    given = {}
+
+    def draw(mesh, *, view, colours):
+        given.update(view=view, colours=colours)
+        return b"png"
+
+    monkeypatch.setattr(difference_module, "mesh_png", draw)
+    places = np.array([MORE, LESS, [0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    mesh = trimesh.Trimesh(places, [[0, 1, 2], [1, 2, 3]], process=False)
+    assert overlay_png(mesh, comparison, view=(1.0, 0.0, 0.0)) == b"png"
+    more, less, neither, outside = given["colours"]
+    assert more[0] > more[2] + 0.2
+    assert less[2] > less[0] + 0.2
+    np.testing.assert_allclose([neither, outside], [SILENT, SILENT], atol=0.05)
+    assert given["view"] == (1.0, 0.0, 0.0)

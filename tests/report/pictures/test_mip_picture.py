@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: MIT
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sononerf.errors import NumericalError
+from sononerf.report.pictures.mip_picture import mip_image, mip_png, mip_pngs
+from sononerf.surface.start.volume import Volume
+
+EXTENTS = ((-0.05, 0.05), (0.0, 0.06))
+
+
+def test_an_image_has_its_first_axis_to_the_right_and_its_second_upwards():
+    projection = np.zeros((10, 6))
+    projection[9, 0] = 1.0
+    pixels = mip_image(projection, longest=10)
+    assert pixels.shape == (6, 10, 3)
+    brightness = pixels.astype(int).sum(axis=2)
+    assert np.unravel_index(brightness.argmax(), brightness.shape) == (5, 9)
+    assert mip_image(projection, longest=40).shape == (24, 40, 3)
+
+
+def test_decibels_show_what_linear_hides():
+    projection = np.array([[1.0, 1e-3]])
+    decibels = mip_image(projection, longest=2).astype(int).sum(axis=2)
+    linear = mip_image(projection, scale="linear", longest=2).astype(int).sum(axis=2)
+    assert decibels[0, 0] > linear[0, 0] + 50
+    # -30 of 40 dB is a quarter of the map, 1e-3 its very foot.
+    assert linear[0, 0] < 20
+
+
+def test_a_picture_is_a_png_and_always_the_same():
+    projection = np.random.default_rng(0).random((20, 12))
+    data = mip_png(projection, EXTENTS, ("y", "z"), title="maximum along x")
+    assert data == mip_png(projection, EXTENTS, ("y", "z"), title="maximum along x")
+    width, height = Image.open(io.BytesIO(data)).size
+    assert width > height > 200
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, -2.0])
+@pytest.mark.parametrize("scale", ["db", "linear"])
+def test_a_constant_projection_is_drawn(value, scale):
+    mip_png(np.full((3, 4), value), EXTENTS, ("y", "z"), scale=scale)
+    assert mip_image(np.full((3, 4), value), scale=scale).shape[2] == 3
+
+
+def test_a_volume_gives_three_pictures():
+    volume = Volume(np.random.default_rng(0).random((4, 30, 12)), np.zeros(3), 0.005)
+    sizes = {name: Image.open(io.BytesIO(data)).size for name, data in mip_pngs(volume).items()}
+    assert set(sizes) == {"x", "y", "z"}
+    assert sizes["x"][0] > sizes["x"][1]
+    assert sizes["z"][0] < sizes["z"][1]
+
+
+def test_wrong_input_is_refused():
+    with pytest.raises(ValueError, match="two axes"):
+        mip_image(np.zeros((2, 2, 2)))
+    with pytest.raises(NumericalError, match="not finite"):
+        mip_png([[np.nan]], EXTENTS, ("y", "z"))

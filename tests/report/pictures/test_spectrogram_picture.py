@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: MIT
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sononerf.errors import NumericalError
+from sononerf.report.pictures.spectrogram_picture import (
+    sounding_slice,
+    spectrogram_image,
+    spectrogram_png,
+)
+
+RANGE = np.linspace(0.15, 0.75, 121)
+FREQUENCY = np.linspace(10e3, 100e3, 47)
+
+
+def echo(ears=2):
+    profile = 40 * np.exp(-(((RANGE - 0.4) / 0.01) ** 2))
+    return np.broadcast_to(profile[:, None], (ears, 121, 47))
+
+
+def test_a_picture_is_a_png_and_always_the_same():
+    first = spectrogram_png(echo(), 0.9 * echo(), RANGE, FREQUENCY, "pose 3")
+    assert first == spectrogram_png(echo(), 0.9 * echo(), RANGE, FREQUENCY, "pose 3")
+    assert Image.open(io.BytesIO(first)).size == (1365, 715)
+
+
+def test_only_what_sounds_is_shown():
+    shown = RANGE[sounding_slice(echo(), RANGE)]
+    # 40 dB falls to 3 dB within 0.01 sqrt(ln(40 / 3)) = 16 mm, and 20 mm are added.
+    assert shown[0] == pytest.approx(0.364, abs=0.005)
+    assert shown[-1] == pytest.approx(0.436, abs=0.005)
+    assert sounding_slice(0 * echo(), RANGE) == slice(0, 121)
+    one = np.zeros((2, 121, 47))
+    one[1, 0, 0] = 50
+    assert sounding_slice(one, RANGE).start == 0
+
+
+@pytest.mark.parametrize("ears", [1, 2, 3])
+def test_any_number_of_ears_and_silence(ears):
+    pixels = spectrogram_image(0 * echo(ears), 0 * echo(ears), RANGE, FREQUENCY)
+    assert pixels.dtype == np.uint8
+    assert pixels.shape[2] == 3
+    assert pixels.std() > 1
+
+
+@pytest.mark.parametrize("ears", [1, 2, 3])
+@pytest.mark.parametrize("alone", [True, False])
+def test_labels_with_the_longest_numbers_have_room(ears, alone):
+    measured = None if alone else 0.6 * echo(ears)
+    pixels = spectrogram_image(measured, echo(ears), RANGE, 2 * FREQUENCY, "pose 3")
+    for edge in (pixels[:2], pixels[-2:], pixels[:, :2], pixels[:, -2:]):
+        assert (edge == 255).all()
+    assert (pixels[:, 2:12] < 255).any()  # the names of the ears are there at all
+
+
+def test_one_range_and_one_frequency():
+    image = spectrogram_image([[[5.0]]], [[[0.0]]], [0.4], [40e3])
+    # One cell fills each panel: the top of the scale, its bottom, and the greatest fall.
+    panels = image[image.shape[0] // 2, [120, 380, 680]].astype(int)
+    np.testing.assert_allclose(panels, [[252, 253, 191], [0, 0, 4], [34, 102, 172]], atol=24)
+
+
+def test_a_prediction_alone_has_one_panel():
+    pixels = spectrogram_image(None, [[[5.0]]], [0.4], [40e3])
+    both = spectrogram_image([[[5.0]]], [[[5.0]]], [0.4], [40e3])
+    assert pixels.shape[0] == both.shape[0]
+    assert 0.3 < pixels.shape[1] / both.shape[1] < 0.5
+    middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2].astype(int)
+    np.testing.assert_allclose(middle, [252, 253, 191], atol=24)  # the top of the scale
+    assert spectrogram_png(None, echo(), RANGE, FREQUENCY)
+
+
+def test_a_difference_shows():
+    same = spectrogram_image(echo(), echo(), RANGE, FREQUENCY)
+    other = spectrogram_image(echo(), 0.5 * echo(), RANGE, FREQUENCY)
+    width = same.shape[1]
+    assert not np.array_equal(same[:, 2 * width // 3 :], other[:, 2 * width // 3 :])
+
+
+def test_wrong_input_is_refused():
+    with pytest.raises(ValueError, match=r"R = 121 and F = 47"):
+        spectrogram_png(echo()[:, :-1], echo()[:, :-1], RANGE, FREQUENCY)
+    with pytest.raises(NumericalError, match="predicted"):
+        spectrogram_png(echo(), echo() * np.nan, RANGE, FREQUENCY)
+
+
+def test_a_logarithmic_axis_is_drawn_as_one():
+    """A tone at the geometric mean of the ends is drawn half-way up, and no channel is lost."""
+    frequency = np.geomspace(10e3, 100e3, 48)
+    level = np.zeros((1, 121, 48))
+    level[..., 23:25] = 40.0
+    level[:, :, 0] = 40.0
+    image = spectrogram_image(level, level, RANGE, frequency)
+    column = image[:, 150].astype(int).sum(axis=1)
+    inside = np.flatnonzero(image[:, 150].max(axis=1) < 250)  # panel, but for the bright tone
+    top, bottom = inside.min(), inside.max()
+    bright = np.flatnonzero(column[top : bottom + 12] > 500)
+    middle = bright[bright < 0.9 * (bottom - top)]
+    assert middle.mean() == pytest.approx((bottom - top) / 2, abs=5)
+    assert (bright > 0.95 * (bottom - top)).any()  # the lowest channel

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: MIT
+"""A run's surface and the baselines are compared with the truth, where it is known."""
+
+from __future__ import annotations
+
+import functools
+import json
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+from sononerf.errors import InputError, NumericalError
+from sononerf.evaluation import baseline
+from sononerf.run import evaluate as evaluate_module
+from sononerf.run import truth
+from sononerf.run.evaluate import evaluate
+from sononerf.run.reconstruct import reconstruct
+from sononerf.scene.scene import Scene
+
+GEOMETRY = {
+    "chamfer_m",
+    "fscore",
+    "thickness_bias_m",
+    "volume_ratio",
+    "iou",
+    "normal_consistency",
+    "components",
+    "components_true",
+    "level",
+}
+
+
+@pytest.fixture
+def few_samples(monkeypatch):
+    """A hundred thousand samples of each surface are for the reports, and so are pictures."""
+    metrics = functools.partial(evaluate_module.geometry_metrics, samples=2000)
+    monkeypatch.setattr(evaluate_module, "geometry_metrics", metrics)
+    of_target = functools.partial(evaluate_module.target_metrics, samples=2000)
+    monkeypatch.setattr(evaluate_module, "target_metrics", of_target)
+    monkeypatch.setattr(evaluate_module, "BASELINE_VOXELS", 24)
+    monkeypatch.setattr(baseline, "LEVEL_SAMPLES", 300)
+
+
+def test_what_is_evaluated(run, few_samples):
+    metrics = evaluate(run)  # reconstructs where that was not done
+    assert (run / "reconstruction" / "mesh.ply").is_file()
+    assert metrics == json.loads((run / "metrics.json").read_text())
+    assert metrics["geometry"].keys() == GEOMETRY
+    assert metrics["geometry"]["fscore"].keys() == {"0.001", "0.002", "0.005"}
+    assert metrics["geometry"]["components_true"] == 1
+    assert metrics["baseline"].keys() == {"backprojection", "voxels"}
+    for name in ("backprojection", "voxels"):
+        assert metrics["baseline"][name].keys() == GEOMETRY, name
+
+
+def test_another_mesh_takes_the_numbers_of_the_last_one_away(
+    run, tmp_path, few_samples, no_projections
+):
+    first = evaluate(run)
+    reconstruct(run, spacing=0.012, output=tmp_path / "aside")
+    with pytest.raises(NumericalError):
+        reconstruct(run, level=1e9)
+    assert json.loads((run / "metrics.json").read_text()) == first
+    for output in (None, run / "reconstruction"):
+        reconstruct(run, spacing=0.012, output=output)
+        left = json.loads((run / "metrics.json").read_text())
+        assert left.keys() == first.keys() - {"geometry"}
+        assert left["baseline"] == first["baseline"]  # which know no mesh
+        again = evaluate(run)
+        assert again.keys() == first.keys()
+        assert again["geometry"]["chamfer_m"] != first["geometry"]["chamfer_m"]
+
+
+def test_a_scene_that_is_not_installed_has_no_truth(run, few_samples):
+    description = json.loads((run / "model.json").read_text())
+    description["settings"]["scene"] = {"name": "theirs", "options": {}}
+    (run / "model.json").write_text(json.dumps(description))
+    metrics = evaluate(run)
+    assert metrics["geometry"] is None
+    assert metrics["baseline"] == {"backprojection": None, "voxels": None}
+    with Image.open(run / "reconstruction" / "view.png") as image:
+        assert min(image.size) > 50
+
+
+def test_what_needs_a_closed_surface_is_null_for_an_open_one(
+    run, few_samples, no_projections, monkeypatch
+):
+    open_mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
+    open_mesh.update_faces(np.arange(len(open_mesh.faces)) > 40)
+    open_scene = Scene(open_mesh)
+    monkeypatch.setattr(truth, "load_scene", lambda *given: open_scene)
+    geometry = evaluate(run)["geometry"]
+    for key in ("volume_ratio", "iou", "thickness_bias_m"):
+        assert geometry[key] is None, key
+    assert geometry["chamfer_m"] > 0
+
+
+def test_amid_surroundings_the_target_is_judged_alone_too(
+    run, few_samples, no_projections, monkeypatch
+):
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
+    slab = trimesh.creation.box((0.1, 0.1, 0.01))
+    slab.apply_translation((0, 0, -0.09))
+    both = trimesh.util.concatenate([slab, sphere])
+    scene = Scene(both, background=np.arange(len(both.faces)) < len(slab.faces))
+    monkeypatch.setattr(truth, "load_scene", lambda *given: scene)
+    geometry = evaluate(run)["geometry"]
+    assert geometry.keys() == GEOMETRY | {"target"}
+    assert geometry["target"]["share"] == 1.0  # nothing was reconstructed near the slab
+    assert geometry["target"]["fscore"]["0.005"] > geometry["fscore"]["0.005"]
+    assert geometry["target"]["chamfer_m"] < geometry["chamfer_m"]
+
+
+@pytest.mark.parametrize("content", [b"", b"ply\nnonsense", b"\x00" * 100])
+def test_a_damaged_mesh_is_told(run, content, no_projections):
+    reconstruct(run, spacing=0.012)
+    (run / "reconstruction" / "mesh.ply").write_bytes(content)
+    with pytest.raises(InputError, match=r"mesh\.ply: .*reconstruct again"):
+        evaluate(run)
+
+
+def test_a_true_surface_from_a_file_replaces_the_scene(run, few_samples, no_projections, tmp_path):
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
+    sphere.export(tmp_path / "true.stl")
+    plain = evaluate(run)["geometry"]["chamfer_m"]
+    larger = evaluate(run, truth=tmp_path / "true.stl")["geometry"]["chamfer_m"]
+    assert larger > plain + 0.002
+
+
+def test_a_registered_surface_is_judged_in_the_frame_of_the_truth(
+    run, few_samples, no_projections, tmp_path
+):
+    evaluate(run)
+    true = trimesh.load_mesh(run / "reconstruction" / "mesh.ply")
+    true.apply_scale((2.0, 2.0, 2.0))
+    true.apply_translation((0.3, 0.0, 0.0))
+    true.export(tmp_path / "true.ply")
+    apart = evaluate(run, truth=tmp_path / "true.ply")["geometry"]
+    found = evaluate(run, truth=tmp_path / "true.ply", registration="similarity")["geometry"]
+    assert apart["chamfer_m"] > 0.1
+    assert found["chamfer_m"] < 0.001
+    assert found["registration"]["scale"] == pytest.approx(2.0, rel=0.02)
+    assert found["registration"]["kind"] == "similarity"

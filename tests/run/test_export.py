@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: MIT
+"""A store and a run are written as files that other programs read."""
+
+from __future__ import annotations
+
+import io
+
+import h5py
+import numpy as np
+import pytest
+import scipy.io
+import zarr
+
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import InputError, SettingsError
+from sononerf.geometry.poses import read_pose_csv
+from sononerf.run.export import export
+from sononerf.run.predict import predict
+from sononerf.run.reconstruct import read_mesh, reconstruct
+
+
+@pytest.fixture(scope="module")
+def run(fitted, tmp_path_factory):
+    predict(fitted)
+    reconstruct(fitted)
+    return fitted
+
+
+def test_echoes_of_a_store(echoes, tmp_path):
+    found = scipy.io.loadmat(export(echoes, tmp_path / "echoes.mat"))
+    store = EnsembleStore.open(echoes)
+    assert np.array_equal(found["spectrogram"][3], store.read_pose(3))
+    assert np.array_equal(found["frequency"].ravel(), store.frequency)
+    assert found["split"].ravel().tolist() == store.split.tolist()
+    assert "sphere" not in str(found["attributes"]["origin"])
+    poses = read_pose_csv(export(echoes, tmp_path / "poses.csv"))
+    assert np.allclose(poses.positions, store.positions)
+    assert np.allclose(poses.rotations, store.rotations)
+
+
+def test_the_store_opens_with_names_and_units(echoes):
+    group = zarr.open_group(echoes, mode="r")
+    assert group["spectrogram"].metadata.dimension_names == ("pose", "ear", "range", "frequency")
+    assert group["range"].attrs["units"] == "m"
+    assert group["frequency"].attrs["units"] == "Hz"
+
+
+def test_prediction_volume_and_points_of_a_run(run, tmp_path):
+    with h5py.File(export(run, tmp_path / "prediction.h5")) as file:
+        assert file["predicted"].shape == file["measured"].shape
+        assert file["predicted"].dims[2].label == "range"
+    with scipy.io.netcdf_file(export(run, tmp_path / "v.nc", what="volume"), mmap=False) as file:
+        assert file.variables["reflectivity"].dimensions == ("x", "y", "z")
+        loudest = np.unravel_index(
+            file.variables["reflectivity"][...].argmax(), file.variables["reflectivity"].shape
+        )
+        place = [
+            float(file.variables[axis][...][k]) for axis, k in zip("xyz", loudest, strict=True)
+        ]
+    assert np.linalg.norm(place) < 0.04  # the sphere of 20 mm lies at the origin
+    lines = export(run, tmp_path / "points.csv").read_text().splitlines()
+    assert lines[0] == "x,y,z,nx,ny,nz,poses"
+    table = np.loadtxt(io.StringIO("\n".join(lines[1:])), delimiter=",")
+    assert len(table) == len(read_mesh(run / "reconstruction" / "mesh.ply").vertices)
+    assert (table[:, :3] * table[:, 3:6]).sum(axis=1).mean() > 0  # normals look outward
+
+
+def test_normals_are_in_the_mesh_file(run):
+    head = (run / "reconstruction" / "mesh.ply").read_bytes()[:1000]
+    for name in (b"property float nx", b"property float ny", b"property float nz"):
+        assert name in head
+
+
+@pytest.mark.parametrize(
+    ("name", "what", "error", "says"),
+    [
+        ("x.txt", "auto", SettingsError, r"expected a suffix of \.mat"),
+        ("x.mat", "echoes", InputError, "is no store"),
+        ("x.csv", "volume", SettingsError, "holds poses or points"),
+    ],
+)
+def test_what_does_not_fit_is_refused(run, tmp_path, name, what, error, says):
+    with pytest.raises(error, match=says):
+        export(run, tmp_path / name, what=what)
+    assert not (tmp_path / name).exists()
+
+
+def test_what_is_missing_or_damaged_is_named(tmp_path, fitted):
+    with pytest.raises(InputError, match="sononerf predict"):
+        export(tmp_path, tmp_path / "x.mat")
+    with pytest.raises(InputError, match="sononerf reconstruct"):
+        export(tmp_path, tmp_path / "x.mat", what="volume")
+    (tmp_path / "prediction").mkdir()
+    (tmp_path / "prediction" / "spectrograms.npz").write_bytes(b"no archive")
+    with pytest.raises(InputError, match="damaged"):
+        export(tmp_path, tmp_path / "x.mat")

@@ -1,0 +1,486 @@
+# SPDX-License-Identifier: MIT
+"""A fit that is interrupted, however often and wherever, ends where the uninterrupted one ends."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.metadata
+import json
+import os
+import signal
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+import trimesh
+
+from sononerf import storage
+from sononerf.callbacks.checkpoint import SIGNALS, CheckpointCallback
+from sononerf.callbacks.preview import PreviewCallback
+from sononerf.callbacks.progress_bar import ProgressCallback
+from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import (
+    IncompatibleError,
+    InputError,
+    LockedError,
+    NumericalError,
+    ResourceError,
+    StoppedError,
+)
+from sononerf.field.checkpoint_io import DurableCheckpointIO
+from sononerf.field.module import EchoModule
+from sononerf.head.directivity.sofa_writer import write_sofa
+from sononerf.progress import Progress
+from sononerf.run import fit as fit_module
+from sononerf.run.build import acquisition, echo_hull
+from sononerf.run.fit import fit, peak_memory_bytes, require_accelerator
+from sononerf.run.reconstruct import reconstruct
+from sononerf.run.run_folder import RunFolder
+from tests.head.directivity.patterns import pair
+
+STEPS, PER_EPOCH = 12, 4
+
+pytestmark = pytest.mark.usefixtures("without_pictures")
+
+
+@pytest.fixture
+def interrupt(monkeypatch):
+    """Send a signal to ourselves at the end of a step."""
+    real = ProgressCallback.on_train_batch_end
+    wanted = {}
+
+    def on_train_batch_end(self, trainer, pl_module, *rest):
+        real(self, trainer, pl_module, *rest)
+        if (number := wanted.pop(pl_module.global_step, None)) is not None:
+            os.kill(os.getpid(), number)
+
+    monkeypatch.setattr(ProgressCallback, "on_train_batch_end", on_train_batch_end)
+    return wanted.__setitem__
+
+
+def run(settings, path, **options):
+    return fit(settings, path, accelerator="cpu", workers=1, **options)
+
+
+def what_a_run_holds(path):
+    """Weights as bits, steps, and what each epoch left."""
+    weights = safetensors.torch.load_file(path / "model.safetensors")
+    epochs = sorted((path / "epochs").iterdir())  # coarse meshes, metrics
+    return {
+        **{name: (tensor.dtype, tensor.numpy().tobytes()) for name, tensor in weights.items()},
+        "previews": [sorted((f.name, f.read_bytes()) for f in p.iterdir()) for p in epochs],
+        "epochs": [p.name for p in epochs],
+        "steps": json.loads((path / "metrics.json").read_text())["cost"]["steps"],
+    }
+
+
+def differences(found, wanted):
+    assert found.keys() == wanted.keys()
+    return [name for name in wanted if found[name] != wanted[name]]
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tiny_settings, without_pictures, tmp_path_factory):
+    """What the fit leaves where nothing happens to it."""
+    path = tmp_path_factory.mktemp("uninterrupted") / "run"
+    run(tiny_settings(), path)
+    held = what_a_run_holds(path)
+    assert held["steps"] == STEPS
+    assert held["epochs"] == ["0001", "0002", "0003"]
+    return held
+
+
+def run_with_stops(settings, path, interrupt, stops, number=signal.SIGTERM):
+    for step in stops:
+        interrupt(step, number)
+        with pytest.raises(StoppedError, match=f"stopped at step {step} of {STEPS}") as caught:
+            run(settings, path)
+        assert caught.value.exit_code == 128 + number
+        assert not (path / "model.json").exists()
+    run(settings, path)
+    return what_a_run_holds(path)
+
+
+@pytest.mark.parametrize(
+    "stops",
+    [
+        [1],
+        [PER_EPOCH - 1],
+        [PER_EPOCH],
+        [PER_EPOCH + 1],
+        [STEPS - 1],
+        [PER_EPOCH, 2 * PER_EPOCH],  # through one boundary into another
+        [3, PER_EPOCH, PER_EPOCH + 1],
+        list(range(1, 11)),
+    ],
+    ids=str,
+)
+def test_interrupted_fits_end_bit_for_bit_alike(tiny, tmp_path, interrupt, uninterrupted, stops):
+    held = run_with_stops(tiny(), tmp_path / "run", interrupt, stops)
+    assert differences(held, uninterrupted) == []
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])  # SIGTERM is above
+def test_every_signal_stops_in_order_and_gives_back_its_handler(
+    tiny, tmp_path, interrupt, uninterrupted, number
+):
+    before = [signal.getsignal(each) for each in SIGNALS]
+    held = run_with_stops(tiny(), tmp_path / "run", interrupt, [5], number)
+    assert differences(held, uninterrupted) == []
+    assert [signal.getsignal(each) for each in SIGNALS] == before
+
+
+def test_a_signal_at_the_last_step_stops_what_would_follow_the_fit(
+    tiny, tmp_path, interrupt, uninterrupted
+):
+    interrupt(STEPS, signal.SIGTERM)
+    with pytest.raises(StoppedError, match="after the last step"):
+        run(tiny(), tmp_path / "run")
+    assert differences(what_a_run_holds(tmp_path / "run"), uninterrupted) == []
+
+
+class PowerCutError(BaseException):
+    """The process is gone."""
+
+
+@pytest.mark.parametrize(
+    ("owner", "hook", "step"),
+    [
+        (PreviewCallback, "on_validation_end", PER_EPOCH),  # validated, not yet saved
+        (CheckpointCallback, "on_epoch", PER_EPOCH),  # previewed, not yet saved
+        (CheckpointCallback, "on_epoch", 2 * PER_EPOCH),
+        (CheckpointCallback, "on_train_batch_end", PER_EPOCH),  # not yet validated
+        (CheckpointCallback, "on_train_batch_end", 6),
+        (ProgressCallback, "on_train_batch_end", 1),
+        (CheckpointCallback, "on_epoch", STEPS),
+    ],
+)
+def test_a_fit_that_was_cut_off_ends_bit_for_bit_alike(
+    tiny, tmp_path, monkeypatch, uninterrupted, owner, hook, step
+):
+    real = getattr(owner, hook)
+
+    def cut(self, trainer, pl_module, *rest):
+        if pl_module.global_step == step:
+            raise PowerCutError
+        return real(self, trainer, pl_module, *rest)
+
+    settings = tiny(fit={"checkpoint_seconds": 1e-9})  # a checkpoint at every step
+    with monkeypatch.context() as patch:
+        patch.setattr(owner, hook, cut)
+        with pytest.raises(PowerCutError):
+            run(settings, tmp_path / "run")
+    run(settings, tmp_path / "run")
+    assert differences(what_a_run_holds(tmp_path / "run"), uninterrupted) == []
+
+
+def test_a_torn_checkpoint_costs_steps_and_no_bits(tiny, tmp_path, interrupt, uninterrupted):
+    interrupt(6, signal.SIGTERM)
+    with pytest.raises(StoppedError):
+        run(tiny(), tmp_path / "run")
+    (tmp_path / "run" / "checkpoints" / "last.ckpt").write_bytes(b"PK")
+    run(tiny(), tmp_path / "run")
+    assert differences(what_a_run_holds(tmp_path / "run"), uninterrupted) == []
+
+
+# Canaries: where something that resuming rests on is taken away, the tests above must see it.
+
+
+def forget_the_seed_of_a_step(monkeypatch):
+    monkeypatch.setattr(EchoModule, "_seed", lambda self, number: None)
+
+
+def lose(key):
+    def change(monkeypatch):
+        real = DurableCheckpointIO.load_checkpoint
+
+        def load_checkpoint(self, *arguments, **options):
+            content = real(self, *arguments, **options)
+            if key == "moments":
+                content["optimizer_states"][0]["state"] = {}
+            elif key == "schedule":
+                content["lr_schedulers"][0]["last_epoch"] = 0
+                content["lr_schedulers"][0]["_step_count"] = 1
+            return content
+
+        monkeypatch.setattr(DurableCheckpointIO, "load_checkpoint", load_checkpoint)
+
+    return change
+
+
+def begin_the_data_anew(monkeypatch):
+    real = fit_module._resume
+
+    def resume(folder, data):
+        found = real(folder, data)
+        data.sampler.start = 0
+        return found
+
+    monkeypatch.setattr(fit_module, "_resume", resume)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [forget_the_seed_of_a_step, lose("moments"), lose("schedule"), begin_the_data_anew],
+    ids=["seeds", "moments", "schedule", "data"],
+)
+def test_canary_what_resuming_rests_on_is_missed(tiny, tmp_path, interrupt, monkeypatch, change):
+    change(monkeypatch)
+    run(tiny(), tmp_path / "through")
+    held = run_with_stops(tiny(), tmp_path / "stopped", interrupt, [6])
+    changed = differences(held, what_a_run_holds(tmp_path / "through"))
+    assert any(name.startswith("field.") for name in changed)
+
+
+def test_without_validation_poses_epochs_are_still_ours(tiny, tmp_path, interrupt):
+    settings = tiny(poses={"validation": 0, "heldout": 0}, data={"store": str(tmp_path / "store")})
+    run(settings, tmp_path / "through")
+    held = run_with_stops(settings, tmp_path / "stopped", interrupt, [PER_EPOCH, 6])
+    assert differences(held, what_a_run_holds(tmp_path / "through")) == []
+    assert held["epochs"] == ["0001", "0002", "0003"]
+
+
+@pytest.mark.slow  # processes that import torch
+def test_the_number_of_loading_processes_moves_no_bit(
+    tiny, tmp_path, interrupt, uninterrupted, echoes
+):
+    settings = tiny(data={"store": str(echoes), "workers": 2})
+    held = run_with_stops(settings, tmp_path / "run", interrupt, [6])
+    assert differences(held, uninterrupted) == []
+
+
+def files(folder):
+    return {
+        str(p.relative_to(folder)): (p.read_bytes(), p.stat().st_mtime_ns)
+        for p in folder.rglob("*")
+        if p.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def finished(tiny_settings, without_pictures, tmp_path_factory):
+    path = tmp_path_factory.mktemp("finished") / "run"
+    run(tiny_settings(), path)
+    return path
+
+
+def test_a_finished_run_is_left_as_it_is(tiny, finished):
+    before = files(finished)
+    found = run(tiny(data={"memory_bytes": 10**9}, fit={"checkpoint_seconds": 5}), finished)
+    assert found.is_fitted
+    assert files(finished) == before
+
+
+def test_other_settings_are_refused_by_name(tiny, finished):
+    before = files(finished)
+    with pytest.raises(IncompatibleError, match=r"other settings \(fit\.epochs, poses\.radius\)"):
+        run(tiny(fit={"epochs": 4}, poses={"radius": 0.5}), finished)
+    assert files(finished) == before
+
+
+def test_overwrite_moves_aside_and_loses_nothing(tiny, tmp_path):
+    path = tmp_path / "run"
+    run(tiny(), path)
+    first = files(path)
+    for number, seed in ((1, 1), (2, 2)):
+        run(tiny(fit={"seed": seed, "max_steps": 2}), path, overwrite=True)
+        assert (tmp_path / f"run.old-{number}" / "model.json").is_file()
+    moved = files(tmp_path / "run.old-1")
+    assert {name: moved[name] for name in first} == first
+
+
+def test_overwrite_leaves_a_run_at_work_and_other_peoples_folders_alone(tiny, tmp_path):
+    path = tmp_path / "run"
+    run(tiny(fit={"max_steps": 1}), path)
+    with storage.lock(path), pytest.raises(LockedError, match="in use"):
+        run(tiny(fit={"max_steps": 2}), path, overwrite=True)
+    assert (path / "model.json").is_file()
+    thesis = tmp_path / "thesis"
+    thesis.mkdir()
+    (thesis / "chapter.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"holds 'chapter\.txt' and is no run"):
+        run(tiny(), thesis, overwrite=True)
+    assert files(thesis).keys() == {"chapter.txt"}
+
+
+def test_what_fails_before_the_fit_leaves_no_run(tiny, tmp_path):
+    deaf = tiny(
+        spectrogram={"range_min": 1.0, "range_max": 1.1}, data={"store": str(tmp_path / "store")}
+    )
+    with pytest.raises(NumericalError, match="no pose received an echo"):
+        run(deaf, tmp_path / "kept" / "runs" / "run")
+    assert not (tmp_path / "kept").exists()
+    (tmp_path / "kept").mkdir()
+    with pytest.raises(NumericalError, match="no pose received an echo"):
+        run(deaf, tmp_path / "kept" / "runs" / "run")
+    assert (tmp_path / "kept").exists()
+    assert not (tmp_path / "kept" / "runs").exists()
+
+
+def test_a_gradient_that_is_no_number_leaves_a_sound_checkpoint(tiny, tmp_path, monkeypatch):
+    real = EchoModule._loss
+
+    def loss(self, predicted, measured):
+        found = real(self, predicted, measured)
+        return found * float("nan") if self.global_step == 6 else found
+
+    monkeypatch.setattr(EchoModule, "_loss", loss)
+    with pytest.raises(NumericalError, match=r"is not finite at step 6; .* anew with --overwrite$"):
+        run(tiny(fit={"checkpoint_seconds": 1e-9}), tmp_path / "run")
+    content = DurableCheckpointIO().load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
+    assert content["global_step"] == 6
+    assert all(bool(value.isfinite().all()) for value in content["state_dict"].values())
+    assert not (tmp_path / "run" / "model.json").exists()
+
+
+def test_what_a_fit_cost_is_counted_over_its_parts(tiny, tmp_path, interrupt, monkeypatch):
+    path = tmp_path / "run"
+
+    def cost():
+        return json.loads((path / "metrics.json").read_text())["cost"]
+
+    interrupt(5, signal.SIGTERM)
+    with pytest.raises(StoppedError):
+        run(tiny(), path)
+    first = cost()["simulate_s"]
+    ensemble, load = fit_module.ensemble, DurableCheckpointIO.load_checkpoint
+
+    def slow(*arguments, **options):
+        time.sleep(first + 0.1)
+        return ensemble(*arguments, **options)
+
+    def long_ago(self, *arguments, **options):
+        content = load(self, *arguments, **options)
+        content["callbacks"]["CheckpointCallback"]["elapsed"] += 1000.0
+        return content
+
+    monkeypatch.setattr(fit_module, "ensemble", slow)
+    monkeypatch.setattr(DurableCheckpointIO, "load_checkpoint", long_ago)
+    run(tiny(), path)
+    assert 1000.0 < cost()["fit_s"] < 1100.0
+    assert cost()["simulate_s"] == first
+    assert cost()["steps"] == STEPS
+    assert cost()["points_evaluated"] > 0
+    assert cost()["device"] == "cpu"
+    assert cost()["peak_memory_bytes"] > 50_000_000
+
+
+@pytest.mark.parametrize(
+    ("changes", "least", "steps", "epochs"),
+    [
+        ({"steps_per_epoch": "auto"}, 1, 12, 3),  # 8 poses, 2 at a time
+        ({"steps_per_epoch": "auto", "batch_poses": 3}, 1, 9, 3),
+        ({"steps_per_epoch": "auto"}, 5, 15, 3),  # a pass is shorter than an epoch may be
+        ({"max_steps": 6}, 60, 6, 1),
+        ({"max_steps": 2}, 60, 2, 1),  # shorter than an epoch: it is the epoch then
+    ],
+)
+def test_the_smaller_bound_ends_the_fit(tiny, tmp_path, monkeypatch, changes, least, steps, epochs):
+    monkeypatch.setattr(fit_module, "LEAST_STEPS", least)
+    run(tiny(fit=changes), tmp_path / "run")
+    held = what_a_run_holds(tmp_path / "run")
+    assert (held["steps"], len(held["epochs"])) == (steps, epochs)
+
+
+@pytest.mark.parametrize(
+    ("steps", "per_pass", "expected"),
+    [("auto", 4, (60, 180)), ("auto", 61, (61, 183)), (4, 61, (4, 12)), (4, 1, (4, 12))],
+)
+def test_an_epoch_has_at_least_sixty_steps_unless_the_settings_say_how_many(
+    tiny, steps, per_pass, expected
+):
+    assert fit_module._length(tiny(fit={"steps_per_epoch": steps}), per_pass) == expected
+
+
+def test_a_run_holds_where_its_training_poses_listened(finished, echoes, tiny):
+    store = EnsembleStore.open(echoes)
+    held = safetensors.torch.load_file(finished / "model.safetensors")
+    known = acquisition(tiny())
+    train = store.indices("train")
+    assert held["hull.emitters"].shape == held["hull.axes"].shape == (8, 3)
+    assert held["hull.receivers"].shape == (8, 2, 3)
+    for row, index in enumerate(train):
+        turn = store.rotations[index]
+        emitter = store.positions[index] + turn @ known.emitter.double().numpy()
+        ears = store.positions[index] + known.ear_positions.double().numpy() @ turn.T
+        np.testing.assert_allclose(held["hull.emitters"][row], emitter, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(held["hull.receivers"][row], ears, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(held["hull.axes"][row], turn[:, 0], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("width", [0.0, 0.02])
+def test_of_poses_on_a_line_it_is_said_what_they_do_not_tell(tmp_path, tiny, monkeypatch, width):
+    monkeypatch.setattr(EchoHull, "width", width)
+    said, progress = [], Progress(quiet=True)
+    monkeypatch.setattr(progress, "say", said.append)
+    run(tiny(fit={"epochs": 1, "steps_per_epoch": 1}), tmp_path / "run", progress=progress)
+    assert any("straight line" in line for line in said) == (width == 0.0)
+
+
+def test_a_run_holds_what_its_training_poses_heard_first(finished, echoes, tiny):
+    hull = echo_hull(tiny(), EnsembleStore.open(echoes))
+    held = safetensors.torch.load_file(finished / "model.safetensors")
+    names = {name for name in held if name.startswith("hull.")}
+    assert names == {f"hull.{name}" for name in vars(hull)}
+    for name, value in vars(hull).items():
+        assert held[f"hull.{name}"].dtype == torch.float64
+        np.testing.assert_array_equal(held[f"hull.{name}"], value)
+    # The sphere's front, 20 mm before its middle, within what its echo is not an impulse.
+    way = np.linalg.norm(hull.sources, axis=1) - 0.02
+    np.testing.assert_allclose(held["hull.first"].mean(dim=1), way, atol=0.0005)
+
+
+def test_provenance_names_no_people_machines_or_folders(finished):
+    text = (finished / "provenance.json").read_text()
+    assert json.loads(text)["packages"]["torch"] == importlib.metadata.version("torch")
+    assert json.loads(text)["echo_hash"]
+    for secret in (os.uname().nodename, str(finished.parent), f"{Path.home()}/"):
+        assert secret not in text
+
+
+def test_a_gpu_that_is_not_there(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    with pytest.raises(ResourceError, match="--accelerator cpu"):
+        fit(tiny(), tmp_path / "run", accelerator="gpu")
+    assert not (tmp_path / "run").exists()
+    require_accelerator("auto")
+
+
+def test_memory_is_counted_in_bytes():
+    assert 50_000_000 < peak_memory_bytes() < 1_000_000_000_000
+
+
+def line(count):
+    return [[0.0, 0.03 * (n - (count - 1) / 2), 0.0] for n in range(count)]
+
+
+@pytest.mark.parametrize(
+    ("count", "directivity"), [(1, "omnidirectional"), (8, "omnidirectional"), (3, "file")]
+)
+def test_any_receivers_from_scene_to_surface(tiny_settings, tmp_path, count, directivity):
+    ears = {"receivers": line(count), "directivity": directivity, "beam_radius": 0.0}
+    if directivity == "file":
+        known = pair()
+        known = dataclasses.replace(known, gains=known.gains[:1], places=None)
+        write_sofa(tmp_path / "a.sofa", known)
+        ears["file"] = str(tmp_path / "a.sofa")
+    settings = tiny_settings(
+        ears=ears,
+        fit={"epochs": 1, "steps_per_epoch": 2, "batch_poses": 2, "batch_frequencies": 2},
+        data={"store": str(tmp_path / "store")},
+        noise={"snr_db": 40.0},
+    )
+    run(settings, tmp_path / "run")
+    store = EnsembleStore.open(tmp_path / "store")
+    assert store.receivers == count
+    heard = store.read_pose(0)
+    assert (heard.max(axis=(1, 2)) > 0.0).all()
+    (tmp_path / "a.sofa").unlink(missing_ok=True)  # the run has a copy
+    folder = reconstruct(tmp_path / "run", accelerator="cpu")
+    assert RunFolder(tmp_path / "run").read_metrics()["cost"]["steps"] == 2
+    assert len(trimesh.load(folder / "mesh.ply").faces) > 100

@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: MIT
+"""A fitted run is what its two files say, and its poses are those of its ensemble."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import IncompatibleError, InputError, ResourceError
+from sononerf.field.weights import load_weights, save_weights
+from sononerf.progress import Progress
+from sononerf.run.build import echo_hull
+from sononerf.run.fit import fit
+from sononerf.run.fitted import load_fitted, poses_of, render_poses, store_of
+from sononerf.settings.schema import validate_settings
+
+QUIET = Progress(quiet=True)
+
+pytestmark = pytest.mark.usefixtures("without_pictures")
+
+
+@pytest.fixture
+def run(fitted_run, tmp_path):
+    """The run with nothing but its two files, somewhere else."""
+    path = tmp_path / "elsewhere"
+    path.mkdir()
+    for name in ("model.safetensors", "model.json"):
+        shutil.copy(fitted_run / name, path)
+    return path
+
+
+def change(path, **values):
+    description = json.loads((path / "model.json").read_text())
+    (path / "model.json").write_text(json.dumps({**description, **values}))
+
+
+def test_what_is_loaded_is_what_was_fitted(run, tiny, echoes):
+    found = load_fitted(run)
+    assert found.settings == tiny()
+    attributes = EnsembleStore.open(echoes).attributes
+    assert found.echo_hash == attributes["echo_hash"]
+    assert found.module.reference == attributes["reference"]
+    assert not found.module.training
+    state, _ = load_weights(run)
+    for part, prefix in ((found.module.field, "field."), (found.module.renderer, "renderer.")):
+        own = part.state_dict()
+        assert {f"{prefix}{name}" for name in own} == {n for n in state if n.startswith(prefix)}
+        for name, tensor in own.items():
+            assert torch.equal(tensor, state[prefix + name]), name
+
+
+def test_the_hull_is_of_the_training_poses_alone(run, echoes):
+    hull = load_fitted(run).hull
+    store = EnsembleStore.open(echoes)
+    train = store.indices("train")
+    assert hull.emitters.dtype == hull.first.dtype == np.float64
+    # A head is some centimetres large.
+    np.testing.assert_allclose(hull.emitters, store.positions[train], atol=0.03)
+    np.testing.assert_allclose(hull.receivers.mean(axis=1), store.positions[train], atol=0.03)
+    np.testing.assert_allclose(hull.axes, store.rotations[train][:, :, 0], atol=1e-6)
+    assert hull.first.shape == (len(train), 2)
+    assert type(hull.within) is float
+    assert -1 <= hull.within <= 1
+
+
+HULL = ["hull.emitters", "hull.receivers", "hull.first", "hull.axes", "hull.within"]
+
+
+@pytest.mark.parametrize("name", [*HULL, "field.region"])
+def test_weights_without_what_is_needed_are_told(run, name):
+    state, description = load_weights(run)
+    del state[name]
+    save_weights(run, state, description)
+    with pytest.raises(InputError, match=rf"incomplete \('{name}'\); repeat the fit") as caught:
+        load_fitted(run)
+    assert "\n" not in str(caught.value)
+    assert "model.json" not in str(caught.value)  # which is whole
+
+
+def test_what_is_loaded_knows_what_first_echoes_leave(run, echoes, tiny):
+    """An ear that heard nothing goes with the weights like all others."""
+    hull = echo_hull(tiny(), EnsembleStore.open(echoes))
+    state, description = load_weights(run)
+    state["hull.first"][3, 1] = -torch.inf
+    save_weights(run, state, description)
+    loaded = load_fitted(run).hull
+    assert loaded.within == hull.within
+    assert isinstance(loaded.within, float)
+    for name in ("emitters", "receivers", "axes"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(hull, name))
+    assert loaded.first[3, 1] == -np.inf
+    points = np.random.default_rng(0).uniform(-0.05, 0.05, (50, 3))
+    heard = hull.first.copy()
+    heard[3, 1] = -np.inf
+    expected = dataclasses.replace(hull, first=heard).clearance(points)
+    np.testing.assert_array_equal(loaded.clearance(points), expected)
+
+
+def damage(path, change):
+    description = json.loads((path / "model.json").read_text())
+    change(description)
+    (path / "model.json").write_text(json.dumps(description))
+
+
+def other_field(description):
+    description["settings"]["field"] = {"kind": "fourier", "options": {}}
+
+
+def unknown_key(description):
+    description["settings"]["fit"]["speed"] = 3
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        (lambda d: d.pop("reference"), InputError, "incomplete"),
+        (lambda d: d.pop("settings"), InputError, "incomplete"),
+        (lambda d: d.update(reference="loud"), InputError, "incomplete"),
+        (lambda d: d.update(reference=float("nan")), InputError, "reference is nan, expected"),
+        (lambda d: d.update(reference=-1.0), InputError, r"model\.json: reference is -1\.0"),
+        (lambda d: d.update(reference=float("inf")), InputError, "reference is inf"),
+        (lambda d: d.update(reference=0), InputError, r"reference is 0\.0"),
+        (lambda d: d.update(schema_version=99), IncompatibleError, "newer sononerf"),
+        (other_field, IncompatibleError, "does not fit fourier and profile"),
+        (unknown_key, IncompatibleError, r"settings of another version: .*fit\.speed"),
+    ],
+)
+def test_a_wrong_description_is_told(run, change, error, message):
+    damage(run, change)
+    with pytest.raises(error, match=message) as caught:
+        load_fitted(run)
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_or_missing_weights_are_told(run, tmp_path):
+    data = bytearray((run / "model.safetensors").read_bytes())
+    data[-5] ^= 1
+    (run / "model.safetensors").write_bytes(data)
+    with pytest.raises(InputError, match="damaged"):
+        load_fitted(run)
+    with pytest.raises(InputError, match="no fitted run"):
+        load_fitted(tmp_path / "nowhere")
+
+
+def test_the_ensemble_is_found_where_the_settings_or_its_hash_say(run, echoes, tmp_path):
+    fitted = load_fitted(run)
+    assert store_of(fitted).path == echoes
+    section = fitted.settings.data.model_dump()
+    plain = {**fitted.settings.plain(), "data": {**section, "store": None}}
+    change(run, settings=validate_settings(plain, "plain").plain())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path)
+        with pytest.raises(InputError, match=rf"sphere-{fitted.echo_hash[:8]}\w*: .*is not there"):
+            store_of(load_fitted(run))
+
+
+def test_an_ensemble_of_other_echoes_is_refused(run):
+    change(run, echo_hash="0" * 64)
+    with pytest.raises(IncompatibleError, match="holds other echoes"):
+        store_of(load_fitted(run))
+
+
+@pytest.mark.parametrize(("split", "count"), [("train", 8), ("val", 2), ("test", 2)])
+def test_poses_of_a_split_with_what_was_measured_there(run, split, count):
+    fitted = load_fitted(run)
+    store = store_of(fitted)
+    poses = poses_of(store, split, fitted.module.renderer)
+    numbers = store.indices(split)
+    assert len(poses) == len(numbers) == count
+    for row, number in enumerate(numbers.tolist()):
+        found = poses[row]
+        assert found.pose.tolist() == [number]
+        np.testing.assert_allclose(found.position[0], store.positions[number], rtol=1e-6)
+        np.testing.assert_allclose(found.rotation[0], store.rotations[number], atol=1e-6)
+        np.testing.assert_array_equal(found.spectrum[0], store.read_pose(number))
+        assert (found.rows.shape[1], len(found.bins)) == store.read_pose(number).shape[1:]
+
+
+def test_a_split_without_poses_has_none(run, monkeypatch):
+    fitted = load_fitted(run)
+    store = store_of(fitted)
+    monkeypatch.setattr(store, "indices", lambda split: np.zeros(0, dtype=np.int64))
+    assert len(poses_of(store, "val", fitted.module.renderer)) == 0
+
+
+def test_rendering_goes_pose_by_pose_and_in_order(run):
+    fitted = load_fitted(run)
+    renderer = fitted.module.renderer
+    poses = poses_of(store_of(fitted), "train", renderer).only(torch.tensor([4, 1, 6]))
+    rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
+    assert rendered.dtype == np.float32
+    assert rendered.shape == (3, 2, len(renderer.range), len(renderer.frequency))
+    assert (rendered >= 0).all()
+    for row in range(3):
+        alone = poses.only(torch.tensor([row]))
+        again = render_poses(fitted, alone, accelerator="cpu", progress=QUIET)
+        np.testing.assert_array_equal(again[0], rendered[row])
+    assert np.abs(rendered[0] - rendered[1]).max() > 0
+
+
+def test_rendering_does_not_look_at_what_was_measured(run, monkeypatch):
+    fitted = load_fitted(run)
+    poses = poses_of(store_of(fitted), "val", fitted.module.renderer)
+    rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
+    read = EnsembleStore.read_pose
+    monkeypatch.setattr(EnsembleStore, "read_pose", lambda *given: 0 * read(*given))
+    again = poses_of(store_of(fitted), "val", fitted.module.renderer)
+    deaf = render_poses(fitted, again, accelerator="cpu", progress=QUIET)
+    np.testing.assert_array_equal(deaf, rendered)
+
+
+def test_a_gpu_that_is_not_there(run, monkeypatch):
+    fitted = load_fitted(run)
+    poses = poses_of(store_of(fitted), "val", fitted.module.renderer)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    with pytest.raises(ResourceError):
+        render_poses(fitted, poses, accelerator="gpu", progress=QUIET)
+
+
+def test_what_was_fitted_without_its_background_is_measured_without_it(run, tiny, echoes, tmp_path):
+    """The surroundings are the tiny echoes themselves, at half their magnitude."""
+    heard = EnsembleStore.open(echoes)
+    alone = EnsembleStore.create(
+        tmp_path / "alone",
+        poses_positions=heard.positions,
+        poses_rotations=heard.rotations,
+        split=heard.split,
+        range=heard.range,
+        frequency=heard.frequency,
+        attributes=heard.attributes,
+    )
+    for index in range(len(heard)):
+        alone.write_pose(index, 0.5 * heard.read_pose(index))
+    alone.seal()
+    fitted = load_fitted(run)
+    settings = tiny(data={"background": str(tmp_path / "alone")})
+    store = store_of(dataclasses.replace(fitted, settings=settings))
+    np.testing.assert_allclose(
+        store.read_pose(1), np.sqrt(0.75) * heard.read_pose(1), rtol=1e-5, atol=1e-9
+    )
+    assert type(store_of(fitted)) is EnsembleStore
+    path = tmp_path / "fitted"
+    fit(settings, path)
+    reference = load_fitted(path).module.reference
+    assert reference == pytest.approx(np.sqrt(0.75) * heard.attributes["reference"], rel=1e-5)
+    with pytest.raises(IncompatibleError, match=r"data\.background"):
+        fit(tiny(), path)

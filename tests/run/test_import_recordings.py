@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: MIT
+"""Recordings become a store, the same bytes each time; bad ones leave nothing behind."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import IncompatibleError, InputError, LockedError, NumericalError
+from sononerf.recordings.understand import understand
+from sononerf.run.import_recordings import check_before, describe, draw, import_recordings
+from sononerf.storage import lock
+from tests.recordings.recorded import SETTINGS, TARGET, arrays, waveforms
+
+GIVEN = (*SETTINGS, "import.source=by formula", "import.licence=CC0")
+
+
+@pytest.fixture
+def brought(tmp_path):
+    """Import arrays with some changes and settings into a store."""
+
+    def run(*overrides, output="store", **changes):
+        np.savez(tmp_path / "a.npz", **arrays(**changes))
+        return import_recordings(
+            "numpy", tmp_path / "a.npz", tmp_path / output, overrides=[*GIVEN, *overrides]
+        )
+
+    return run
+
+
+def files(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_store_knows_all_that_a_fit_needs(brought):
+    store, verdict = brought()
+    known = store.attributes
+    assert verdict.message == ""
+    assert (len(store), store.receivers, store.missing(), store.check()) == (24, 2, [], [])
+    assert (known["origin"], known["source"], known["licence"]) == ("recorded", "by formula", "CC0")
+    assert set(known["settings"]) == {"air", "ears", "call", "spectrogram"}
+    assert known["settings"]["spectrogram"]["sampling_rate"] == 250e3
+    assert known["settings"]["call"]["kind"] == "linear"
+    assert known["speed_of_sound"] == 343.0
+    assert known["noise_floor_mae_db"] is None
+    loudest = max(store.read_pose(int(i)).max() for i in store.indices("train"))
+    assert known["reference"] == pytest.approx(1e-3 * loudest)
+
+
+def test_echoes_are_where_the_target_is(brought):
+    store, _ = brought()
+    for index in range(4):
+        power = np.square(store.read_pose(index)).mean(axis=(0, 2))
+        distance = np.linalg.norm(store.positions[index] - TARGET)
+        assert store.range[power.argmax()] == pytest.approx(distance, abs=3e-3)
+
+
+def test_the_same_again_is_the_same_bytes_and_costs_nothing(brought, tmp_path, monkeypatch):
+    store, _ = brought()
+    before = files(store.path)
+    assert files(brought(output="again")[0].path) == before
+    monkeypatch.setattr(EnsembleStore, "create", None)
+    assert brought()[0].path == store.path
+    assert files(store.path) == before
+
+
+def test_what_changes_the_echoes_is_another_ensemble(brought):
+    brought()
+    for changes in (
+        {"waveform": 1.001 * waveforms()},
+        {"start": 1e-6},
+        {"position_m": arrays()["position_m"] + 1e-4},
+    ):
+        with pytest.raises(IncompatibleError, match="holds other echoes"):
+            brought(**changes)
+    with pytest.raises(IncompatibleError):
+        brought("import.scale=2")
+    brought("import.source=somebody else")  # says nothing of the echoes
+
+
+def test_an_interrupted_import_goes_on(brought, tmp_path):
+    store, _ = brought()
+    whole = files(store.path)
+    chunk = next((store.path / "spectrogram").glob("c.5.*"))
+    chunk.unlink()
+    assert brought()[0].missing() == []
+    assert files(store.path) == whole
+
+
+def test_repeated_pings_tell_the_noise_floor(brought):
+    given = arrays()
+    twice = {name: np.repeat(given[name], 2, axis=0) for name in ("position_m", "rotation")}
+    waves = np.repeat(given["waveform"], 2, axis=0)
+    waves += 1e-5 * np.random.default_rng(1).standard_normal(waves.shape)
+    store, _ = brought(waveform=waves, **twice)
+    assert 0.01 < store.attributes["noise_floor_mae_db"] < 3
+    split = store.split
+    np.testing.assert_array_equal(split[::2], split[1::2])
+
+
+def mirrored():
+    given, mirror = arrays(), np.diag([1.0, -1.0, 1.0])
+    return {
+        "waveform": waveforms(call={"kind": "impulse"}),
+        "position_m": given["position_m"] @ mirror,
+        "rotation": mirror @ given["rotation"] @ mirror,
+    }
+
+
+def test_a_wrong_convention_is_named(brought):
+    store, verdict = brought("call={kind: impulse}", **mirrored())
+    assert verdict.name == "left-handed frame"
+    assert len(store) == 24
+
+
+def test_what_is_bad_leaves_nothing_behind(brought, tmp_path):
+    bad = waveforms()
+    bad[3, 1, 50] = np.nan
+    with pytest.raises(InputError, match="NaN"):
+        brought(waveform=bad)
+    with pytest.raises(InputError, match="24 pings and 20 poses"):
+        brought(position_m=np.zeros((20, 3)), rotation=np.stack([np.eye(3)] * 20))
+    assert not (tmp_path / "store").exists()
+    with pytest.raises(NumericalError, match="all recordings are silent"):
+        brought(waveform=np.zeros((24, 2, 1600)))
+
+
+def test_poses_are_checked_without_a_store(tmp_path):
+    np.savez(tmp_path / "a.npz", **arrays(**mirrored()))
+    given = [*GIVEN, "call={kind: impulse}"]
+    known = understand("numpy", tmp_path / "a.npz", tmp_path / "s", overrides=given)
+    assert check_before(known).name == "left-handed frame"
+    assert not (tmp_path / "s").exists()
+
+
+def test_a_store_in_use_is_not_touched(brought, tmp_path):
+    with lock(tmp_path / "store"), pytest.raises(LockedError, match="in use"):
+        brought()
+
+
+def test_what_was_understood_is_said_and_drawn(tmp_path):
+    np.savez(tmp_path / "a.npz", **arrays())
+    known = understand("numpy", tmp_path / "a.npz", tmp_path / "s", overrides=GIVEN)
+    text = "\n".join(describe(known))
+    for words in (
+        "a.npz (numpy), 250000 Hz",
+        "24 read, 0 clipped and rejected; 21 train, 1 validation, 2 test",
+        "receivers:  2, omnidirectional",
+        "frame enu; lengths in m",
+        "linear, 20 to 80 kHz",
+        "(window 16, hop 1, fft 128)",
+        "343.0 m/s",
+        "import.compress=true resolves them to",
+    ):
+        assert words in text
+    known = understand(
+        "numpy", tmp_path / "a.npz", tmp_path / "s", overrides=[*GIVEN, "import.compress=true"]
+    )
+    text = "\n".join(describe(known))
+    assert "impulse, by pulse compression" in text
+    assert "import.compress=true" not in text
+    assert draw(known, tmp_path / "p").read_bytes().startswith(b"\x89PNG")
+    assert not (tmp_path / "s").exists()

@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: MIT
+"""Predictions need two files and run no code; where echoes were measured they are compared."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import IncompatibleError, InputError, ResourceError
+from sononerf.progress import Progress
+from sononerf.run import predict as predict_module
+from sononerf.run.fit import fit
+from sononerf.run.fitted import load_fitted
+from sononerf.run.predict import predict
+from sononerf.run.run_folder import RunFolder
+
+CSV = "x,y,z,yaw,pitch,roll\n-0.4,0,0,0,0,0\n0,0,0.4,0,90,0\n"
+AXES = {"range_m", "frequency_hz", "reference", "pose", "position", "rotation"}
+
+
+@pytest.fixture(scope="module")
+def fitted(tiny_settings, without_pictures, tmp_path_factory):
+    path = tmp_path_factory.mktemp("fitted") / "run"
+    fit(tiny_settings(), path, accelerator="cpu", workers=1)
+    return path
+
+
+@pytest.fixture
+def run(fitted, tmp_path):
+    """The run with nothing but its two files, somewhere else."""
+    path = tmp_path / "elsewhere"
+    path.mkdir()
+    for name in ("model.safetensors", "model.json"):
+        shutil.copy(fitted / name, path)
+    return path
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    monkeypatch.setattr(predict_module, "spectrogram_png", lambda *given: b"")
+
+
+def arrays_of(folder):
+    with np.load(folder / "spectrograms.npz", allow_pickle=False) as file:
+        return dict(file)
+
+
+def test_measured_predicted_and_numbered_as_in_the_store(run, echoes):
+    folder = predict(run, accelerator="cpu")
+    store = EnsembleStore.open(echoes)
+    numbers = store.indices("test").tolist()
+    assert folder == run / "prediction"
+    assert sorted(p.name for p in folder.iterdir()) == [
+        *(f"pose_{number:04d}.png" for number in numbers),
+        "spectrograms.npz",
+    ]
+    arrays = arrays_of(folder)
+    assert arrays.keys() == {"measured", "predicted"} | AXES
+    shape = (len(numbers), 2, len(store.range), len(store.frequency))
+    assert arrays["predicted"].shape == arrays["measured"].shape == shape
+    assert np.isfinite(arrays["predicted"]).all()
+    assert (arrays["predicted"] >= 0).all()
+    np.testing.assert_array_equal(arrays["pose"], numbers)
+    np.testing.assert_array_equal(arrays["measured"][1], store.read_pose(numbers[1]))
+    np.testing.assert_allclose(arrays["position"], store.positions[numbers], rtol=1e-6)
+    np.testing.assert_allclose(arrays["range_m"], store.range, rtol=1e-6)
+    with Image.open(io.BytesIO((folder / f"pose_{numbers[0]:04d}.png").read_bytes())) as image:
+        assert min(image.size) > 100
+
+
+def test_the_numbers_are_those_of_the_arrays(run, echoes, no_pictures):
+    arrays = arrays_of(predict(run, accelerator="cpu"))
+    numbers = json.loads((run / "metrics.json").read_text())["prediction"]
+    store = EnsembleStore.open(echoes)
+    assert float(arrays["reference"]) == store.attributes["reference"]
+
+    def db(values):
+        return 20 * np.log10(1 + values / store.attributes["reference"])
+
+    measured, predicted = (
+        db(arrays["measured"].astype(float)),
+        db(arrays["predicted"].astype(float)),
+    )
+    mean = np.mean([db(store.read_pose(int(i)).astype(float)) for i in store.indices("train")], 0)
+    assert numbers["mae_db"] == pytest.approx(np.abs(measured - predicted).mean(), rel=1e-5)
+    assert numbers["mean_predictor_mae_db"] == pytest.approx(
+        np.abs(measured - mean).mean(), rel=1e-5
+    )
+    assert (numbers["split"], numbers["poses"]) == ("test", 2)
+    assert numbers["noise_floor_mae_db"] == store.attributes["noise_floor_mae_db"]
+
+
+@pytest.mark.parametrize(("split", "count"), [("train", 8), ("val", 2)])
+def test_other_splits_have_their_own_folder_and_no_numbers(run, split, count, no_pictures):
+    folder = predict(run, split=split, accelerator="cpu")
+    assert folder == run / f"prediction-{split}"
+    assert len(arrays_of(folder)["pose"]) == count
+    assert not (run / "metrics.json").exists()
+
+
+def test_poses_of_ones_own_need_neither_store_nor_scene(run, tmp_path, monkeypatch):
+    def gone(*given):
+        raise AssertionError("asked for the ensemble")
+
+    monkeypatch.setattr(predict_module, "store_of", gone)
+    (tmp_path / "poses.csv").write_text(CSV)
+    folder = predict(run, poses_csv=tmp_path / "poses.csv", accelerator="cpu")
+    assert folder == run / "prediction-poses"
+    arrays = arrays_of(folder)
+    assert arrays.keys() == {"predicted"} | AXES
+    assert len(arrays["predicted"]) == 2
+    np.testing.assert_allclose(arrays["position"][0], [-0.4, 0, 0], rtol=1e-6)
+    np.testing.assert_allclose(arrays["rotation"][1][:, 0], [0, 0, -1], atol=1e-6)  # looks down
+    assert len(list(folder.glob("pose_*.png"))) == 2
+    assert not (run / "metrics.json").exists()
+
+
+def test_what_was_not_measured_is_not_drawn(run, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(
+        predict_module, "spectrogram_png", lambda measured, *_: drawn.append(measured) or b""
+    )
+    (tmp_path / "poses.csv").write_text(CSV)
+    predict(run, poses_csv=tmp_path / "poses.csv", accelerator="cpu")
+    assert drawn == [None, None]
+
+
+@pytest.mark.parametrize("pose", ["9,0,0,180,0,0", "0.4,0,-300,0,0,0", "1e200,0,0,180,0,0"])
+def test_poses_that_can_hear_nothing_of_the_region_are_refused(run, tmp_path, pose):
+    csv = tmp_path / "poses.csv"
+    csv.write_text(f"{CSV}{pose}\n")
+    with pytest.raises(InputError, match=r"poses\.csv: from pose 2 .* positions are in metres"):
+        predict(run, poses_csv=csv, output=tmp_path / "out", accelerator="cpu")
+    assert not (tmp_path / "out").exists()
+
+
+def test_nor_are_those_that_are_too_near_to_hear_any(run, tmp_path):
+    csv = tmp_path / "poses.csv"
+    csv.write_text(f"{CSV}0,0,0,0,0,0\n")
+    module = load_fitted(run).module
+    assert module.field.region.norm(dim=1).max() < module.renderer.range[0]
+    with pytest.raises(InputError, match="from pose 2"):
+        predict(run, poses_csv=csv, accelerator="cpu")
+
+
+def test_poses_within_the_region_are_told(run, tmp_path, no_pictures, monkeypatch):
+    csv, told = tmp_path / "poses.csv", []
+    lower, upper = load_fitted(run).module.field.region.double().numpy()
+    x, y, z = lower + 0.01 * (upper - lower)
+    csv.write_text(f"{CSV}{x},{y},{z},0,0,0\n")
+    fitted = load_fitted(run)
+    fitted.module.renderer.range[0] = 0.0
+    monkeypatch.setattr(predict_module, "load_fitted", lambda path: fitted)
+    monkeypatch.setattr(Progress, "say", lambda self, text: told.append(text))
+    predict(run, poses_csv=csv, accelerator="cpu")
+    assert len(told) == 1
+    assert told[0].endswith("within the fitted region, where no pose was trained, lie poses 2")
+
+
+def test_a_pose_that_hears_the_regions_far_side_alone_will_do(run, tmp_path, no_pictures):
+    csv, module = tmp_path / "poses.csv", load_fitted(run).module
+    lower, upper = module.field.region.double().numpy()
+    first = float(module.renderer.range[0])
+    csv.write_text(f"{CSV}{upper[0] + first - (upper[0] - lower[0]) / 2},0,0,180,0,0\n")
+    assert len(arrays_of(predict(run, poses_csv=csv, accelerator="cpu"))["pose"]) == 3
+
+
+def test_that_tracing_is_missing_is_told(run, no_pictures, monkeypatch):
+    told = []
+    monkeypatch.setattr(Progress, "say", lambda self, text: told.append(text))
+    predict(run, accelerator="cpu")
+    predict(run, accelerator="cpu")  # nothing was traced
+    RunFolder(run).write_metrics("prediction", None)
+    predict(run, accelerator="cpu")
+    assert told == []
+    RunFolder(run).write_metrics("prediction", {"traced_weight": 0.3})
+    predict(run, accelerator="cpu")
+    assert len(told) == 1
+    assert f"{run / 'traced.safetensors'} is missing" in told[0]
+    assert "0.30" in told[0]
+
+
+def test_the_same_field_predicts_the_same_bits_wherever_it_lies(run, fitted, tmp_path, no_pictures):
+    (tmp_path / "poses.csv").write_text(CSV)
+    first, second = (
+        arrays_of(
+            predict(p, poses_csv=tmp_path / "poses.csv", output=tmp_path / o, accelerator="cpu")
+        )
+        for p, o in ((run, "a"), (fitted, "b"))
+    )
+    np.testing.assert_array_equal(first["predicted"], second["predicted"])
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"reference": "loud"}, InputError, "incomplete"),
+        ({"echo_hash": "0" * 64}, IncompatibleError, "other echoes"),
+    ],
+)
+def test_what_cannot_be_predicted_leaves_no_folder(run, change, error, message):
+    description = json.loads((run / "model.json").read_text())
+    (run / "model.json").write_text(json.dumps({**description, **change}))
+    with pytest.raises(error, match=message):
+        predict(run, accelerator="cpu")
+    assert not (run / "prediction").exists()
+
+
+def test_a_gpu_that_is_not_there(run, monkeypatch):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    with pytest.raises(ResourceError):
+        predict(run, accelerator="gpu")

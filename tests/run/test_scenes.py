@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: MIT
+"""The list of scenes: a broken one says so and hurts no other."""
+
+from __future__ import annotations
+
+import io
+import logging
+import sys
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import StorageError
+from sononerf.run import scenes as scenes_module
+from sononerf.run.scenes import (
+    describe_scene,
+    describe_scenes,
+    draw_ensemble,
+    draw_scenes,
+    option_table,
+    scene_table,
+)
+
+
+@pytest.fixture
+def few(monkeypatch):
+    """Leave but a few of the scenes that are installed: building all takes seconds."""
+    real = scenes_module.list_scenes
+    wanted = {"sphere", "mesh", "fixture_bar", "broken", "failing", "choosy", "loud"}
+
+    def listed():
+        return [plugin for plugin in real() if plugin.name in wanted]
+
+    monkeypatch.setattr(scenes_module, "list_scenes", listed)
+
+
+def test_one_scene_tells_its_options():
+    lines = option_table(describe_scene("mesh"))
+    assert lines[0] == "Load a surface from a file."
+    assert not any("Returns" in line or "Raises" in line for line in lines)
+    rows = {
+        line.split()[0]: line.split(maxsplit=2)[1:] for line in lines[lines.index("") :] if line
+    }
+    assert rows["path"] == ["needed", "text"]
+    assert rows["scale"] == ["1.0", "a number above 0"]
+    assert rows["centre"] == ["true", "true or false"]
+    assert rows["unit"] == ["none", "m, cm, mm or none"]
+
+
+def test_every_scene_says_where_it_is_from_and_what_it_takes(plugin, few):
+    rows = {row["name"]: row for row in describe_scenes()}
+    assert rows.keys() == {"sphere", "mesh", "fixture_bar"}
+    assert rows["sphere"]["distribution"] == "sononerf"
+    assert rows["sphere"]["summary"].startswith("Build a sphere")
+    assert rows["sphere"]["options"] == ["radius", "material"]
+    assert (rows["fixture_bar"]["distribution"], rows["fixture_bar"]["version"]) == (
+        "sononerf-fixture",
+        "1.0",
+    )
+    assert rows["fixture_bar"]["options"] == ["length", "radius"]
+    assert not any(row["broken"] for row in rows.values())
+    assert rows["fixture_bar"]["size_m"] == pytest.approx([0.02, 0.02, 0.12], rel=0.02)
+    assert rows["fixture_bar"]["triangles"] > 100
+    assert rows["fixture_bar"]["needs"] == []
+    mesh = rows["mesh"]
+    assert (mesh["needs"], mesh["size_m"], mesh["triangles"]) == (["path"], None, None)
+
+
+FAULTY = """
+import warnings
+from sononerf.scene.scene import Scene
+def failing():
+    \"\"\"Raise.\"\"\"
+    raise RuntimeError("no\\nluck")
+def choosy(size: float):
+    \"\"\"Build what needs an option.\"\"\"
+def loud():
+    \"\"\"Talk, and make an open mesh.\"\"\"
+    import trimesh
+    print("hello")
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    return Scene(trimesh.Trimesh(box.vertices, box.faces[:-1]))
+"""
+
+
+@pytest.fixture
+def broken(tmp_path, monkeypatch):
+    info = tmp_path / "broken-2.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: broken\nVersion: 2.0\n")
+    names = ["failing", "choosy", "loud"]
+    lines = ["broken = no_such_module:make", *(f"{name} = faulty_scenes:{name}" for name in names)]
+    (info / "entry_points.txt").write_text("\n".join(["[sononerf.scenes]", *lines]) + "\n")
+    (tmp_path / "faulty_scenes.py").write_text(FAULTY)
+    monkeypatch.syspath_prepend(tmp_path)
+    yield
+    sys.modules.pop("faulty_scenes", None)
+
+
+def test_a_broken_scene_hurts_only_its_own_row(broken, few, capsys, caplog):
+    rows = {row["name"]: row for row in describe_scenes()}
+    assert {name for name, row in rows.items() if row["broken"]} == {"broken", "failing"}
+    assert "no_such_module" in rows["broken"]["summary"]
+    assert rows["failing"]["summary"].endswith("failed: RuntimeError: no luck")
+    assert rows["failing"]["size_m"] is None
+    assert rows["choosy"]["needs"] == ["size"]
+    assert rows["loud"]["size_m"] == pytest.approx([0.1, 0.1, 0.1])
+    assert capsys.readouterr().out == ""  # of `--json`, standard output is ours alone
+    assert caplog.records == []
+
+
+def test_the_table_is_aligned():
+    row = {"distribution": "d", "version": "1", "needs": [], "size_m": None, "triangles": None}
+    rows = [
+        {**row, "name": "a", "size_m": [0.03, 0.0305, 1.0], "triangles": 12, "summary": "Build a."},
+        {**row, "name": "longer", "needs": ["path"], "summary": "Load."},
+        {**row, "name": "b", "broken": True, "summary": "broken: why"},
+    ]
+    assert scene_table(rows) == [
+        "name    from  size (mm)         triangles",
+        "a       d 1   30 x 30.5 x 1000         12  Build a.",
+        "longer  d 1   needs path                -  Load.",
+        "b       d 1   -                         -  broken: why",
+    ]
+
+
+def size_of(path):
+    with Image.open(io.BytesIO(path.read_bytes())) as image:
+        image.load()
+        return image.size
+
+
+def test_scenes_are_drawn_but_those_that_cannot_be(broken, few, tmp_path):
+    written, skipped = draw_scenes(tmp_path / "pictures")
+    assert [path.name for path in written] == ["loud.png", "sphere.png"]
+    assert min(size_of(written[0])) > 100
+    reasons = dict(line.split(": ", 1) for line in skipped)
+    assert reasons["mesh"] == "needs scene.options.path"
+    assert reasons["choosy"] == "needs scene.options.size"
+    assert "no_such_module" in reasons["broken"]
+    assert reasons["failing"].endswith("no luck")
+
+
+def test_a_folder_that_is_a_file_is_refused_before_the_work(tmp_path, monkeypatch):
+    monkeypatch.setattr(scenes_module, "load_scene", lambda *_: pytest.fail("was built"))
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(StorageError, match="file"):
+        draw_scenes(tmp_path / "file")
+
+
+def test_an_ensemble_is_drawn_with_the_echo_of_its_first_test_pose(
+    tiny, echoes, tmp_path, monkeypatch, caplog
+):
+    drawn = {}
+    real = scenes_module.echo_png
+
+    def keep(*given, **named):
+        drawn.update(points=given[1], level=given[2], position=given[3], named=named)
+        return real(*given, **named)
+
+    monkeypatch.setattr(scenes_module, "echo_png", keep)
+    store = EnsembleStore.open(echoes)
+    load = scenes_module.load_scene
+
+    def warn(*given, **named):
+        logging.getLogger("sononerf").warning("parts intersect")
+        return load(*given, **named)
+
+    monkeypatch.setattr(scenes_module, "load_scene", warn)
+    written = draw_ensemble(tiny(), store, tmp_path)
+    assert caplog.text == ""  # it was said before the simulation
+    assert [path.name for path in written] == ["scene.png", "pose_0010.png"]
+    assert all(min(size_of(path)) > 100 for path in written)
+    assert store.split[10] == 2
+    assert drawn["named"]["title"] == "sphere, pose 10"
+    # The loudest hit of a sphere is where its surface faces the head.
+    loudest = drawn["points"][np.argmax(drawn["level"])]
+    towards = drawn["position"] / np.linalg.norm(drawn["position"])
+    assert np.degrees(np.arccos(loudest @ towards / 0.02)) < 15

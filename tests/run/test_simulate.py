@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: MIT
+"""Echoes are made once, found again by what they depend on, and go on where they stopped."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+from dataclasses import replace
+
+import distributed
+import numpy as np
+import pytest
+import trimesh
+
+from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.subtracted import SubtractedStore
+from sononerf.errors import (
+    IncompatibleError,
+    InputError,
+    LockedError,
+    NumericalError,
+    SettingsError,
+)
+from sononerf.head.directivity.sofa_writer import write_sofa
+from sononerf.run import simulate as simulate_module
+from sononerf.run.simulate import (
+    background_path,
+    echo_hash,
+    ensemble,
+    simulate,
+    store_path,
+)
+from sononerf.scene.material import LEAF, RIGID
+from sononerf.scene.scene import Scene, load_scene
+from sononerf.storage import lock
+from tests.head.directivity.patterns import pair
+
+
+def hashed(settings):
+    return echo_hash(settings, load_scene(settings.scene.name, settings.scene.options))
+
+
+def test_the_hash_covers_all_that_echoes_depend_on_and_nothing_else(tiny):
+    base = hashed(tiny())
+    for changed in (
+        {"scene": {"options": {"radius": 0.021}}},
+        {"poses": {"seed": 1}},
+        {"poses": {"radius": 0.41}},
+        {"simulation": {"rays": 501}},
+        {"air": {"temperature_c": 20.0}},
+        {"ears": {"azimuth_deg": 20.0}},
+        {"ears": {"receivers": [[0.0, 0.0, 0.0]]}},
+        {"ears": {"directivity": "piston"}},
+        {"spectrogram": {"range_max": 0.46}},
+    ):
+        assert hashed(tiny(**changed)) != base, changed
+    for changed in (
+        {"fit": {"epochs": 9}},
+        {"field": {"options": {"levels": 1}}},
+        {"data": {"store": "elsewhere"}},
+        {"reconstruction": {"spacing": 0.01}},
+    ):
+        assert hashed(tiny(**changed)) == base, changed
+
+
+def test_a_directivity_counts_as_what_it_is_not_as_where_it_lies(tiny, tmp_path):
+    first, second, third = (tmp_path / f"{name}.sofa" for name in "abc")
+    write_sofa(first, pair())
+    second.write_bytes(first.read_bytes())
+    write_sofa(third, pair(beam=False))
+    one, same, other = (
+        hashed(tiny(ears={"directivity": "file", "file": str(path)}))
+        for path in (first, second, third)
+    )
+    assert one == same
+    assert one != other
+    with pytest.raises(InputError, match="no such file"):
+        hashed(tiny(ears={"directivity": "file", "file": str(tmp_path / "d.sofa")}))
+
+
+def test_what_is_background_sounds_as_it_would_otherwise(tiny):
+    settings = tiny()
+    scene = load_scene(settings.scene.name, settings.scene.options)
+    background = np.arange(len(scene.mesh.faces)) > 0
+    assert echo_hash(settings, replace(scene, background=background)) == hashed(settings)
+
+
+def test_another_simulator_makes_another_ensemble(tiny, monkeypatch):
+    settings = tiny()
+    scene = load_scene(settings.scene.name, settings.scene.options)
+    before = echo_hash(settings, scene)
+    monkeypatch.setattr(simulate_module, "VERSION", simulate_module.VERSION + 1)
+    assert echo_hash(settings, scene) != before
+
+
+HEADER = "x,y,z,yaw,pitch,roll\n"
+ROWS = [f"0.4,{0.01 * row},0.0,180,{row},0\n" for row in range(8)]
+
+
+def test_a_path_counts_as_the_poses_it_holds(tiny, tmp_path):
+    def of(name, rows, **changes):
+        (tmp_path / name).write_text(HEADER + "".join(rows), encoding="utf-8")
+        path = {"arrangement": "path", "path": str(tmp_path / name), **changes}
+        return hashed(tiny(poses=path))
+
+    base = of("a.csv", ROWS)
+    assert of("b.csv", ROWS) == base
+    assert of("b.csv", ROWS, count=99, radius=9.0) == base  # neither is of a path
+    assert of("a.csv", [*ROWS[:-1], ROWS[-1].replace(",7,0", ",7,1")]) != base
+    assert of("a.csv", [*ROWS[:-1], "0.41" + ROWS[-1][3:]]) != base
+    assert of("a.csv", ROWS[::-1]) != base
+    assert of("a.csv", ROWS, heldout=1) != base
+
+
+def test_a_path_is_simulated_in_its_order(tiny, tmp_path):
+    (tmp_path / "a.csv").write_text(HEADER + "".join(ROWS), encoding="utf-8")
+    settings = tiny(poses={"arrangement": "path", "path": str(tmp_path / "a.csv")})
+    store = simulate(settings, output=tmp_path / "store", workers=1)
+    np.testing.assert_allclose(store.positions[:, 1], 0.01 * np.arange(8))
+    assert np.bincount(store.split).tolist() == [4, 2, 2]
+    assert min(store.read_pose(index).max() for index in range(8)) > 0
+
+
+def test_where_the_store_lies(tiny, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = tiny(data={"store": None}, poses={"count": 2, "validation": 0, "heldout": 0})
+    store = simulate(settings, workers=1)
+    assert str(store.path) == f"data/sphere-{hashed(settings)[:12]}"
+    scene = load_scene("sphere", settings.scene.options)
+    assert store_path(tiny(data={"store": "there"}), scene, None).name == "there"
+    assert store_path(tiny(data={"store": "there"}), scene, tmp_path / "here").name == "here"
+
+
+def test_a_whole_store_is_opened_and_nothing_is_simulated(tiny, echoes, monkeypatch):
+    monkeypatch.setattr(simulate_module, "Simulator", None)
+    store = simulate(tiny())
+    assert store.path == echoes
+    assert store.mode == "r"
+
+
+def test_a_store_of_other_settings_is_refused(tiny, echoes):
+    with pytest.raises(IncompatibleError, match="holds echoes of other settings"):
+        simulate(tiny(simulation={"rays": 501}), output=echoes)
+
+
+def test_an_interrupted_simulation_goes_on(tiny, echoes, tmp_path, monkeypatch):
+    real = EnsembleStore.write_pose
+    written = []
+
+    def cut(self, index, spectrogram):
+        if len(written) == 5:
+            raise KeyboardInterrupt
+        written.append(index)
+        real(self, index, spectrogram)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(EnsembleStore, "write_pose", cut)
+        with pytest.raises(KeyboardInterrupt):
+            simulate(tiny(), output=tmp_path / "store", workers=1)
+
+    def count(self, index, spectrogram):
+        assert index not in written
+        real(self, index, spectrogram)
+
+    monkeypatch.setattr(EnsembleStore, "write_pose", count)
+    store = simulate(tiny(), output=tmp_path / "store", workers=1)
+    whole = EnsembleStore.open(echoes)
+    assert store.missing() == []
+    for index in range(len(whole)):
+        np.testing.assert_array_equal(store.read_pose(index), whole.read_pose(index))
+    for name in ("reference", "noise_floor_mae_db", "echo_hash"):
+        assert store.attributes[name] == whole.attributes[name]
+
+
+def content(store):
+    files = sorted(path for path in store.path.rglob("*") if path.is_file())
+    return {str(path.relative_to(store.path)): path.read_bytes() for path in files}
+
+
+class Stopper:
+    """Calls something after so many poses were written."""
+
+    def __init__(self, monkeypatch):
+        self.real, self.after, self.action, self.written = EnsembleStore.write_pose, -1, None, 0
+        monkeypatch.setattr(EnsembleStore, "write_pose", lambda *given: self.write(*given))
+
+    def arm(self, after, action):
+        self.after, self.action, self.written = after, action, 0
+
+    def write(self, store, index, spectrogram):
+        self.real(store, index, spectrogram)
+        self.written += 1
+        if self.written == self.after:
+            self.action()
+
+
+def test_stops_and_other_numbers_of_workers_change_no_byte(tiny, echoes, tmp_path, monkeypatch):
+    stopper = Stopper(monkeypatch)
+
+    def stop():
+        raise KeyboardInterrupt
+
+    for after, workers in ((3, 1), (4, 2)):
+        stopper.arm(after, stop)
+        with pytest.raises(KeyboardInterrupt):
+            simulate(tiny(), output=tmp_path / "store", workers=workers)
+    stopper.arm(-1, stop)
+    store = simulate(tiny(), output=tmp_path / "store", workers=3)
+    alone = EnsembleStore.open(echoes)
+    assert stopper.written == len(alone) - 3 - 4
+    assert content(store) == content(alone)
+
+
+def test_a_killed_worker_costs_nothing(tiny, tmp_path, monkeypatch):
+    settings = tiny(poses={"count": 20}, simulation={"rays": 4000})
+    alone = simulate(settings, output=tmp_path / "alone", workers=1)
+    stopper = Stopper(monkeypatch)
+    cluster = distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        dashboard_address="127.0.0.1:0",
+        silence_logs=logging.CRITICAL,
+    )
+    with cluster:
+        before = [worker.pid for worker in cluster.workers.values()]
+        stopper.arm(5, lambda: os.kill(before[0], signal.SIGKILL))
+        store = simulate(settings, output=tmp_path / "shared", scheduler=cluster.scheduler_address)
+    assert stopper.written == len(alone) == 24
+    assert content(store) == content(alone)
+
+
+def test_the_noise_floor_is_that_of_other_rays(echoes, tiny, tmp_path):
+    store = EnsembleStore.open(echoes)
+    train = max(float(store.read_pose(int(i)).max()) for i in store.indices("train"))
+    error = np.array(store.attributes["expected_error_db"])
+    assert error.shape == store.frequency.shape
+    assert error[0] > error[-1] > 0.0
+    assert store.attributes["reference"] == pytest.approx(train / 1000)
+    coarse = store.attributes["noise_floor_mae_db"]
+    fine = simulate(
+        tiny(simulation={"rays": 20_000}), output=tmp_path / "fine", workers=1
+    ).attributes["noise_floor_mae_db"]
+    assert 0 < fine < coarse / 2
+    none = simulate(
+        tiny(poses={"count": 2, "heldout": 0}), output=tmp_path / "none", workers=1
+    ).attributes
+    assert none["noise_floor_mae_db"] is None
+
+
+@pytest.mark.parametrize("limits", [(1.0, 1.1), (0.1, 0.2)])
+def test_range_limits_that_no_echo_reaches(tiny, tmp_path, limits):
+    settings = tiny(spectrogram=dict(zip(("range_min", "range_max"), limits, strict=True)))
+    with pytest.raises(NumericalError, match="no pose received an echo"):
+        simulate(settings, output=tmp_path / "store")
+    assert not (tmp_path / "store").exists()
+
+
+def test_a_store_in_use_is_left_alone(tiny, tmp_path):
+    with lock(tmp_path / "store"), pytest.raises(LockedError):
+        simulate(tiny(), output=tmp_path / "store")
+
+
+def before_a_wall(settings):
+    """The tiny sphere, and a plate behind it that is background."""
+    sphere = load_scene("sphere", settings.scene.options).mesh
+    plate = trimesh.creation.box((0.002, 0.1, 0.1))
+    plate.apply_translation((-0.03, 0, 0))
+    both = trimesh.util.concatenate([sphere, plate])
+    marked = np.arange(len(both.faces)) >= len(sphere.faces)
+    return Scene(both, (RIGID, LEAF), marked.astype(int), background=marked)
+
+
+def test_the_scenes_own_background_is_simulated_alone_and_taken_off(tiny, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = tiny(data={"store": None, "background": "scene"})
+    scene = before_a_wall(settings)
+    monkeypatch.setattr(simulate_module, "load_scene", lambda *given, **named: scene)
+    left = ensemble(settings, workers=1)
+    whole = simulate(tiny(data={"store": None}), workers=1)
+    alone = EnsembleStore.open(background_path(settings))
+    assert left.path == whole.path
+    assert alone.path.name.endswith("-background")
+    for index in range(len(whole)):
+        power = whole.read_pose(index) ** 2 - alone.read_pose(index) ** 2
+        np.testing.assert_allclose(left.read_pose(index) ** 2, power.clip(min=0), atol=1e-6)
+    assert max(alone.read_pose(index).max() for index in range(len(alone))) > 0
+    assert max(left.read_pose(index).max() for index in range(len(left))) > 0
+    # The plate alone is heard as it is, and as what it is made of.
+    plate = scene.surroundings()
+    assert len(plate.mesh.faces) == 12
+    assert (plate.part == 1).all()
+    assert plate.materials == (RIGID, LEAF)
+    # What is there is not simulated again.
+    monkeypatch.setattr(simulate_module, "Simulator", None)
+    np.testing.assert_array_equal(ensemble(settings).read_pose(0), left.read_pose(0))
+
+
+def test_a_background_of_ones_own_is_taken_off(tiny, echoes, tmp_path):
+    settings = tiny(data={"background": str(echoes)})
+    assert background_path(settings) == echoes
+    assert isinstance(ensemble(settings), SubtractedStore)
+    assert background_path(tiny()) is None
+    assert not isinstance(ensemble(tiny()), SubtractedStore)
+
+
+def test_a_background_that_is_not_there_is_told_before_anything_is_simulated(tiny, monkeypatch):
+    monkeypatch.setattr(simulate_module, "simulate", None)
+    with pytest.raises(InputError, match="nowhere: no ensemble store"):
+        ensemble(tiny(data={"background": "nowhere"}))
+
+
+def test_a_scene_without_background_has_none_to_take_off(tiny, monkeypatch):
+    monkeypatch.setattr(simulate_module, "simulate", None)
+    with pytest.raises(SettingsError, match="the scene 'sphere' marks no background") as error:
+        ensemble(tiny(data={"background": "scene"}))
+    assert "\n" not in str(error.value)

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import numpy as np
+
+from sononerf.echoes.store import EnsembleStore
+from sononerf.surface.refine import echo_data
+from sononerf.surface.refine.echo_data import Echoes
+
+
+def store_of(path, split):
+    count = len(split)
+    store = EnsembleStore.create(
+        path,
+        poses_positions=np.random.default_rng(0).standard_normal((count, 3)),
+        poses_rotations=np.broadcast_to(np.eye(3), (count, 3, 3)),
+        split=split,
+        range=np.linspace(0.2, 0.3, 5),
+        frequency=np.linspace(1e4, 2e4, 3),
+        attributes={"echo_hash": "a"},
+    )
+    for number in range(count):
+        store.write_pose(number, np.full((2, 5, 3), float(number)))
+    return store
+
+
+def test_poses_come_from_their_splits(tmp_path):
+    echoes = Echoes.of(store_of(tmp_path / "s", [0, 0, 1, 2, 0]))
+    assert echoes.training.tolist() == [0, 1, 4]
+    assert echoes.validation.tolist() == [2]
+    assert float(echoes.magnitude(4).mean()) == 4.0
+
+
+def test_without_validation_poses_some_of_training_are_held_back(tmp_path):
+    echoes = Echoes.of(store_of(tmp_path / "s", [0] * 25))
+    assert len(echoes.validation) >= 2
+    assert len(echoes.training) + len(echoes.validation) == 25
+    assert not set(echoes.training) & set(echoes.validation)
+
+
+def test_all_training_poses_come_in_turn_and_the_step_alone_decides():
+    numbers = np.arange(20)
+    echoes = Echoes(np.zeros((20, 3)), np.zeros((20, 3, 3)), numbers, numbers[:0], lambda i: None)
+    drawn = np.concatenate([echoes.batch(3, step, 8) for step in range(5)])
+    assert sorted(drawn[:20]) == sorted(drawn[20:40]) == numbers.tolist()
+    assert drawn[:20].tolist() != drawn[20:40].tolist()
+    assert echoes.batch(3, 4, 8).tolist() == drawn[32:].tolist()
+    assert echoes.batch(4, 0, 8).tolist() != drawn[:8].tolist()
+    assert len(echoes.batch(0, 0, 50)) == 20
+
+
+def test_memory_is_bounded(monkeypatch):
+    reads = []
+
+    def read(number):
+        reads.append(number)
+        return np.zeros((2, 5, 3), np.float32)
+
+    numbers = np.arange(3)
+    echoes = Echoes(np.zeros((3, 3)), np.zeros((3, 3, 3)), numbers, numbers[:0], read)
+    monkeypatch.setattr(echo_data, "KEPT_BYTES", 2 * 2 * 5 * 3 * 4)
+    for _ in range(2):
+        for number in range(3):
+            echoes.magnitude(number)
+    assert reads == [0, 1, 2, 2]

@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from sononerf.geometry.raycast import Occlusion
+from sononerf.scene.scene import Scene
+from sononerf.surface.refine.echo_data import optics_of
+from sononerf.surface.refine.mesh_operators import MeshOperators, unit
+from sononerf.surface.refine.visibility import listen
+from tests.surface.conftest import RADIUS, given
+
+
+def hear(optics, mesh, poses):
+    faces = np.array(mesh.faces, dtype=np.int64)
+    vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
+    operators = MeshOperators(torch.as_tensor(faces), len(vertices))
+    area = operators.areas(vertices)
+    bending = operators.bending(vertices, unit(area), 1)
+    places, turns = torch.as_tensor(poses.positions), torch.as_tensor(poses.rotations)
+    sight = Occlusion(vertices.numpy(), faces)
+    pieces, heads, middle = listen(optics, operators, vertices, area, bending, sight, places, turns)
+    return pieces, heads, (vertices - middle).float(), area.float()
+
+
+def whole(optics, heard, like):
+    """Rendered magnitudes on the axis of the store."""
+    found = np.zeros_like(like)
+    for pose, row in enumerate(heard.row.tolist()):
+        magnitude = heard.power[pose].detach().sqrt().numpy()
+        first, last = max(row, 0), min(row + magnitude.shape[1], optics.rows)
+        found[pose, :, first:last] = magnitude[:, first - row : last - row]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("call", "front"),
+    [
+        ({"kind": "impulse"}, "stft"),
+        ({"kind": "linear"}, "stft"),
+        ({"kind": "linear", "frequency_end": 25e3, "harmonics": [1.0, 0.5]}, "stft"),
+        ({"kind": "impulse"}, "gammatone"),
+    ],
+)
+def test_a_sphere_sounds_as_the_simulator_says(call, front, ball, poses, simulated):
+    settings = given(call=call, spectrogram={"range_min": 0.2, "range_max": 0.4, "kind": front})
+    optics = optics_of(settings, Scene(ball))
+    fine = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    wanted = simulated(fine, settings, poses)
+    pieces, heads, points, area = hear(optics, fine, poses)
+    found = whole(optics, optics.render(points, area, pieces, heads), wanted)
+    high = optics.frequencies > 40e3
+    errors = []
+    for a, b in zip(found[..., high], wanted[..., high], strict=True):
+        floor = b.max() / 10
+        a, b = 20 * np.log10(1 + a / floor), 20 * np.log10(1 + b / floor)
+        errors.append(np.abs(a - b)[(a >= 3) | (b >= 3)].mean())
+    assert np.mean(errors) < 0.7
+
+
+def test_gradients_are_those_of_finite_differences(optics, ball, poses):
+    pieces, heads, points, area = hear(optics, ball, poses)
+    normals = unit(area)
+    way = torch.as_tensor(np.random.default_rng(0).standard_normal(len(points))).float()
+    way = (way * (points[:, 2] > 0))[:, None] * normals
+
+    floor = 1e-3 * optics.render(points, area, pieces, heads).power.max()
+
+    def value(points, area):
+        heard = optics.render(points, area, pieces, heads)
+        return torch.log(heard.power + floor).double().mean()
+
+    points.requires_grad_(True)
+    area.requires_grad_(True)
+    value(points, area).backward()
+    step = 3e-5
+    with torch.no_grad():
+        ends = [float(value(points + sign * step * way, area)) for sign in (1, -1)]
+        wanted = (ends[0] - ends[1]) / (2 * step)
+        assert float((points.grad * way).sum()) == pytest.approx(wanted, rel=0.1)
+        grown = area * way.norm(dim=1, keepdim=True)
+        ends = [float(value(points, area + sign * 0.02 * grown)) for sign in (1, -1)]
+        wanted = (ends[0] - ends[1]) / 0.04
+        assert float((area.grad * grown).sum()) == pytest.approx(wanted, rel=0.05)
+
+
+def test_a_plate_seen_straight_on_is_at_its_mirror_point_and_one_on_edge_is_not(optics):
+    points = torch.tensor([[0.0, 0.0, 0.0]])
+    head = torch.tensor([[0.3, 0.0, 0.0]])
+    flat = torch.zeros(1, 6)
+    on = optics.near_mirror(points, torch.tensor([[1e-6, 0.0, 0.0]]), flat, head, head)
+    slant = optics.near_mirror(points, torch.tensor([[0.8e-6, 0.6e-6, 0.0]]), flat, head, head)
+    away = optics.near_mirror(points, torch.tensor([[-1e-6, 0.0, 0.0]]), flat, head, head)
+    assert bool(on[0])
+    assert bool(slant[0])
+    assert not bool(away[0])
+    assert float(on[4]) < 1e-6
+    # The path's slope is 1.2, and over the plate it bends by twice cos² of 37 degrees over 0.3 m.
+    assert float(slant[2]) == pytest.approx(0.5 * 1.2**2 / (2 * 0.8**2 / 0.3), rel=0.02)
+
+
+def test_gains_are_those_of_the_tables(optics):
+    ears = optics.hearing.ears
+    row, column = 40, 100
+    level = np.cos(ears.elevation[row])
+    way = [
+        level * np.cos(ears.azimuth[column]),
+        level * np.sin(ears.azimuth[column]),
+        np.sin(ears.elevation[row]),
+    ]
+    found = optics.gains(torch.tensor([1]), torch.tensor([way]).float(), torch.eye(3)[None])
+    assert np.allclose(found[0], ears.ears[0, optics.kept_nodes, row, column], rtol=2e-3)

@@ -1,0 +1,273 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from sononerf.errors import InputError
+from sononerf.simulation.simulator import Simulator
+from sononerf.surface.refine import comparison
+from sononerf.surface.refine import refinement as module
+from sononerf.surface.refine.descent import Descent
+from sononerf.surface.refine.echo_data import Echoes
+from sononerf.surface.refine.later_bounces import quiet_scene
+from sononerf.surface.refine.objective import Level
+from sononerf.surface.refine.optics import Optics
+from sononerf.surface.refine.refinement import Refinement
+from sononerf.surface.refine.stages import Stage
+from tests.surface.conftest import RADIUS
+
+
+def unasked(mesh):
+    raise AssertionError("no stage asks for the simulator")
+
+
+def refined(mesh, echoes, optics, **given):
+    work = started(mesh, echoes, optics, **given)
+    while not work.done:
+        work.advance()
+    return work.result()
+
+
+def started(mesh, echoes, optics, *, simulate=unasked, stages=None):
+    return Refinement(
+        {"body": mesh}, echoes, optics, simulate=simulate, seed=1, stages=stages or SHORT
+    )
+
+
+SHORT = (
+    Stage(smoothing=2.0, edge=0.8, blur=0.3, rate=0.02, steps=8, beyond="trace"),
+    Stage(smoothing=1.2, edge=0.7, blur=0.0, rate=0.02, steps=8, beyond="keep"),
+)
+
+
+def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, echoes, optics):
+    tilt = np.linspace(0.3, 3.0, len(optics.frequencies)).astype(np.float32)
+    own = (echoes.positions, echoes.rotations, echoes.training, echoes.validation)
+    tilted = Echoes(*own, lambda pose: echoes.read(pose) * tilt)
+    work = Refinement(
+        {"body": bumpy},
+        tilted,
+        optics,
+        simulate=unasked,
+        seed=1,
+        stages=SHORT,
+        calibrated=False,
+    )
+    while work.stage == 0:
+        work.advance()
+    gain = work.level.gain[0].exp().numpy()
+    assert gain[-1] / gain[0] > 5.0
+
+
+@pytest.fixture(autouse=True)
+def few_rays(monkeypatch):
+    monkeypatch.setattr(comparison, "RAYS", 4000)
+
+
+@pytest.fixture(scope="module")
+def bumpy():
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    way = np.asarray(mesh.vertices) / RADIUS
+    height = 4e-4 * (1 + np.sin(5 * way[:, 0] + 1) * np.cos(4 * way[:, 1]))
+    return trimesh.Trimesh(way * (RADIUS + height)[:, None], mesh.faces, process=False)
+
+
+def test_a_bumpy_sphere_becomes_round(bumpy, echoes, optics):
+    found = refined(bumpy, echoes, optics)
+    assert found.kept
+    assert len(found.support) == len(found.mesh.vertices)
+    assert found.gain.shape == (2, len(optics.frequencies))
+    assert [(one["stage"], one["way"]) for one in found.history][:2] == [
+        (0, "blurred"),
+        (0, "sharp"),
+    ]
+    assert [one["stage"] for one in found.history] == [0, 0, 1]
+
+    def off(mesh):
+        return np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).mean()
+
+    assert off(found.mesh) < 0.5 * off(bumpy)
+
+
+def test_a_surface_that_gets_worse_is_not_kept(echoes, optics, monkeypatch):
+    true = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS)
+
+    def spoil(self, number, part):
+        self.vertices = self.vertices * 1.01
+        return 1.0
+
+    monkeypatch.setattr(Descent, "step", spoil)
+    found = refined(true, echoes, optics)
+    assert not found.kept
+    assert np.array_equal(found.mesh.vertices, true.vertices)
+
+
+def test_of_two_starts_the_one_that_explains_more_is_refined(bumpy, echoes, optics):
+    half = bumpy.copy().apply_scale(0.5)
+    for starts in ({"whole": bumpy, "half": half}, {"half": half, "whole": bumpy}):
+        work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        work.advance()
+        assert work.start == "whole"
+        assert len(work.candidates) == 1
+        np.testing.assert_array_equal(work.candidates[0].vertices, bumpy.vertices)
+        again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        again.load(work.state())
+        assert again.start == "whole"
+
+
+@pytest.fixture
+def simulated_stage(settings):
+    """Two short stages, the second one corrected by the simulator."""
+    few = settings.simulation.model_copy(update={"rays": 2000})
+
+    def simulate(mesh):
+        changed = settings.model_copy(update={"simulation": few})
+        return Simulator.from_settings(quiet_scene(mesh), changed)
+
+    last = dataclasses.replace(SHORT[1], beyond="simulate")
+    return {"simulate": simulate, "stages": (SHORT[0], last)}
+
+
+def test_a_surface_that_cannot_be_simulated_is_refined_all_the_same(
+    bumpy, echoes, optics, simulated_stage
+):
+    def refuse(mesh):
+        raise InputError("the mesh is 1e-06 m large")
+
+    simulated_stage["simulate"] = refuse
+    assert refined(bumpy, echoes, optics, **simulated_stage).kept
+
+
+@pytest.mark.parametrize("corrected", [False, True])
+def test_going_on_from_any_step_ends_the_same(bumpy, echoes, optics, simulated_stage, corrected):
+    given = simulated_stage if corrected else {}
+    whole = started(bumpy, echoes, optics, **given)
+    states = {}
+    while not whole.done:
+        states[whole.drawn] = {k: v.clone() for k, v in whole.state().items()}
+        whole.advance()
+    for step in (5, 8, 12, 16, 20):
+        again = started(bumpy, echoes, optics, **given)
+        again.load(states[step])
+        while not again.done:
+            again.advance()
+        assert np.array_equal(again.candidates[-1].vertices, whole.candidates[-1].vertices)
+        assert torch.equal(again.level.gain, whole.level.gain)
+
+
+def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
+    bumpy, echoes, optics, settings
+):
+    factor = 3.0
+    old = optics.hearing
+    analysis = settings.spectrogram
+    slow = analysis.model_copy(
+        update={
+            "sampling_rate": analysis.sampling_rate / factor,
+            "frequency_min": analysis.frequency_min / factor,
+            "frequency_max": analysis.frequency_max / factor,
+            "range_min": analysis.range_min * factor,
+            "range_max": analysis.range_max * factor,
+        }
+    )
+    none = np.zeros_like(old.absorption)
+
+    def optics_at(scale, spectrogram):
+        ears = dataclasses.replace(
+            old.ears,
+            frequency=old.ears.frequency / scale,
+            emitter=old.ears.emitter * scale,
+            positions=old.ears.positions * scale,
+        )
+        synthesis = dataclasses.replace(old.synthesis, nodes=old.synthesis.nodes / scale)
+        hearing = dataclasses.replace(old, ears=ears, synthesis=synthesis, absorption=none)
+        reception = type(optics.reception)(
+            settings.call, spectrogram, settings.noise, speed_of_sound=old.speed_of_sound
+        )
+        return Optics(hearing, reception, np.zeros((1, analysis.window)))
+
+    def moved(scale, spectrogram):
+        world = Echoes(
+            echoes.positions * scale,
+            echoes.rotations,
+            echoes.training,
+            echoes.validation,
+            lambda number: echoes.read(number) / np.float32(scale),
+        )
+        heard = optics_at(scale, spectrogram)
+        mesh = trimesh.Trimesh(bumpy.vertices * scale, bumpy.faces, process=False)
+        made = module.remesh(mesh, 0.8 * heard.wavelength, 0.3 * heard.wavelength)
+        level = Level(heard.ears, len(heard.frequencies), heard.get_buffer("wavenumber"))
+        work = Descent(
+            made, world, heard, level, smoothing=1.5 * heard.wavelength, rate=0.02, seed=0
+        )
+        for step in range(4):
+            work.step(step, step / 4)
+        return work.vertices / scale
+
+    one, three = moved(1.0, analysis), moved(factor, slow)
+    assert one.shape == three.shape
+    assert float((one - three).abs().max()) < 2e-3 * optics.wavelength
+
+
+def test_the_better_of_the_blurred_and_the_sharp_surface_goes_on(
+    bumpy, echoes, optics, monkeypatch
+):
+    for worse, better in (("blurred", "sharp"), ("sharp", "blurred")):
+        work = started(bumpy, echoes, optics)
+        monkeypatch.setattr(
+            work.comparison,
+            "objective",
+            lambda *a, work=work, worse=worse, **k: 9.0 if work.way == worse else 1.0,
+        )
+        ends = []
+        while work.stage == 0:
+            work.advance()
+            if work.step == 0:
+                ends.append(work._rivals[-1] if work.stage == 0 else work.candidates[-1])
+        assert work.way == better
+        assert (ends[1] is ends[0]) == (better == "blurred")
+        assert len(work.candidates) == 2
+
+
+def slab(height):
+    """A thin plate, thinner than any voxel of the stages."""
+    plate = trimesh.creation.box((0.02, 0.02, height))
+    return plate.subdivide().subdivide().subdivide().subdivide()
+
+
+def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
+    bumpy, echoes, optics, monkeypatch
+):
+    thin = slab(2e-4)
+    for value, start in ((1.1, "sheet"), (2.0, "body")):
+        starts = {"body": bumpy, "sheet": thin}
+        work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        monkeypatch.setattr(
+            work.comparison,
+            "objective",
+            lambda *a, work=work, value=value, **k: value if work.way == "sheet" else 1.0,
+        )
+        while not work.done:
+            work.advance()
+        assert work.drawn == work.total
+        assert work.start == start
+        again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        again.load(work.state())
+        assert (again.start, again.way) == (start, work.way)
+        assert again.history == work.history
+        if start == "sheet":
+            assert all(len(mesh.faces) == len(thin.faces) for mesh in work.candidates)
+
+
+def test_a_sheet_alone_is_refined(echoes, optics):
+    work = Refinement({"sheet": slab(2e-4)}, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+    while not work.done:
+        work.advance()
+    assert work.result().start == "sheet"
+    assert {one["way"] for one in work.history} == {"sheet"}

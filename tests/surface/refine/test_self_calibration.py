@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: MIT
+"""Errors of a recording are found again, each with an uncertainty that holds the truth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial.transform import Rotation
+
+from sononerf.surface.refine.echo_data import Echoes
+from sononerf.surface.refine.self_calibration import Body, Calibrator
+from tests.surface.conftest import RADIUS
+
+COUNT = 14
+
+
+@pytest.fixture(scope="module")
+def body():
+    """A bumpy sphere: a round one tells no lateral shift."""
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    way = np.asarray(mesh.vertices) / RADIUS
+    bump = 1.0 + 0.12 * np.sin(5 * way[:, 0]) * np.cos(4 * way[:, 1] + 1)
+    return trimesh.Trimesh(RADIUS * bump[:, None] * way, mesh.faces, process=False)
+
+
+@pytest.fixture
+def heard(body, optics, poses):
+    """What poses at several distances hear of the body, with errors."""
+
+    def make(*, gain=(0.0, 0.0), offset=0.0, speed=0.0):
+        positions, rotations = poses.positions[:COUNT], poses.rotations[:COUNT]
+        positions = positions * np.linspace(0.8, 1.25, len(positions))[:, None]
+        count = len(positions)
+        magnitude = Body(body, optics).render(
+            positions, rotations, np.full(count, np.exp(-speed)), np.full(count, 2 * offset)
+        )
+        magnitude = magnitude * np.exp(np.asarray(gain, dtype=np.float32))[:, None, None]
+        numbers = np.arange(count)
+        return Echoes(positions, rotations, numbers, numbers[:0], lambda pose: magnitude[pose])
+
+    return make
+
+
+def found(mesh, echoes, optics, *kinds, steps=6):
+    work = Calibrator(mesh, echoes, optics, kinds, dependent=50.0)
+    for _ in range(steps):
+        work.step()
+    return work.result()
+
+
+def test_gains_are_found(body, heard, optics):
+    estimate = found(body, heard(gain=(0.1, 0.7)), optics, "gain", steps=4)
+    np.testing.assert_allclose(estimate.calibration.gain, [0.1, 0.7], atol=0.02)
+    assert estimate.error_db[-1] < 0.2 * estimate.error_db[0]
+
+
+def test_a_range_offset_is_told_from_the_size(body, heard, optics):
+    # A fit to ranges that are 2 mm too far makes the body smaller by as much.
+    normals = np.asarray(body.vertex_normals)
+    small = trimesh.Trimesh(body.vertices - 0.002 * normals, body.faces, process=False)
+    estimate = found(small, heard(offset=0.002), optics, "range_offset", steps=8)
+    assert estimate.calibration.range_offset == pytest.approx(0.002, abs=0.0002)
+    assert estimate.deviation["range_offset"] < 0.001
+
+
+def test_the_speed_of_sound_is_found_from_several_distances(body, heard, optics):
+    several = found(body, heard(speed=0.005), optics, "speed_of_sound")
+    assert several.calibration.speed_of_sound == pytest.approx(0.005, abs=0.0005)
+
+
+def test_positions_and_aims_are_found(body, heard, optics):
+    echoes = heard()
+    rng = np.random.default_rng(1)
+    shift = rng.normal(0.0, 0.001, echoes.positions.shape)
+    turn = np.radians(rng.normal(0.0, 1.0, echoes.positions.shape))
+    true, echoes.positions = echoes.positions, echoes.positions + shift
+    straight = echoes.rotations
+    echoes.rotations = Rotation.from_rotvec(turn).as_matrix() @ straight
+    estimate = found(body, echoes, optics, "position", "aim", steps=8)
+    corrected = echoes.positions + estimate.calibration.position
+    towards = true / np.linalg.norm(true, axis=1, keepdims=True)
+    off = ((corrected - true) * towards).sum(axis=1)
+    before = (shift * towards).sum(axis=1)
+    assert np.sqrt((off**2).mean()) < 0.25 * np.sqrt((before**2).mean())
+    assert estimate.error_db[-1] < 0.3 * estimate.error_db[0]
+    assert 0.0 < estimate.deviation["position"] < 0.01
+
+
+def test_without_errors_nothing_is_found(body, heard, optics):
+    estimate = found(body, heard(), optics, "gain", "speed_of_sound", steps=2)
+    assert np.abs(estimate.calibration.gain).max() < 1e-3
+    assert abs(estimate.calibration.speed_of_sound) < 1e-4

@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: MIT
+import numpy as np
+import pytest
+
+from sononerf.errors import NumericalError, ResourceError
+from sononerf.surface.start import volume as volume_module
+from sononerf.surface.start.volume import (
+    Volume,
+    estimated_bytes,
+    grid_over,
+    volume_from_function,
+    vti_bytes,
+)
+
+LOWER, UPPER = (-0.02, 0.0, 0.01), (0.03, 0.011, 0.02)
+
+
+def test_grid_covers_the_box_and_is_centred_on_it():
+    grid = grid_over(LOWER, UPPER, 0.002)
+    assert (grid.origin <= np.asarray(LOWER) + 1e-12).all()
+    assert (grid.upper >= np.asarray(UPPER) - 1e-12).all()
+    assert (np.asarray(LOWER) - grid.origin < 0.001 + 1e-12).all()
+    np.testing.assert_allclose((grid.origin + grid.upper) / 2, np.add(LOWER, UPPER) / 2)
+    assert grid.shape == (26, 7, 6)
+
+
+def test_an_exact_multiple_needs_no_further_voxel():
+    # 0.3 / 0.1 is 2.9999999999999996 and (0.2 + 0.1) / 0.1 is 3.0000000000000004.
+    assert grid_over((0, -0.1, 0), (0.3, 0.2, 0.1), 0.1).shape == (4, 4, 2)
+
+
+def test_points_follow_the_order_of_the_values():
+    volume = volume_from_function(lambda x: x @ [1, 10, 100], LOWER, UPPER, 0.002)
+    x, y, z = volume.axes()
+    assert volume.values[3, 4, 5] == pytest.approx(x[3] + 10 * y[4] + 100 * z[5])
+    np.testing.assert_allclose(volume.points() @ [1, 10, 100], volume.values.ravel())
+
+
+def test_chunks_leave_no_seam_and_report_progress():
+    seen = []
+
+    def wavy(points):
+        return np.sin(1e3 * points).sum(axis=1)
+
+    whole = volume_from_function(wavy, LOWER, UPPER, 0.002)
+    pieces = volume_from_function(
+        wavy, LOWER, UPPER, 0.002, chunk=97, progress=lambda done, total: seen.append((done, total))
+    )
+    np.testing.assert_array_equal(whole.values, pieces.values)
+    assert seen[0] == (97, 26 * 7 * 6)
+    assert seen[-1] == (26 * 7 * 6, 26 * 7 * 6)
+
+
+def test_a_field_that_is_not_finite_is_named_with_its_place():
+    def broken(points):
+        return np.where(points[:, 0] > 0.028, np.nan, 1.0)
+
+    with pytest.raises(NumericalError, match=r"not finite at \[0\.03"):
+        volume_from_function(broken, LOWER, UPPER, 0.002)
+
+
+def test_wrong_shapes_are_refused():
+    with pytest.raises(ValueError, match="one value per point"):
+        volume_from_function(lambda x: x, LOWER, UPPER, 0.002)
+    with pytest.raises(ValueError, match="chunk"):
+        volume_from_function(lambda x: x[:, 0], LOWER, UPPER, 0.002, chunk=0)
+    with pytest.raises(ValueError, match="lower must lie below"):
+        grid_over(UPPER, LOWER, 0.002)
+    with pytest.raises(ValueError, match="three finite"):
+        grid_over((0, 0), (1, 1), 0.1)
+    with pytest.raises(ValueError, match="spacing"):
+        grid_over(LOWER, UPPER, 0)
+    with pytest.raises(ValueError, match="X, Y, Z"):
+        Volume(np.zeros((2, 2)), np.zeros(3), 1.0)
+    with pytest.raises(ValueError, match="origin"):
+        Volume(np.zeros((2, 2, 2)), np.full(3, np.nan), 1.0)
+    with pytest.raises(ValueError, match="spacing"):
+        Volume(np.zeros((2, 2, 2)), np.zeros(3), -1.0)
+    with pytest.raises(ValueError, match="expected"):
+        Volume(np.zeros((2, 2, 2)), np.zeros(3), 1.0).with_values(np.zeros((1, 2, 2)))
+
+
+def test_a_grid_beyond_memory_is_refused_with_a_spacing_that_fits(monkeypatch):
+    monkeypatch.setattr(volume_module, "available_memory", lambda: 1_000_000)
+    with pytest.raises(ResourceError, match=r"needs [\d,]+ bytes and 1,000,000 are free") as caught:
+        grid_over((0, 0, 0), (1, 1, 1), 0.001)
+    fits = float(str(caught.value).split("fits is ")[1].split()[0])
+    assert 0.8e6 < estimated_bytes((0, 0, 0), (1, 1, 1), fits) <= 1_000_000
+    assert estimated_bytes((0, 0, 0), (1, 1, 1), 0.001) == 1001**3 * 80
+
+
+def test_vti_opens_in_vtk_with_the_same_values_in_the_same_place(tmp_path):
+    import pyvista
+
+    generator = np.random.default_rng(0)
+    volume = Volume(generator.random((3, 4, 5)), np.array([0.1, -0.2, 0.3]), 0.004)
+    path = tmp_path / "volume.vti"
+    path.write_bytes(vti_bytes(volume))
+    image = pyvista.read(path)
+    np.testing.assert_allclose(image.points[1], [0.104, -0.2, 0.3])
+    values = np.asarray(image["reflectivity"])
+    np.testing.assert_allclose(values, volume.values.ravel(order="F"), rtol=1e-6)
+    assert vti_bytes(volume) == path.read_bytes()
+
+
+def test_vti_names_are_checked():
+    with pytest.raises(ValueError, match="letters"):
+        vti_bytes(Volume(np.zeros((1, 1, 1)), np.zeros(3), 1.0), 'a"b')

@@ -1,0 +1,392 @@
+# SPDX-License-Identifier: MIT
+"""Closed surfaces, sheets, and what was heard from one side alone."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from skimage.measure import marching_cubes
+
+from sononerf.echoes.free_space import EchoHull
+from sononerf.field.fourier import FourierField
+from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.geometry.lattice import Lattice
+from sononerf.surface import openness
+from sononerf.surface.openness import (
+    FACING,
+    THIN,
+    Openness,
+    known_part,
+    leaving_out,
+    without_unseen,
+)
+from sononerf.surface.start import read_out
+from sononerf.surface.start.evidence import Evidence
+
+RADIUS, DISTANCE, RESOLUTION = 0.02, 0.4, 0.006
+THINNEST = THIN * RESOLUTION
+CAP = np.radians(30)
+WALL = 0.05
+
+
+def judge_openness(mesh, sources, resolution=RESOLUTION):
+    return openness.judge_openness(mesh, sources, resolution=resolution)
+
+
+def sphere():
+    return trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+
+
+def all_around(count=200):
+    return DISTANCE * fibonacci_sphere(count)
+
+
+def cap(angle=CAP):
+    """Poses around the x axis, dense at the cap's edge, which alone says how far they see."""
+    turn = np.linspace(0, 2 * np.pi, 120, endpoint=False)
+    rings = [
+        np.stack((0 * turn + np.cos(a), np.sin(a) * np.cos(turn), np.sin(a) * np.sin(turn)), axis=1)
+        for a in (0.0, angle / 2, angle)
+    ]
+    return DISTANCE * np.concatenate(rings)
+
+
+def farthest_seen(angle=CAP):
+    """Angle from the x axis down to which a sphere's surface faces a pose at the cap's edge."""
+    past = np.linspace(0, np.pi / 2, 100_001)  # angle between a normal and the edge's pose
+    ahead = DISTANCE * np.cos(past) - RADIUS
+    aside = DISTANCE * np.sin(past)
+    return angle + past[np.flatnonzero(ahead / np.hypot(ahead, aside) > FACING)[-1]]
+
+
+def plate(thickness, side=0.04):
+    return trimesh.creation.box((side, side, thickness)).subdivide_to_size(0.005)
+
+
+def cup(depth=0.04, inner=0.02, wall=0.008):
+    """A pot that is open upwards, and which of its triangles are inside of it."""
+    bottom = -wall
+    profile = [
+        (0.0, bottom), (inner + wall, bottom), (inner + wall, depth), (inner, depth), (inner, 0.0),
+        (0.0, 0.0),
+    ]  # fmt: skip
+    mesh = trimesh.creation.revolve(profile, sections=48).subdivide_to_size(0.005)
+    middles = mesh.triangles_center
+    out = np.linalg.norm(middles[:, :2], axis=1)
+    inside = (out < inner + 1e-6) & (middles[:, 2] > -1e-6) & (middles[:, 2] < depth - 1e-6)
+    assert mesh.is_watertight
+    assert mesh.volume > 0
+    return mesh, inside
+
+
+def test_a_body_that_was_heard_from_all_around_is_closed():
+    found = judge_openness(sphere(), all_around())
+    assert found.kind == "closed"
+    assert found.unseen.shape == (5120,)
+    assert not found.unseen.any()
+    assert (found.unseen_share, found.thin_share) == (0.0, 0.0)
+
+
+def test_of_a_body_heard_from_one_side_the_far_side_is_cut_off():
+    mesh = sphere()
+    found = judge_openness(mesh, cap())
+    edge = farthest_seen()
+    assert 105 < np.degrees(edge) < 115
+    # What lies behind has a share of (1 + cos) / 2. Its edge is rugged by half a triangle's
+    # height, a thirtieth of the radius.
+    rugged = 1 / 30
+    assert found.unseen_share == pytest.approx((1 + np.cos(edge)) / 2, abs=rugged / 4)
+    assert found.kind == "one-sided"
+    angle = np.arccos(mesh.triangles_center[:, 0] / np.linalg.norm(mesh.triangles_center, axis=1))
+    assert angle[found.unseen].min() > edge - rugged
+    assert angle[~found.unseen].max() < edge + rugged
+    cut = without_unseen(mesh, found)
+    assert len(cut.faces) == (~found.unseen).sum()
+    assert len(np.unique(cut.faces)) == len(cut.vertices) < len(mesh.vertices)
+    np.testing.assert_allclose(cut.triangles, mesh.triangles[~found.unseen])
+    assert not cut.is_watertight
+    assert cut.area == pytest.approx((1 - found.unseen_share) * mesh.area)
+    assert len(mesh.faces) == 5120  # the given one stays whole
+
+
+def test_what_hardly_anyone_missed_is_closed_by_guess():
+    """Poses over more than a half leave a share of 0.12: less than a quarter."""
+    found = judge_openness(sphere(), cap(np.radians(60)))
+    expected = (1 + np.cos(farthest_seen(np.radians(60)))) / 2
+    assert 0.1 < expected < 0.15
+    assert found.unseen_share == pytest.approx(expected, abs=1 / 120)
+    assert found.kind == "closed"
+
+
+def test_what_stands_in_the_way_hides_what_lies_behind():
+    """Of two balls in a row, heard from one end, the rear one is hidden by the front one."""
+    front, rear = (trimesh.creation.icosphere(subdivisions=3, radius=r) for r in (0.02, 0.01))
+    rear.apply_translation([-0.04, 0.0, 0.0])
+    alone = judge_openness(rear, np.array([[DISTANCE, 0.0, 0.0]]))
+    assert alone.unseen_share == pytest.approx(0.55, abs=0.02)  # faces the pose, by FACING
+    both = judge_openness(trimesh.util.concatenate([front, rear]), np.array([[DISTANCE, 0.0, 0.0]]))
+    count = len(front.faces)
+    np.testing.assert_array_equal(
+        both.unseen[:count], judge_openness(front, np.array([[DISTANCE, 0.0, 0.0]])).unseen
+    )
+    assert both.unseen[count:].all()
+
+
+@pytest.mark.parametrize("thickness", [0.0015, THINNEST - 1e-5])
+def test_a_thin_plate_is_a_sheet(thickness):
+    mesh = plate(thickness)
+    found = judge_openness(mesh, all_around(300))
+    assert found.kind == "sheet"
+    # Its narrow sides are not thin; their other sides are 40 mm away.
+    share = 0.04 / (0.04 + 2 * thickness)
+    assert found.thin_share == pytest.approx(share, rel=1e-6)
+    assert found.unseen_share == 0.0
+
+
+@pytest.mark.parametrize("thickness", [THINNEST + 1e-5, 0.01])
+def test_a_thick_plate_is_closed(thickness):
+    found = judge_openness(plate(thickness), all_around(300))
+    assert found.kind == "closed"
+    assert found.thin_share == 0.0
+
+
+def test_what_is_thin_follows_from_the_resolution_and_not_from_the_size_of_triangles():
+    mesh = plate(0.004)
+    assert judge_openness(mesh, all_around(), 0.006).kind == "sheet"
+    assert judge_openness(mesh, all_around(), 0.005).kind == "closed"
+    large = mesh.copy().apply_scale(10)
+    assert judge_openness(large, 10 * all_around(), 0.06).kind == "sheet"
+    fine = mesh.subdivide()
+    found = judge_openness(fine, all_around(), 0.006)
+    assert found.thin_share == pytest.approx(judge_openness(mesh, all_around(), 0.006).thin_share)
+
+
+def test_a_plate_that_was_heard_from_one_side_is_one_sided():
+    sources = all_around(300)
+    mesh = plate(0.0015)
+    found = judge_openness(mesh, sources[sources[:, 2] > 0.1])
+    assert found.kind == "one-sided"
+    top = mesh.face_normals[:, 2] > 0.5
+    assert not found.unseen[top].any()
+    assert found.unseen[mesh.face_normals[:, 2] < -0.5].all()
+
+
+def test_a_pit_that_poses_look_into_was_heard():
+    mesh, inside = cup(depth=0.01)
+    found = judge_openness(mesh, all_around(300))
+    assert inside.sum() > 100
+    assert not found.unseen.any()
+    assert found.kind == "closed"
+
+
+@pytest.mark.parametrize("count", [100, 400])
+def test_a_deep_pit_was_heard_by_poses_that_its_walls_hardly_face(count):
+    """The wall faces best the poses that the wall across hides, and more of them the more are."""
+    mesh, inside = cup(depth=0.06)
+    found = judge_openness(mesh, all_around(count))
+    assert inside.mean() > 0.3
+    assert found.unseen_share < 0.001
+    assert found.kind == "closed"
+
+
+def test_a_pit_that_no_pose_looks_into_was_not():
+    mesh, inside = cup(depth=0.04)
+    sources = all_around(300)
+    # From 15 degrees above the rim one sees a centimetre of the wall, and no bottom.
+    found = judge_openness(mesh, sources[sources[:, 2] < DISTANCE * np.sin(np.radians(15))])
+    depth = 0.04 - mesh.triangles_center[:, 2]
+    assert inside[depth > 0.02].any()
+    assert found.unseen[inside & (depth > 0.02)].all()
+    assert not found.unseen[~inside & (depth > 0.002)].any()
+
+
+def test_pieces_of_the_work_change_nothing(monkeypatch):
+    whole = judge_openness(sphere(), cap())
+    monkeypatch.setattr(openness, "_CHUNK", 777)
+    pieces = judge_openness(sphere(), cap())
+    np.testing.assert_array_equal(pieces.unseen, whole.unseen)
+
+
+@pytest.mark.parametrize(
+    ("unseen", "thin", "kind"),
+    [
+        (0.0, 0.0, "closed"),
+        (0.25, 0.75, "closed"),
+        (0.26, 0.0, "one-sided"),
+        (0.25, 0.76, "sheet"),
+        (0.5, 0.9, "one-sided"),  # a sheet that was heard from one side alone
+    ],
+)
+def test_what_is_called_what(unseen, thin, kind):
+    assert Openness(np.zeros(3, dtype=bool), unseen, thin).kind == kind
+
+
+def hull_over(sources):
+    """First echoes off the sphere, for heads that call and hear at one place."""
+    return EchoHull(
+        emitters=sources,
+        receivers=sources[:, None],
+        first=np.linalg.norm(sources, axis=1, keepdims=True) - RADIUS,
+        axes=-sources / np.linalg.norm(sources, axis=1, keepdims=True),
+    )
+
+
+def room_behind(half=0.06):
+    """What the onsets of a cap leave of a box, with the walls of the box behind."""
+    spacing = 0.002
+    hull = hull_over(cap())
+    axis = np.arange(-half, half + spacing / 2, spacing)
+    places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1)
+    inside = hull.clearance(places.reshape(-1, 3))[0].reshape(places.shape[:3])
+    vertices, faces, _, _ = marching_cubes(
+        np.pad(-inside, 1, constant_values=spacing), 0.0, gradient_direction="ascent"
+    )
+    mesh = trimesh.Trimesh(vertices * spacing - half - spacing, faces)
+    if mesh.volume < 0:
+        mesh.invert()
+    return mesh, hull, half
+
+
+def heard_where(mesh, chosen, poses=5):
+    return np.where(chosen(mesh.vertices), poses, 0).astype(np.int32)
+
+
+def test_an_open_surface_ends_where_what_was_heard_ends():
+    """Behind a ball heard from one side the onsets leave a cone up to the region's walls."""
+    mesh, hull, half = room_behind()
+    assert np.abs(mesh.vertices).max() > 0.98 * half
+    heard = heard_where(mesh, lambda p: np.linalg.norm(p, axis=1) < RADIUS + 0.001)
+    known = known_part(mesh, heard, hull, resolution=RESOLUTION)
+    middles = mesh.triangles_center
+    away = np.linalg.norm(middles, axis=1)
+    assert known[(away < RADIUS) & (middles[:, 0] > 0)].all()
+    assert not known[away > RADIUS + 2 * RESOLUTION].any()
+    judged = judge_openness(mesh, cap())
+    assert judged.kind == "one-sided"
+    left = leaving_out(judged, ~known, mesh.area_faces)
+    assert left.kind == "one-sided"
+    open_ = without_unseen(mesh, left)
+    assert 0 < open_.area < 2 * np.pi * RADIUS**2
+    assert left.unseen_share == pytest.approx(1 - open_.area / mesh.area)
+    assert np.abs(open_.vertices).max() < half - RESOLUTION
+
+
+def test_between_what_was_heard_the_onsets_close_an_open_surface():
+    """Only the middle and a ring of a ball's side are heard; what lies between is kept."""
+    mesh, hull, _ = room_behind()
+
+    def rings(places):
+        off = np.linalg.norm(places[:, 1:], axis=1)
+        return (places[:, 0] > 0) & ((off < 0.004) | (np.abs(off - 0.012) < 0.0015))
+
+    known = known_part(mesh, heard_where(mesh, rings), hull, resolution=RESOLUTION)
+    off = np.linalg.norm(mesh.triangles_center[:, 1:], axis=1)
+    between = (off > 0.006) & (off < 0.009) & (mesh.triangles_center[:, 0] > 0.01)
+    assert between.sum() > 50
+    # A ball bulges out of the convex hull of its places by less than the resolution.
+    assert known[between].all()
+    assert not known[off > 0.02].any()
+
+
+def test_one_pose_alone_does_not_tell_where_a_surface_ends():
+    mesh, hull, _ = room_behind()
+    heard = heard_where(mesh, lambda p: np.linalg.norm(p, axis=1) < RADIUS + 0.001)
+    stray = heard_where(mesh, lambda p: p[:, 1] > 0.05, 1)
+    assert stray.any()
+    one = known_part(mesh, heard, hull, resolution=RESOLUTION)
+    both = known_part(mesh, np.maximum(heard, stray), hull, resolution=RESOLUTION)
+    np.testing.assert_array_equal(one, both)
+
+
+def test_where_nothing_was_heard_of_a_surface_the_onsets_bound_it_and_walls_do_not():
+    mesh, hull, half = room_behind()
+    none = np.zeros(len(mesh.vertices), np.int32)
+    known = known_part(mesh, none, hull, resolution=RESOLUTION)
+    depth = hull.clearance(mesh.triangles_center)[0]
+    assert known.any()
+    assert depth[known].max() < RESOLUTION
+    assert not known[mesh.triangles_center[:, 0] < -0.9 * half].any()
+    flat = heard_where(mesh, lambda p: np.arange(len(p)) < 2)
+    assert 0 < known_part(mesh, flat, hull, resolution=RESOLUTION).sum() < 30
+
+
+@pytest.fixture
+def read(monkeypatch):
+    """Read out a field whose occupancy is the sphere, whatever was heard."""
+    region = torch.tensor([[-0.03] * 3, [0.03] * 3])
+    torch.manual_seed(0)
+    field = FourierField(region, torch.tensor([40e3, 60e3]), octaves=2, width=8)
+
+    def body(gathered, belief):
+        mesh = sphere()
+        return SimpleNamespace(mesh=mesh)
+
+    def gathered(*given):
+        nothing = np.zeros((0, 3))
+        evidence = Evidence(nothing, nothing, np.zeros(0), np.zeros(0, np.intp))
+        return SimpleNamespace(
+            hull=given[2],
+            resolution=given[-1],
+            evidence=evidence,
+            weight=np.zeros(0),
+            lattice=Lattice.over(np.full(3, -WALL), np.full(3, WALL), 0.002),
+        )
+
+    monkeypatch.setattr(read_out, "gather_evidence", gathered)
+    monkeypatch.setattr(
+        read_out, "poses_that_heard", lambda mesh, *given: np.arange(len(mesh.vertices))
+    )
+    monkeypatch.setattr(read_out, "estimate_occupancy", body)
+    monkeypatch.setattr(read_out, "isosurface", lambda *given: sphere())
+
+    def make(hull, method="filled"):
+        return read_out.reconstruct(
+            field, hull=hull, spacing=0.02, method=method, directions=2, resolution=RESOLUTION
+        )
+
+    return make
+
+
+def test_a_surface_is_of_the_occupancy_where_poses_are_known(read):
+    assert read(hull_over(all_around()), method="auto").method == "filled"
+    assert read(None, method="auto").method == "isosurface"
+
+
+def test_a_closed_surface_is_read_out_whole(read):
+    found = read(hull_over(all_around()))
+    assert found.openness.kind == "closed"
+    assert found.mesh.is_watertight
+    assert len(found.mesh.faces) == 5120
+
+
+def test_a_read_out_loses_what_no_pose_can_have_heard(read):
+    found = read(hull_over(cap()))
+    assert found.openness.kind == "one-sided"
+    assert len(found.openness.unseen) == 5120
+    assert len(found.mesh.faces) == (~found.openness.unseen).sum() < 5120
+    assert found.mesh.vertices[:, 0].min() > -0.6 * RADIUS
+    # Each vertex keeps its own number of poses.
+    np.testing.assert_array_equal(sphere().vertices[found.support], found.mesh.vertices)
+
+
+def test_a_wall_of_the_region_is_no_part_of_a_read_out(read, monkeypatch):
+    monkeypatch.setitem(globals(), "WALL", 0.015)
+    found = read(hull_over(cap()))
+    assert np.abs(found.mesh.triangles_center).max() < 0.013
+    assert found.openness.unseen.sum() == 5120 - len(found.mesh.faces)
+
+
+def test_a_hole_of_a_closed_surface_stays_closed(read):
+    found = read(hull_over(cap(np.radians(60))))
+    assert found.openness.unseen.any()
+    assert found.openness.kind == "closed"
+    assert found.mesh.is_watertight
+
+
+def test_an_isosurface_is_not_judged(read):
+    assert read(None, method="auto").openness is None
+    found = read(hull_over(cap()), method="isosurface")
+    assert found.openness is None
+    assert found.mesh.is_watertight
