@@ -25,8 +25,9 @@ import yaml
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sononerf import __version__, cli, storage
+from sononerf import __version__, storage
 from sononerf.callbacks import preview, spectrogram_images
+from sononerf.cli import entry
 from sononerf.evaluation import baseline
 from sononerf.field.weights import load_weights, save_weights
 from sononerf.run import evaluate as evaluate_module
@@ -58,7 +59,7 @@ def run(*arguments):
         patch.setattr(sys, "argv", ["sononerf", *map(str, arguments)])
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             with pytest.raises(SystemExit) as caught:
-                cli.main()
+                entry.main()
     return SimpleNamespace(code=caught.value.code or 0, out=out.getvalue(), err=err.getvalue())
 
 
@@ -718,7 +719,7 @@ def test_a_fault_of_ours_is_not_dressed_up(monkeypatch):
     monkeypatch.setattr(scenes, "describe_scenes", broken)
     monkeypatch.setattr(sys, "argv", ["sononerf", "scenes"])
     with pytest.raises(ZeroDivisionError):
-        cli.main()
+        entry.main()
 
 
 # Help.
@@ -732,7 +733,7 @@ def test_help(command):
 
 
 def test_all_commands_are_here():
-    assert sorted(typer.main.get_command(cli.app).commands) == sorted(COMMANDS)
+    assert sorted(typer.main.get_command(entry.app).commands) == sorted(COMMANDS)
 
 
 def test_nothing_and_nonsense_are_wrong_usage():

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from sononerf.field.module import EchoModule
-from sononerf.run.build import check_plugins, field_and_renderer
+from sononerf.run.build import check_plugins, field_and_renderer, head_of
 from sononerf.run.fit import fit
 from sononerf.scene.scene import load_scene
-from sononerf.settings.schema import dump_yaml, load_settings, read_yaml, validate_settings
+from sononerf.settings.loading import dump_yaml, load_settings, read_yaml, validate_settings
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 FILES = sorted(set(CONFIGS.rglob("*.yaml")) - {CONFIGS / "store.yaml"})  # it needs a store
@@ -62,7 +62,7 @@ def test_it_says_only_what_differs_from_the_defaults(path):
 def test_its_scene_field_and_renderer_build(path):
     settings = load_settings(path)
     assert len(load_scene(settings.scene.name, settings.scene.options).mesh.faces) > 0
-    field, renderer = field_and_renderer(settings, BOX)
+    field, renderer = field_and_renderer(settings, head_of(settings), BOX)
     assert sum(parameter.numel() for parameter in field.parameters()) > 0
     assert renderer.whole_poses == (settings.renderer.kind != "shell")
 
@@ -88,7 +88,7 @@ def test_the_options_for_the_published_code_are_known():
     assert len(told) > 10
     for options in told:
         settings = load_settings(PAPER, shlex.split(options.replace("NUMBER", "20000")))
-        check_plugins(settings)
+        check_plugins(settings, head_of(settings))
         assert settings != load_settings(PAPER), options
 
 

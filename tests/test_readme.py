@@ -10,11 +10,11 @@ from pathlib import Path
 import pytest
 import typer
 
-from sononerf.cli import app
+from sononerf.cli.entry import app
 from sononerf.run import new_scene as new_scene_module
+from sononerf.settings.loading import load_settings
 from sononerf.settings.plugins import SCENES as GROUP
 from sononerf.settings.plugins import check_options, load, registered
-from sononerf.settings.schema import load_settings
 
 ROOT = Path(__file__).resolve().parent.parent
 TEXT = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -98,7 +98,7 @@ def test_the_code_of_the_guides_runs(code):
     names = {}
     exec(compile(code, "guide", "exec"), names)
     assert names["waveform"].any()
-    assert names["magnitude"].shape == (2, len(names["simulator"].range), 47)
+    assert names["magnitude"].shape == (2, len(names["simulator"].head.range), 47)
 
 
 def test_the_guide_shows_the_scene_that_is_written(tmp_path, monkeypatch):

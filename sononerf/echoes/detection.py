@@ -43,6 +43,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from sononerf.head.point_echo import own_top
+
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -185,20 +187,6 @@ def _flank(window: Array) -> tuple[Array, float]:
         first, middle = own_top(window), (len(window) - 1) / 2.0
     rising = window[: first + 1] / window[first]
     return np.concatenate(([0.0], rising)), middle + 1.0
-
-
-def own_top(window: Array) -> int:
-    """Return where a point echo (W,) is greatest about its own range, which is in the middle.
-
-    What lies apart from that, as another harmonic's echo does, may be greater.
-    """
-    top = (len(window) - 1) // 2
-    while 0 < top < len(window) - 1:
-        beside = top + (1 if window[top + 1] > window[top - 1] else -1)
-        if window[beside] <= window[top]:
-            break
-        top = beside
-    return top
 
 
 def _crossing(rising: Array, fraction: float) -> float:

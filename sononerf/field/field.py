@@ -299,3 +299,18 @@ class Field(nn.Module):
         for direction in sphere_directions(directions, positions):
             total += self.select(positions, direction.expand(positions.shape), None).abs().sum(-1)
         return total
+
+
+def lattice_over(region: Tensor, spacing: float) -> Tensor:
+    """Return the vertices of a cubic lattice over a box, (N, 3), from its lower corner."""
+    steps = [
+        region[0, a]
+        + spacing
+        * torch.arange(
+            math.floor(float(region[1, a] - region[0, a]) / spacing + 1e-6) + 1,
+            dtype=region.dtype,
+            device=region.device,
+        )
+        for a in range(3)
+    ]
+    return torch.stack(torch.meshgrid(*steps, indexing="ij"), dim=-1).reshape(-1, 3)

@@ -11,9 +11,10 @@ import torch.nn.functional as F
 from pydantic import Field as Option
 from torch import Tensor, nn
 
-from sononerf.field.field import Field
+from sononerf.field.field import Field, lattice_over
 from sononerf.field.range_bins import Deposit, Window
-from sononerf.field.renderer import Acquisition, Possible, Renderer, look_up
+from sononerf.field.renderer import Possible, Renderer, look_up, tensor
+from sononerf.head.head import Head
 
 KERNEL_SKIRT = 31e-6
 """The kernel reaches so much further than the window, s: beam and ears lengthen an echo."""
@@ -58,8 +59,8 @@ class ProfileRenderer(Renderer):
     ----------
     region : (2, 3) float, m
         Lower and upper corner of the box that holds the field.
-    acquisition : Acquisition
-        How the measured spectra came to be.
+    head : Head
+        What heard the spectra.
     mode : {"power", "coherent"}
         What is summed. ``coherent`` costs about twice as much, starts as ``power``, and asks for
         places that are right to a fraction of a wavelength.
@@ -98,7 +99,7 @@ class ProfileRenderer(Renderer):
     def __init__(
         self,
         region: Tensor,
-        acquisition: Acquisition,
+        head: Head,
         *,
         mode: Literal["power", "coherent"] = "power",
         occlusion: bool = False,
@@ -110,28 +111,27 @@ class ProfileRenderer(Renderer):
         prune_below: Annotated[float, Option(ge=0, lt=1)] = 1e-6,
         surroundings: Annotated[float, Option(gt=0)] = 5.0,
     ) -> None:
-        super().__init__(region, acquisition)
+        super().__init__(region, head)
         self.points, self.uniform, self.start = points, uniform, start
         self.prune_every, self.prune_below = prune_every, prune_below
-        self.surroundings = surroundings * _resolution(acquisition)
+        self.surroundings = surroundings * head.resolution
         self.occlusion = occlusion
         self._turned = False
         self._summed = (torch.zeros(0), -1, False)  # phased, as of when, and what it said
         self.oversampling = oversampling
         self.mode = mode
         self.register_buffer("phased", torch.zeros(()))
-        self.register_buffer(
-            "wave", 4 * math.pi * acquisition.frequency / acquisition.speed_of_sound
-        )
-        step = float(acquisition.range[1] - acquisition.range[0])
+        self.register_buffer("wave", 4 * math.pi * self.frequency / head.speed_of_sound)
+        step = float(self.range[1] - self.range[0])
         self.bin = step / oversampling
-        per_sample = acquisition.speed_of_sound / acquisition.sampling_rate / 2
-        self._even = torch.allclose(acquisition.window, acquisition.window.flip(1))
+        per_sample = head.speed_of_sound / head.sampling_rate / 2
+        window = tensor(head.window)
+        self._even = torch.allclose(window, window.flip(1))
         # A row that is not swept has no middle. Of uneven ones the middle may not be the greatest.
-        window = acquisition.window.clamp(1e-6, 1.0 if self._even else None)
+        window = window.clamp(1e-6, 1.0 if self._even else None)
         last = window.shape[1] - 1
         half = last / 2
-        reach = math.ceil((half + KERNEL_SKIRT * acquisition.sampling_rate) * per_sample / self.bin)
+        reach = math.ceil((half + KERNEL_SKIRT * head.sampling_rate) * per_sample / self.bin)
         offsets = half - torch.arange(reach + 1) * self.bin / per_sample  # from the middle down
         left = offsets.floor().long().clamp(0, last - 1)
         part = offsets - left
@@ -143,11 +143,11 @@ class ProfileRenderer(Renderer):
             sides.append(torch.where(offsets >= 0, skirt, floor).float()[:, 1:])
         self.log_kernel = nn.Parameter(torch.cat(sides, dim=1))
         self._taps = 2 * reach + 1
-        self.first = float(acquisition.range[0]) - reach * self.bin
-        self.register_buffer("absorption", acquisition.absorption.clone())
-        self.register_buffer("lag", acquisition.lag)
-        self.log_spectrum = nn.Parameter(torch.zeros(len(acquisition.frequency)))
-        self.log_noise = nn.Parameter(torch.full((len(acquisition.frequency),), -16.0))
+        self.first = float(self.range[0]) - reach * self.bin
+        self.register_buffer("absorption", tensor(head.row_absorption))
+        self.register_buffer("lag", None if head.lag is None else tensor(head.lag))
+        self.log_spectrum = nn.Parameter(torch.zeros(len(self.frequency)))
+        self.log_noise = nn.Parameter(torch.full((len(self.frequency),), -16.0))
         self.register_buffer("lattice", torch.zeros(0, 3))
         self.register_buffer("alive", torch.zeros(0, dtype=torch.bool))
         self.register_buffer("energy", torch.zeros(0))
@@ -438,35 +438,7 @@ class ProfileRenderer(Renderer):
         return known, way, middle
 
 
-def _resolution(acquisition: Acquisition) -> float:
-    """Return the width in range over which a point echo is above half of its magnitude, m."""
-    band = acquisition.frequency.double()  # each row counts with its part of it
-    part = torch.gradient(band)[0] if len(band) > 1 else torch.ones_like(band)
-    power = (part / part.sum()) @ acquisition.window.double().square()
-    top = (len(power) - 1) // 2  # what lies apart from its own range is another harmonic's echo
-    low = (power < 0.25 * power[top]).nonzero()[:, 0].tolist()
-    first = max((sample for sample in low if sample < top), default=-1)
-    last = min((sample for sample in low if sample > top), default=len(power))
-    samples = last - first - 1
-    return samples * acquisition.speed_of_sound / acquisition.sampling_rate / 2
-
-
 def _length(vectors: Tensor) -> Tensor:
     """Return the lengths of (..., 3, M) vectors, (..., M)."""
     x, y, z = vectors.unbind(-2)
     return (x * x + y * y + z * z).clamp_min(1e-12).sqrt()
-
-
-def lattice_over(region: Tensor, spacing: float) -> Tensor:
-    """Return the vertices of a cubic lattice over a box, (N, 3), from its lower corner."""
-    steps = [
-        region[0, a]
-        + spacing
-        * torch.arange(
-            math.floor(float(region[1, a] - region[0, a]) / spacing + 1e-6) + 1,
-            dtype=region.dtype,
-            device=region.device,
-        )
-        for a in range(3)
-    ]
-    return torch.stack(torch.meshgrid(*steps, indexing="ij"), dim=-1).reshape(-1, 3)

@@ -1,65 +1,26 @@
 # SPDX-License-Identifier: MIT
-"""What every renderer promises, and the head that it listens with."""
+"""What every renderer promises, and gains that are looked up in tables."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from sononerf.field.field import Field
+from sononerf.head.head import Head
 
 Possible = Callable[[Tensor, float], Tensor]
 """Takes places (N, 3) and how far each speaks for its surroundings, in m; returns (N,) bool."""
 
 
-@dataclass(frozen=True)
-class Acquisition:
-    """How the measured spectra came to be: what a renderer has to know, as plain tensors.
-
-    Parameters
-    ----------
-    frequency : (F,) float, Hz
-        Frequencies.
-    range : (R,) float, m
-        Ranges of the slices, evenly spaced.
-    window : (F, W) float
-        How a point echo swells and fades in each frequency's row, 1 in its middle, one value per
-        sample: the analysis window, or what it makes of a sweep.
-    sampling_rate : float, Hz
-        Of the window.
-    speed_of_sound : float, m/s
-        In the air.
-    absorption : (F,) float, Np/m
-        Amplitude loss of the air.
-    beam : (F, L, A) float
-        Gain of the emission over elevation and azimuth, head frame, both ends included.
-    ears : (E, F, L, A) float
-        Gain of each ear, likewise.
-    emitter : (3,) float, m
-        Place of the emitter in the head frame.
-    ear_positions : (E, 3) float, m
-        Places of the ears in the head frame.
-    lag : (E, F, L, A) float or None, m
-        How much too far off each ear hears an echo, over the directions of ``ears``; none for an
-        impulse.
-    """
-
-    frequency: Tensor
-    range: Tensor
-    window: Tensor
-    sampling_rate: float
-    speed_of_sound: float
-    absorption: Tensor
-    beam: Tensor
-    ears: Tensor
-    emitter: Tensor
-    ear_positions: Tensor
-    lag: Tensor | None = None
+def tensor(values: Any) -> Tensor:
+    """Return numbers of a head as a tensor in single precision; a tensor stays as it is."""
+    return values if isinstance(values, Tensor) else torch.tensor(values, dtype=torch.float32)
 
 
 def look_up(table: Tensor, directions: Tensor) -> Tensor:
@@ -99,8 +60,8 @@ class Renderer(nn.Module):
     ----------
     region : (2, 3) float, m
         Lower and upper corner of the box that holds the field.
-    acquisition : Acquisition
-        How the measured spectra came to be.
+    head : Head
+        What heard the spectra.
     """
 
     whole_poses: bool = True
@@ -115,11 +76,18 @@ class Renderer(nn.Module):
     ear_positions: Tensor
     points_evaluated: Tensor
 
-    def __init__(self, region: Tensor, acquisition: Acquisition) -> None:
+    def __init__(self, region: Tensor, head: Head) -> None:
         super().__init__()
         self.register_buffer("region", region.clone())
-        for name in ("frequency", "range", "beam", "ears", "emitter", "ear_positions"):
-            whole = getattr(acquisition, name).clone(memory_format=torch.contiguous_format)
+        for name, values in (
+            ("frequency", head.frequency),
+            ("range", head.range),
+            ("beam", head.row_gains.beam),
+            ("ears", head.row_gains.ears),
+            ("emitter", head.emitter),
+            ("ear_positions", head.receivers),
+        ):
+            whole = tensor(values).clone(memory_format=torch.contiguous_format)
             self.register_buffer(name, whole)
         self.log_gain = nn.Parameter(torch.zeros(()))
         self.register_buffer("points_evaluated", torch.zeros((), dtype=torch.long))

@@ -10,7 +10,8 @@ from pydantic import Field as Option
 from torch import Tensor, nn
 
 from sononerf.field.field import Field, sphere_directions
-from sononerf.field.renderer import Acquisition, Renderer, look_up
+from sononerf.field.renderer import Renderer, look_up
+from sononerf.head.head import Head
 
 
 class ShellRenderer(Renderer):
@@ -28,8 +29,8 @@ class ShellRenderer(Renderer):
     ----------
     region : (2, 3) float, m
         Lower and upper corner of the box that holds the field.
-    acquisition : Acquisition
-        How the measured spectra came to be.
+    head : Head
+        What heard the spectra.
     directions : int
         Number of directions over the forward hemisphere.
     direction : {"incidence", "sensor"}
@@ -50,27 +51,24 @@ class ShellRenderer(Renderer):
     def __init__(
         self,
         region: Tensor,
-        acquisition: Acquisition,
+        head: Head,
         *,
         directions: Annotated[int, Option(ge=1)] = 600,
         direction: Literal["incidence", "sensor"] = "incidence",
         call_spectrum: Literal["flat", "learned"] = "flat",
     ) -> None:
-        super().__init__(region, acquisition)
+        super().__init__(region, head)
         self.told = direction
-        sphere = sphere_directions(2 * directions, acquisition.range)
+        sphere = sphere_directions(2 * directions, self.range)
         # Turned so that the lattice's axis is the head's: its first half is then the hemisphere.
         forward = sphere[:directions][:, [2, 0, 1]]
         self.register_buffer("directions", forward)
         ears = torch.stack(
-            [
-                look_up(acquisition.beam * acquisition.ears[e], forward)
-                for e in range(len(acquisition.ears))
-            ]
+            [look_up(self.beam * self.ears[e], forward) for e in range(len(self.ears))]
         )
         self.register_buffer("transfer", ears)  # (E, D, F)
         self.log_spectrum = nn.Parameter(
-            torch.zeros(len(acquisition.frequency)), requires_grad=call_spectrum == "learned"
+            torch.zeros(len(self.frequency)), requires_grad=call_spectrum == "learned"
         )
 
     def forward(

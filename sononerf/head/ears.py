@@ -75,6 +75,18 @@ class Ears:
         """Whether all receivers share one table in memory."""
         return len(self.ears) == 1 or self.ears.strides[0] == 0
 
+    def cone(self, least: float) -> float:
+        """Return the cosine to the head's axis down to which every direction has a gain.
+
+        Parameters
+        ----------
+        least : float
+            Gain of beam and receivers that suffices, as a fraction of the greatest.
+        """
+        gain = (self.beam * self.ears.max(axis=0)).max(axis=0).astype(np.float64)
+        deaf = self.directions[..., 0][gain < least * gain.max()]
+        return float(deaf.max()) if len(deaf) else -1.0
+
     @cached_property
     def _by_direction(self) -> NDArray[np.float32]:
         """Beam, then ears, with frequency last: (1 + E, L A, F); one look-up is one row."""
@@ -129,9 +141,9 @@ def ear_tables(settings: EarSettings, frequency: ArrayLike) -> Ears:
     return Ears(azimuth, elevation, f, beam, tables, emitter, places)
 
 
-def receiver_count(settings: EarSettings) -> int:
-    """Return how many receivers settings describe; raises as :func:`ear_tables`."""
-    return len(_places(settings, _measured(settings))[0])
+def receiver_places(settings: EarSettings) -> NDArray[np.float64]:
+    """Return the places (E, 3) of the receivers, m, head frame; raises as :func:`ear_tables`."""
+    return _places(settings, _measured(settings))[0]
 
 
 def directivity_content(settings: EarSettings) -> str | None:

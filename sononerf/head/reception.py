@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From impulse responses to what the ears hear of a call, and to its dechirped spectrogram."""
+"""How call and analysis suit one another: the echo of a point in each row, and warnings."""
 
 from __future__ import annotations
 
@@ -9,17 +9,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.errors import InputError
 from sononerf.head.call import (
     call_waveform,
     covered,
-    emit,
     has_ghosts,
     sweep_delay,
     sweep_rate,
 )
-from sononerf.head.call_file import load_call
-from sononerf.head.noise import draw_noise, loudest_power, noise_level, target_gain
 from sononerf.head.row_filters import (
     WINDOW_BANDWIDTH,
     WINDOW_DURATION,
@@ -27,7 +23,7 @@ from sononerf.head.row_filters import (
     row_widths,
 )
 from sononerf.head.spectrogram import echo_samples, frequency_axis, spectrogram
-from sononerf.settings.schema import CallSettings, NoiseSettings, SpectrogramSettings
+from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 logger = logging.getLogger("sononerf")
 
@@ -36,113 +32,6 @@ FAINT = 1e-2
 """A point echo is followed over time down to this, over its height at its own range."""
 MOST = 4.0
 """How much louder it may be at another time, where another harmonic is: 12 dB."""
-
-
-class Reception:
-    """Call, noise and analysis, ready to be applied to the impulse responses of pose after pose.
-
-    Parameters
-    ----------
-    call : CallSettings
-        What is emitted.
-    analysis : SpectrogramSettings
-        How echoes become spectrograms.
-    noise : NoiseSettings
-        Of the ears.
-    speed_of_sound : float, m/s
-        Of the medium.
-
-    Attributes
-    ----------
-    waveform : (N,) float64
-        The call.
-    delay : (F,) float64, s
-        When each of the analysis' frequencies is emitted.
-    samples : int
-        Length S of the received waveforms: to the end of what the last frame's rows read.
-
-    Raises
-    ------
-    InputError
-        If the call is a file that cannot be used, or that holds nothing of the analysed band.
-    """
-
-    def __init__(
-        self,
-        call: CallSettings,
-        analysis: SpectrogramSettings,
-        noise: NoiseSettings,
-        *,
-        speed_of_sound: float,
-    ) -> None:
-        self.analysis, self.noise, self.speed_of_sound = analysis, noise, speed_of_sound
-        self.waveform = call_waveform(call, analysis.sampling_rate)
-        if call.file is not None and not covered(call, _within(analysis)).any():
-            raise InputError(_outside(call, analysis))
-        self.delay = sweep_delay(call, frequency_axis(analysis))
-        self.samples = echo_samples(analysis, speed_of_sound, float(self.delay.max()))
-        self._stretch = max(row_filters(analysis).length, len(self.waveform))
-        target = target_gain(noise.target_strength_db, noise.target_distance)
-        self._target_power = loudest_power(target * self.waveform[None], analysis, self._stretch)
-
-    def receive(
-        self, impulse_responses: ArrayLike, *, seed: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Pressure at the ears, noise included, and its spectrogram.
-
-        Parameters
-        ----------
-        impulse_responses : (E, S) float
-            Pressure for a call that is one sample of height 1. They should have ``samples``
-            samples; of shorter ones, down to the last frame of an impulse, the last rows lack
-            what the window lets in from behind.
-        seed : int
-            Of the pose; the noise is drawn from it.
-
-        Returns
-        -------
-        waveform : (E, S) float64
-            From the start of the emission on.
-        magnitude : (E, R, F) float64
-            Linear.
-
-        Raises
-        ------
-        ValueError
-            If the impulse responses are too short.
-        """
-        waveform = emit(impulse_responses, self.waveform)[:, : self.samples]
-        if self.noise.snr_db is not None:
-            own = self.noise.relative_to == "pose"
-            power = (
-                loudest_power(waveform, self.analysis, self._stretch)
-                if own
-                else np.repeat(self._target_power, len(waveform))
-            )
-            level = noise_level(self.noise, power, self.analysis)
-            waveform = waveform + draw_noise(level, waveform.shape[-1], seed=seed)
-        return waveform, self.analyse(waveform)
-
-    def analyse(self, waveform: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the spectrogram (E, R, F) of what was heard, (E, S) from the emission on.
-
-        Raises
-        ------
-        ValueError
-            If the waveform is shorter than ``samples``.
-        """
-        return spectrogram(waveform, self.analysis, self.speed_of_sound, self.delay)
-
-
-def _outside(call: CallSettings, analysis: SpectrogramSettings) -> str:
-    assert call.file is not None
-    bands = load_call(call.file).bands
-    held = ", ".join(f"{low / 1e3:.1f} to {high / 1e3:.1f}" for low, high in bands)
-    return (
-        f"{call.file}: holds sound at {held} kHz, nothing within spectrogram.frequency_min to "
-        f"frequency_max ({analysis.frequency_min / 1e3:g} to {analysis.frequency_max / 1e3:g} "
-        "kHz); change these, or take another call"
-    )
 
 
 def row_duration(
@@ -208,14 +97,14 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
     return round(analysis.sampling_rate * math.sqrt(WINDOW_BANDWIDTH / WINDOW_DURATION * slowness))
 
 
-def _within(analysis: SpectrogramSettings) -> NDArray[np.float64]:
+def within_band(analysis: SpectrogramSettings) -> NDArray[np.float64]:
     """Return the rows' frequencies, the outermost drawn to the ends of the band asked for."""
     return np.clip(frequency_axis(analysis), analysis.frequency_min, analysis.frequency_max)
 
 
 def _heard(call: CallSettings, analysis: SpectrogramSettings) -> NDArray[np.float64]:
     """Return those of the rows' frequencies that the call covers; all, where it covers none."""
-    frequency = _within(analysis)
+    frequency = within_band(analysis)
     heard = covered(call, frequency)
     return frequency[heard] if heard.any() else frequency
 
@@ -282,7 +171,7 @@ def _cropped(
     width = row.shape[1]
     middle = row[:, [(width - 1) // 2, width // 2]].mean(axis=1)
     window = row / np.maximum(middle, 1e-12 * row.max())[:, None]
-    heard = covered(call, _within(analysis))
+    heard = covered(call, within_band(analysis))
     if not heard.all() and heard.any():
         window[~heard] = np.minimum(window[~heard], 1.0)  # it has no middle of its own
     window = np.minimum(window, MOST)
@@ -322,7 +211,7 @@ def warn_of_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
 
 def warn_of_band(call: CallSettings, analysis: SpectrogramSettings) -> None:
     """Log one line if a call does not cover the analysed band."""
-    frequency = _within(analysis)
+    frequency = within_band(analysis)
     silent = ~covered(call, frequency)
     if silent.any():
         edges = np.flatnonzero(np.diff(silent, prepend=False, append=False)).reshape(-1, 2)

@@ -11,22 +11,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.errors import InputError
-from sononerf.head.air import absorption_in, speed_in
-from sononerf.head.ears import Ears
-from sononerf.head.spectrogram import frequency_axis
+from sononerf.head.head import Head
 from sononerf.recordings.folder import read_sound
 from sononerf.recordings.pings import Cutter, cut, mix
 from sononerf.recordings.recording import Recording
 from sononerf.recordings.reference import calibrate
 from sononerf.settings.import_schema import ImportSettings
-from sononerf.settings.schema import Settings
 
 
 def calibrated(
     recording: Recording,
     wanted: ImportSettings,
-    settings: Settings,
-    ears: Ears,
+    head: Head,
     folder: Path,
 ) -> tuple[Cutter, dict[str, Any]]:
     """Return what cuts pings, with background, reference and offsets, and what was applied.
@@ -37,10 +33,8 @@ def calibrated(
         All pings.
     wanted : ImportSettings
         What to apply.
-    settings : Settings
-        Air, call and analysis.
-    ears : Ears
-        Gains and places.
+    head : Head
+        Gains, places, air, call and analysis.
     folder : Path
         Of background and reference.
 
@@ -56,7 +50,7 @@ def calibrated(
     InputError
         If background or reference do not fit the pings, or no target is heard.
     """
-    speed, rate = speed_in(settings.air), recording.sampling_rate
+    speed, rate = head.speed_of_sound, recording.sampling_rate
     applied: dict[str, Any] = {
         "scale": wanted.scale,
         "time_offset_s": wanted.time_offset,
@@ -82,11 +76,7 @@ def calibrated(
         found = calibrate(
             mix(echo, wanted.channels) * wanted.scale,
             target,
-            ears=ears,
-            call=settings.call,
-            analysis=settings.spectrogram,
-            absorption=absorption_in(settings.air, frequency_axis(settings.spectrogram)),
-            speed_of_sound=speed,
+            head,
         )
         delay -= 2.0 * found.range_offset / speed
         cutter = replace(cutter, delay=delay, gain=wanted.scale * found.gain)

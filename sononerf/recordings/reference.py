@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from sononerf.errors import InputError
 from sononerf.head.call import call_waveform, covered, sweep_delay
-from sononerf.head.ears import Ears, beam_gain, ear_gain
+from sononerf.head.ears import beam_gain, ear_gain
+from sononerf.head.head import Head
 from sononerf.head.spectrogram import frequency_axis, range_axis, spectrogram
 from sononerf.settings.import_schema import ReferenceSettings
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
@@ -52,12 +53,7 @@ class Calibration:
 def calibrate(
     echo: Array,
     reference: ReferenceSettings,
-    *,
-    ears: Ears,
-    call: CallSettings,
-    analysis: SpectrogramSettings,
-    absorption: Array,
-    speed_of_sound: float,
+    head: Head,
 ) -> Calibration:
     """Compare the echo of a reference target with what it should be.
 
@@ -67,23 +63,17 @@ def calibrate(
         What the receivers heard of it, from the emission on.
     reference : ReferenceSettings
         The target.
-    ears : Ears
-        Gains, and places of emitter and receivers.
-    call : CallSettings
-        What was emitted.
-    analysis : SpectrogramSettings
-        Window and band; its range limits do not matter.
-    absorption : (F,) float, dB/m
-        Of the air, at the analysis' frequencies.
-    speed_of_sound : float, m/s
-        Of the air.
+    head : Head
+        Gains, places, air, call and analysis; its range limits do not matter.
 
     Raises
     ------
     InputError
         If the recording ends before the target, or nothing is heard of it.
     """
-    near = analysis.model_copy(
+    ears, call, speed_of_sound = head.gains, head.call, head.speed_of_sound
+    absorption = head.absorption(head.frequency)
+    near = head.analysis.model_copy(
         update={
             "hop": 1,
             "range_min": reference.distance * (1.0 - SEARCH),

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -12,108 +10,78 @@ from torch import Tensor
 
 from sononerf.echoes.consistency import weighted
 from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.onsets import Onsets, PointEcho, find_onsets
+from sononerf.echoes.onsets import Onsets, find_onsets
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.field import Field
 from sononerf.field.module import EchoModule
-from sononerf.field.renderer import Acquisition, Possible, Renderer
-from sononerf.head.air import absorption_in, speed_in
+from sononerf.field.renderer import Possible, Renderer
 from sononerf.head.decibels import ACTIVE_DB
-from sononerf.head.ears import analysed_ears, ear_tables
-from sononerf.head.reception import effective_window
-from sononerf.head.spectrogram import frequency_axis, range_axis
+from sononerf.head.head import Head
+from sononerf.scene.scene import Scene
 from sononerf.settings import plugins
-from sononerf.settings.schema import Settings, faults_of
+from sononerf.settings.schema import Settings
+from sononerf.settings.setting_faults import faults_of
+from sononerf.simulation.simulator import Simulator
 
 
 def _tensor(values: NDArray[np.floating]) -> Tensor:
     return torch.tensor(np.asarray(values), dtype=torch.float32)
 
 
-def acquisition(settings: Settings) -> Acquisition:
-    """Return what a renderer has to know of how the spectra came to be."""
-    air, analysis = settings.air, settings.spectrogram
-    speed = speed_in(air)
-    frequency = frequency_axis(analysis)
-    ears, lag = analysed_ears(settings.ears, settings.call, analysis)
-    absorption = absorption_in(air, frequency)
-    return Acquisition(
-        frequency=_tensor(frequency),
-        range=_tensor(range_axis(analysis, speed)),
-        window=_tensor(effective_window(settings.call, analysis)),
-        sampling_rate=analysis.sampling_rate,
-        speed_of_sound=speed,
-        absorption=_tensor(absorption) * (math.log(10.0) / 20.0),
-        beam=_tensor(ears.beam),
-        ears=_tensor(ears.ears),
-        emitter=_tensor(ears.emitter),
-        ear_positions=_tensor(ears.positions),
-        lag=None if lag is None else _tensor(lag) * (speed / 2.0),
+def head_of(settings: Settings) -> Head:
+    """Return the head that settings describe.
+
+    Raises
+    ------
+    InputError, SettingsError
+        As :class:`sononerf.head.head.Head`.
+    """
+    return Head(
+        ears=settings.ears,
+        call=settings.call,
+        air=settings.air,
+        analysis=settings.spectrogram,
+        noise=settings.noise,
     )
 
 
-def point_echo(settings: Settings) -> PointEcho:
-    """Return what the analysis makes of the echo of one point."""
-    return PointEcho.of(settings.call, settings.spectrogram, speed_in(settings.air))
+def simulator_of(scene: Scene, settings: Settings) -> Simulator:
+    """Return the simulator of a scene that settings describe; raises as :meth:`Simulator.of`."""
+    return Simulator.of(scene, head_of(settings), settings.simulation)
 
 
-def echo_hull(settings: Settings, store: EnsembleStore, heard: Onsets | None = None) -> EchoHull:
+def echo_hull(head: Head, store: EnsembleStore, heard: Onsets | None = None) -> EchoHull:
     """Return the space that the onsets of the asked poses leave, outliers of weight zero.
 
     Parameters
     ----------
-    settings : Settings
-        The experiment.
+    head : Head
+        What heard the echoes.
     store : EnsembleStore
-        Its echoes.
+        The echoes.
     heard : Onsets or None
         What is detected in them; detected anew where None.
     """
-    known, echo = acquisition(settings), point_echo(settings)
-    heard = heard or find_onsets(store, echo)
+    heard = heard or find_onsets(store, head.point_echo)
     positions = np.asarray(store.positions, dtype=np.float64)[heard.poses]
     rotations = np.asarray(store.rotations, dtype=np.float64)[heard.poses]
-    ears = known.ear_positions.double().numpy()
+    emitters, receivers = head.places(positions, rotations)
     hull = EchoHull(
-        emitters=positions + rotations @ known.emitter.double().numpy(),
-        receivers=positions[:, None] + np.einsum("pij,ej->pei", rotations, ears),
-        first=heard.first - _mean_lag(known),
+        emitters=emitters,
+        receivers=receivers,
+        first=heard.first - head.mean_lag,
         axes=rotations[:, :, 0],
-        within=_beam_cosine(known),
+        within=head.row_gains.cone(WITNESS_GAIN),
     )
-    return weighted(hull, echo.resolution)
-
-
-def _mean_lag(known: Acquisition) -> float:
-    """Return how much farther off a sweep is heard on the mean over rows and directions, m.
-
-    Each counts with its power. Rows that are nearly silent in a direction may lag by many times
-    as much, but they have no part in the onset.
-    """
-    if known.lag is None:
-        return 0.0
-    elevation = torch.linspace(-math.pi / 2, math.pi / 2, known.beam.shape[1]).double()
-    power = (known.beam * known.ears).double().square() * elevation.cos()[:, None]
-    return float((power * known.lag).sum() / power.sum())
-
-
-def _beam_cosine(known: Acquisition) -> float:
-    """Return the cosine to the head's axis down to which a pose hears in every direction."""
-    gain = (known.beam * known.ears.amax(dim=0)).amax(dim=0).double()
-    gain /= gain.max()
-    rows, columns = gain.shape
-    elevation = torch.linspace(-math.pi / 2, math.pi / 2, rows).double()[:, None]
-    azimuth = torch.linspace(-math.pi, math.pi, columns).double()
-    ahead = elevation.cos() * azimuth.cos()
-    deaf = ahead[gain < WITNESS_GAIN]
-    return float(deaf.max()) if len(deaf) else -1.0
+    return weighted(hull, head.resolution)
 
 
 def echo_region(
     settings: Settings,
+    head: Head,
     store: EnsembleStore,
     hull: EchoHull | None = None,
     heard: Onsets | None = None,
@@ -124,6 +92,8 @@ def echo_region(
     ----------
     settings : Settings
         The experiment.
+    head : Head
+        What heard the echoes.
     store : EnsembleStore
         Its echoes.
     hull : EchoHull or None
@@ -138,12 +108,10 @@ def echo_region(
     possible : callable
         Which places the echoes leave possible, given how far a place speaks for its surroundings.
     """
-    echo = point_echo(settings)
-    heard = heard or find_onsets(store, echo)
-    hull = hull or echo_hull(settings, store, heard)
-    ears = ear_tables(settings.ears, frequency_axis(settings.spectrogram))
+    heard = heard or find_onsets(store, head.point_echo)
+    hull = hull or echo_hull(head, store, heard)
     rotations = np.asarray(store.rotations, dtype=np.float64)[heard.poses]
-    found = EchoRegion(heard, hull, ears, rotations, echo.resolution)
+    found = EchoRegion(heard, hull, head.gains, rotations, head.resolution)
     set_region = settings.region
     if set_region.lower is not None and set_region.upper is not None:
         box = np.asarray((set_region.lower, set_region.upper))
@@ -159,7 +127,7 @@ def echo_region(
     return _tensor(box), possible
 
 
-def field_and_renderer(settings: Settings, region: Tensor) -> tuple[Field, Renderer]:
+def field_and_renderer(settings: Settings, head: Head, region: Tensor) -> tuple[Field, Renderer]:
     """Return an unfitted field and its renderer.
 
     Raises
@@ -169,7 +137,6 @@ def field_and_renderer(settings: Settings, region: Tensor) -> tuple[Field, Rende
     InputError
         If a plugin returns something else.
     """
-    known = acquisition(settings)
     with faults_of(settings.source):
         make_field = plugins.load(plugins.FIELDS, settings.field.kind)
         field_options = plugins.check_options(
@@ -180,8 +147,8 @@ def field_and_renderer(settings: Settings, region: Tensor) -> tuple[Field, Rende
             make_renderer, settings.renderer.options, where="renderer.options", given=2
         )
         torch.manual_seed(settings.fit.seed)
-        field = make_field(region, known.frequency, **field_options)
-        renderer = make_renderer(region, known, **renderer_options)
+        field = make_field(region, _tensor(head.frequency), **field_options)
+        renderer = make_renderer(region, head, **renderer_options)
     for made, kind, name in (
         (field, Field, settings.field.kind),
         (renderer, Renderer, settings.renderer.kind),
@@ -193,10 +160,10 @@ def field_and_renderer(settings: Settings, region: Tensor) -> tuple[Field, Rende
     return field, renderer
 
 
-def check_plugins(settings: Settings) -> None:
+def check_plugins(settings: Settings, head: Head) -> None:
     """Refuse unknown kinds and options before anything expensive."""
     region = torch.tensor([[-0.05] * 3, [0.05] * 3])
-    _, renderer = field_and_renderer(settings, region)
+    _, renderer = field_and_renderer(settings, head, region)
     if settings.fit.silent_share < 1.0 and renderer.whole_poses:
         with faults_of(settings.source):
             raise SettingsError(

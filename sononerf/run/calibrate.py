@@ -18,15 +18,15 @@ from sononerf import storage
 from sononerf.echoes.sealing import seal
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, SettingsError
-from sononerf.head.air import speed_in
+from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
 from sononerf.run.attached import attach
-from sononerf.run.fitted import load_fitted, store_of
+from sononerf.run.fitted import Fitted, load_fitted, store_of
 from sononerf.run.reconstruct import read_mesh
-from sononerf.settings.schema import HEAD_SECTIONS, Settings, SpectrogramSettings
-from sononerf.surface.refine.echo_data import Echoes, optics_of
-from sononerf.surface.refine.later_bounces import quiet_scene
+from sononerf.settings.schema import HEAD_SECTIONS, SpectrogramSettings
+from sononerf.surface.refine.echo_data import Echoes
+from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.self_calibration import KINDS, Calibration, Calibrator, Estimate, Kind
 
 STEPS = 20
@@ -115,22 +115,21 @@ def calibrate(
         raise IncompatibleError(f"{output}: holds something already; choose another --output")
     storage.probe_writable(output)
     store, mesh = store_of(fitted), read_mesh(file)
-    estimate = _estimate(fitted.settings, store, mesh, wanted, progress)
-    corrected = _write(fitted.settings, store, output, estimate.calibration, wanted, progress)
-    lines, warnings = describe(fitted.settings, store, mesh, estimate, wanted)
+    estimate = _estimate(fitted.head, store, mesh, wanted, progress)
+    corrected = _write(fitted, store, output, estimate.calibration, wanted, progress)
+    lines, warnings = describe(fitted.head, store, mesh, estimate, wanted)
     return Calibrated(corrected, estimate, lines, warnings)
 
 
 def _estimate(
-    settings: Settings,
+    head: Head,
     store: EnsembleStore,
     mesh: trimesh.Trimesh,
     kinds: Sequence[Kind],
     progress: Progress,
 ) -> Estimate:
-    optics = optics_of(settings, quiet_scene(mesh))
     work = Calibrator(
-        mesh, Echoes.of(store), optics, kinds, dependent=dependent_cells(settings.spectrogram)
+        mesh, Echoes.of(store), Optics(head), kinds, dependent=dependent_cells(head.analysis)
     )
     with progress.task("calibrating", STEPS * len(work.poses)) as task:
         for _ in range(STEPS):
@@ -156,7 +155,7 @@ def dependent_cells(analysis: SpectrogramSettings) -> float:
 
 
 def _write(
-    settings: Settings,
+    fitted: Fitted,
     store: EnsembleStore,
     output: Path,
     found: Calibration,
@@ -164,9 +163,10 @@ def _write(
     progress: Progress,
 ) -> EnsembleStore:
     """Write the store without the errors; see :func:`calibrate`."""
+    settings = fitted.settings
     plain = settings.plain()
     sections = {name: plain[name] for name in HEAD_SECTIONS}
-    speed = speed_in(settings.air) * math.exp(found.speed_of_sound)
+    speed = fitted.head.speed_of_sound * math.exp(found.speed_of_sound)
     axis = np.asarray(store.range, dtype=np.float64)
     if "speed_of_sound" in kinds:
         axis = axis * math.exp(found.speed_of_sound)
@@ -244,7 +244,7 @@ def _fingerprint(found: Calibration) -> str:
 
 
 def describe(
-    settings: Settings,
+    head: Head,
     store: EnsembleStore,
     mesh: trimesh.Trimesh,
     estimate: Estimate,
@@ -254,7 +254,7 @@ def describe(
 
     Parameters
     ----------
-    settings, store, mesh
+    head, store, mesh
         Of the run.
     estimate : Estimate
         What was found.
@@ -264,8 +264,7 @@ def describe(
     found, deviation = estimate.calibration, estimate.deviation
     train = store.indices("train")
     reach = float(np.linalg.norm(store.positions[train] - mesh.centroid, axis=1).mean())
-    resolution = optics_of(settings, quiet_scene(mesh)).resolution
-    speed = speed_in(settings.air)
+    resolution, speed = head.resolution, head.speed_of_sound
     error = estimate.error_db
     lines = [
         f"error:          {error[0]:.2f} dB before, {error[-1]:.2f} dB after {len(error)} steps"

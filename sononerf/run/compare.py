@@ -19,11 +19,10 @@ from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.difference_picture import difference_pngs, overlay_png
-from sononerf.run.build import acquisition
 from sononerf.run.fitted import Fitted, all_poses, load_fitted, render_poses
 from sononerf.run.run_folder import differing_keys, results_folder
 from sononerf.run.truth import true_mesh
-from sononerf.simulation.ensemble import TRAIN
+from sononerf.simulation.pose_sets import TRAIN
 from sononerf.surface.start.volume import Volume, vti_bytes
 
 HEARING = ("air", "ears", "call", "spectrogram")
@@ -169,7 +168,6 @@ def _heard(
         len(renderer.frequency),
     )
     rendered = render_poses(run, whole, accelerator=accelerator, progress=progress)
-    known = acquisition(run.settings)
     # Delay-and-sum adds squares; the square of this is the level.
     roots = (np.sqrt(compress(spectrogram, reference)) for spectrogram in rendered)
     return backprojection(
@@ -180,8 +178,8 @@ def _heard(
         lower,
         upper,
         float((upper - lower).max()) / VOXELS,
-        emitter_offset=known.emitter.double().numpy(),
-        ear_offsets=known.ear_positions.double().numpy(),
+        emitter_offset=run.head.emitter,
+        ear_offsets=run.head.receivers,
     )
 
 

@@ -19,7 +19,6 @@ from sononerf.evaluation.registration import Kind, Registration, register
 from sononerf.evaluation.true_surface import TrueSurface
 from sononerf.evaluation.voxels import voxel_fit
 from sononerf.progress import Progress
-from sononerf.run.build import acquisition
 from sononerf.run.fitted import Fitted, load_fitted, store_of
 from sononerf.run.reconstruct import read_mesh, reconstruct
 from sononerf.run.run_folder import RunFolder
@@ -107,7 +106,7 @@ def _baselines(fitted: Fitted) -> Iterator[tuple[str, Volume]]:
     """Yield what needs no learning, read out on one grid: backprojection and voxel fit."""
     store = store_of(fitted)
     train = store.indices("train")
-    known = acquisition(fitted.settings)
+    head = fitted.head
     lower, upper = (corner.double().numpy() for corner in fitted.module.field.region)
     given = (
         store.positions[train],
@@ -117,19 +116,20 @@ def _baselines(fitted: Fitted) -> Iterator[tuple[str, Volume]]:
         upper,
         float((upper - lower).max()) / BASELINE_VOXELS,
     )
-    emitter, ears = known.emitter.double().numpy(), known.ear_positions.double().numpy()
     yield (
         "backprojection",
-        backprojection(_heard(store, train), *given, emitter_offset=emitter, ear_offsets=ears),
+        backprojection(
+            _heard(store, train), *given, emitter_offset=head.emitter, ear_offsets=head.receivers
+        ),
     )
     fitted_voxels = voxel_fit(
         _heard(store, train),
         *given,
-        emitter_offset=emitter,
-        ear_offsets=ears,
+        emitter_offset=head.emitter,
+        ear_offsets=head.receivers,
         # Of a sweep each row has a window of its own; where rows are added up, their mean.
-        window=known.window.double().square().mean(dim=0).numpy(),
-        window_step=known.speed_of_sound / known.sampling_rate / 2,
+        window=np.square(head.window).mean(axis=0),
+        window_step=head.speed_of_sound / head.sampling_rate / 2,
     )
     yield "voxels", fitted_voxels
 

@@ -31,6 +31,7 @@ from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.module import EchoModule
 from sononerf.field.weights import save_weights
+from sononerf.head.head import Head
 from sononerf.progress import Progress
 from sononerf.run.build import (
     check_plugins,
@@ -38,8 +39,8 @@ from sononerf.run.build import (
     echo_hull,
     echo_region,
     field_and_renderer,
+    head_of,
     module_for,
-    point_echo,
 )
 from sononerf.run.run_folder import RunFolder
 from sononerf.run.simulate import (
@@ -161,11 +162,12 @@ def fit(
     run = RunFolder(path)
     require_accelerator(accelerator)
     settings = with_store(settings)
-    check_plugins(settings)
+    head = head_of(settings)
+    check_plugins(settings, head)
     if follows():
         # The first process holds the lock, simulates and writes; the others only compute.
         store = _wait_for_store(settings)
-        _fit(settings, run, store, accelerator, devices, num_nodes, Progress(quiet=True))
+        _fit(settings, head, run, store, accelerator, devices, num_nodes, Progress(quiet=True))
         return run
     if overwrite:
         aside = run.move_aside()
@@ -186,7 +188,7 @@ def fit(
             )
             if "simulate_s" not in run.read_metrics().get("cost", {}):
                 run.write_metrics("cost", {"simulate_s": simulated}, merge=True)
-            _fit(settings, run, store, accelerator, devices, num_nodes, progress)
+            _fit(settings, head, run, store, accelerator, devices, num_nodes, progress)
     finally:
         storage.remove_if_empty(created)  # those stay that something came of
     return run
@@ -204,6 +206,7 @@ def _length(settings: Settings, per_pass: int) -> tuple[int, int]:
 
 def _fit(
     settings: Settings,
+    head: Head,
     run: RunFolder,
     store: EnsembleStore,
     accelerator: str,
@@ -213,15 +216,14 @@ def _fit(
 ) -> None:
     quiet_lightning()
     keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
-    echo = point_echo(settings)
-    heard = find_onsets(store, echo)
-    hull = echo_hull(settings, store, heard)
-    region, possible = echo_region(settings, store, hull, heard)
+    heard = find_onsets(store, head.point_echo)
+    hull = echo_hull(head, store, heard)
+    region, possible = echo_region(settings, head, store, hull, heard)
     corners = (1000 * region).round().int().tolist()
     progress.say(f"region {corners[0]} to {corners[1]} mm")
-    if hull.width < echo.resolution:
+    if hull.width < head.resolution:
         progress.say(LINE)
-    field, renderer = field_and_renderer(settings, region)
+    field, renderer = field_and_renderer(settings, head, region)
     options = settings.fit
     data = data_for(settings, store, renderer)
     per_epoch, total = _length(settings, data.stream().batches_per_pass)

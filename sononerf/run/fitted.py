@@ -22,13 +22,15 @@ from sononerf.field.range_slices import PoseReader, WholePoses
 from sononerf.field.renderer import Renderer
 from sononerf.field.weights import DESCRIPTION_NAME, load_weights
 from sononerf.geometry.poses import Poses
+from sononerf.head.head import Head
 from sononerf.progress import Progress
 from sononerf.run.attached import with_attached
-from sononerf.run.build import field_and_renderer, module_for
+from sononerf.run.build import field_and_renderer, head_of, module_for
 from sononerf.run.fit import quiet_lightning, require_accelerator
 from sononerf.run.simulate import default_store, open_ensemble
-from sononerf.settings.schema import Settings, validate_settings
-from sononerf.simulation.ensemble import ensemble_poses
+from sononerf.settings.loading import validate_settings
+from sononerf.settings.schema import Settings
+from sononerf.simulation.pose_sets import ensemble_poses
 
 Split = Literal["train", "val", "test"]
 
@@ -38,6 +40,7 @@ class Fitted:
     """A fitted field as its run's two files describe it."""
 
     settings: Settings
+    head: Head
     module: EchoModule
     echo_hash: str
     hull: EchoHull  # where the training poses were, and what their first echoes leave
@@ -74,7 +77,8 @@ def load_fitted(path: Path) -> Fitted:
             "0; fetch the run again, or repeat the fit with --overwrite"
         )
     settings = with_attached(settings, path)
-    field, renderer = field_and_renderer(settings, region)
+    head = head_of(settings)
+    field, renderer = field_and_renderer(settings, head, region)
     module = module_for(settings, field, renderer, reference=reference)
     for part, prefix in ((field, "field."), (renderer, "renderer.")):
         own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
@@ -86,7 +90,7 @@ def load_fitted(path: Path) -> Fitted:
                 f"{settings.renderer.kind} of this version: {str(error).splitlines()[-1].strip()}"
             ) from None
     module.eval()
-    return Fitted(settings, module, echoes, hull)
+    return Fitted(settings, head, module, echoes, hull)
 
 
 def _hull(state: dict[str, torch.Tensor]) -> EchoHull:
@@ -134,7 +138,7 @@ def has_heldout(fitted: Fitted) -> bool:
 def all_poses(fitted: Fitted) -> tuple[Poses, NDArray[np.int8]]:
     """Return the poses of a run's ensemble and what each is for (P,): 0 train, 1 val, 2 test."""
     if fitted.settings.scene is not None:
-        return ensemble_poses(fitted.settings)
+        return ensemble_poses(fitted.settings.poses)
     store = store_of(fitted)
     return Poses(store.positions, store.rotations), store.split
 

@@ -16,18 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf import __version__, storage
-from sononerf.echoes.onsets import PointEcho, find_onsets
+from sononerf.echoes.onsets import find_onsets
 from sononerf.echoes.sealing import seal
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError
 from sononerf.head.reception import warn_of_call
-from sononerf.head.spectrogram import frequency_axis, range_axis
 from sononerf.progress import Progress
 from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses
 from sononerf.recordings.splits import repeats
-from sononerf.recordings.understand import Understood, understand
 from sononerf.report.pictures.ping_picture import pings_png
 from sononerf.run.attached import attach
+from sononerf.run.understand import Understood, understand
 from sononerf.settings.schema import HEAD_SECTIONS, CallSettings
 
 logger = logging.getLogger("sononerf")
@@ -53,7 +52,7 @@ def echo_hash(understood: Understood) -> str:
     digest.update(understood.split.tobytes())
     digest.update(understood.pings.astype("<i8").tobytes())
     digest.update(np.round(understood.recording.emission, 12).astype("<f8").tobytes())
-    digest.update(understood.cutter.digest(understood.reception.samples))
+    digest.update(understood.cutter.digest(understood.head.samples))
     if understood.cutter.background is not None:
         digest.update(np.round(understood.cutter.background, 9).astype("<f8").tobytes())
     return digest.hexdigest()
@@ -61,9 +60,8 @@ def echo_hash(understood: Understood) -> str:
 
 def spectrogram_of(understood: Understood, ping: int) -> NDArray[np.float32]:
     """Return what the receivers heard of one ping of the recording, (E, R, F)."""
-    reception = understood.reception
-    echo = understood.cutter.echo(ping, reception.samples)
-    return reception.analyse(echo).astype(np.float32)
+    head = understood.head
+    return head.analyse(understood.cutter.echo(ping, head.samples)).astype(np.float32)
 
 
 def import_recordings(
@@ -135,10 +133,10 @@ def import_understood(
             poses_positions=poses.positions,
             poses_rotations=poses.rotations,
             split=known.split,
-            range=range_axis(known.settings.spectrogram, known.speed_of_sound),
-            frequency=frequency_axis(known.settings.spectrogram),
+            range=known.head.range,
+            frequency=known.head.frequency,
             attributes=_attributes(known, wanted),
-            receivers=_receivers(known),
+            receivers=len(known.head.receivers),
         )
         attach(known.settings, output)
         missing = store.missing()
@@ -153,11 +151,6 @@ def import_understood(
     return store, verdict(known, store)
 
 
-def _receivers(known: Understood) -> int:
-    places = known.settings.ears.receivers
-    return len(known.ears.positions) if places is None else len(places)
-
-
 def _attributes(known: Understood, wanted: str) -> dict[str, Any]:
     plain = known.settings.plain()
     return {
@@ -170,7 +163,7 @@ def _attributes(known: Understood, wanted: str) -> dict[str, Any]:
         "import": known.wanted.model_dump(mode="json"),
         "calibration": known.calibration,
         "rejected_clipped": known.clipped,
-        "speed_of_sound": known.speed_of_sound,
+        "speed_of_sound": known.head.speed_of_sound,
         "units": {
             "spectrogram": "linear magnitude, sound pressure over that of the call at 1 m"
             if known.wanted.reference is not None
@@ -185,17 +178,15 @@ def _attributes(known: Understood, wanted: str) -> dict[str, Any]:
 
 def verdict(known: Understood, store: EnsembleStore) -> Verdict:
     """Return what the first echoes of the training poses say of the conventions of poses."""
-    echo = PointEcho.of(known.settings.call, known.settings.spectrogram, known.speed_of_sound)
-    heard = find_onsets(store, echo)
+    heard = find_onsets(store, known.head.point_echo)
     columns = known.recording.columns.take(known.pings[heard.poses])
-    places = known.settings.ears.receivers
     return check_poses(
         heard.first,
         known.poses[known.pings[heard.poses]],
         alternatives(columns, known.wanted),
-        emitter=known.ears.emitter,
-        receivers=known.ears.positions if places is None else np.asarray(places, dtype=np.float64),
-        resolution=echo.resolution,
+        emitter=known.head.emitter,
+        receivers=known.head.receivers,
+        resolution=known.head.resolution,
     )
 
 
@@ -221,8 +212,7 @@ def describe(known: Understood) -> list[str]:
     settings, analysis = known.settings, known.settings.spectrogram
     poses = known.poses[known.pings]
     lower, upper = poses.positions.min(axis=0), poses.positions.max(axis=0)
-    axis = range_axis(analysis, known.speed_of_sound)
-    frequency = frequency_axis(analysis)
+    axis, frequency = known.head.range, known.head.frequency
     units = known.recording.columns.units
     said = ", ".join(sorted({f"{kind} in {unit}" for kind, unit in _kinds(units).items()}))
     counts = np.bincount(known.split, minlength=3)
@@ -233,13 +223,13 @@ def describe(known: Understood) -> list[str]:
         f"source:     {known.recording.path} ({known.form}), {known.recording.sampling_rate:g} Hz",
         f"pings:      {len(known.recording)} read, {known.clipped} clipped and rejected; "
         f"{counts[0]} train, {counts[1]} validation, {counts[2]} test",
-        f"receivers:  {_receivers(known)}, {settings.ears.directivity}",
+        f"receivers:  {len(known.head.receivers)}, {settings.ears.directivity}",
         f"poses:      frame {frame}{'; ' + said if said else ''}; x {lower[0]:.3f} to "
         f"{upper[0]:.3f}, y {lower[1]:.3f} to {upper[1]:.3f}, z {lower[2]:.3f} to "
         f"{upper[2]:.3f} m",
         f"call:       {call.kind}{', ' + bands if bands else ''}"
         f"{', by pulse compression' if known.wanted.compress else ''}",
-        f"air:        {known.speed_of_sound:.1f} m/s",
+        f"air:        {known.head.speed_of_sound:.1f} m/s",
         f"range:      {axis[0]:.3f} to {axis[-1]:.3f} m in {len(axis)} slices of "
         f"{1e3 * (axis[1] - axis[0]) if len(axis) > 1 else 0.0:.2f} mm",
         f"frequency:  {frequency[0] / 1e3:.1f} to {frequency[-1] / 1e3:.1f} kHz in "
@@ -247,10 +237,8 @@ def describe(known: Understood) -> list[str]:
         f"noise:      the loudest echo of a ping is {known.level_db:.0f} dB above the quietest "
         "tenth of its ranges",
     ]
-    here, there = (
-        1e3 * PointEcho.of(each, analysis, known.speed_of_sound).resolution
-        for each in (call, CallSettings())
-    )
+    of_impulse = replace(known.head, call=CallSettings())
+    here, there = (1e3 * head.resolution for head in (known.head, of_impulse))
     if here > COARSER * there:
         lines.append(
             f"note:       ranges are resolved to {here:.0f} mm; import.compress=true resolves "
@@ -274,15 +262,15 @@ def draw(known: Understood, folder: Path) -> Path:
     StorageError
         If it cannot be written.
     """
-    reception = known.reception
+    head = known.head
     pings = [int(ping) for ping in known.pings[:SHOWN]]
     picture = pings_png(
-        [known.cutter.echo(ping, reception.samples) for ping in pings],
+        [known.cutter.echo(ping, head.samples) for ping in pings],
         [spectrogram_of(known, ping) for ping in pings],
         [known.recording.labels[ping] for ping in pings],
         sampling_rate=known.settings.spectrogram.sampling_rate,
-        range_m=range_axis(known.settings.spectrogram, known.speed_of_sound),
-        frequency_hz=frequency_axis(known.settings.spectrogram),
+        range_m=head.range,
+        frequency_hz=head.frequency,
         poses=known.poses[known.pings],
     )
     storage.commit_bytes(folder / "pings.png", picture)

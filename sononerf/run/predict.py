@@ -97,7 +97,7 @@ def predict(
         rendered = render_poses(fitted, poses, accelerator=accelerator, progress=progress)
         magnitude, reference = rendered, fitted.module.reference
         if surface is not None and surface.weight.any():
-            traced = trace_poses(fitted.settings, surface, poses, progress=progress)
+            traced = trace_poses(fitted, surface, poses, progress=progress)
             both = compress(rendered, reference), compress(traced, reference)
             level = mix(*both, surface.weight)
             magnitude = (reference * (10 ** (level / 20) - 1)).astype(np.float32)

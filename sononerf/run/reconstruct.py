@@ -20,7 +20,6 @@ from sononerf.progress import Progress, Task
 from sononerf.report.mesh_files import MeshFormat, mesh_bytes
 from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png, side_by_side_png
 from sononerf.report.pictures.mip_picture import mip_pngs
-from sononerf.run.build import point_echo
 from sononerf.run.fitted import Fitted, load_fitted, store_of
 from sononerf.run.refine import refine_surface
 from sononerf.run.run_folder import RunFolder, results_folder
@@ -145,7 +144,6 @@ def _read_out(
         If none gives a surface.
     """
     options = fitted.settings.reconstruction
-    resolution = point_echo(fitted.settings).resolution
     found: list[Reconstruction] = []
     error: NumericalError | None = None
     for method in methods:
@@ -165,7 +163,7 @@ def _read_out(
                     method=method,
                     directions=options.directions,
                     smoothing=options.smoothing if method == "isosurface" else 0.0,
-                    resolution=resolution,
+                    resolution=fitted.head.resolution,
                     earlier=found[-1] if found else None,
                     judge=False,
                     progress=shown,

@@ -16,13 +16,15 @@ from safetensors import SafetensorError, safe_open
 
 from sononerf import storage
 from sononerf.field.weights import model_checksum
+from sononerf.head.head import Head
 from sononerf.progress import Progress
 from sononerf.run.fit import require_accelerator
 from sononerf.run.fitted import Fitted, store_of
-from sononerf.settings.schema import NoiseSettings, Settings
+from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine.echo_data import Echoes, optics_of
+from sononerf.surface.refine.echo_data import Echoes
 from sononerf.surface.refine.later_bounces import quiet_scene
+from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.refinement import Refined, Refinement
 
 STATE = Path("checkpoints") / "surface.safetensors"
@@ -64,13 +66,13 @@ def refine_surface(
     require_accelerator(accelerator)
     settings = fitted.settings
     store = store_of(fitted)
-    optics = optics_of(settings, quiet_scene(next(iter(starts.values())))).to(_device(accelerator))
+    optics = Optics(fitted.head).to(_device(accelerator))
     work = Refinement(
         starts,
         Echoes.of(store),
         optics,
         hull=fitted.hull,
-        simulate=partial(surface_simulator, settings, rays=RAYS),
+        simulate=partial(surface_simulator, fitted.head, settings.simulation, rays=RAYS),
         seed=settings.fit.seed,
         # The level of a recording is that of its microphone and its amplifier.
         calibrated=store.attributes.get("origin") == "simulated",
@@ -93,12 +95,12 @@ def refine_surface(
     return refined
 
 
-def surface_simulator(settings: Settings, mesh: trimesh.Trimesh, *, rays: int) -> Simulator:
-    """Return the default engine on a surface, with so many rays and without noise."""
-    wanted = settings.simulation
-    changes = {"engine": "hybrid", "rays": rays}
-    changed = {"simulation": wanted.model_copy(update=changes), "noise": NoiseSettings()}
-    return Simulator.from_settings(quiet_scene(mesh), settings.model_copy(update=changed))
+def surface_simulator(
+    head: Head, options: SimulationSettings, mesh: trimesh.Trimesh, *, rays: int
+) -> Simulator:
+    """Return the default engine on a surface, with a number of rays and without noise."""
+    wanted = options.model_copy(update={"engine": "hybrid", "rays": rays})
+    return Simulator.of(quiet_scene(mesh), head.without_noise(), wanted)
 
 
 def _device(accelerator: str) -> torch.device:

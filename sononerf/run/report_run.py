@@ -22,7 +22,7 @@ from sononerf.report.pictures.scene_picture import scene_png
 from sononerf.run.fitted import Fitted, all_poses, has_heldout, load_fitted
 from sononerf.run.run_folder import RunFolder, results_folder
 from sononerf.run.truth import true_mesh
-from sononerf.settings.schema import dump_yaml
+from sononerf.settings.loading import dump_yaml
 from sononerf.surface.start.read_out import reconstruct as read_out
 
 PAGE = "report.md"

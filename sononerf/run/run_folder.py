@@ -16,7 +16,8 @@ from sononerf import __version__, storage
 from sononerf.errors import IncompatibleError, InputError
 from sononerf.field.weights import DESCRIPTION_NAME
 from sononerf.run.attached import attach
-from sononerf.settings.schema import Settings, dump_yaml, read_yaml, validate_settings
+from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
+from sononerf.settings.schema import Settings
 
 METRICS_SCHEMA = 1
 FREE_KEYS = (

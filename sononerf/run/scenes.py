@@ -19,12 +19,12 @@ from sononerf.head.decibels import compress
 from sononerf.report.pictures.echo_picture import echo_png
 from sononerf.report.pictures.mesh_picture import mesh_png
 from sononerf.report.pictures.scene_picture import scene_png
+from sononerf.run.build import simulator_of
 from sononerf.run.simulate import scene_of
 from sononerf.scene.scene import list_scenes, load_scene
 from sononerf.settings import plugins
 from sononerf.settings.schema import Settings
 from sononerf.simulation.ensemble import pose_seed
-from sononerf.simulation.simulator import Simulator
 
 
 def describe_scenes() -> list[dict[str, Any]]:
@@ -221,7 +221,7 @@ def draw_ensemble(settings: Settings, store: EnsembleStore, folder: Path) -> lis
     )
     index = int([*store.indices("test"), 0][0])
     written.append(folder / f"pose_{index:04d}.png")
-    simulator = Simulator.from_settings(scene, settings)
+    simulator = simulator_of(scene, settings)
     pose = store.positions[index], store.rotations[index]
     seed = pose_seed(settings.simulation.seed, index)
     points, level_db = simulator.hits(*pose, seed=seed)
@@ -235,7 +235,7 @@ def draw_ensemble(settings: Settings, store: EnsembleStore, folder: Path) -> lis
         compress(store.read_pose(index), store.attributes["reference"]),
         store.range,
         store.frequency,
-        speed_of_sound=simulator.speed_of_sound,
+        speed_of_sound=simulator.head.speed_of_sound,
         title=f"{name}, pose {index}",
     )
     storage.commit_bytes(written[1], picture)

@@ -23,16 +23,12 @@ from sononerf.head.ears import directivity_content
 from sononerf.head.reception import warn_of_call
 from sononerf.progress import Progress
 from sononerf.run.attached import attach
+from sononerf.run.build import head_of
 from sononerf.run.store_settings import complete_store
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import Settings
-from sononerf.simulation.ensemble import (
-    check_poses,
-    check_reach,
-    deaf,
-    ensemble_poses,
-    simulate_ensemble,
-)
+from sononerf.simulation.ensemble import check_poses, check_reach, deaf, simulate_ensemble
+from sononerf.simulation.pose_sets import ensemble_poses
 from sononerf.simulation.simulator import VERSION, Simulator
 from sononerf.simulation.validity import expected_error_db
 
@@ -51,7 +47,7 @@ def echo_hash(settings: Settings, scene: Scene) -> str:
     plain = _heard_settings(settings)
     digest = hashlib.sha256(f"simulator {VERSION}".encode())
     digest.update(json.dumps([plain[name] for name in HASHED_SECTIONS], sort_keys=True).encode())
-    poses, split = ensemble_poses(settings)
+    poses, split = ensemble_poses(settings.poses)
     for values in (poses.positions, poses.rotations):
         # The last bits of a sine are the processor's own; adding zero makes -0 the same as 0.
         digest.update((np.round(values, 9) + 0.0).astype("<f8").tobytes())
@@ -223,11 +219,11 @@ def simulate(
             )
         if "reference" in store.attributes and not store.missing():
             return store
-    poses, split = ensemble_poses(settings)
+    poses, split = ensemble_poses(settings.poses)
     warn_of_call(settings.call, settings.spectrogram)
-    simulator = Simulator.from_settings(scene, settings)
-    head = np.concatenate((simulator.ears.emitter[None], simulator.ears.positions))
-    check_poses(scene, poses, offsets=head)
+    head = head_of(settings)
+    simulator = Simulator.of(scene, head, settings.simulation)
+    check_poses(scene, poses, offsets=np.vstack((head.emitter, head.receivers)))
     check_reach(
         scene,
         poses,
@@ -244,10 +240,10 @@ def simulate(
             poses_positions=poses.positions,
             poses_rotations=poses.rotations,
             split=split,
-            range=simulator.range,
-            frequency=simulator.frequency,
+            range=head.range,
+            frequency=head.frequency,
             attributes=_attributes(settings, wanted, simulator),
-            receivers=len(simulator.ears.positions),
+            receivers=len(head.receivers),
         )
         attach(settings, path)
         _fill(store, simulator, poses, settings, workers, scheduler, progress)
@@ -257,13 +253,13 @@ def simulate(
 def _attributes(settings: Settings, wanted: str, simulator: Simulator) -> dict[str, object]:
     plain = settings.plain()
     engine = simulator.engine
-    error = expected_error_db(engine, engine.scene, simulator.frequency)
+    error = expected_error_db(engine, engine.scene, simulator.head.frequency)
     return {
         "echo_hash": wanted,
         "origin": "simulated",
         "scene": plain["scene"],
         "settings": {name: plain[name] for name in ("poses", *HASHED_SECTIONS)},
-        "speed_of_sound": simulator.speed_of_sound,
+        "speed_of_sound": simulator.head.speed_of_sound,
         "expected_error_db": None
         if error is None
         else [round(value, 2) for value in error.tolist()],

@@ -8,7 +8,8 @@ from pathlib import Path
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError
 from sononerf.run.attached import with_attached
-from sononerf.settings.schema import HEAD_SECTIONS, Settings, validate_settings
+from sononerf.settings.loading import validate_settings
+from sononerf.settings.schema import HEAD_SECTIONS, Settings
 
 OWN_KEYS = ("spectrogram.dynamic_range_db",)
 """Keys of these sections that an experiment may choose: they do not describe the echoes."""

@@ -20,11 +20,10 @@ from sononerf.field.range_slices import WholePoses
 from sononerf.field.weights import model_checksum
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
-from sononerf.run.fitted import load_fitted, poses_of, render_poses, store_of
+from sononerf.run.fitted import Fitted, load_fitted, poses_of, render_poses, store_of
 from sononerf.run.reconstruct import read_mesh
 from sononerf.run.refine import surface_simulator
 from sononerf.run.simulate import prepare
-from sononerf.settings.schema import Settings
 from sononerf.simulation.simulator import Simulator
 
 NAME = "traced.safetensors"
@@ -90,7 +89,7 @@ def learn_traced(
     numbers = np.linspace(0, len(training) - 1, min(GAIN_POSES, len(training))).astype(int)
     some = training.only(torch.as_tensor(numbers))
     try:
-        simulator = surface_simulator(options, mesh, rays=RAYS)
+        simulator = surface_simulator(fitted.head, options.simulation, mesh, rays=RAYS)
         both = zip(_places(some), _places(validation), strict=True)
         positions, rotations = (np.concatenate(parts) for parts in both)
         prepare(simulator, positions, rotations, progress)
@@ -108,12 +107,12 @@ def learn_traced(
 
 
 def trace_poses(
-    settings: Settings, traced: Traced, poses: WholePoses, *, progress: Progress
+    fitted: Fitted, traced: Traced, poses: WholePoses, *, progress: Progress
 ) -> NDArray[np.float64]:
     """Trace echoes off the surface, (P, E, R, F) linear magnitude, without noise."""
-    simulator = surface_simulator(settings, traced.mesh, rays=RAYS)
+    simulator = surface_simulator(fitted.head, fitted.settings.simulation, traced.mesh, rays=RAYS)
     prepare(simulator, *_places(poses), progress)
-    found = _trace(simulator, poses, settings.fit.seed, progress)
+    found = _trace(simulator, poses, fitted.settings.fit.seed, progress)
     return found * 10 ** (traced.gain_db[:, None] / 20)
 
 

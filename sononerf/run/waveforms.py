@@ -10,13 +10,14 @@ import yaml
 from sononerf import storage
 from sononerf.errors import InputError, SettingsError
 from sononerf.progress import Progress
-from sononerf.recordings.understand import OWN_SETTINGS
 from sononerf.recordings.writer import pose_table, wav_bytes
+from sononerf.run.build import simulator_of
 from sononerf.run.simulate import prepare
+from sononerf.run.understand import OWN_SETTINGS
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
-from sononerf.simulation.ensemble import ensemble_poses, pose_seed
-from sononerf.simulation.simulator import Simulator
+from sononerf.simulation.ensemble import pose_seed
+from sononerf.simulation.pose_sets import ensemble_poses
 
 
 def write_waveforms(
@@ -67,8 +68,8 @@ def write_waveforms(
         raise SettingsError(f"spectrogram.sampling_rate: a WAV file cannot hold {rate} Hz")
     if folder.is_dir() and any(folder.iterdir()):
         raise InputError(f"{folder}: is not empty; choose another folder for the recordings")
-    simulator = Simulator.from_settings(scene, settings)
-    poses, split = ensemble_poses(settings)
+    simulator = simulator_of(scene, settings)
+    poses, split = ensemble_poses(settings.poses)
     prepare(simulator, poses.positions, poses.rotations, progress)
     digits = max(4, len(str(len(poses) - 1)))
     names = [f"ping_{index:0{digits}d}.wav" for index in range(len(poses))]

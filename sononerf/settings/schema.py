@@ -8,30 +8,20 @@ SI units and radians inside; another unit is in the name.
 from __future__ import annotations
 
 import difflib
-import math
-import re
-import typing
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from sononerf.errors import SettingsError
 from sononerf.settings.call_presets import CALL_PRESETS
+from sononerf.settings.window_defaults import fft_of, hop_of, window_of
 
-MAX_SETTINGS_BYTES = 1_000_000
-MAX_SETTINGS_DEPTH = 50
 HEAD_SECTIONS = ("air", "ears", "call", "spectrogram")
 """Sections that describe the head: a store and an import state them."""
 FILE_SECTIONS = ("ears", "call")
 """Sections whose key ``file`` names a file."""
-PLUGIN_NAMES = (("scene", "name"), ("field", "kind"), ("renderer", "kind"))
-"""Keys whose value decides what the options beside it mean."""
-
 Vector = tuple[float, float, float]
 Name = Annotated[str, Field(min_length=1)]
 Positive = Annotated[float, Field(gt=0)]
@@ -215,28 +205,6 @@ class CallSettings(_Section):
         return {h: (h * low, h * high) for h, a in enumerate(self.harmonics, start=1) if a > 0.0}
 
 
-def _window_of(analysis: dict[str, Any]) -> int:
-    """Return the power of two, in samples, that is nearest to 6.4 periods of the highest frequency.
-
-    It gives 64 at 1 MHz for up to 100 kHz.
-    """
-    if not {"sampling_rate", "frequency_max"} <= analysis.keys():  # told as a fault of its own
-        return 64
-    periods = 6.4 * analysis["sampling_rate"] / analysis["frequency_max"]
-    return int(2 ** max(round(math.log2(periods)), 3))
-
-
-def _hop_of(analysis: dict[str, Any]) -> int:
-    """Return a sixteenth of the window that suits the band, in samples."""
-    return max(_window_of(analysis) // 16, 1)
-
-
-def _fft_of(analysis: dict[str, Any]) -> int:
-    """Return eight times the window that suits the band, and more if a longer one is set."""
-    longest = max(8 * _window_of(analysis), analysis.get("window", 8))
-    return int(2 ** math.ceil(math.log2(longest)))
-
-
 class SpectrogramSettings(_Section):
     """The analysis: filters of equal or of growing width, a hop, and a crop in range.
 
@@ -248,9 +216,9 @@ class SpectrogramSettings(_Section):
     sampling_rate: Positive = 1e6
     frequency_min: Positive = 10e3
     frequency_max: Positive = 100e3
-    window: Annotated[int, Field(ge=8)] = Field(default_factory=_window_of)
-    hop: Count = Field(default_factory=_hop_of)
-    fft: Annotated[int, Field(ge=8)] = Field(default_factory=_fft_of)
+    window: Annotated[int, Field(ge=8)] = Field(default_factory=window_of)
+    hop: Count = Field(default_factory=hop_of)
+    fft: Annotated[int, Field(ge=8)] = Field(default_factory=fft_of)
     range_min: Positive = 0.15
     range_max: Positive = 0.75
     dynamic_range_db: Annotated[float, Field(gt=0, le=200)] = 60.0
@@ -471,272 +439,3 @@ class Settings(_Section):
     def plain(self) -> dict[str, Any]:
         """Return the settings as plain data, ready for YAML, JSON and checkpoints."""
         return self.model_dump(mode="json")
-
-
-class _StrictLoader(yaml.SafeLoader):
-    """YAML that refuses duplicate keys and reads ``3e-3`` as the number it is."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str):
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} is no text", key_node.start_mark
-                )
-            if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} stands twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep=deep)
-
-
-# YAML 1.1 reads 3e-3 as text, 010 as eight, 12:30 as 750 and `on` as true; YAML 1.2's core
-# schema does not.
-_StrictLoader.yaml_implicit_resolvers = {}
-for _tag, _pattern, _first in (
-    ("null", r"^(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
-    ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", list("tTfF")),
-    ("int", r"^[-+]?(?:0|[1-9][0-9]*)$", list("-+0123456789")),
-    (
-        "float",
-        r"^[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$",
-        list("-+0123456789."),
-    ),
-):
-    _StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
-
-
-def _parse_yaml(text: str, where: str) -> Any:
-    depth = 0
-    try:
-        for event in yaml.parse(text, Loader=_StrictLoader):
-            if isinstance(event, yaml.AliasEvent):
-                raise SettingsError(f"{where}: YAML aliases are not accepted; write the value out")
-            if isinstance(event, yaml.CollectionStartEvent):
-                depth += 1
-                if depth > MAX_SETTINGS_DEPTH:
-                    raise SettingsError(f"{where}: nested deeper than {MAX_SETTINGS_DEPTH} levels")
-            elif isinstance(event, yaml.CollectionEndEvent):
-                depth -= 1
-        return yaml.load(text, Loader=_StrictLoader)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        place = f"{where}:{mark.line + 1}:{mark.column + 1}" if mark else where
-        problem = getattr(error, "problem", None) or "is no YAML"
-        raise SettingsError(f"{place}: {problem}") from None
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """Read one settings file as plain data.
-
-    Raises
-    ------
-    SettingsError
-        If the file is missing, not UTF-8, too large, or no YAML mapping.
-    """
-    try:
-        if path.stat().st_size > MAX_SETTINGS_BYTES:
-            raise SettingsError(f"{path}: larger than {MAX_SETTINGS_BYTES} bytes; no settings file")
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        near = difflib.get_close_matches(
-            path.name, [p.name for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
-        )
-        hint = f"; did you mean {path.parent / near[0]}?" if near else ""
-        raise SettingsError(f"{path}: no such settings file{hint}") from None
-    except UnicodeDecodeError:
-        raise SettingsError(f"{path}: not UTF-8 text; save it as UTF-8") from None
-    except OSError as error:
-        raise SettingsError(f"{path}: cannot be read ({error.strerror})") from None
-    data = _parse_yaml(text, str(path))
-    if data is None:
-        data = {}
-    if not isinstance(data, dict):
-        raise SettingsError(f"{path}: holds {type(data).__name__}, expected `section:` lines")
-    return data
-
-
-def apply_override(data: dict[str, Any], assignment: str) -> None:
-    """Set one dotted ``KEY=VALUE`` in ``data``, in place.
-
-    Raises
-    ------
-    SettingsError
-        If the text is no assignment or runs through a value that is no section.
-    """
-    key, equals, value = assignment.partition("=")
-    parts = key.strip().split(".")
-    if not equals or not all(parts):
-        raise SettingsError(
-            f"{assignment!r}: expected KEY=VALUE with a dotted key, such as fit.epochs=5"
-        )
-    node = data
-    for part in parts[:-1]:
-        child = node.setdefault(part, {})
-        if not isinstance(child, dict):
-            raise SettingsError(f"{key}: {part} is a value, not a section")
-        node = child
-    node[parts[-1]] = _parse_yaml(value, key)
-
-
-def _drop_options_of_another(data: dict[str, Any], assignment: str) -> None:
-    """Leave out the file's options where the command line names another scene than the file."""
-    key, _, value = assignment.partition("=")
-    section, _, name = key.strip().partition(".")
-    if (section, name) not in PLUGIN_NAMES or not isinstance(data.get(section), dict):
-        return
-    if data[section].get(name) != value.strip():
-        data[section].pop("options", None)
-
-
-def _model_at(model: type[BaseModel], path: Iterable[str | int]) -> type[BaseModel] | None:
-    for part in path:
-        if isinstance(part, int):  # in a list of models, each of them
-            continue
-        info = model.model_fields.get(part)
-        found = info.annotation if info else None
-        if typing.get_origin(found) is list:
-            found = typing.get_args(found)[0]
-        if not (isinstance(found, type) and issubclass(found, BaseModel)):
-            return None
-        model = found
-    return model
-
-
-def describe_faults(
-    error: ValidationError, model: type[BaseModel], source: str | None, prefix: str = ""
-) -> str:
-    """Turn pydantic's faults into one line each: source, dotted key, what is wrong, a way out."""
-    head = "" if source is None else f"{source}: "
-    lines: dict[str, None] = {}
-    for fault in error.errors():
-        if fault["type"] == "default_factory_not_called":
-            continue  # it follows from a key that is at fault itself
-        location = [
-            part
-            for part in fault["loc"]
-            if not (isinstance(part, str) and re.search(r"constrained|literal|\[", part))
-        ]
-        # A union reports one fault per member, with the member's type as last part.
-        if location and location[-1] in ("int", "float", "none", "str"):
-            location = location[:-1]
-        key = ".".join([*([prefix] if prefix else []), *(str(part) for part in location)])
-        if fault["type"] == "extra_forbidden":
-            parent = _model_at(model, location[:-1])
-            known = list(parent.model_fields) if parent else []
-            near = difflib.get_close_matches(str(location[-1]), known, n=1)
-            listed = f"known here: {', '.join(known)}" if known else "there is none to set here"
-            hint = f"did you mean {near[0]}?" if near else listed
-            lines[f"{head}{key}: unknown key; {hint}"] = None
-        elif fault["type"] == "missing" and isinstance(location[-1], int):
-            # One fault for each value that a list is short of; the last one tells the length.
-            short = ".".join([*([prefix] if prefix else []), *map(str, location[:-1])])
-            end = f"found {fault['input']!r}; give {location[-1] + 1} values"
-            lines = {line: None for line in lines if not line.startswith(f"{head}{short}: found")}
-            lines[f"{head}{short}: {end}"] = None
-        elif fault["type"] == "missing":
-            lines[f"{head}{key}: missing; set it, e.g. {key}=..."] = None
-        elif fault["type"] == "value_error":
-            message = fault["msg"].removeprefix("Value error, ")
-            lines[f"{head}{key + ': ' if key else ''}{message}"] = None
-        else:
-            message = fault["msg"][0].lower() + fault["msg"][1:]
-            found = repr(fault["input"])
-            found = found if len(found) < 80 else found[:77] + "..."
-            lines[f"{head}{key}: found {found}; {message}"] = None
-    return "\n".join(lines)
-
-
-def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
-    """Check plain data against the settings.
-
-    Raises
-    ------
-    SettingsError
-        One line per fault, naming ``source``, the dotted key and what is allowed.
-    """
-    try:
-        settings = Settings.model_validate(dict(data))
-    except ValidationError as error:
-        raise SettingsError(describe_faults(error, Settings, source)) from None
-    refuse_truths(data, settings, source=source)
-    settings.__dict__["source"] = source
-    return settings
-
-
-def refuse_truths(
-    given: Mapping[str, Any], taken: BaseModel, *, source: str | None = None, prefix: str = ""
-) -> None:
-    """Refuse yes and no where a number is meant; pydantic takes them for 1 and 0.
-
-    Parameters
-    ----------
-    given : mapping
-        What the settings say.
-    taken : BaseModel
-        What pydantic made of it.
-    source, prefix : str
-        Where it was read from, and the dotted key of all of it, for messages.
-
-    Raises
-    ------
-    SettingsError
-        One line for each.
-    """
-    head = "" if source is None else f"{source}: "
-    keys = [".".join([*([prefix] if prefix else []), *key]) for key in _truths(given, taken)]
-    if keys:
-        raise SettingsError("\n".join(f"{head}{key}: give a number, not yes or no" for key in keys))
-
-
-def _truths(given: Any, taken: Any) -> Iterator[tuple[str, ...]]:
-    if isinstance(given, bool):
-        if isinstance(taken, int | float) and not isinstance(taken, bool):
-            yield ()
-        return
-    pairs: Iterable[tuple[str, Any, Any]] = ()
-    if isinstance(given, Mapping) and isinstance(taken, BaseModel):
-        pairs = ((str(k), v, getattr(taken, k, None)) for k, v in given.items())
-    elif isinstance(given, list | tuple) and isinstance(taken, list | tuple):
-        pairs = ((str(n), *both) for n, both in enumerate(zip(given, taken, strict=False)))
-    for key, one, other in pairs:
-        yield from ((key, *rest) for rest in _truths(one, other))
-
-
-@contextmanager
-def faults_of(source: str | None) -> Iterator[None]:
-    """Name the file, where it is known, in faults of settings that are checked later on."""
-    try:
-        yield
-    except SettingsError as error:
-        if source is None:
-            raise
-        lines = [f"{source}: {line}" for line in str(error).splitlines()]
-        raise SettingsError("\n".join(lines)) from None
-
-
-def load_settings(path: Path, overrides: Iterable[str] = ()) -> Settings:
-    """Read a settings file and lay ``KEY=VALUE`` assignments over it.
-
-    An assignment that names another scene, field or renderer than the file does takes the file's
-    options for the old one away.
-
-    Raises
-    ------
-    SettingsError
-        If the file cannot be read or any key or value is not allowed.
-    """
-    data = read_yaml(path)
-    overrides = list(overrides)
-    for assignment in overrides:
-        _drop_options_of_another(data, assignment)
-    for assignment in overrides:
-        apply_override(data, assignment)
-    return validate_settings(data, str(path))
-
-
-def dump_yaml(settings: Settings) -> str:
-    """Return the settings, whole, as YAML text that :func:`load_settings` reads back."""
-    return str(yaml.safe_dump(settings.plain(), sort_keys=False, allow_unicode=True))

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 
 from sononerf.errors import NumericalError
 from sononerf.geometry.spread import spread_points
-from sononerf.head.ears import Ears
 from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.solved import Heads, Solved
@@ -78,8 +76,6 @@ class Sources(Solved):
         What is ensonified; closed and rigid.
     hearing : Hearing
         Head and air.
-    gains, absorption : callable
-        See :class:`Solved`.
     most : int
         Sources at the highest frequency. With the area of the surface they say which it is.
     fall : float
@@ -104,8 +100,6 @@ class Sources(Solved):
         scene: Scene,
         hearing: Hearing,
         *,
-        gains: Callable[[NDArray[np.float64]], Ears],
-        absorption: Callable[[NDArray[np.float64]], NDArray[np.float64]],
         most: int,
         fall: float,
     ) -> None:
@@ -114,8 +108,6 @@ class Sources(Solved):
         super().__init__(
             scene,
             hearing,
-            gains=gains,
-            absorption=absorption,
             frequency_max=resolved_frequency(scene, most, speed_of_sound=hearing.speed_of_sound),
             fall=fall,
         )

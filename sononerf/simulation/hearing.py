@@ -4,15 +4,22 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.head.ears import Ears, beam_gain, ear_gain
-from sononerf.simulation.impulse_response import Bins, Synthesis, air_loss, deposit, synthesise
+from sononerf.head.ears import beam_gain, ear_gain
+from sononerf.head.head import Head
+from sononerf.simulation.impulse_response import (
+    Bins,
+    Synthesis,
+    air_loss,
+    deposit,
+    plan_synthesis,
+    synthesise,
+)
 
 MOST_WAITING = 300_000  # echoes; laying them into bins goes over all bins, so it is done seldom
 
@@ -73,26 +80,31 @@ class Sound:
         return self.bins[ear]
 
 
-@dataclass(frozen=True, eq=False)
 class Hearing:
-    """A head in air, for which echoes of points are collected.
+    """What a head hears of echoes of points.
+
+    Parameters
+    ----------
+    head : Head
+        Emitter, receivers and air.
+    synthesis : Synthesis
+        Time bins and filters.
 
     Attributes
     ----------
     ears : Ears
-        At the nodes of the synthesis.
-    synthesis : Synthesis
-        Time bins and filters.
+        Gains at the nodes of the synthesis.
     absorption : (F,) float64, dB/m
         Of the air at the nodes.
     speed_of_sound : float, m/s
         Of the air.
     """
 
-    ears: Ears
-    synthesis: Synthesis
-    absorption: NDArray[np.float64]
-    speed_of_sound: float
+    def __init__(self, head: Head, synthesis: Synthesis) -> None:
+        self.head, self.synthesis = head, synthesis
+        self.ears = head.tables(synthesis.nodes)
+        self.absorption = head.absorption(synthesis.nodes)
+        self.speed_of_sound = head.speed_of_sound
 
     @cached_property
     def _air(self) -> NDArray[np.float32]:
@@ -103,10 +115,7 @@ class Hearing:
         self, position: NDArray[np.float64], rotation: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the emitter (3,) and the ears (E, 3) of a pose, m, world frame."""
-        return (
-            position + rotation @ self.ears.emitter,
-            position + self.ears.positions @ rotation.T,
-        )
+        return self.head.places(position, rotation)
 
     def silence(self) -> Sound:
         """Return nothing heard yet."""
@@ -204,6 +213,12 @@ class Hearing:
                 for ear in range(len(sound.bins))
             ]
         )
+
+
+@lru_cache(maxsize=2)  # tables of many receivers are large
+def hearing_of(head: Head) -> Hearing:
+    """Return what a head hears, with the time bins that its analysis needs; made once a head."""
+    return Hearing(head, plan_synthesis(head.analysis, head.samples))
 
 
 def _into_head(vectors: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:

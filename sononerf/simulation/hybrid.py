@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.head.ears import Ears
 from sononerf.scene.scene import Scene
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.equivalent_sources import THIN, Sources, resolved_frequency, sources_worth
@@ -78,8 +77,6 @@ def hybrid(
     scene: Scene,
     hearing: Hearing,
     *,
-    gains: Callable[[NDArray[np.float64]], Ears],
-    absorption: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     sources: int,
     frequency_min: float,
     **rays: Any,
@@ -92,8 +89,6 @@ def hybrid(
         What is ensonified.
     hearing : Hearing
         Head and air.
-    gains, absorption : callable
-        See :class:`Solved`.
     sources : int
         The most that may be used, which bounds the time.
     frequency_min : float, Hz
@@ -107,7 +102,7 @@ def hybrid(
         Rays where a surface is open, not rigid, too large or too thin; its ``note`` says why.
     """
     most = min(sources, sources_worth(scene))
-    found = _low_band(scene, hearing, gains, absorption, most, frequency_min)
+    found = _low_band(scene, hearing, most, frequency_min)
     if isinstance(found, str):
         alone = Rays(scene, hearing, **rays)
         alone.note = f"rays at all frequencies, because {found}"
@@ -124,8 +119,6 @@ def hybrid(
 def _low_band(
     scene: Scene,
     hearing: Hearing,
-    gains: Callable[[NDArray[np.float64]], Ears],
-    absorption: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     most: int,
     frequency_min: float,
 ) -> Sources | str:
@@ -140,7 +133,7 @@ def _low_band(
             f"the scene is so large that {most} sources reach {highest / 1e3:.2g} kHz; "
             "simulation.sources raises that"
         )
-    low = Sources(scene, hearing, gains=gains, absorption=absorption, most=most, fall=FALL)
+    low = Sources(scene, hearing, most=most, fall=FALL)
     if low.thin > THIN:
         return "the body is too thin for equivalent sources"
     error = low.trial()

@@ -16,35 +16,22 @@ from sononerf.geometry.directions import CapSpiral
 from sononerf.geometry.normals import bodies, enclosing_balls
 from sononerf.geometry.raycast import Hits
 from sononerf.scene.scene import Scene
+from sononerf.simulation.audibility import EARS_APART, RESOLVED_FREQUENCY, Audibility, row_dot
 from sononerf.simulation.diffraction import Diffraction
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.footprint import Real
 from sononerf.simulation.hearing import Hearing, Listener
+from sononerf.simulation.outlines import Outlines
 from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
 from sononerf.simulation.reflection import coarse_gain, unfaded
-from sononerf.simulation.shadows import LEAST, Outlines, Shadow, behind
+from sononerf.simulation.shadows import LEAST, Shadow, behind
 
 HIDDEN_SHARE = 0.15  # as many rays again, for what lies behind obstacles
 HIDDEN_DIVIDED = 0.4  # of these, kept as above
 DIVIDED_SHARE = 0.6  # of the rays, kept for where a few would be noise
 FINE = 0.3  # rad; a cell over which the path bends by less lacks nothing
 SILENT = 7.0  # e to the minus this is -61 dB
-# When a cell is fine enough, seen at this wavelength: a mirror point in it or near it is resolved
-# once the path bends over the cell by less than a radian.
-RESOLVED_FREQUENCY = 80e3  # Hz
-RESOLVED = 1.0  # rad
-NEAR = 4.0  # rad; a mirror point that far off counts for e to the minus this
-REACHED = 1.0  # sides; how far from the middle of a cell a mirror point may be for its own
-# A bundle wider than this may hold a mirror point of the next bounce that its ray does not show.
-WIDE = 5e-4  # m
-EXPLORE = 0.1  # of what such a bundle may bring, against what one with a mirror point brings
 BALLS = 32  # that hold the scene between them; rays that miss all of them are not traced
-EARS_APART = 0.03  # m; up to this what holds for the middle between the ears holds for each
-
-
-def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    product: NDArray[np.float64] = np.einsum("nd,nd->n", a, b)
-    return product
 
 
 class Rays(Engine):
@@ -112,6 +99,8 @@ class Rays(Engine):
             math.inf if of_part.material.lobe_width else SILENT / float(of_part.fade.min())
             for of_part in self.reflections
         )
+        turns_per_metre = 2.0 * math.pi * RESOLVED_FREQUENCY / hearing.speed_of_sound
+        self._audibility = Audibility(turns_per_metre, self._farthest, self._radius, bounces)
         synthesis = hearing.synthesis
         _, gain = unfaded(synthesis.frequency, speed_of_sound=hearing.speed_of_sound)
         self._smooth = np.array([r.material.lobe_width is None for r in self.reflections])
@@ -225,7 +214,7 @@ class Rays(Engine):
         listeners = self._listeners(position, rotation)
 
         def judge(bounce: Bounce) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-            return self._judge_all(bounce, listeners)
+            return self._audibility.judge_all(bounce, listeners)
 
         index = self._reaching(cap, emitter)
         return echo_paths(
@@ -261,7 +250,7 @@ class Rays(Engine):
         cap = CapSpiral(max(rays - extra, 1), axis @ rotation, half_angle, offset, rotation)
 
         def judge(bounce: Bounce) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-            audible, doubt = self._judge_all(bounce, listeners)
+            audible, doubt = self._audibility.judge_all(bounce, listeners)
             chosen = np.flatnonzero(audible)
             level = shadow.level(bounce.points[chosen], bounce.triangles[chosen, -1])
             audible[chosen] = level > LEAST
@@ -292,47 +281,6 @@ class Rays(Engine):
             if all(np.linalg.norm(ear - other) >= EARS_APART / 2.0 for other in chosen):
                 chosen.append(ear)
         return np.stack(chosen)
-
-    def _judge_all(
-        self, bounce: Bounce, listeners: NDArray[np.float64]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Which hits some listener can hear (H,), and by how much each (H,) may be wrong."""
-        audible, doubt = self._judge(bounce, listeners[0])
-        for place in listeners[1:]:
-            also, more = self._judge(bounce, place)
-            audible |= also
-            np.maximum(doubt, more, out=doubt)
-        return audible, doubt
-
-    def _judge(
-        self, bounce: Bounce, listener: NDArray[np.float64]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
-        """Which hits can be heard (H,), and by how much each (H,) may be wrong."""
-        away = listener - bounce.points
-        distance = np.sqrt(_dot(away, away))
-        away /= distance[:, None]
-        rise, detour, _, stiffness = bounce.detour(away, distance)
-        # Seen from an ear either may be somewhat different from the middle between the ears.
-        facing = rise * distance > -EARS_APART
-        audible = facing & (detour < 1.25 * self._farthest)
-        k = np.float32(2.0 * math.pi * RESOLVED_FREQUENCY / self.hearing.speed_of_sound)
-        side = np.sqrt(bounce.solid_angle)
-        # Counted in turns of the ray at the emitter, the mirror point is this far from the cell.
-        off = np.sqrt(2.0 * detour / np.maximum(stiffness, np.float32(1e-12))) - REACHED * side
-        least = 0.5 * stiffness * np.square(np.maximum(off, 0.0))
-        turns = k * stiffness * side**2
-        coarse = facing & (turns > RESOLVED) & (k * least < NEAR)
-        width = np.sqrt(bounce.footprint.tube)
-        level = np.float32(bounce.solid_angle) * width
-        doubt = np.zeros(len(level))
-        chosen = np.flatnonzero(coarse)
-        doubt[chosen] = level[chosen] / distance[chosen] * np.exp(-k * least[chosen])
-        doubt[chosen] *= np.minimum(turns[chosen], 10.0)
-        if 1 < bounce.number < self.bounces:
-            # What goes on from here may be heard, however it looks from the head.
-            wide = side * width > WIDE
-            np.maximum(doubt, np.where(wide, EXPLORE / self._radius * level, 0.0), out=doubt)
-        return audible, doubt
 
     def _hear(
         self,
@@ -386,12 +334,12 @@ class Rays(Engine):
         At last which of these are shaded (M,), and what passes of them (M, F), or None.
         """
         away = ear - bounce.points
-        distance = np.sqrt(_dot(away, away))
+        distance = np.sqrt(row_dot(away, away))
         towards = away / distance[:, None]
         rise, detour, spread, stiffness = bounce.detour(towards, distance)
         heard = (rise > 0.0) & (detour < self._farthest)
         if self._reach < math.pi:
-            heard &= _dot(bounce.mirrored, towards) > math.cos(self._reach)
+            heard &= row_dot(bounce.mirrored, towards) > math.cos(self._reach)
         near = np.flatnonzero(heard)
         seen = self.caster.visible(
             bounce.points.take(near, axis=0), ear, normals=bounce.flat.take(near, axis=0)
@@ -459,7 +407,7 @@ class Rays(Engine):
         detour: Real,
     ) -> NDArray[np.floating[Any]]:
         """Lobe times strength towards a listener (N, F)."""
-        cosine = _dot(bounce.mirrored.take(heard, axis=0), towards)
+        cosine = row_dot(bounce.mirrored.take(heard, axis=0), towards)
         triangle = bounce.triangles[heard, -1]
         curvature = self.caster.curvature[triangle]
         if len(self.reflections) == 1:

@@ -4,25 +4,19 @@
 from __future__ import annotations
 
 import logging
-from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.errors import SettingsError
-from sononerf.head.air import absorption_in, speed_in
-from sononerf.head.ears import Ears, ear_tables, receiver_count
-from sononerf.head.reception import Reception
+from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
-from sononerf.head.spectrogram import frequency_axis, range_axis
 from sononerf.scene.scene import Scene
-from sononerf.settings.schema import Settings, SimulationSettings, SpectrogramSettings
+from sononerf.settings.schema import SimulationSettings, SpectrogramSettings
 from sononerf.simulation.arrival import silence_before
 from sononerf.simulation.engine import Engine
-from sononerf.simulation.hearing import Hearing
+from sononerf.simulation.hearing import hearing_of
 from sononerf.simulation.hybrid import hybrid
-from sononerf.simulation.impulse_response import plan_synthesis
 from sononerf.simulation.rays import Rays
 from sononerf.simulation.reference.boundary import Boundary
 from sononerf.simulation.reference.kirchhoff import Kirchhoff
@@ -35,92 +29,63 @@ VERSION = 4  # to be raised when the same settings give other echoes: stores are
 
 
 class Simulator:
-    """What the ears of a pose hear of a scene.
+    """What the receivers of a pose hear of a scene.
 
     Parameters
     ----------
     engine : Engine
-        Brings the sound to the ears.
-    ears : Ears
-        At the frequencies of the spectrogram.
-    reception : Reception
-        Call, noise and analysis.
+        Brings the sound to the receivers; its head makes spectrograms of it.
 
     Attributes
     ----------
-    range : (R,) float64, m
-        Axis of the spectrograms.
-    frequency : (F,) float64, Hz
-        Axis of the spectrograms.
+    head : Head
+        What hears.
     """
 
-    def __init__(self, engine: Engine, *, ears: Ears, reception: Reception) -> None:
+    def __init__(self, engine: Engine) -> None:
         self.engine = engine
-        self.ears = ears
-        self.reception = reception
-        self.speed_of_sound = engine.hearing.speed_of_sound
-        self.range = range_axis(reception.analysis, self.speed_of_sound)
-        self.frequency = frequency_axis(reception.analysis)
+        self.head = engine.hearing.head
 
     @classmethod
-    def from_settings(cls, scene: Scene, settings: Settings) -> Simulator:
-        """Build the simulator that settings describe.
+    def of(cls, scene: Scene, head: Head, options: SimulationSettings) -> Simulator:
+        """Return the simulator of a scene and a head.
+
+        Parameters
+        ----------
+        scene : Scene
+            What is ensonified.
+        head : Head
+            What hears.
+        options : SimulationSettings
+            The engine and what bounds its work.
 
         Raises
         ------
         ValueError
-            If the settings' ranges hold no analysis frame.
+            If the range limits hold no analysis frame.
         InputError
-            If the file of the directivity cannot be read.
-        SettingsError
-            If receivers of settings and file do not fit, or noise is set for two of others.
+            If the engine cannot simulate the scene.
         """
-        _check_noise(settings)
-        air = settings.air
-        speed = speed_in(air)
-        analysis = settings.spectrogram
-        reception = Reception(settings.call, analysis, settings.noise, speed_of_sound=speed)
-        synthesis = plan_synthesis(analysis, reception.samples)
-        gains, absorption = partial(ear_tables, settings.ears), partial(absorption_in, air)
-        hearing = Hearing(gains(synthesis.nodes), synthesis, absorption(synthesis.nodes), speed)
-        wanted = settings.simulation
-        engine: Engine
-        if wanted.engine in ("spheres", "bem"):
-            solver = Spheres if wanted.engine == "spheres" else Boundary
-            engine = solver(
-                scene,
-                hearing,
-                gains=gains,
-                absorption=absorption,
-                frequency_max=solved_frequency(wanted, analysis),
-            )
-        elif wanted.engine == "kirchhoff":
+        hearing, analysis = hearing_of(head), head.analysis
+        if options.engine in ("spheres", "bem"):
+            solver = Spheres if options.engine == "spheres" else Boundary
+            return cls(solver(scene, hearing, frequency_max=solved_frequency(options, analysis)))
+        if options.engine == "kirchhoff":
             if any(material.lobe_width is not None for material in scene.materials):
                 logger.warning(
                     "simulation.engine=kirchhoff takes surfaces as smooth; the material's lobes "
                     "are left out, simulation.engine=rays has them"
                 )
-            engine = Kirchhoff(scene, hearing, frequency_max=1.1 * analysis.frequency_max)
-        else:
-            rays: dict[str, Any] = {
-                "rays": wanted.rays,
-                "bounces": wanted.bounces,
-                "diffraction_points": wanted.diffraction_points,
-            }
-            if wanted.engine == "rays":
-                engine = Rays(scene, hearing, **rays)
-            else:
-                engine = hybrid(
-                    scene,
-                    hearing,
-                    gains=gains,
-                    absorption=absorption,
-                    sources=wanted.sources,
-                    frequency_min=analysis.frequency_min,
-                    **rays,
-                )
-        ears = ear_tables(settings.ears, frequency_axis(analysis))
-        return cls(engine, ears=ears, reception=reception)
+            return cls(Kirchhoff(scene, hearing, frequency_max=1.1 * analysis.frequency_max))
+        rays: dict[str, Any] = {
+            "rays": options.rays,
+            "bounces": options.bounces,
+            "diffraction_points": options.diffraction_points,
+        }
+        if options.engine == "rays":
+            return cls(Rays(scene, hearing, **rays))
+        lowest, most = analysis.frequency_min, options.sources
+        return cls(hybrid(scene, hearing, sources=most, frequency_min=lowest, **rays))
 
     def hits(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
@@ -143,7 +108,7 @@ class Simulator:
         if isinstance(engine, Solved):
             return echo
         emitter, ears = engine.hearing.places(position, rotation)
-        first = engine.arrival.shortest(emitter[None], ears[None])[0] / self.speed_of_sound
+        first = engine.arrival.shortest(emitter[None], ears[None])[0] / self.head.speed_of_sound
         rate = engine.hearing.synthesis.sampling_rate
         return silence_before(echo, first, sampling_rate=rate)
 
@@ -190,18 +155,7 @@ class Simulator:
             Linear; dechirped where the call is a sweep.
         """
         echo = self.echo(position, rotation, seed=seed)
-        return self.reception.receive(echo, seed=seed)
-
-
-def _check_noise(settings: Settings) -> None:
-    """Refuse noise levels of two ears where a file has another number of receivers."""
-    if isinstance(settings.noise.snr_db, tuple):
-        count = receiver_count(settings.ears)
-        if count != 2:
-            raise SettingsError(
-                f"noise.snr_db: gives 2 levels, but {settings.ears.file} holds {count} receivers; "
-                "give one level for all"
-            )
+        return self.head.receive(echo, seed=seed)
 
 
 def solved_frequency(wanted: SimulationSettings, analysis: SpectrogramSettings) -> float:

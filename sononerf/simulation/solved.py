@@ -105,10 +105,6 @@ class Solved(Engine):
         What is ensonified.
     hearing : Hearing
         Head and air.
-    gains : callable
-        Takes frequencies (K,) in Hz, returns the tables of beam and ears at them.
-    absorption : callable
-        Takes frequencies (K,) in Hz, returns the absorption of the air (K,) in dB/m.
     frequency_max : float, Hz
         Where the response has fallen to zero.
     fall : float
@@ -133,13 +129,10 @@ class Solved(Engine):
         scene: Scene,
         hearing: Hearing,
         *,
-        gains: Callable[[NDArray[np.float64]], Ears],
-        absorption: Callable[[NDArray[np.float64]], NDArray[np.float64]],
         frequency_max: float,
         fall: float = TAPER,
     ) -> None:
         super().__init__(scene, hearing)
-        self.gains, self.absorption = gains, absorption
         rate = hearing.synthesis.sampling_rate
         self.frequency_max = min(frequency_max, rate / 2.0)
         self.frequency_full = self.frequency_max / fall
@@ -224,12 +217,12 @@ class Solved(Engine):
         first = self.arrival.shortest(emitters, ears) / self.hearing.speed_of_sound
         start = np.floor((first - self._lead) * rate).astype(np.int64)
         spectrum = np.zeros((*start.shape, self.period // 2 + 1), dtype=np.complex128)
-        absorbed = self.absorption(self.frequency) * (math.log(10.0) / 20.0)
+        absorbed = self.hearing.head.absorption(self.frequency) * (math.log(10.0) / 20.0)
         fall = self.taper(self.frequency)
         for index, frequency in enumerate(self.frequency.tolist()):
             turn = 2.0 * math.pi * frequency
             wavenumber = complex(turn / self.hearing.speed_of_sound, -absorbed[index])
-            gains = self.gains(self.frequency[index : index + 1])
+            gains = self.hearing.head.tables(self.frequency[index : index + 1])
             found = self.respond(wavenumber, Heads(emitters, ears, turns, gains))
             spectrum[:, :, index + 1] = fall[index] * found * np.exp(1j * turn / rate * start)
             if progress is not None:

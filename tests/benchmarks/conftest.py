@@ -5,12 +5,12 @@ import functools
 
 import pytest
 
-from sononerf.run import build
+from sononerf.head import head as head_module
 
 
 @pytest.fixture(scope="module")
 def quick_ears():
     """Ears take a second each time, and most settings have the same."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "analysed_ears", functools.cache(build.analysed_ears))
+        patch.setattr(head_module, "analysed_ears", functools.cache(head_module.analysed_ears))
         yield

@@ -31,7 +31,7 @@ def test_solving_is_shared_by_all_poses_and_the_first_call_is_not_counted(monkey
     engine = SimpleNamespace(prepare=prepare)
     simulator = SimpleNamespace(engine=engine, spectrogram=spectrogram)
     monkeypatch.setattr(module.time, "process_time", lambda: now[0])
-    monkeypatch.setattr(module.Simulator, "from_settings", lambda scene, settings: simulator)
+    monkeypatch.setattr(module, "simulator_of", lambda scene, settings: simulator)
     poses = Some(np.arange(4.0)[:, None], np.zeros((4, 3, 3)))
     monkeypatch.setattr(module, "ensemble_poses", lambda settings: (poses, None))
     config = tmp_path / "some.yaml"

@@ -9,7 +9,7 @@ import subprocess
 import pytest
 
 from sononerf.errors import IncompatibleError
-from sononerf.settings.schema import dump_yaml, load_settings
+from sononerf.settings.loading import dump_yaml, load_settings
 from tools.benchmarks import experiment
 from tools.benchmarks.experiment import CONFIG, row_of, run_experiment, run_series, summary, table
 

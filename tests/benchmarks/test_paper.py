@@ -13,11 +13,11 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from sononerf.errors import IncompatibleError
-from sononerf.run.build import field_and_renderer, module_for
+from sononerf.run.build import field_and_renderer, head_of, module_for
 from sononerf.run.fit import _length
 from sononerf.run.simulate import echo_hash
 from sononerf.scene.scene import load_scene
-from sononerf.settings.schema import load_settings
+from sononerf.settings.loading import load_settings
 from tools import benchmark
 from tools.benchmarks import paper as module
 from tools.benchmarks.experiment import CONFIG
@@ -198,7 +198,9 @@ def test_fewer_steps_are_the_first_of_the_papers_hundred_epochs(steps):
 
     def rates(*overrides):
         settings = load_settings(PAPER, overrides)
-        field, renderer = field_and_renderer(settings, torch.tensor([[-0.1] * 3, [0.1] * 3]))
+        field, renderer = field_and_renderer(
+            settings, head_of(settings), torch.tensor([[-0.1] * 3, [0.1] * 3])
+        )
         per_epoch, total = _length(settings, per_pass)
         fitted = module_for(
             settings, field, renderer, reference=1.0, total_steps=total, steps_per_epoch=per_epoch

@@ -200,7 +200,7 @@ def test_what_broke_off_or_cannot_be_compared_fails_alone(asked, monkeypatch, tm
 
 
 def test_the_conditions_change_one_thing_at_a_time_and_their_settings_are_known():
-    from sononerf.settings.schema import load_settings
+    from sononerf.settings.loading import load_settings
     from tools.benchmarks.experiment import CONFIG
 
     assert [condition.name for condition in CONDITIONS if condition.main] == [

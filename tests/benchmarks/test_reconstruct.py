@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 from tools.benchmarks import reconstruct as module
 
 

@@ -10,9 +10,9 @@ from argparse import Namespace
 
 import pytest
 
-from sononerf.run.build import acquisition, check_plugins
+from sononerf.run.build import check_plugins, head_of
 from sononerf.scene.scene import load_scene
-from sononerf.settings.schema import load_settings
+from sononerf.settings.loading import load_settings
 from tools.benchmarks import scale as module
 from tools.benchmarks.experiment import CONFIG
 from tools.benchmarks.scale import OTHERS, powers, sentences, table, watched
@@ -90,11 +90,11 @@ def test_all_axes_are_looked_at_unless_some_are_chosen(monkeypatch, tmp_path):
 @pytest.mark.parametrize("case", OTHERS, ids=lambda case: case.name)
 def test_each_case_is_what_it_says(case, quick_ears):
     settings = load_settings(CONFIG, case.settings)
-    check_plugins(settings)
+    check_plugins(settings, head_of(settings))
     scene = load_scene(settings.scene.name, settings.scene.options)
     plain = load_scene("three_spheres", {})
     if case.axis == "slices":
-        assert len(acquisition(settings).range) == case.value
+        assert len(head_of(settings).range) == case.value
     elif case.axis == "size":
         assert scene.mesh.extents == pytest.approx(case.value * plain.mesh.extents)
         reach = abs(scene.mesh.vertices).max() * 3**0.5

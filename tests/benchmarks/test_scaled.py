@@ -10,11 +10,11 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.head.air import air_absorption
 from sononerf.head.ears import analysed_ears
 from sononerf.head.spectrogram import frequency_axis, range_axis
+from sononerf.run.build import simulator_of
 from sononerf.run.simulate import _attributes, echo_hash, simulate
 from sononerf.scene.scene import load_scene
-from sononerf.settings.schema import load_settings
-from sononerf.simulation.ensemble import ensemble_poses
-from sononerf.simulation.simulator import Simulator
+from sononerf.settings.loading import load_settings
+from sononerf.simulation.pose_sets import ensemble_poses
 from tools.benchmarks.experiment import CONFIG
 from tools.benchmarks.scaled import UNSCALED, scaled_settings, scaled_store
 
@@ -32,7 +32,7 @@ def test_scene_poses_and_analysis_are_three_times_as_large(worlds):
     plain, large = worlds
     small, big = (load_scene(world.scene.name, world.scene.options).mesh for world in worlds)
     np.testing.assert_allclose(big.vertices, 3.0 * small.vertices, atol=1e-8)
-    poses, more = ensemble_poses(plain)[0], ensemble_poses(large)[0]
+    poses, more = ensemble_poses(plain.poses)[0], ensemble_poses(large.poses)[0]
     np.testing.assert_allclose(more.positions, 3.0 * poses.positions, rtol=1e-12)
     np.testing.assert_allclose(more.rotations, poses.rotations, atol=1e-12)
     one, other = (frequency_axis(world.spectrogram) for world in worlds)
@@ -61,19 +61,19 @@ def test_head_and_air_are_heard_alike(worlds):
 
 def test_echoes_are_those_of_the_unscaled_world(worlds, tmp_path):
     plain, large = worlds
-    scene, (poses, split) = load_scene("three_spheres"), ensemble_poses(plain)
-    simulator = Simulator.from_settings(scene, plain)
+    scene, (poses, split) = load_scene("three_spheres"), ensemble_poses(plain.poses)
+    simulator = simulator_of(scene, plain)
     old = EnsembleStore.create(
         tmp_path / "old",
         poses_positions=poses.positions,
         poses_rotations=poses.rotations,
         split=split,
-        range=simulator.range,
-        frequency=simulator.frequency,
+        range=simulator.head.range,
+        frequency=simulator.head.frequency,
         attributes=_attributes(plain, echo_hash(plain, scene), simulator),
     )
     random = np.random.default_rng(0)
-    shape = (2, len(simulator.range), len(simulator.frequency))
+    shape = (2, len(simulator.head.range), len(simulator.head.frequency))
     heard = random.uniform(size=(len(split), *shape)).astype(np.float32)
     for index, spectrogram in enumerate(heard):
         old.write_pose(index, spectrogram)

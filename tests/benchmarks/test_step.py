@@ -120,7 +120,7 @@ def test_traffic_counts_what_is_read_and_written_and_not_what_is_only_looked_at(
 
 
 def test_each_field_goes_through_each_renderer_with_settings_that_are_known():
-    from sononerf.settings.schema import load_settings
+    from sononerf.settings.loading import load_settings
 
     kinds = set()
     for pair in PAIRS[1:]:

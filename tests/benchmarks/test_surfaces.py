@@ -11,7 +11,7 @@ import pytest
 
 from sononerf.errors import IncompatibleError
 from sononerf.scene.scene import load_scene
-from sononerf.settings.schema import load_settings
+from sononerf.settings.loading import load_settings
 from tools.benchmarks import surfaces as module
 from tools.benchmarks.experiment import CONFIG
 from tools.benchmarks.surfaces import CASES, NEW, PROCEDURAL, chosen_cases, measured, table

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from sononerf.errors import SettingsError
-from sononerf.run.build import check_plugins
-from sononerf.settings.schema import load_settings
+from sononerf.run.build import check_plugins, head_of
+from sononerf.settings.loading import load_settings
 from tools.benchmarks import variants as module
 from tools.benchmarks.paper import PAPER
 from tools.benchmarks.variants import VARIANTS, row_of, table
@@ -41,7 +41,7 @@ def test_every_option_of_the_page_is_measured_and_every_measured_one_is_on_the_p
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
 def test_each_is_the_paper_but_for_one_thing(variant, quick_ears):
     settings = load_settings(PAPER, variant.settings)
-    check_plugins(settings)
+    check_plugins(settings, head_of(settings))
     assert (settings == load_settings(PAPER)) == (variant.name == "paper")
 
 

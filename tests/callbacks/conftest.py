@@ -12,10 +12,10 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from sononerf.echoes.store import EnsembleStore
 from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import EchoDataModule
-from sononerf.run.build import echo_region, field_and_renderer, module_for
+from sononerf.run.build import echo_region, field_and_renderer, head_of, module_for
 from sononerf.run.fit import quiet_lightning
 from sononerf.run.simulate import simulate
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 
 SETTINGS = {
     "scene": {"name": "sphere", "options": {"radius": 0.02}},
@@ -44,10 +44,11 @@ def training(ensemble, tmp_path):
     def make(*callbacks, validation=True, sanity=0, logger=False, start=0, steps=STEPS):
         quiet_lightning()
         store = EnsembleStore.open(path)
-        region, possible = echo_region(settings, store)
+        head = head_of(settings)
+        region, possible = echo_region(settings, head, store)
         module = module_for(
             settings,
-            *field_and_renderer(settings, region),
+            *field_and_renderer(settings, head, region),
             reference=store.attributes["reference"],
             possible=possible,
             total_steps=steps,

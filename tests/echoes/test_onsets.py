@@ -7,7 +7,8 @@ import pytest
 
 from sononerf.echoes import detection, onsets
 from sononerf.echoes.detection import FALSE_ALARMS, RANK, threshold_factor
-from sononerf.echoes.onsets import Onsets, PointEcho, asked_poses, find_onsets
+from sononerf.echoes.onsets import Onsets, asked_poses, find_onsets
+from sononerf.head.point_echo import PointEcho
 from sononerf.head.reception import effective_window
 from sononerf.head.spectrogram import frequency_axis, range_axis
 from sononerf.settings.schema import CallSettings, SpectrogramSettings

@@ -4,13 +4,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 from sononerf.field.field import Field
-from sononerf.field.renderer import Acquisition
+from sononerf.head.point_echo import PointEcho
 
 
 class Head:
@@ -44,6 +46,23 @@ class Head:
         x, y, z = vector / np.linalg.norm(vector)
         unit = math.atan2(y, x) / math.pi, math.asin(z) / (math.pi / 2)
         return cls.beam(*unit), np.stack([cls.ear(number, *unit) for number in (0, 1)])
+
+
+@dataclass(frozen=True)
+class Listener:
+    """What a renderer reads of a head, as tensors in double precision."""
+
+    frequency: torch.Tensor
+    range: torch.Tensor
+    window: torch.Tensor
+    sampling_rate: float
+    speed_of_sound: float
+    row_absorption: torch.Tensor
+    row_gains: SimpleNamespace
+    emitter: torch.Tensor
+    receivers: torch.Tensor
+    resolution: float
+    lag: torch.Tensor | None = None
 
 
 def table(gain):
@@ -105,18 +124,18 @@ def formula():
 
 
 @pytest.fixture(scope="session")
-def acquisition():
-    """What a renderer has to know of that head, in double precision."""
+def listener():
+    """That head as a renderer reads it."""
     ears = [table(lambda a, e, n=number: Head.ear(n, a, e)) for number in (0, 1)]
-    return Acquisition(
+    return Listener(
         frequency=torch.from_numpy(Head.frequency),
         range=torch.from_numpy(Head.range),
         window=torch.from_numpy(Head.window).expand(3, -1),
         sampling_rate=Head.rate,
         speed_of_sound=Head.speed,
-        absorption=torch.from_numpy(Head.alpha),
-        beam=table(Head.beam),
-        ears=torch.stack(ears),
+        row_absorption=torch.from_numpy(Head.alpha),
+        row_gains=SimpleNamespace(beam=table(Head.beam), ears=torch.stack(ears)),
         emitter=torch.from_numpy(Head.emitter),
-        ear_positions=torch.from_numpy(Head.ears),
+        receivers=torch.from_numpy(Head.ears),
+        resolution=PointEcho(Head.window**2, Head.per_sample, 1.0).resolution,
     )

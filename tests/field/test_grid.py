@@ -3,8 +3,7 @@ import pytest
 import torch
 
 from sononerf.errors import SettingsError
-from sononerf.field.field import sphere_directions
-from sononerf.field.profile import lattice_over
+from sononerf.field.field import lattice_over, sphere_directions
 from tests.field.lobes import REGION, fill, grid, places_in
 
 WITH_OPTIONS = pytest.mark.parametrize("options", [{}, {"rank": 2}, {"rank": 1, "correction": 4}])

@@ -15,7 +15,7 @@ from sononerf.field.grid import GridField
 from sononerf.field.module import EchoModule, decibels
 from sononerf.field.profile import ProfileRenderer
 from sononerf.field.range_slices import RangeSlices
-from sononerf.field.renderer import Acquisition, Renderer
+from sononerf.field.renderer import Renderer
 from sononerf.field.shell import ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.poses import look_at
@@ -23,17 +23,18 @@ from sononerf.geometry.poses import look_at
 REGION = torch.tensor([[-0.02] * 3, [0.02] * 3])
 FREQUENCY = torch.tensor([40e3, 60e3, 80e3])
 STEP = 4 * 343 / 1e6 / 2
-ACQUISITION = Acquisition(
+LISTENER = SimpleNamespace(
     frequency=FREQUENCY,
     range=0.2 + torch.arange(150) * STEP,
     window=torch.hamming_window(64, periodic=False).expand(3, -1),
     sampling_rate=1e6,
     speed_of_sound=343.0,
-    absorption=torch.tensor([0.1, 0.2, 0.3]),
-    beam=torch.ones(3, 5, 9),
-    ears=torch.ones(2, 3, 5, 9),
+    row_absorption=torch.tensor([0.1, 0.2, 0.3]),
+    row_gains=SimpleNamespace(beam=torch.ones(3, 5, 9), ears=torch.ones(2, 3, 5, 9)),
+    lag=None,
+    resolution=34 * STEP / 4,
     emitter=torch.zeros(3),
-    ear_positions=torch.tensor([[-0.01, 0.01, 0.0], [-0.01, -0.01, 0.0]]),
+    receivers=torch.tensor([[-0.01, 0.01, 0.0], [-0.01, -0.01, 0.0]]),
 )
 
 
@@ -41,7 +42,7 @@ class Given(Renderer):
     """Renders a parameter, whatever the field and the pose."""
 
     def __init__(self, values):
-        super().__init__(REGION, ACQUISITION)
+        super().__init__(REGION, LISTENER)
         self.values = torch.nn.Parameter(values.clone())
 
     def forward(self, field, position, rotation, rows, bins=None):
@@ -310,7 +311,7 @@ class Asked(TorchDispatchMode):
 @pytest.mark.parametrize("mode", ["power", "coherent"])
 def test_a_step_on_a_gpu_waits_for_no_number(mode, monkeypatch):
     field = GridField(REGION, FREQUENCY, spacing=0.01, levels=2)
-    found = module(ProfileRenderer(REGION, ACQUISITION, mode=mode), field, total_steps=4)
+    found = module(ProfileRenderer(REGION, LISTENER, mode=mode), field, total_steps=4)
     optimizer = found.configure_optimizers()["optimizer"]
     monkeypatch.setattr(found, "_is_logged", lambda step: False)
     monkeypatch.setattr(torch.Tensor, "tolist", lambda self: [x.item() for x in self])
@@ -442,7 +443,7 @@ def store(tmp_path_factory):
         field.grids[0][:, 0] = -10.0
         for x, y, z in ((1, 1, 1), (3, 2, 1), (2, 3, 4)):
             field.grids[0][0, 0, z, y, x] = 0.0
-    renderer = ProfileRenderer(REGION, ACQUISITION)
+    renderer = ProfileRenderer(REGION, LISTENER)
     renderer.prepare(field, None, 0)
     positions = 0.24 * fibonacci_sphere(12)
     rotations = look_at(positions, np.zeros(3))
@@ -456,7 +457,7 @@ def store(tmp_path_factory):
         poses_positions=positions,
         poses_rotations=rotations,
         split=np.arange(12) % 6 == 5,
-        range=ACQUISITION.range.numpy(),
+        range=LISTENER.range.numpy(),
         frequency=FREQUENCY.numpy(),
         attributes={"echo_hash": "a", "reference": float(heard.max()) / 1000},
     )
@@ -501,11 +502,11 @@ def fit(store, renderer, path, steps):
 
 
 def test_training_lowers_the_loss_and_repeats(store, tmp_path):
-    losses, metrics, _ = fit(store, ProfileRenderer(REGION, ACQUISITION), tmp_path, 40)
+    losses, metrics, _ = fit(store, ProfileRenderer(REGION, LISTENER), tmp_path, 40)
     assert len(losses) == 40
     assert np.mean(losses[-3:]) < 0.3 * losses[0]
     assert metrics["val/mae_db"] < 0.3 * 60 * losses[0]
-    again, _, _ = fit(store, ProfileRenderer(REGION, ACQUISITION), tmp_path, 40)
+    again, _, _ = fit(store, ProfileRenderer(REGION, LISTENER), tmp_path, 40)
     assert again == losses
 
 
@@ -518,13 +519,13 @@ def test_a_fit_with_phase_sets_the_gain_anew_when_phase_comes(store, tmp_path, m
         calibrated.append((bool(renderer.phased), float(renderer.log_gain.detach())))
 
     monkeypatch.setattr(ProfileRenderer, "calibrate", calibrate)
-    renderer = ProfileRenderer(REGION, ACQUISITION, mode="coherent")
+    renderer = ProfileRenderer(REGION, LISTENER, mode="coherent")
     losses, _, found = fit(store, renderer, tmp_path, 10)
     assert [phased for phased, _ in calibrated] == [False, True]
     assert calibrated[0][1] != calibrated[1][1]
     assert np.isfinite(losses).all()
     # What was fitted with phase is loaded with phase, and a step of it sets no gain.
-    again = module(ProfileRenderer(REGION, ACQUISITION, mode="coherent"), total_steps=10)
+    again = module(ProfileRenderer(REGION, LISTENER, mode="coherent"), total_steps=10)
     again.load_state_dict(found.state_dict())
     logged(again, monkeypatch)
     monkeypatch.setattr(type(again), "global_step", 8)
@@ -540,7 +541,7 @@ def test_a_fit_with_phase_sets_the_gain_anew_when_phase_comes(store, tmp_path, m
 
 
 def test_training_on_single_slices_lowers_the_loss(store, tmp_path):
-    losses, _, found = fit(store, ShellRenderer(REGION, ACQUISITION, directions=200), tmp_path, 30)
+    losses, _, found = fit(store, ShellRenderer(REGION, LISTENER, directions=200), tmp_path, 30)
     assert np.mean(losses[-3:]) < 0.8 * losses[0]
     assert all(p.isfinite().all() for p in found.parameters())
 

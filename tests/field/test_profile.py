@@ -7,15 +7,15 @@ import pytest
 import torch
 import trimesh
 
+from sononerf.field.field import lattice_over
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.field.hash import HashField
-from sononerf.field.profile import ProfileRenderer, lattice_over
+from sononerf.field.profile import ProfileRenderer
 from sononerf.geometry.poses import look_at, rotation_from_euler
-from sononerf.run.build import acquisition as acquisition_of
+from sononerf.run.build import head_of, simulator_of
 from sononerf.scene.scene import Scene
-from sononerf.settings.schema import validate_settings
-from sononerf.simulation.simulator import Simulator
+from sononerf.settings.loading import validate_settings
 from tests.field.lobes import fill, grid, hashed
 
 REGION = torch.tensor([[-0.02, -0.03, -0.01], [0.02, 0.01, 0.03]], dtype=torch.float64)
@@ -43,7 +43,7 @@ def quiet(renderer):
 
 
 @pytest.fixture
-def one_place(acquisition, formula):
+def one_place(listener, formula):
     """Make field and renderer of a single place that answers alike in all directions."""
 
     def make(place, strength=1.0, **options):
@@ -51,11 +51,11 @@ def one_place(acquisition, formula):
         region = torch.stack((corner, corner + 0.001))
         field = formula(
             region,
-            acquisition.frequency,
+            listener.frequency,
             lambda x, u: torch.full((*u.shape[:-1], 3), strength, dtype=u.dtype),
             spacing=0.01,
         )
-        renderer = quiet(ProfileRenderer(region, acquisition, **options))
+        renderer = quiet(ProfileRenderer(region, listener, **options))
         assert renderer.prepare(field, None, 0)
         assert len(renderer.lattice) == 1
         return field, renderer
@@ -71,10 +71,10 @@ def smooth(places, directions):
 
 
 @pytest.fixture
-def cloud(acquisition, formula):
+def cloud(listener, formula):
     """A smooth field on a lattice of 10 mm, 125 places, and its renderer."""
-    field = formula(REGION, acquisition.frequency, smooth, spacing=0.01)
-    renderer = quiet(ProfileRenderer(REGION, acquisition))
+    field = formula(REGION, listener.frequency, smooth, spacing=0.01)
+    renderer = quiet(ProfileRenderer(REGION, listener))
     renderer.prepare(field, None, 0)
     assert len(renderer.lattice) == 125
     return field, renderer
@@ -120,12 +120,12 @@ def test_one_place_sounds_as_the_window(head, one_place, oversampling):
     np.testing.assert_allclose(found, np.array(peaks)[:, None].repeat(3, 1), atol=2e-5)
 
 
-def test_each_frequency_has_a_window_of_its_own(acquisition, one_place):
+def test_each_frequency_has_a_window_of_its_own(listener, one_place):
     """A sweep's echo is longer where it sweeps slowly; beyond its end a skirt may be learned."""
     offset = torch.arange(-100, 101, dtype=torch.float64)
     width = torch.tensor([15.0, 30.0, 45.0], dtype=torch.float64)
     window = (-0.5 * (offset / width[:, None]) ** 2).exp()
-    known = dataclasses.replace(acquisition, window=window)
+    known = dataclasses.replace(listener, window=window)
     _, renderer = one_place(np.zeros(3))
     made = quiet(ProfileRenderer(renderer.region, known))
     assert made.log_kernel.shape == (3, 66)  # 100 samples and 31 µs more, in bins of 2 samples
@@ -136,18 +136,18 @@ def test_each_frequency_has_a_window_of_its_own(acquisition, one_place):
     assert (made.log_kernel[:, 50:] == -9.0).all()
 
 
-def test_a_row_that_is_not_swept_has_a_window_all_the_same(acquisition, one_place):
+def test_a_row_that_is_not_swept_has_a_window_all_the_same(listener, one_place):
     """What is not called has no middle to measure by: leakage may be louder off it, or nothing."""
     window = torch.ones(3, 101, dtype=torch.float64)
     window[1, :40] = window[1, 61:] = 5.0
     window[2, :40] = window[2, 61:] = 0.0
     _, renderer = one_place(np.zeros(3))
-    made = ProfileRenderer(renderer.region, dataclasses.replace(acquisition, window=window))
+    made = ProfileRenderer(renderer.region, dataclasses.replace(listener, window=window))
     assert (made.log_kernel[1, :25] == 0.0).all()
     assert (made.log_kernel[2, 6:] == -9.0).all()
 
 
-def test_a_sweeps_rows_hear_a_place_by_their_lag_farther_off(head, acquisition, one_place):
+def test_a_sweeps_rows_hear_a_place_by_their_lag_farther_off(head, listener, one_place):
     def lag(azimuth, elevation):
         return np.array([-0.002, 0.0, 0.005]) * (1 + azimuth) * (1 - elevation)
 
@@ -155,7 +155,7 @@ def test_a_sweeps_rows_hear_a_place_by_their_lag_farther_off(head, acquisition, 
     table = [[lag(a, e) for a in np.linspace(-1, 1, 181)] for e in np.linspace(-1, 1, 91)]
     one = torch.from_numpy(np.array(table)).permute(2, 0, 1)
     field, renderer = one_place(place)
-    known = dataclasses.replace(acquisition, lag=torch.stack((one, -one)))
+    known = dataclasses.replace(listener, lag=torch.stack((one, -one)))
     lagging = quiet(ProfileRenderer(renderer.region, known))
     lagging.prepare(field, None, 0)
     middles = []
@@ -205,13 +205,13 @@ def slow(head, renderer, reflectivity, position, rotation):
 
 
 @pytest.mark.parametrize("kind", ["real", "complex"])
-def test_many_places_against_a_slow_loop(head, acquisition, formula, kind, monkeypatch):
+def test_many_places_against_a_slow_loop(head, listener, formula, kind, monkeypatch):
     def turning(places, directions):
         return smooth(places, directions) * torch.exp(1j * 50 * places[..., :1])
 
     function = smooth if kind == "real" else turning
-    field = formula(REGION, acquisition.frequency, function, spacing=0.01)
-    renderer = quiet(ProfileRenderer(REGION, acquisition))
+    field = formula(REGION, listener.frequency, function, spacing=0.01)
+    renderer = quiet(ProfileRenderer(REGION, listener))
     renderer.prepare(field, None, 0)
     window = heard_from_bins(renderer, monkeypatch)
     with torch.no_grad():
@@ -229,10 +229,10 @@ def test_many_places_against_a_slow_loop(head, acquisition, formula, kind, monke
 LOBES = pytest.mark.parametrize("make", [grid, hashed])
 
 
-def heard_by_lobes(make, acquisition, **options):
+def heard_by_lobes(make, listener, **options):
     """A field with a code for each place, and its renderer, with what it makes of two poses."""
-    field = fill(make(REGION, acquisition.frequency), size=0.3)
-    renderer = quiet(ProfileRenderer(REGION, acquisition, **options))
+    field = fill(make(REGION, listener.frequency), size=0.3)
+    renderer = quiet(ProfileRenderer(REGION, listener, **options))
     renderer.prepare(field, None, 0)
     return field, renderer, lambda: renderer(field, *tensors(POSITION, ROTATION), rows(poses=2))
 
@@ -241,11 +241,11 @@ def heard_by_lobes(make, acquisition, **options):
 @pytest.mark.parametrize("far", [0.29, 0.25, 0.34, 0.2, 0.4])
 @pytest.mark.parametrize("mode", ["power", "coherent"])
 def test_only_slices_that_may_sound_are_looked_at_and_nothing_is_lost(
-    acquisition, formula, far, mode, monkeypatch
+    listener, formula, far, mode, monkeypatch
 ):
     region = REGION + torch.tensor([0.30 - far, 0.0, 0.0])
-    field = formula(region, acquisition.frequency, smooth, spacing=0.005)
-    renderer = quiet(ProfileRenderer(region, acquisition, mode=mode, oversampling=3))
+    field = formula(region, listener.frequency, smooth, spacing=0.005)
+    renderer = quiet(ProfileRenderer(region, listener, mode=mode, oversampling=3))
     renderer.prepare(field, None, 0)
     renderer.advance(1, 1)
     given = (*tensors(POSITION[0], ROTATION[0]), rows())
@@ -268,8 +268,8 @@ def test_only_slices_that_may_sound_are_looked_at_and_nothing_is_lost(
 
 
 @LOBES
-def test_what_is_heard_follows_the_places_that_are_alive(make, acquisition):
-    _, renderer, hear = heard_by_lobes(make, acquisition)
+def test_what_is_heard_follows_the_places_that_are_alive(make, listener):
+    _, renderer, hear = heard_by_lobes(make, listener)
     silent = torch.zeros_like(renderer.alive)
     few = silent.clone()
     few[:3] = True
@@ -296,8 +296,8 @@ def direct(region, frequency):
 
 
 @pytest.mark.parametrize("make", [grid, hashed, direct])
-def test_a_fit_may_begin_with_a_validation(make, acquisition):
-    field, _, hear = heard_by_lobes(make, acquisition)
+def test_a_fit_may_begin_with_a_validation(make, listener):
+    field, _, hear = heard_by_lobes(make, listener)
     with torch.inference_mode():
         first = hear()
     again = hear()
@@ -307,9 +307,9 @@ def test_a_fit_may_begin_with_a_validation(make, acquisition):
 
 
 @LOBES
-def test_a_sample_has_the_right_power_on_average(make, acquisition):
+def test_a_sample_has_the_right_power_on_average(make, listener):
     """Some of the places that are loudest in the books being dead."""
-    _, renderer, hear = heard_by_lobes(make, acquisition, points=25)
+    _, renderer, hear = heard_by_lobes(make, listener, points=25)
     renderer.energy = torch.linspace(1, 2, 125, dtype=torch.float64) ** 4
     renderer.alive[60:80] = renderer.alive[120:] = False
     renderer.eval()
@@ -323,8 +323,8 @@ def test_a_sample_has_the_right_power_on_average(make, acquisition):
     assert (deviation / whole)[loud].median() < 0.05  # so that the test can tell
 
 
-def test_loud_places_are_drawn_more_often(acquisition):
-    _, renderer, _ = heard_by_lobes(grid, acquisition, points=70, uniform=0.4)
+def test_loud_places_are_drawn_more_often(listener):
+    _, renderer, _ = heard_by_lobes(grid, listener, points=70, uniform=0.4)
     renderer.alive[:50] = False
     renderer.energy = (torch.arange(125) >= 115).double()
     torch.manual_seed(0)
@@ -334,7 +334,7 @@ def test_loud_places_are_drawn_more_often(acquisition):
     assert (drawn >= 65).double().mean() == pytest.approx(0.65, abs=0.18)
 
 
-def test_doubling_the_range_divides_by_four(acquisition, one_place):
+def test_doubling_the_range_divides_by_four(listener, one_place):
     """Pressure falls with the product of both ways, here d²; the air's part is taken out."""
     levels = []
     for distance in (0.145, 0.29):
@@ -362,20 +362,20 @@ def test_emitter_and_ear_may_be_exchanged(one_place):
     torch.testing.assert_close(there, back, rtol=1e-9, atol=1e-9)
 
 
-def test_the_mirrored_scene_exchanges_the_ears(acquisition, formula):
+def test_the_mirrored_scene_exchanges_the_ears(listener, formula):
     mirror = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
     region = torch.tensor([[-0.02] * 3, [0.02] * 3], dtype=torch.float64)
     heard = []
     for function in (smooth, lambda x, u: smooth(x * mirror, u * mirror)):
-        field = formula(region, acquisition.frequency, function, spacing=0.01)
-        renderer = quiet(ProfileRenderer(region, acquisition))
+        field = formula(region, listener.frequency, function, spacing=0.01)
+        renderer = quiet(ProfileRenderer(region, listener))
         renderer.prepare(field, None, 0)
         heard.append(renderer(field, *tensors([0.28, 0, 0.01], LEVEL_BACK), rows()))
     torch.testing.assert_close(heard[0], heard[1].flip(1), rtol=1e-9, atol=1e-9)
     assert (heard[0] - heard[1]).abs().max() > 0.05 * heard[0].max()
 
 
-def test_turning_scene_and_head_together_changes_nothing(acquisition, formula):
+def test_turning_scene_and_head_together_changes_nothing(listener, formula):
     turn, shift = rotation_from_euler(np.pi / 2, 0.0, 0.0), np.array([1.0, -2.0, 0.5])
     turned = torch.from_numpy(turn)
     region = torch.tensor([[-0.02] * 3, [0.02] * 3], dtype=torch.float64)
@@ -389,8 +389,8 @@ def test_turning_scene_and_head_together_changes_nothing(acquisition, formula):
         (region, smooth, POSITION[0], ROTATION[0]),
         (moved, elsewhere, turn @ POSITION[0] + shift, turn @ ROTATION[0]),
     ):
-        field = formula(box, acquisition.frequency, function, spacing=0.01)
-        renderer = quiet(ProfileRenderer(box, acquisition))
+        field = formula(box, listener.frequency, function, spacing=0.01)
+        renderer = quiet(ProfileRenderer(box, listener))
         renderer.prepare(field, None, 0)
         heard.append(renderer(field, *tensors(where, rotation), rows()))
     torch.testing.assert_close(*heard, rtol=1e-9, atol=1e-9)
@@ -405,9 +405,9 @@ def test_the_order_of_the_places_changes_nothing(cloud):
     torch.testing.assert_close(one, two, rtol=1e-12, atol=1e-12)
 
 
-def test_silence_in_only_noise_out(acquisition, formula):
-    field = formula(REGION, acquisition.frequency, lambda x, u: 0 * smooth(x, u), spacing=0.01)
-    renderer = ProfileRenderer(REGION, acquisition).double()
+def test_silence_in_only_noise_out(listener, formula):
+    field = formula(REGION, listener.frequency, lambda x, u: 0 * smooth(x, u), spacing=0.01)
+    renderer = ProfileRenderer(REGION, listener).double()
     renderer.prepare(field, None, 0)
     heard = renderer(field, *tensors(POSITION, ROTATION), rows(poses=2))
     # The noise starts at exp(-16), and the power's floor of 1e-24 lies below it.
@@ -456,25 +456,25 @@ def test_a_sample_of_the_places_is_right_on_average(cloud):
     assert int(renderer.points_evaluated) == 125 + 600 * 30
 
 
-def test_the_first_lattice_is_as_fine_as_its_bound_allows(acquisition, formula):
-    field = formula(REGION, acquisition.frequency, smooth, spacing=0.005)
+def test_the_first_lattice_is_as_fine_as_its_bound_allows(listener, formula):
+    field = formula(REGION, listener.frequency, smooth, spacing=0.005)
     # 9 x 9 x 9 = 729 vertices at 5 mm, 125 at 10 mm, 27 at 20 mm.
     for start, count, spacing in ((729, 729, 0.005), (728, 125, 0.01), (124, 27, 0.02)):
-        renderer = ProfileRenderer(REGION, acquisition, start=start).double()
+        renderer = ProfileRenderer(REGION, listener, start=start).double()
         assert renderer.prepare(field, None, 0)
         assert (len(renderer.lattice), float(renderer.spacing)) == (count, pytest.approx(spacing))
         assert not renderer.prepare(field, None, 1)
 
 
-def test_only_possible_places_are_laid(acquisition, formula):
-    field = formula(REGION, acquisition.frequency, smooth, spacing=0.01)
+def test_only_possible_places_are_laid(listener, formula):
+    field = formula(REGION, listener.frequency, smooth, spacing=0.01)
     asked = []
 
     def right(places, tolerance):
         asked.append(tolerance)
         return places[:, 1] > -0.011
 
-    renderer = ProfileRenderer(REGION, acquisition).double()
+    renderer = ProfileRenderer(REGION, listener).double()
     renderer.prepare(field, right, 0)
     assert len(renderer.lattice) == 75
     assert asked == [pytest.approx(0.01 * math.sqrt(3) / 2)]  # half of a cell's diagonal
@@ -487,10 +487,10 @@ def ball(places, directions):
     return torch.where(inside, 1.0, 1e-6)[..., None].expand(*directions.shape[:-1], 3)
 
 
-def test_the_lattice_is_refined_where_there_is_energy(acquisition, formula):
+def test_the_lattice_is_refined_where_there_is_energy(listener, formula):
     region = torch.tensor([[-0.024] * 3, [0.024] * 3], dtype=torch.float64)
-    field = formula(region, acquisition.frequency, ball, spacing=0.002)
-    renderer = quiet(ProfileRenderer(region, acquisition, start=400, prune_every=10))
+    field = formula(region, listener.frequency, ball, spacing=0.002)
+    renderer = quiet(ProfileRenderer(region, listener, start=400, prune_every=10))
     assert renderer.prepare(field, None, 0)
     assert float(renderer.spacing) == pytest.approx(0.008)  # 343 vertices
     assert [renderer.prepare(field, None, step) for step in (1, 9)] == [False, False]
@@ -516,11 +516,11 @@ def test_the_lattice_is_refined_where_there_is_energy(acquisition, formula):
     assert heard.max() > 1
 
 
-def test_a_box_of_unequal_sides_is_refined_where_there_is_energy_too(acquisition, formula):
+def test_a_box_of_unequal_sides_is_refined_where_there_is_energy_too(listener, formula):
     corners = [[-0.008, -0.016, -0.024], [0.04, 0.024, 0.016]]
     region = torch.tensor(corners, dtype=torch.float64)
-    field = formula(region, acquisition.frequency, ball, spacing=0.002)
-    renderer = quiet(ProfileRenderer(region, acquisition, start=400, prune_every=10))
+    field = formula(region, listener.frequency, ball, spacing=0.002)
+    renderer = quiet(ProfileRenderer(region, listener, start=400, prune_every=10))
     for step in (0, 10, 20, 30):
         renderer.prepare(field, None, step)
     found, fine = renderer.lattice[renderer.alive], lattice_over(region, 0.002)
@@ -529,17 +529,17 @@ def test_a_box_of_unequal_sides_is_refined_where_there_is_energy_too(acquisition
     assert torch.cdist(found, expected).amin(1).max() < 1e-6
 
 
-def test_a_lattice_that_is_refined_stays_within_what_is_possible(acquisition, formula):
+def test_a_lattice_that_is_refined_stays_within_what_is_possible(listener, formula):
     """The neighbours of what is alive are asked about, each as finely as it is laid."""
     region = torch.tensor([[-0.024] * 3, [0.024] * 3], dtype=torch.float64)
-    field = formula(region, acquisition.frequency, ball, spacing=0.002)
+    field = formula(region, listener.frequency, ball, spacing=0.002)
     asked = []
 
     def left(places, tolerance):
         asked.append(tolerance)
         return places[:, 0] <= 0.25 * tolerance
 
-    renderer = quiet(ProfileRenderer(region, acquisition, start=400, prune_every=10))
+    renderer = quiet(ProfileRenderer(region, listener, start=400, prune_every=10))
     for step, spacing in ((0, 0.008), (10, 0.004), (20, 0.002), (30, 0.002)):
         renderer.prepare(field, left, step)
         assert float(renderer.spacing) == pytest.approx(spacing)
@@ -556,7 +556,7 @@ def test_a_lattice_that_is_refined_stays_within_what_is_possible(acquisition, fo
     assert torch.cdist(found, expected).amin(1).max() < 1e-6
 
 
-def test_a_place_60_db_below_its_surroundings_is_dropped(acquisition, formula):
+def test_a_place_60_db_below_its_surroundings_is_dropped(listener, formula):
     """And one 50 dB below them is not: such is the edge of a face beside its flash."""
     region = torch.tensor([[0.0] * 3, [0.02, 0.0, 0.0]], dtype=torch.float64)
     magnitude = torch.tensor([1.0, 10 ** (-50 / 20), 10 ** (-65 / 20)], dtype=torch.float64)
@@ -565,14 +565,14 @@ def test_a_place_60_db_below_its_surroundings_is_dropped(acquisition, formula):
         value = magnitude[(places[..., 0] / 0.01).round().long().clamp(0, 2)]
         return value[..., None].expand(*directions.shape[:-1], 3)
 
-    field = formula(region, acquisition.frequency, three, spacing=0.01)
-    renderer = ProfileRenderer(region, acquisition, prune_every=1).double()
+    field = formula(region, listener.frequency, three, spacing=0.01)
+    renderer = ProfileRenderer(region, listener, prune_every=1).double()
     renderer.prepare(field, None, 0)
     renderer.prepare(field, None, 1)
     assert renderer.alive.tolist() == [True, True, False]
 
 
-def test_what_is_weak_but_alone_is_kept(acquisition, formula):
+def test_what_is_weak_but_alone_is_kept(listener, formula):
     """Judged by its surroundings of 30 mm: a faint place far from a loud one stays."""
     region = torch.tensor([[-0.1, 0.0, 0.0], [0.1, 0.01, 0.01]], dtype=torch.float64)
 
@@ -582,8 +582,8 @@ def test_what_is_weak_but_alone_is_kept(acquisition, formula):
         value = torch.where(places[..., 0] > 0.095, 1e-3, value)
         return value[..., None].expand(*directions.shape[:-1], 3)
 
-    field = formula(region, acquisition.frequency, two, spacing=0.01)
-    renderer = ProfileRenderer(region, acquisition, prune_every=1, prune_below=1e-4).double()
+    field = formula(region, listener.frequency, two, spacing=0.01)
+    renderer = ProfileRenderer(region, listener, prune_every=1, prune_below=1e-4).double()
     renderer.prepare(field, None, 0)
     renderer.prepare(field, None, 1)
     x = renderer.lattice[renderer.alive][:, 0]
@@ -593,18 +593,18 @@ def test_what_is_weak_but_alone_is_kept(acquisition, formula):
     assert not near_loud.any()
 
 
-def test_never_pruned_where_the_settings_say_so(acquisition, formula):
-    field = formula(REGION, acquisition.frequency, ball, spacing=0.005)
-    renderer = ProfileRenderer(REGION, acquisition, start=200, prune_every=0).double()
+def test_never_pruned_where_the_settings_say_so(listener, formula):
+    field = formula(REGION, listener.frequency, ball, spacing=0.005)
+    renderer = ProfileRenderer(REGION, listener, start=200, prune_every=0).double()
     renderer.prepare(field, None, 0)
     assert not any(renderer.prepare(field, None, step) for step in range(1, 300))
     assert len(renderer.lattice) == 125
 
 
-def test_the_lattice_goes_with_the_weights(acquisition, formula, cloud):
+def test_the_lattice_goes_with_the_weights(listener, formula, cloud):
     field, renderer = cloud
     renderer.alive[5:50] = False
-    other = ProfileRenderer(REGION, acquisition).double()
+    other = ProfileRenderer(REGION, listener).double()
     other.load_state_dict(renderer.state_dict())
     assert not other.prepare(field, None, 7)
     poses = tensors(POSITION[0], ROTATION[0])
@@ -613,15 +613,15 @@ def test_the_lattice_goes_with_the_weights(acquisition, formula, cloud):
 
 
 @pytest.mark.parametrize("kind", ["grid", "fourier"])
-def test_gradients(acquisition, gradients_are_right, kind):
+def test_gradients(listener, gradients_are_right, kind):
     torch.manual_seed(0)
     if kind == "grid":
-        field = GridField(REGION, acquisition.frequency, spacing=0.02, levels=1)
+        field = GridField(REGION, listener.frequency, spacing=0.02, levels=1)
         with torch.no_grad():
             field.grids[0].normal_()
     else:
-        field = FourierField(REGION, acquisition.frequency, octaves=2, width=8)
-    renderer = ProfileRenderer(REGION, acquisition, start=30).double()
+        field = FourierField(REGION, listener.frequency, octaves=2, width=8)
+    renderer = ProfileRenderer(REGION, listener, start=30).double()
     renderer.prepare(field.double(), None, 0)
     with torch.no_grad():
         renderer.log_noise.fill_(-3.0)
@@ -637,18 +637,18 @@ class Everywhere(GridField):
         return torch.ones(len(sources), len(positions), dtype=torch.bool)
 
 
-def test_leaving_out_who_does_not_answer_changes_nothing_to_be_heard(acquisition):
+def test_leaving_out_who_does_not_answer_changes_nothing_to_be_heard(listener):
     """Each lobe is left out 43 dB below its own peak, which is 1 / 20 000 of its power."""
     heard, evaluated = [], []
     for kind in (GridField, Everywhere):
-        field = kind(REGION, acquisition.frequency, spacing=0.005, levels=1).double()
+        field = kind(REGION, listener.frequency, spacing=0.005, levels=1).double()
         generator = torch.Generator().manual_seed(0)
         with torch.no_grad():
             shape = field.grids[0].shape
             field.grids[0].copy_(torch.randn(shape, dtype=torch.float64, generator=generator))
             field.grids[0][:, 0] = 0.0
             field.grids[0][:, 1:4] *= 12.0
-        renderer = quiet(ProfileRenderer(REGION, acquisition))
+        renderer = quiet(ProfileRenderer(REGION, listener))
         renderer.prepare(field, None, 0)
         heard.append(renderer(field, *tensors(POSITION, ROTATION), rows(poses=2)).detach())
         evaluated.append(int(renderer.points_evaluated))
@@ -658,13 +658,13 @@ def test_leaving_out_who_does_not_answer_changes_nothing_to_be_heard(acquisition
     assert not torch.equal(*heard)
 
 
-def test_where_no_one_answers_there_is_noise(acquisition):
+def test_where_no_one_answers_there_is_noise(listener):
     class Deaf(GridField):
         def audible(self, positions, sources, code=None):
             return torch.zeros(len(sources), len(positions), dtype=torch.bool)
 
-    field = Deaf(REGION, acquisition.frequency, spacing=0.01, levels=1).double()
-    renderer = ProfileRenderer(REGION, acquisition).double()
+    field = Deaf(REGION, listener.frequency, spacing=0.01, levels=1).double()
+    renderer = ProfileRenderer(REGION, listener).double()
     renderer.prepare(field, None, 0)
     heard = renderer(field, *tensors(POSITION, ROTATION), rows(poses=2))
     torch.testing.assert_close(heard, torch.full_like(heard, math.exp(-16)), rtol=1e-6, atol=0)
@@ -673,7 +673,7 @@ def test_where_no_one_answers_there_is_noise(acquisition):
     assert int(renderer.points_evaluated) == 0
 
 
-def test_a_lead_brings_the_echo_nearer_by_as_much(head, acquisition, one_place, monkeypatch):
+def test_a_lead_brings_the_echo_nearer_by_as_much(head, listener, one_place, monkeypatch):
     """Towards one of two poses, by whole slices: what is heard is the same, and nothing else is."""
     field, renderer = one_place([0.004, 0.013, -0.006])
     poses = tensors(POSITION, ROTATION)
@@ -692,12 +692,12 @@ def test_a_lead_brings_the_echo_nearer_by_as_much(head, acquisition, one_place, 
     assert (after[0] - before[0]).abs().max() > 0.1 * before[0].max()
 
 
-def test_gradients_of_a_lead(acquisition, formula, gradients_are_right):
+def test_gradients_of_a_lead(listener, formula, gradients_are_right):
     class Leading(formula):
         """Places that sound from nearer, each by a length of its own."""
 
         def __init__(self):
-            super().__init__(REGION, acquisition.frequency, smooth, spacing=0.02)
+            super().__init__(REGION, listener.frequency, smooth, spacing=0.02)
             generator = torch.Generator().manual_seed(0)
             lengths = 0.004 * torch.rand(27, dtype=torch.float64, generator=generator)
             self.lengths = torch.nn.Parameter(lengths)
@@ -708,7 +708,7 @@ def test_gradients_of_a_lead(acquisition, formula, gradients_are_right):
             return self.select(there, directions, bins), self.lengths[index]
 
     field = Leading()
-    renderer = ProfileRenderer(REGION, acquisition).double()
+    renderer = ProfileRenderer(REGION, listener).double()
     renderer.prepare(field, None, 0)
     assert len(renderer.lattice) == 27
     with torch.no_grad():
@@ -747,19 +747,19 @@ def test_a_tiny_sphere_sounds_where_and_as_long_as_the_simulator_hears_it(kind, 
         "test",
     )
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.003)
-    simulator = Simulator.from_settings(Scene(ball), settings)
-    known = acquisition_of(settings)
+    simulator = simulator_of(Scene(ball), settings)
+    known = head_of(settings)
     position = np.array([0.4, 0.0, 0.0])
     measured = simulator.spectrogram(position, look_at(position, np.zeros(3)), seed=0)
     region = torch.tensor([[0.0029, -1e-4, -1e-4], [0.003, 0.0, 0.0]])  # the sphere's front
-    field = GridField(region, known.frequency, spacing=0.001, levels=1)
+    field = GridField(region, torch.tensor(known.frequency).float(), spacing=0.001, levels=1)
     renderer = ProfileRenderer(region, known)
     renderer.prepare(field, None, 0)
     poses = tensors(position, look_at(position, np.zeros(3)))
     predicted = renderer(
         field, poses[0].float(), poses[1].float(), torch.arange(len(known.range))[None]
     )
-    axis = known.range.numpy()
+    axis = known.range
     for ear in (0, 1):
         one, two = measured[ear] ** 2, predicted[0, ear].detach().numpy() ** 2
         even = kind != "harmonics"

@@ -25,7 +25,7 @@ from tests.field.test_profile import (
     tensors,
 )
 
-C = 343.0  # speed of sound of the acquisition, m/s
+C = 343.0  # speed of sound of the listener, m/s
 DISTANCE = 0.29
 FINE = 0.004  # divides FREE
 
@@ -49,7 +49,7 @@ def point_head(renderer):
 
 
 @pytest.fixture
-def two_places(acquisition, formula):
+def two_places(listener, formula):
     """Make field and renderer of two places, each of which is heard as 1 in ``POSITION``."""
 
     def make(apart, axis=0, **options):
@@ -58,7 +58,7 @@ def two_places(acquisition, formula):
         region[1, axis] = apart
         field = formula(
             region,
-            acquisition.frequency,
+            listener.frequency,
             lambda x, u: (
                 (x - x.new_tensor([DISTANCE, 0, 0]))
                 .square()
@@ -67,7 +67,7 @@ def two_places(acquisition, formula):
             ),
             spacing=apart,
         )
-        renderer = point_head(quiet(ProfileRenderer(region, acquisition, **options)))
+        renderer = point_head(quiet(ProfileRenderer(region, listener, **options)))
         renderer.prepare(field, None, 0)
         assert len(renderer.lattice) == 2
         return field, renderer
@@ -127,9 +127,9 @@ def test_a_lead_turns_the_phase_as_well(head, two_places, monkeypatch):
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
 
 
-def test_answers_of_complex_fields_turn_the_phase(acquisition, two_places):
+def test_answers_of_complex_fields_turn_the_phase(listener, two_places):
     """A half turn of one of two places makes of a notch a peak."""
-    apart = C / (4 * float(acquisition.frequency[1]))
+    apart = C / (4 * float(listener.frequency[1]))
     field, renderer = two_places(apart, mode="coherent")
     plain = field.function
     field.function = lambda x, u: plain(x, u) * torch.exp(1j * math.pi / apart * x[..., :1])
@@ -138,7 +138,7 @@ def test_answers_of_complex_fields_turn_the_phase(acquisition, two_places):
 
 
 @pytest.fixture
-def one_place(acquisition, formula):
+def one_place(listener, formula):
     """Make field and renderer of a single place that answers alike in all directions."""
 
     def make(place, mode):
@@ -146,11 +146,11 @@ def one_place(acquisition, formula):
         region = torch.stack((corner, corner + 0.001))
         field = formula(
             region,
-            acquisition.frequency,
+            listener.frequency,
             lambda x, u: torch.full((*u.shape[:-1], 3), 3.0, dtype=u.dtype),
             spacing=0.01,
         )
-        renderer = with_phase(quiet(ProfileRenderer(region, acquisition, mode=mode)))
+        renderer = with_phase(quiet(ProfileRenderer(region, listener, mode=mode)))
         renderer.prepare(field, None, 0)
         return field, renderer
 
@@ -187,10 +187,10 @@ def test_of_a_single_place_in_the_middle_of_a_bin_phase_is_not_heard_at_all(one_
 
 
 @pytest.fixture
-def cloud(acquisition, formula):
+def cloud(listener, formula):
     """A smooth field on a lattice of 10 mm, 125 places, and its renderer with phase."""
-    field = formula(REGION, acquisition.frequency, smooth, spacing=0.01)
-    renderer = with_phase(quiet(ProfileRenderer(REGION, acquisition, mode="coherent")))
+    field = formula(REGION, listener.frequency, smooth, spacing=0.01)
+    renderer = with_phase(quiet(ProfileRenderer(REGION, listener, mode="coherent")))
     renderer.prepare(field, None, 0)
     assert len(renderer.lattice) == 125
     return field, renderer
@@ -256,9 +256,9 @@ def test_a_sample_of_the_places_has_the_right_pressure_on_average(cloud):
     assert deviation[loud].div(whole.abs()[loud]).median() < 0.1  # so that the test can tell
 
 
-def test_phase_comes_in_the_middle_of_the_fit_and_asks_for_the_gain_once(acquisition, formula):
-    field = formula(REGION, acquisition.frequency, smooth, spacing=0.01)
-    renderer = ProfileRenderer(REGION, acquisition, mode="coherent").double()
+def test_phase_comes_in_the_middle_of_the_fit_and_asks_for_the_gain_once(listener, formula):
+    field = formula(REGION, listener.frequency, smooth, spacing=0.01)
+    renderer = ProfileRenderer(REGION, listener, mode="coherent").double()
     asked, phased = [], []
     for step in range(11):
         renderer.advance(step, 11)
@@ -270,11 +270,9 @@ def test_phase_comes_in_the_middle_of_the_fit_and_asks_for_the_gain_once(acquisi
 
 
 @pytest.mark.parametrize("prune_every", [3, 5])
-def test_the_turn_is_told_of_in_a_step_that_prunes_as_well(acquisition, formula, prune_every):
-    field = formula(REGION, acquisition.frequency, smooth, spacing=0.01)
-    renderer = ProfileRenderer(
-        REGION, acquisition, mode="coherent", prune_every=prune_every
-    ).double()
+def test_the_turn_is_told_of_in_a_step_that_prunes_as_well(listener, formula, prune_every):
+    field = formula(REGION, listener.frequency, smooth, spacing=0.01)
+    renderer = ProfileRenderer(REGION, listener, mode="coherent", prune_every=prune_every).double()
     asked = []
     for step in range(12):
         renderer.advance(step, 12)
@@ -282,9 +280,9 @@ def test_the_turn_is_told_of_in_a_step_that_prunes_as_well(acquisition, formula,
     assert [step for step, changed in enumerate(asked) if changed] == [0, 6]
 
 
-def test_power_never_turns(acquisition, formula):
-    field = formula(REGION, acquisition.frequency, smooth, spacing=0.01)
-    renderer = ProfileRenderer(REGION, acquisition).double()
+def test_power_never_turns(listener, formula):
+    field = formula(REGION, listener.frequency, smooth, spacing=0.01)
+    renderer = ProfileRenderer(REGION, listener).double()
     assert renderer.mode == "power"
     asked = []
     for step in range(12):
@@ -294,10 +292,10 @@ def test_power_never_turns(acquisition, formula):
     assert not renderer.phased
 
 
-def test_phase_goes_with_the_weights(acquisition, cloud):
+def test_phase_goes_with_the_weights(listener, cloud):
     field, renderer = cloud
     pose = tensors(POSITION[0], ROTATION[0])
-    other = quiet(ProfileRenderer(REGION, acquisition, mode="coherent"))
+    other = quiet(ProfileRenderer(REGION, listener, mode="coherent"))
     before = other.state_dict()
     other.load_state_dict(renderer.state_dict())
     assert before.keys() == renderer.state_dict().keys()
@@ -307,21 +305,21 @@ def test_phase_goes_with_the_weights(acquisition, cloud):
         other.advance(step, 10)
         assert not other.prepare(field, None, step)
     # One that goes on before it does.
-    early = quiet(ProfileRenderer(REGION, acquisition, mode="coherent"))
+    early = quiet(ProfileRenderer(REGION, listener, mode="coherent"))
     early.prepare(field, None, 0)
-    resumed = quiet(ProfileRenderer(REGION, acquisition, mode="coherent"))
+    resumed = quiet(ProfileRenderer(REGION, listener, mode="coherent"))
     resumed.load_state_dict(early.state_dict())
     resumed.advance(5, 10)
     assert resumed.prepare(field, None, 5)
     assert not torch.equal(early(field, *pose, rows()), renderer(field, *pose, rows()))
 
 
-def test_gradients_of_sums_with_phase(acquisition, gradients_are_right):
+def test_gradients_of_sums_with_phase(listener, gradients_are_right):
     torch.manual_seed(0)
-    field = GridField(REGION, acquisition.frequency, spacing=0.02, levels=1)
+    field = GridField(REGION, listener.frequency, spacing=0.02, levels=1)
     with torch.no_grad():
         field.grids[0].normal_()
-    renderer = with_phase(ProfileRenderer(REGION, acquisition, start=30, mode="coherent").double())
+    renderer = with_phase(ProfileRenderer(REGION, listener, start=30, mode="coherent").double())
     renderer.prepare(field.double(), None, 0)
     with torch.no_grad():
         renderer.log_noise.fill_(-3.0)
@@ -384,7 +382,7 @@ def listening(field, monkeypatch):
 
 
 @pytest.fixture
-def front_and_back(acquisition, formula):
+def front_and_back(listener, formula):
     """Make field and renderer of two places on the x axis, ``apart`` steps of 4 mm."""
 
     def make(apart, *, back=0.1, occlusion=True):
@@ -397,8 +395,8 @@ def front_and_back(acquisition, formula):
             value = torch.where(((x + apart * FINE).abs() < 0.001) & (aside < 0.001), back, value)
             return value[..., None].expand(*directions.shape[:-1], 3)
 
-        field = formula(region, acquisition.frequency, two, spacing=FINE)
-        renderer = quiet(ProfileRenderer(region, acquisition, occlusion=occlusion, prune_every=1))
+        field = formula(region, listener.frequency, two, spacing=FINE)
+        renderer = quiet(ProfileRenderer(region, listener, occlusion=occlusion, prune_every=1))
         renderer.emitter.zero_()
         renderer.prepare(field, None, 0)
         renderer.prepare(field, None, 1)
@@ -471,10 +469,10 @@ def test_what_lies_behind_a_pose_hides_nothing_from_it(front_and_back, monkeypat
 
 
 @pytest.mark.parametrize("spacing", [0.008, 0.016, 0.032])
-def test_on_a_coarse_lattice_too_no_place_shades_itself(acquisition, formula, monkeypatch, spacing):
+def test_on_a_coarse_lattice_too_no_place_shades_itself(listener, formula, monkeypatch, spacing):
     region = torch.tensor([[-0.032] * 3, [0.032] * 3], dtype=torch.float64)
-    field = formula(region, acquisition.frequency, smooth, spacing=spacing)
-    renderer = quiet(ProfileRenderer(region, acquisition, occlusion=True, prune_every=0))
+    field = formula(region, listener.frequency, smooth, spacing=spacing)
+    renderer = quiet(ProfileRenderer(region, listener, occlusion=True, prune_every=0))
     renderer.prepare(field, None, 0)
     heard = listening(field, monkeypatch)
     for direction in ([1.0, 0.0, 0.0], [0.6, 0.64, 0.48], [0.8, -0.6, 0.0]):
@@ -486,14 +484,14 @@ def test_on_a_coarse_lattice_too_no_place_shades_itself(acquisition, formula, mo
 
 
 @pytest.mark.parametrize("at", [0.02, 0.028])
-def test_a_wall_hides_what_is_behind_it_and_no_more(acquisition, formula, monkeypatch, at):
+def test_a_wall_hides_what_is_behind_it_and_no_more(listener, formula, monkeypatch, at):
     """Lines from places to an oblique pose, cut with a wall of one layer, tell what is hidden.
 
     One wall lies in a face of the region, where lines end that pass beside it.
     """
     region = torch.tensor([[-0.028] * 3, [0.028] * 3], dtype=torch.float64)
-    field = formula(region, acquisition.frequency, smooth, spacing=FINE)
-    renderer = quiet(ProfileRenderer(region, acquisition, occlusion=True, prune_every=0))
+    field = formula(region, listener.frequency, smooth, spacing=FINE)
+    renderer = quiet(ProfileRenderer(region, listener, occlusion=True, prune_every=0))
     renderer.emitter.zero_()
     renderer.prepare(field, None, 0)
     x, y, z = renderer.lattice.T
@@ -518,9 +516,9 @@ def test_a_wall_hides_what_is_behind_it_and_no_more(acquisition, formula, monkey
     assert seen[beside | (x > at)].all()
 
 
-def test_without_the_option_nothing_is_hidden(acquisition, front_and_back):
+def test_without_the_option_nothing_is_hidden(listener, front_and_back):
     """To the bit, however opaque the places are."""
-    assert not ProfileRenderer(REGION, acquisition).occlusion
+    assert not ProfileRenderer(REGION, listener).occlusion
     field, renderer = front_and_back(5, occlusion=False)
     assert renderer.opaque.any()
     pose = from_there(FRONT)
@@ -534,10 +532,10 @@ def test_without_the_option_nothing_is_hidden(acquisition, front_and_back):
     assert not torch.equal(renderer(field, *pose, rows()), without)
 
 
-def test_shadows_go_with_the_weights(acquisition, front_and_back):
+def test_shadows_go_with_the_weights(listener, front_and_back):
     field, renderer = front_and_back(5)
     other_field, _ = front_and_back(5)
-    other = ProfileRenderer(renderer.region, acquisition, occlusion=True).double()
+    other = ProfileRenderer(renderer.region, listener, occlusion=True).double()
     pose = from_there(FRONT)
     assert not len(other.opaque)
     other.load_state_dict(renderer.state_dict())

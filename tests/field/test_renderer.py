@@ -19,21 +19,21 @@ from sononerf.settings.schema import EarSettings
 REGION = torch.tensor([[-0.03] * 3, [0.03] * 3], dtype=torch.float64)
 
 
-def test_gains_between_the_nodes_are_bilinear(head, acquisition, device):
+def test_gains_between_the_nodes_are_bilinear(head, listener, device):
     directions = sphere_directions(200, REGION)
-    found = look_up(acquisition.beam.to(device), directions.reshape(4, 50, 3).to(device))
+    found = look_up(listener.row_gains.beam.to(device), directions.reshape(4, 50, 3).to(device))
     assert found.shape == (4, 50, 3)
     expected = np.stack([head.towards(d)[0] for d in directions.numpy()])
     np.testing.assert_allclose(found.cpu().reshape(200, 3), expected, rtol=1e-12)
-    left = look_up(acquisition.ears[0], directions)
+    left = look_up(listener.row_gains.ears[0], directions)
     expected = np.stack([head.towards(d)[1][0] for d in directions.numpy()])
     np.testing.assert_allclose(left, expected, rtol=1e-12)
 
 
-def test_several_tables_are_looked_up_each_in_its_own_directions(acquisition):
+def test_several_tables_are_looked_up_each_in_its_own_directions(listener):
     directions = sphere_directions(24, REGION).reshape(2, 3, 4, 3)
-    found = look_up(acquisition.ears, directions)
-    each = [look_up(*pair) for pair in zip(acquisition.ears, directions, strict=True)]
+    found = look_up(listener.row_gains.ears, directions)
+    each = [look_up(*pair) for pair in zip(listener.row_gains.ears, directions, strict=True)]
     assert found.shape == (2, 3, 4, 3)
     assert torch.equal(found, torch.stack(each))
 
@@ -46,9 +46,9 @@ def test_gains_are_those_that_the_simulator_hears_with():
     np.testing.assert_allclose(found, beam_gain(ears, directions.numpy()), rtol=1e-5, atol=1e-7)
 
 
-def test_the_poles_and_the_back_are_in_the_table(acquisition):
+def test_the_poles_and_the_back_are_in_the_table(listener):
     ends = torch.cat((torch.eye(3), 0.0 - torch.eye(3))).double()  # no -0, which turns azimuth
-    gains = look_up(acquisition.beam, ends)
+    gains = look_up(listener.row_gains.beam, ends)
     # Straight up the elevation's factor is 0.7, straight down 1.3; backwards 0.6 is left of 1.
     assert gains[2, 0] == pytest.approx(0.7)
     assert gains[5, 0] == pytest.approx(1.3)
@@ -56,8 +56,8 @@ def test_the_poles_and_the_back_are_in_the_table(acquisition):
     assert gains[0, 0] == pytest.approx(1.0)
 
 
-def test_calibration_makes_the_energies_equal(acquisition):
-    renderer = Renderer(REGION, acquisition).double()
+def test_calibration_makes_the_energies_equal(listener):
+    renderer = Renderer(REGION, listener).double()
     measured = torch.rand(2, 2, 5, 3, dtype=torch.float64)
     renderer.calibrate(measured / 40, measured)
     assert float(renderer.log_gain.detach().exp()) == pytest.approx(40)
@@ -67,16 +67,16 @@ def test_calibration_makes_the_energies_equal(acquisition):
     assert bool(renderer.log_gain.isfinite())
 
 
-def test_only_the_first_step_calibrates_and_rendering_is_each_ones_own(acquisition):
-    renderer = Renderer(REGION, acquisition)
+def test_only_the_first_step_calibrates_and_rendering_is_each_ones_own(listener):
+    renderer = Renderer(REGION, listener)
     assert [renderer.prepare(None, None, step) for step in (0, 1, 100)] == [True, False, False]
     with pytest.raises(NotImplementedError):
         renderer(None, REGION, REGION, REGION)
 
 
 @pytest.mark.parametrize("kind", [Renderer, ShellRenderer, ProfileRenderer])
-def test_how_far_a_fit_has_come_matters_to_no_renderer_unless_it_is_told_to(acquisition, kind):
-    renderer = kind(REGION, acquisition)
+def test_how_far_a_fit_has_come_matters_to_no_renderer_unless_it_is_told_to(listener, kind):
+    renderer = kind(REGION, listener)
     before = {name: value.clone() for name, value in renderer.state_dict().items()}
     for step in (0, 5, 9):
         assert renderer.advance(step, 10) is None
@@ -98,10 +98,10 @@ FIELDS = {
     [partial(ShellRenderer, call_spectrum="learned"), ProfileRenderer],
     ids=["shell", "profile"],
 )
-def test_any_field_works_with_any_renderer(acquisition, kind, heard_by, device):
+def test_any_field_works_with_any_renderer(listener, kind, heard_by, device):
     torch.manual_seed(0)
-    field = FIELDS[kind](REGION.float(), acquisition.frequency.float()).to(device)
-    renderer = heard_by(REGION, acquisition).float().to(device)
+    field = FIELDS[kind](REGION.float(), listener.frequency.float()).to(device)
+    renderer = heard_by(REGION, listener).float().to(device)
     position = 0.28 * sphere_directions(3, REGION.float())
     rotation = torch.as_tensor(look_at(position.numpy(), np.zeros(3))).float().to(device)
     assert renderer.prepare(field, None, 0)

@@ -24,13 +24,13 @@ def complex_reflectivity(places, directions):
 
 
 @pytest.fixture
-def field(formula, acquisition):
-    return formula(REGION, acquisition.frequency, complex_reflectivity)
+def field(formula, listener):
+    return formula(REGION, listener.frequency, complex_reflectivity)
 
 
 @pytest.fixture
-def renderer(acquisition):
-    return ShellRenderer(REGION, acquisition).double()
+def renderer(listener):
+    return ShellRenderer(REGION, listener).double()
 
 
 def poses():
@@ -53,8 +53,8 @@ def slow(head, renderer, pose, row, told):
 
 
 @pytest.mark.parametrize("told", ["incidence", "sensor"])
-def test_equation_17_against_a_slow_loop(head, acquisition, field, told):
-    renderer = ShellRenderer(REGION, acquisition, direction=told).double()
+def test_equation_17_against_a_slow_loop(head, listener, field, told):
+    renderer = ShellRenderer(REGION, listener, direction=told).double()
     with torch.no_grad():
         renderer.log_gain.fill_(0.3)
         renderer.log_spectrum.copy_(torch.tensor([0.1, -0.2, 0.4]))
@@ -70,10 +70,8 @@ def test_equation_17_against_a_slow_loop(head, acquisition, field, told):
 
 
 @pytest.mark.parametrize(("call_spectrum", "learned"), [("flat", False), ("learned", True)])
-def test_a_call_spectrum_is_learned_where_it_is_asked_for(
-    acquisition, field, call_spectrum, learned
-):
-    renderer = ShellRenderer(REGION, acquisition, call_spectrum=call_spectrum).double()
+def test_a_call_spectrum_is_learned_where_it_is_asked_for(listener, field, call_spectrum, learned):
+    renderer = ShellRenderer(REGION, listener, call_spectrum=call_spectrum).double()
     renderer(field, *poses(), ROWS).sum().backward()
     assert renderer.log_gain.grad is not None
     assert (renderer.log_spectrum.grad is not None) == learned
@@ -89,31 +87,31 @@ def test_six_hundred_even_directions_over_the_forward_hemisphere(renderer):
     torch.testing.assert_close(directions.mean(0), mean, rtol=0, atol=2e-3)
 
 
-def test_the_ears_are_not_apart_and_nothing_spreads(formula, acquisition):
+def test_the_ears_are_not_apart_and_nothing_spreads(formula, listener):
     """A field that is 1 everywhere: every slice the same, whatever its range."""
     region = torch.tensor([[-2.0] * 3, [2.0] * 3], dtype=torch.float64)
-    field = formula(region, acquisition.frequency, lambda x, u: x.new_ones(*x.shape[:-1], 3))
-    renderer = ShellRenderer(region, acquisition).double()
+    field = formula(region, listener.frequency, lambda x, u: x.new_ones(*x.shape[:-1], 3))
+    renderer = ShellRenderer(region, listener).double()
     found = renderer(field, *poses(), ROWS)
     torch.testing.assert_close(found, renderer.transfer.mean(1)[None, :, None].expand(found.shape))
 
 
-def test_what_lies_outside_costs_nothing(formula, acquisition, renderer):
+def test_what_lies_outside_costs_nothing(formula, listener, renderer):
     asked = []
 
     def ones(places, directions):
         asked.append(places)
         return places.new_ones(*places.shape[:-1], 3)
 
-    renderer(formula(REGION, acquisition.frequency, ones), *poses(), ROWS)
+    renderer(formula(REGION, listener.frequency, ones), *poses(), ROWS)
     places = torch.cat(asked)
     assert ((places >= REGION[0]) & (places <= REGION[1])).all()
     assert 0 < len(places) < 0.2 * ROWS.numel() * 600
     assert int(renderer.points_evaluated) == len(places)
 
 
-def test_a_slice_that_misses_the_region_is_silent(formula, acquisition, field):
-    renderer = ShellRenderer(REGION, acquisition).double()
+def test_a_slice_that_misses_the_region_is_silent(formula, listener, field):
+    renderer = ShellRenderer(REGION, listener).double()
     far = torch.from_numpy(POSITION) + 5
     heard = renderer(field, far, torch.from_numpy(ROTATION), ROWS)
     assert heard.abs().max() == 0
@@ -130,11 +128,11 @@ def test_frequencies_and_slices_are_those_asked_for(field, renderer):
         torch.testing.assert_close(some[pose], whole[pose][:, ROWS[pose]][..., bins])
 
 
-def test_the_mirrored_field_exchanges_the_ears(formula, acquisition):
+def test_the_mirrored_field_exchanges_the_ears(formula, listener):
     mirror = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
     region = torch.tensor([[-0.2] * 3, [0.2] * 3], dtype=torch.float64)
     # Many directions: the lattice itself is not its own mirror image.
-    renderer = ShellRenderer(region, acquisition, directions=40_000).double()
+    renderer = ShellRenderer(region, listener, directions=40_000).double()
     rotation = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))[None]
     position = torch.tensor([[0.28, 0.0, 0.0]], dtype=torch.float64)
 
@@ -144,7 +142,7 @@ def test_the_mirrored_field_exchanges_the_ears(formula, acquisition):
         )
 
     one, two = (
-        renderer(formula(region, acquisition.frequency, function), position, rotation, ROWS[:1])
+        renderer(formula(region, listener.frequency, function), position, rotation, ROWS[:1])
         for function in (smooth, lambda x, u: smooth(x * mirror, u * mirror))
     )
     torch.testing.assert_close(one, two.flip(1), rtol=0.005, atol=0)
@@ -152,8 +150,8 @@ def test_the_mirrored_field_exchanges_the_ears(formula, acquisition):
 
 
 @pytest.mark.parametrize("bins", [None, torch.tensor([0])])
-def test_gradients(acquisition, gradients_are_right, bins):
+def test_gradients(listener, gradients_are_right, bins):
     torch.manual_seed(0)
-    field = FourierField(REGION, acquisition.frequency, octaves=2, width=8)
-    renderer = ShellRenderer(REGION, acquisition, directions=60)
+    field = FourierField(REGION, listener.frequency, octaves=2, width=8)
+    renderer = ShellRenderer(REGION, listener, directions=60)
     assert gradients_are_right(field, renderer, *poses(), ROWS[:, :2], bins)

@@ -15,8 +15,9 @@ from sononerf.head.call import (
     sweep_rate,
 )
 from sononerf.head.call_file import load_call
-from sononerf.head.reception import Reception, effective_window
-from sononerf.settings.schema import CallSettings, NoiseSettings, SpectrogramSettings
+from sononerf.head.head import Head
+from sononerf.head.reception import effective_window
+from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 RATE = 500_000
 SWEEP = CallSettings(
@@ -151,4 +152,4 @@ def test_a_call_outside_the_band_is_refused(written):
     call = written(call_waveform(SWEEP, RATE).astype(np.float32))
     analysis = SpectrogramSettings(frequency_min=150e3, frequency_max=200e3)
     with pytest.raises(InputError, match=r"holds sound at 2\d.\d to 1\d\d.\d kHz, nothing within"):
-        Reception(call, analysis, NoiseSettings(), speed_of_sound=343.0)
+        Head(call=call, analysis=analysis)

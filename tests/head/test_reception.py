@@ -6,8 +6,8 @@ import pytest
 import scipy.signal
 
 from sononerf.head.call import sweep_delay
+from sononerf.head.head import Head
 from sononerf.head.reception import (
-    Reception,
     best_window,
     effective_window,
     row_duration,
@@ -27,11 +27,8 @@ def analysis(**changes):
 
 
 def reception(call=None, noise=None, **changes):
-    return Reception(
-        call or CallSettings(),
-        analysis(**changes),
-        noise or NoiseSettings(),
-        speed_of_sound=SPEED,
+    return Head(
+        call=call or CallSettings(), analysis=analysis(**changes), noise=noise or NoiseSettings()
     )
 
 

@@ -8,8 +8,8 @@ import pytest
 
 from sononerf.errors import InputError
 from sononerf.head.call import call_waveform, emit
-from sononerf.recordings.understand import understand
 from sononerf.run.import_recordings import spectrogram_of
+from sononerf.run.understand import understand
 from tests.recordings.recorded import RATE, SETTINGS, arrays, waveforms
 
 LIMITS = ("spectrogram.range_min=0.3", "spectrogram.range_max=0.55")
@@ -60,7 +60,7 @@ def test_a_background_is_taken_off(recorded, tmp_path):
 
 def test_a_reference_target_sets_level_and_range(recorded, tmp_path):
     # A sphere of 5 cm at 0.4 m ahead, heard 6 dB too faint in receiver 1, and 8 mm too far off.
-    ahead, ears = 0.45, recorded().ears
+    ahead, ears = 0.45, recorded().head.gains
     back = np.linalg.norm(ears.emitter + np.array([ahead, 0, 0]) - ears.positions, axis=1)
     path = ahead + back - 0.1 + 2 * 0.008
     frequency = np.fft.rfftfreq(1600, 1 / RATE)

@@ -11,6 +11,7 @@ import pytest
 from sononerf.errors import InputError
 from sononerf.head.call import call_waveform, emit
 from sononerf.head.ears import beam_gain, ear_gain, ear_tables
+from sononerf.head.head import Head
 from sononerf.head.spectrogram import frequency_axis
 from sononerf.recordings.reference import calibrate
 from sononerf.settings.import_schema import ReferenceSettings
@@ -46,15 +47,18 @@ def echo_of(call, gain=(1.0, 1.0), offset=0.0, samples=6000):
     return emit(responses, call_waveform(call, RATE))[:, :samples]
 
 
+class Still(Head):
+    """A head in air that absorbs nothing."""
+
+    def absorption(self, frequency):
+        return np.zeros(len(frequency))
+
+
 def calibration(call, echo):
     return calibrate(
         echo,
         TARGET,
-        ears=EARS,
-        call=call,
-        analysis=ANALYSIS,
-        absorption=np.zeros(len(EARS.frequency)),
-        speed_of_sound=SPEED,
+        Still(ears=EarSettings(notch_depth=0.0), call=call, analysis=ANALYSIS),
     )
 
 

@@ -9,11 +9,11 @@ import shutil
 import pytest
 
 from sononerf.callbacks import spectrogram_images
-from sononerf.run import build
+from sononerf.head import head as head_module
 from sononerf.run import reconstruct as reconstruct_module
 from sononerf.run.fit import fit
 from sononerf.run.simulate import simulate
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 
 TINY = {
     "scene": {"name": "sphere", "options": {"radius": 0.02}},
@@ -61,7 +61,7 @@ def tiny(tiny_settings):
 def without_pictures():
     """Spectrograms and ears take most of a tiny fit and have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(build, "analysed_ears", functools.cache(build.analysed_ears))
+        patch.setattr(head_module, "analysed_ears", functools.cache(head_module.analysed_ears))
         patch.setattr(spectrogram_images.SpectrogramImages, "on_epoch", lambda *given: None)
         yield
 

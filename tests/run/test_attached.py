@@ -9,7 +9,7 @@ import pytest
 
 from sononerf.errors import InputError
 from sononerf.run.attached import attach, with_attached
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 
 
 @pytest.fixture

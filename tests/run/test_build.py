@@ -13,6 +13,7 @@ import torch
 from sononerf.echoes import onsets
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.onsets import Onsets, asked_poses, find_onsets
+from sononerf.echoes.region import WITNESS_GAIN
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
 from sononerf.field.fourier import FourierField
@@ -24,14 +25,13 @@ from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.reception import effective_window
 from sononerf.run import build
 from sononerf.run.build import (
-    acquisition,
     check_plugins,
     data_for,
     echo_hull,
     echo_region,
     field_and_renderer,
+    head_of,
     module_for,
-    point_echo,
 )
 from sononerf.run.simulate import simulate
 from sononerf.settings import plugins
@@ -39,34 +39,31 @@ from sononerf.settings import plugins
 BOX = torch.tensor([[-0.05] * 3, [0.05] * 3])
 
 
-def test_the_acquisition_has_the_axes_of_the_store(tiny, echoes):
-    store = EnsembleStore.open(echoes)
-    known = acquisition(tiny())
-    torch.testing.assert_close(known.range.double(), torch.as_tensor(store.range))
-    torch.testing.assert_close(known.frequency.double(), torch.as_tensor(store.frequency))
-    assert known.speed_of_sound == store.attributes["speed_of_sound"] == 343.0
-    assert acquisition(tiny(air={"temperature_c": 0.0})).speed_of_sound == pytest.approx(
-        331.3, abs=0.5
-    )
+def test_the_head_has_the_axes_of_the_store(tiny, echoes):
+    store, head = EnsembleStore.open(echoes), head_of(tiny())
+    np.testing.assert_array_equal(head.range, store.range)
+    np.testing.assert_array_equal(head.frequency, store.frequency)
+    assert head.speed_of_sound == store.attributes["speed_of_sound"] == 343.0
+    assert head_of(tiny(air={"temperature_c": 0.0})).speed_of_sound == pytest.approx(331.3, abs=0.5)
     # dB per metre become nepers: 20 log10(e) dB are one.
-    assert float(known.absorption[-1]) == pytest.approx(3.3 / 8.686, rel=0.3)  # at 100 kHz
+    assert float(head.row_absorption[-1]) == pytest.approx(3.3 / 8.686, rel=0.3)  # at 100 kHz
 
 
-def test_the_acquisition_of_a_sweep_is_told_how_long_and_how_late_its_rows_are(tiny):
-    impulse = acquisition(tiny())
+def test_a_sweep_is_heard_longer_and_later_in_each_row(tiny):
+    impulse = head_of(tiny())
     assert impulse.lag is None
-    torch.testing.assert_close(
-        impulse.window, torch.hamming_window(64, periodic=False).expand(47, -1)
-    )
+    np.testing.assert_array_equal(impulse.window, np.tile(np.hamming(64), (47, 1)))
     settings = tiny(call={"kind": "hyperbolic"}, spectrogram={"window": 120, "frequency_min": 45e3})
-    known = acquisition(settings)
-    window = effective_window(settings.call, settings.spectrogram)
-    np.testing.assert_allclose(known.window, window, rtol=1e-6)
-    assert known.window.shape[1] > 200
-    assert known.lag.shape == known.ears.shape
+    head = head_of(settings)
+    np.testing.assert_array_equal(
+        head.window, effective_window(settings.call, settings.spectrogram)
+    )
+    assert head.window.shape[1] > 200
+    assert head.lag.shape == head.row_gains.ears.shape
     # 0.4 ms for 110 kHz are 0.6 mm per kHz: a few kHz off the middle of a row that a notch cuts.
-    assert 0.5e-3 < float(known.lag.abs().amax()) < 30e-3
-    assert not torch.equal(known.ears, acquisition(tiny(spectrogram={"window": 120})).ears[:, 18:])
+    assert 0.5e-3 < np.abs(head.lag).max() < 30e-3
+    other = head_of(tiny(spectrogram={"window": 120}))
+    assert not np.array_equal(head.row_gains.ears, other.row_gains.ears[:, 18:])
 
 
 @pytest.mark.parametrize(
@@ -81,7 +78,7 @@ def test_any_field_with_any_renderer(tiny, field, renderer, kinds):
     settings = tiny(
         field={"kind": field, "options": {}}, renderer={"kind": renderer, "options": {}}
     )
-    made = field_and_renderer(settings, BOX)
+    made = field_and_renderer(settings, head_of(settings), BOX)
     assert tuple(type(each) for each in made) == kinds
     module = module_for(settings, *made, reference=1e-3, total_steps=7, steps_per_epoch=3)
     assert (module.total_steps, module.steps_per_epoch) == (7, 3)
@@ -90,7 +87,12 @@ def test_any_field_with_any_renderer(tiny, field, renderer, kinds):
 
 def test_the_module_is_told_what_is_heard_at_first(tiny):
     settings = tiny(fit={"early_range_db": 25.0, "early_share": 0.5})
-    module = module_for(settings, *field_and_renderer(settings, BOX), reference=1.0, total_steps=8)
+    module = module_for(
+        settings,
+        *field_and_renderer(settings, head_of(settings), BOX),
+        reference=1.0,
+        total_steps=8,
+    )
     whole = settings.spectrogram.dynamic_range_db
     assert [module.range_db(step) for step in (0, 3, 4)] == [25.0, 25.0, whole]
 
@@ -99,7 +101,7 @@ def test_slices_without_an_active_cell_are_silent(tiny):
     settings = tiny(
         renderer={"kind": "shell", "options": {}}, fit={"silent_share": 0.0, "batch_slices": 1}
     )
-    known = acquisition(settings)
+    known = head_of(settings)
     heard = torch.zeros(2, len(known.range), len(known.frequency))
     heard[1, 3, 2] = 0.41  # 2.98 dB where the reference is 1
     heard[0, 5, 1] = 0.42  # 3.05 dB
@@ -107,24 +109,20 @@ def test_slices_without_an_active_cell_are_silent(tiny):
         indices=lambda split: np.array([0]),
         positions=np.zeros((1, 3)),
         rotations=np.eye(3)[None],
-        range=known.range.numpy(),
-        frequency=known.frequency.numpy(),
+        range=known.range,
+        frequency=known.frequency,
         attributes={"reference": 1.0},
         read_pose=lambda number: heard.numpy(),
     )
-    _, renderer = field_and_renderer(settings, BOX)
+    _, renderer = field_and_renderer(settings, head_of(settings), BOX)
     stream = data_for(settings, store, renderer).stream()
     assert stream.items == 1
     assert int(stream[0].rows) == 5
 
 
 def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeypatch):
-    known = dataclasses.replace(
-        acquisition(tiny()),
-        emitter=torch.tensor([0.002, 0.0, -0.010]),
-        ear_positions=torch.tensor([[-0.010, 0.010, 0.005], [-0.010, -0.004, 0.005]]),
-    )
-    monkeypatch.setattr(build, "acquisition", lambda settings: known)
+    receivers = ((-0.010, 0.010, 0.005), (-0.010, -0.004, 0.005))
+    head = head_of(tiny(ears={"emitter": (0.002, 0.0, -0.010), "receivers": receivers}))
     left = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # looks along y
     store = SimpleNamespace(
         positions=np.array([[9.0, 9.0, 9.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]),
@@ -136,12 +134,12 @@ def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeyp
     asked = []
     monkeypatch.setattr(build, "find_onsets", lambda *given: asked.append(given) or found)
     monkeypatch.setattr(build, "weighted", lambda hull, resolution: hull)
-    hull = echo_hull(tiny(), store)
+    hull = echo_hull(head, store)
     expected = [[1.0, 2.002, 2.99], [0.002, 0.0, -0.01]]
     np.testing.assert_allclose(hull.emitters, expected, rtol=0, atol=1e-7)
     expected = [[0.99, 1.99, 3.005], [1.004, 1.99, 3.005]]
     np.testing.assert_allclose(hull.receivers[0], expected, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(hull.receivers[1], known.ear_positions, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(hull.receivers[1], receivers, rtol=0, atol=1e-7)
     # Half way: the ears' middle is (-10, 3, 5) mm, that to it from the emitter (-4, 1.5, -2.5) mm.
     expected = [[1 - 0.0015, 2 - 0.004, 3 - 0.0025], [-0.004, 0.0015, -0.0025]]
     np.testing.assert_allclose(hull.sources, expected, rtol=0, atol=1e-7)
@@ -154,68 +152,66 @@ def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeyp
     for values in (hull.emitters, hull.receivers, hull.first, hull.axes):
         assert values.dtype == np.float64
     # A sweep is heard too far off by its mean lag; what is silent has no part in it.
-    late = torch.full_like(known.ears, 0.001)
-    silent = (known.ears * known.beam) < 1e-3 * (known.ears * known.beam).amax()
+    gain = head.row_gains.ears * head.row_gains.beam
+    silent = gain < 1e-3 * gain.max()
     assert silent.any()
-    late[silent] = 0.05
-    known = dataclasses.replace(known, lag=late)
-    np.testing.assert_allclose(echo_hull(tiny(), store).first, heard - 0.001, rtol=0, atol=2e-6)
+    head.__dict__["_smeared"] = (head.row_gains, np.where(silent, 0.05, 0.001) * 2.0 / 343.0)
+    head.__dict__.pop("mean_lag")
+    np.testing.assert_allclose(echo_hull(head, store).first, heard - 0.001, rtol=0, atol=2e-6)
 
 
 def test_the_hull_is_weighted_by_the_range_resolution(tiny, echoes, monkeypatch):
     asked = []
     monkeypatch.setattr(build, "weighted", lambda *given: asked.append(given) or "the others")
-    assert echo_hull(tiny(), EnsembleStore.open(echoes)) == "the others"
+    assert echo_hull(head_of(tiny()), EnsembleStore.open(echoes)) == "the others"
     ((hull, resolution),) = asked
     assert hull.first.shape == (8, 2)
-    assert resolution == point_echo(tiny()).resolution == pytest.approx(0.0058, abs=1e-4)
+    assert resolution == head_of(tiny()).resolution == pytest.approx(0.0058, abs=1e-4)
 
 
 def test_the_hull_of_a_sphere_holds_it_and_little_more(tiny, echoes):
     """The front of a sphere is its nearest point."""
-    hull = echo_hull(tiny(), EnsembleStore.open(echoes))
+    hull = echo_hull(head_of(tiny()), EnsembleStore.open(echoes))
     assert hull.first.shape == (8, 2)
     front = hull.clearance(0.02 * hull.sources / np.linalg.norm(hull.sources, axis=1)[:, None])[0]
     # Beam and ears lengthen an echo, so it rises a little earlier, which is the safe side.
     assert (front > -0.0001).all()
-    assert (front < 0.1 * point_echo(tiny()).resolution).all()
+    assert (front < 0.1 * head_of(tiny()).resolution).all()
     assert (hull.clearance(0.0199 * fibonacci_sphere(200))[0] > 0).all()
     assert (hull.clearance(0.021 * hull.sources / 0.4)[0] < 0).all()
 
 
 def test_a_pose_speaks_for_where_it_hears_in_every_direction(tiny):
     """A gain of a tenth of the best ends a cone of 60 degrees; to the left it reaches farther."""
-    known = acquisition(tiny())
-    count, rows, columns = known.beam.shape
-    elevation = torch.linspace(-90, 90, rows).deg2rad()[:, None]
-    azimuth = torch.linspace(-180, 180, columns).deg2rad()
-    ahead = elevation.cos() * azimuth.cos()
-    beam = torch.where(ahead > 0.5, 2.0, 0.1)
-    beam[:, (azimuth > 0.6) & (azimuth < 1.8)] = 1.0
+    known = head_of(tiny()).row_gains
+    ahead = known.directions[..., 0]
+    beam = np.where(ahead > 0.5, 2.0, 0.1)
+    beam[:, (known.azimuth > 0.6) & (known.azimuth < 1.8)] = 1.0
     flat = dataclasses.replace(
-        known, beam=beam.expand(count, -1, -1), ears=torch.ones_like(known.ears)
+        known,
+        beam=np.broadcast_to(beam, known.beam.shape).astype(np.float32),
+        ears=np.ones_like(known.ears),
     )
     # The tables have a direction every few degrees.
-    assert build._beam_cosine(flat) == pytest.approx(0.5, abs=0.04)
-    assert build._beam_cosine(flat) <= 0.5
-    everywhere = dataclasses.replace(flat, beam=torch.full_like(known.beam, 3.0))
-    assert build._beam_cosine(everywhere) == -1.0
+    assert flat.cone(WITNESS_GAIN) == pytest.approx(0.5, abs=0.04)
+    assert flat.cone(WITNESS_GAIN) <= 0.5
+    everywhere = dataclasses.replace(flat, beam=np.full_like(known.beam, 3.0))
+    assert everywhere.cone(WITNESS_GAIN) == -1.0
     # What one ear or one frequency hears is heard.
-    ears = torch.zeros_like(known.ears)
+    ears = np.zeros_like(known.ears)
     ears[1, 5] = 1.0
-    halves = dataclasses.replace(everywhere, ears=ears)
-    assert build._beam_cosine(halves) == -1.0
-    real = build._beam_cosine(known)
+    assert dataclasses.replace(everywhere, ears=ears).cone(WITNESS_GAIN) == -1.0
+    real = known.cone(WITNESS_GAIN)
     assert -1.0 < real < 1.0
-    gain = (known.beam * known.ears.amax(0)).amax(0)
-    assert float(gain[ahead > real].min()) >= 0.1 * float(gain.max())
+    gain = (known.beam * known.ears.max(axis=0)).max(axis=0)
+    assert gain[ahead > real].min() >= 0.1 * gain.max()
 
 
 def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):
     def weights(seed):
         settings = tiny(field={"kind": "fourier", "options": {}}, fit={"seed": seed})
         torch.rand(3)  # whatever went before
-        return next(field_and_renderer(settings, BOX)[0].parameters())
+        return next(field_and_renderer(settings, head_of(settings), BOX)[0].parameters())
 
     assert torch.equal(weights(1), weights(1))
     assert not torch.equal(weights(1), weights(2))
@@ -245,7 +241,7 @@ def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):
 )
 def test_wrong_kinds_and_options_are_refused(tiny, changes, message):
     with pytest.raises(SettingsError, match=f"^tiny: {message}"):
-        check_plugins(tiny(**changes))
+        check_plugins(tiny(**changes), head_of(tiny(**changes)))
 
 
 def test_a_plugin_that_makes_something_else(tiny, monkeypatch):
@@ -258,12 +254,12 @@ def test_a_plugin_that_makes_something_else(tiny, monkeypatch):
 
     monkeypatch.setattr(plugins, "load", load)
     with pytest.raises(InputError, match="'grid' makes a str, expected a sononerf Field"):
-        check_plugins(tiny(field={"options": {}}))
+        check_plugins(tiny(field={"options": {}}), head_of(tiny(field={"options": {}})))
 
 
 def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):
     store = EnsembleStore.open(echoes)
-    region, possible = echo_region(tiny(), store)
+    region, possible = echo_region(tiny(), head_of(tiny()), store)
     assert bool((region[0] < -0.015).all())
     assert bool((region[1] > 0.015).all())  # the sphere's radius is 20 mm
     assert bool((region.abs() < 0.2).all())
@@ -271,9 +267,8 @@ def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):
     found = possible(places, 0.001)
     assert found.shape == (500,)
     assert 0 < int(found.sum()) < 500
-    chosen, _ = echo_region(
-        tiny(region={"lower": (-0.1, -0.1, -0.1), "upper": (0.1, 0.2, 0.3)}), store
-    )
+    box = tiny(region={"lower": (-0.1, -0.1, -0.1), "upper": (0.1, 0.2, 0.3)})
+    chosen, _ = echo_region(box, head_of(box), store)
     torch.testing.assert_close(chosen[1], torch.tensor([0.1, 0.2, 0.3]))
 
 
@@ -284,7 +279,9 @@ def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
     def heard(name, **noise):
         settings = tiny(poses=poses, noise=noise, data={"store": str(tmp_path / name)})
         store = simulate(settings, workers=1)
-        return echo_region(settings, store)[0], echo_hull(settings, store)
+        return echo_region(settings, head_of(settings), store)[0], echo_hull(
+            head_of(settings), store
+        )
 
     box, _ = heard("plain")
     for snr_db, error in ((40, 0.001), (20, 0.002), (10, 0.003)):
@@ -298,24 +295,24 @@ def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
 
 def test_of_many_poses_hull_and_region_ask_the_same_ones(tiny, echoes, monkeypatch):
     store = EnsembleStore.open(echoes)
-    whole = echo_region(tiny(), store)[0]
+    whole = echo_region(tiny(), head_of(tiny()), store)[0]
     monkeypatch.setattr(onsets, "MOST_POSES", 6)
     asked = asked_poses(store)
-    heard = find_onsets(store, point_echo(tiny()))
-    hull = echo_hull(tiny(), store, heard)
+    heard = find_onsets(store, head_of(tiny()).point_echo)
+    hull = echo_hull(head_of(tiny()), store, heard)
     assert hull.first.shape == (6, 2)
     assert len(asked) < len(store.indices("train"))
     np.testing.assert_array_equal(heard.poses, asked)
     np.testing.assert_allclose(hull.axes, store.rotations[asked][:, :, 0])
-    few = echo_region(tiny(), store, hull, heard)[0]
+    few = echo_region(tiny(), head_of(tiny()), store, hull, heard)[0]
     assert (few[0] <= whole[0] + 0.002).all()
     assert (few[1] >= whole[1] - 0.002).all()
 
 
 def test_what_is_possible_is_what_the_hull_leaves(tiny, echoes):
     store = EnsembleStore.open(echoes)
-    hull = echo_hull(tiny(), store)
-    own, given = (echo_region(tiny(), store, each) for each in (None, hull))
+    hull = echo_hull(head_of(tiny()), store)
+    own, given = (echo_region(tiny(), head_of(tiny()), store, each) for each in (None, hull))
     torch.testing.assert_close(own[0], given[0])
     places = own[0][0] + torch.rand(2000, 3) * (own[0][1] - own[0][0])
     found = given[1](places, 0.002)
@@ -330,5 +327,5 @@ def test_what_is_possible_is_what_the_hull_leaves(tiny, echoes):
     # A hull that leaves nothing is not believed over the settings' own box.
     box = {"lower": (-0.1,) * 3, "upper": (0.1,) * 3}
     empty = EchoHull(hull.emitters, hull.receivers, hull.first + 1.0, hull.axes)
-    _, possible = echo_region(tiny(region=box), store, empty)
+    _, possible = echo_region(tiny(region=box), head_of(tiny()), store, empty)
     assert possible(places, 0.002).all()

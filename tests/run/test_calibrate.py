@@ -85,7 +85,7 @@ def test_what_is_not_determined_is_said(run):
         {"gain": 0.5, "range_offset": 0.01, "speed_of_sound": 0.1, "position": 0.01},
         [3.0, 2.9],
     )
-    _, warnings = describe(fitted.settings, store, SPHERE, estimate, kinds)
+    _, warnings = describe(fitted.head, store, SPHERE, estimate, kinds)
     text = "\n".join(warnings)
     for words in (
         "gain: the echoes do not determine it",

@@ -14,7 +14,7 @@ from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.field.weights import load_weights, save_weights
 from sononerf.progress import Progress
 from sononerf.run.compare import compare_runs
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 
 RADIUS = 0.02  # of the sphere that the fitted run heard
 

@@ -36,7 +36,7 @@ from sononerf.field.module import EchoModule
 from sononerf.head.directivity.sofa_writer import write_sofa
 from sononerf.progress import Progress
 from sononerf.run import fit as fit_module
-from sononerf.run.build import acquisition, echo_hull
+from sononerf.run.build import echo_hull, head_of
 from sononerf.run.fit import fit, peak_memory_bytes, require_accelerator
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
@@ -399,14 +399,14 @@ def test_an_epoch_has_at_least_sixty_steps_unless_the_settings_say_how_many(
 def test_a_run_holds_where_its_training_poses_listened(finished, echoes, tiny):
     store = EnsembleStore.open(echoes)
     held = safetensors.torch.load_file(finished / "model.safetensors")
-    known = acquisition(tiny())
+    known = head_of(tiny())
     train = store.indices("train")
     assert held["hull.emitters"].shape == held["hull.axes"].shape == (8, 3)
     assert held["hull.receivers"].shape == (8, 2, 3)
     for row, index in enumerate(train):
         turn = store.rotations[index]
-        emitter = store.positions[index] + turn @ known.emitter.double().numpy()
-        ears = store.positions[index] + known.ear_positions.double().numpy() @ turn.T
+        emitter = store.positions[index] + turn @ known.emitter
+        ears = store.positions[index] + known.receivers @ turn.T
         np.testing.assert_allclose(held["hull.emitters"][row], emitter, rtol=0, atol=1e-12)
         np.testing.assert_allclose(held["hull.receivers"][row], ears, rtol=0, atol=1e-12)
         np.testing.assert_allclose(held["hull.axes"][row], turn[:, 0], rtol=0, atol=1e-12)
@@ -422,7 +422,7 @@ def test_of_poses_on_a_line_it_is_said_what_they_do_not_tell(tmp_path, tiny, mon
 
 
 def test_a_run_holds_what_its_training_poses_heard_first(finished, echoes, tiny):
-    hull = echo_hull(tiny(), EnsembleStore.open(echoes))
+    hull = echo_hull(head_of(tiny()), EnsembleStore.open(echoes))
     held = safetensors.torch.load_file(finished / "model.safetensors")
     names = {name for name in held if name.startswith("hull.")}
     assert names == {f"hull.{name}" for name in vars(hull)}

@@ -15,10 +15,10 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
 from sononerf.field.weights import load_weights, save_weights
 from sononerf.progress import Progress
-from sononerf.run.build import echo_hull
+from sononerf.run.build import echo_hull, head_of
 from sononerf.run.fit import fit
 from sononerf.run.fitted import load_fitted, poses_of, render_poses, store_of
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 
 QUIET = Progress(quiet=True)
 
@@ -85,7 +85,7 @@ def test_weights_without_what_is_needed_are_told(run, name):
 
 def test_what_is_loaded_knows_what_first_echoes_leave(run, echoes, tiny):
     """An ear that heard nothing goes with the weights like all others."""
-    hull = echo_hull(tiny(), EnsembleStore.open(echoes))
+    hull = echo_hull(head_of(tiny()), EnsembleStore.open(echoes))
     state, description = load_weights(run)
     state["hull.first"][3, 1] = -torch.inf
     save_weights(run, state, description)

@@ -8,8 +8,8 @@ import pytest
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, LockedError, NumericalError
-from sononerf.recordings.understand import understand
 from sononerf.run.import_recordings import check_before, describe, draw, import_recordings
+from sononerf.run.understand import understand
 from sononerf.storage import lock
 from tests.recordings.recorded import SETTINGS, TARGET, arrays, waveforms
 

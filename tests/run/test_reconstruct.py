@@ -14,7 +14,6 @@ from PIL import Image
 from sononerf.errors import NumericalError
 from sononerf.progress import Progress
 from sononerf.run import reconstruct as reconstruct_module
-from sononerf.run.build import point_echo
 from sononerf.run.fitted import load_fitted
 from sononerf.run.reconstruct import reconstruct
 from sononerf.surface.openness import Openness
@@ -114,7 +113,7 @@ def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, mo
 
     def judge(mesh, sources, *, resolution):
         asked.append(sources)
-        assert resolution == point_echo(load_fitted(run).settings).resolution
+        assert resolution == load_fitted(run).head.resolution
         return plain(mesh, sources, resolution=resolution)
 
     monkeypatch.setattr(read_out_module, "judge_openness", judge)

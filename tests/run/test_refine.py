@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -82,7 +83,7 @@ def test_a_run_has_its_refined_surface(run, monkeypatch):
     monkeypatch.setattr(
         reconstruct_module,
         "load_fitted",
-        lambda path: type(fitted)(wanted, fitted.module, fitted.echo_hash, fitted.hull),
+        lambda path: replace(fitted, settings=wanted),
     )
     folder = reconstruct(run, accelerator="cpu", spacing=0.008)
     assert asked == ["cpu"]
@@ -110,12 +111,7 @@ def test_an_interrupted_refinement_goes_on_to_the_same_surface(run, monkeypatch)
     assert not (run / STATE).exists()
     fitted = load_fitted(run)
     often = fitted.settings.fit.model_copy(update={"checkpoint_seconds": 1e-9})
-    hasty = type(fitted)(
-        fitted.settings.model_copy(update={"fit": often}),
-        fitted.module,
-        fitted.echo_hash,
-        fitted.hull,
-    )
+    hasty = replace(fitted, settings=fitted.settings.model_copy(update={"fit": often}))
     real, steps = Refinement.advance, []
 
     def stops(self):
@@ -146,7 +142,7 @@ def test_a_state_that_does_not_fit_is_ignored(run, what):
         work = module.Refinement(
             {"filled": BUMPY.copy().apply_scale(1.1)},
             module.Echoes.of(module.store_of(fitted)),
-            module.optics_of(fitted.settings, module.quiet_scene(BUMPY)),
+            module.Optics(fitted.head),
             simulate=lambda mesh: None,
             seed=0,
         )

@@ -9,7 +9,7 @@ import pytest
 
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.run.run_folder import RunFolder, differing_keys
-from sononerf.settings.schema import dump_yaml, load_settings
+from sononerf.settings.loading import dump_yaml, load_settings
 
 
 @pytest.fixture

@@ -15,7 +15,8 @@ from sononerf.run.finish import finish
 from sononerf.run.fit import fit
 from sononerf.run.simulate import simulate
 from sononerf.run.store_settings import with_store
-from sononerf.settings.schema import HEAD_SECTIONS, validate_settings
+from sononerf.settings.loading import validate_settings
+from sononerf.settings.schema import HEAD_SECTIONS
 
 
 @pytest.fixture

@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,6 +22,7 @@ from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.run import predict as predict_module
 from sononerf.run import traced as traced_module
+from sononerf.run.build import head_of, simulator_of
 from sononerf.run.fitted import load_fitted, poses_of, render_poses, store_of
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import read_mesh
@@ -147,7 +149,7 @@ def test_the_regression_has_the_validation_poses_alone(run, monkeypatch):
     np.testing.assert_array_equal(given["measured"], compress(measured, reference))
     rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
     np.testing.assert_array_equal(given["rendered"], compress(rendered, reference))
-    traced = trace_poses(fitted.settings, surface, poses, progress=QUIET)
+    traced = trace_poses(fitted, surface, poses, progress=QUIET)
     np.testing.assert_allclose(given["traced"], compress(traced, reference), rtol=1e-6, atol=1e-9)
 
 
@@ -239,7 +241,7 @@ def switched_off(path, patch):
 def test_what_cannot_be_borne_out_or_is_not_wanted_is_not_traced(run, believe, monkeypatch, why):
     believe(run, 1.0)  # as an earlier fit may have left it
     why(run, monkeypatch)
-    monkeypatch.setattr(Simulator, "from_settings", never)
+    monkeypatch.setattr(Simulator, "of", never)
     monkeypatch.setattr(traced_module, "render_poses", never)
     heard = Heard()
     assert not learn(run, progress=heard).any()
@@ -278,18 +280,18 @@ def test_a_mesh_that_is_gone_or_damaged_is_an_error(run):
 
 @pytest.fixture
 def traceable(run):
-    """Settings, what is traced off, and where."""
+    """A fitted run, what is traced off, and where."""
     fitted = load_fitted(run)
     poses = poses_of(store_of(fitted), "val", fitted.module.renderer)
     rows = len(fitted.module.renderer.frequency)
-    return fitted.settings, Traced(SPHERE, np.zeros((2, rows)), np.ones(rows)), poses
+    return fitted, Traced(SPHERE, np.zeros((2, rows)), np.ones(rows)), poses
 
 
 def test_traced_echoes_are_those_that_were_measured(traceable, echoes):
-    settings, surface, poses = traceable
+    fitted, surface, poses = traceable
     store = EnsembleStore.open(echoes)
     measured = np.stack([store.read_pose(int(number)) for number in poses.numbers])
-    traced = trace_poses(settings, surface, poses, progress=QUIET)
+    traced = trace_poses(fitted, surface, poses, progress=QUIET)
     assert traced.shape == measured.shape
     reference = store.attributes["reference"]
     error = np.abs(compress(traced, reference) - compress(measured, reference)).mean()
@@ -306,21 +308,22 @@ def test_traced_echoes_are_those_that_were_measured(traceable, echoes):
     ],
 )
 def test_noise_engine_and_rays_of_the_experiment_are_left_out(traceable, section, values):
-    settings, surface, poses = traceable
-    changed = getattr(settings, section).model_copy(update=values)
-    other = settings.model_copy(update={section: changed})
-    assert other != settings
+    fitted, surface, poses = traceable
+    changed = getattr(fitted.settings, section).model_copy(update=values)
+    settings = fitted.settings.model_copy(update={section: changed})
+    assert settings != fitted.settings
+    other = replace(fitted, settings=settings, head=head_of(settings))
     some = poses.only(torch.tensor([0]))
     np.testing.assert_array_equal(
         trace_poses(other, surface, some, progress=QUIET),
-        trace_poses(settings, surface, some, progress=QUIET),
+        trace_poses(fitted, surface, some, progress=QUIET),
     )
 
 
 def test_the_gain_applies_to_its_own_ear_and_frequency(traceable):
-    settings, surface, poses = traceable
+    fitted, surface, poses = traceable
     some = poses.only(torch.tensor([0]))
-    plain = trace_poses(settings, surface, some, progress=QUIET)
+    plain = trace_poses(fitted, surface, some, progress=QUIET)
     gain = np.zeros_like(surface.gain_db)
     gain[0, 3], gain[1, -1] = 20, -20
     expected = plain.copy()
@@ -328,7 +331,7 @@ def test_the_gain_applies_to_its_own_ear_and_frequency(traceable):
     expected[:, 1, :, -1] /= 10
     tuned = Traced(SPHERE, gain, surface.weight)
     np.testing.assert_allclose(
-        trace_poses(settings, tuned, some, progress=QUIET), expected, rtol=1e-12
+        trace_poses(fitted, tuned, some, progress=QUIET), expected, rtol=1e-12
     )
 
 
@@ -437,7 +440,7 @@ def parts(path, poses):
     """What the field renders and what is traced, as a blend takes them."""
     fitted = load_fitted(path)
     rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
-    traced = trace_poses(fitted.settings, load_traced(path), poses, progress=QUIET)
+    traced = trace_poses(fitted, load_traced(path), poses, progress=QUIET)
     return rendered, traced, fitted.module.reference
 
 
@@ -471,7 +474,7 @@ def test_a_prediction_without_belief_is_the_rendering(run, believe):
     np.testing.assert_array_equal(never_learned["predicted"], rendered)
     believe(run, 0.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Simulator, "from_settings", never)
+        patch.setattr(Simulator, "of", never)
         unbelieved, same = arrays_and_numbers(run)
     np.testing.assert_array_equal(unbelieved["predicted"], rendered)
     assert same == numbers
@@ -491,7 +494,7 @@ def test_poses_of_ones_own_are_traced_off_the_run_without_store_or_scene(
     arrays, numbers = arrays_and_numbers(run, poses_csv=tmp_path / "poses.csv")
     assert numbers is None
     fitted = load_fitted(run)
-    simulator = Simulator.from_settings(Scene(load_traced(run).mesh), fitted.settings)
+    simulator = simulator_of(Scene(load_traced(run).mesh), fitted.settings)
     mine = np.stack(
         [
             simulator.spectrogram(position.astype(float), rotation.astype(float), seed=0)

@@ -4,7 +4,7 @@ import pytest
 
 from sononerf.errors import InputError, SettingsError
 from sononerf.scene.scene import MATERIALS, load_scene
-from sononerf.settings.schema import load_settings
+from sononerf.settings.loading import load_settings
 
 BOX = {"scene": "box", "options": {"size": [0.02, 0.04, 0.06]}}
 

@@ -3,7 +3,8 @@ import pytest
 
 from sononerf.errors import SettingsError
 from sononerf.settings.call_presets import CALL_PRESETS
-from sononerf.settings.schema import CallSettings, dump_yaml, load_settings, validate_settings
+from sononerf.settings.loading import dump_yaml, load_settings, validate_settings
+from sononerf.settings.schema import CallSettings
 
 
 def settings(**call):

@@ -7,13 +7,8 @@ import pytest
 
 from sononerf.errors import SettingsError
 from sononerf.settings import schema as config
-from sononerf.settings.schema import (
-    Settings,
-    apply_override,
-    load_settings,
-    read_yaml,
-    validate_settings,
-)
+from sononerf.settings.loading import apply_override, load_settings, read_yaml, validate_settings
+from sononerf.settings.schema import Settings
 
 SCENE = "scene: {name: sphere}\n"
 

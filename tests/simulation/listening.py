@@ -5,6 +5,7 @@ import numpy as np
 import trimesh
 
 from sononerf.head.ears import Ears
+from sononerf.head.head import Head
 from sononerf.head.spectrogram import echo_samples
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SpectrogramSettings
@@ -21,17 +22,49 @@ RIGHT = {"rays": 40_000, "bounces": 1, "diffraction_points": 4000}
 
 def hearing(emitter=(0.0, 0.0, 0.0), ears=((0.0, 0.0, 0.0),), absorption=0.0):
     """Points that send and hear alike in all directions."""
-    grid = (len(NODES), 3, 5)
-    head = Ears(
-        np.linspace(-np.pi, np.pi, 5),
-        np.linspace(-np.pi / 2, np.pi / 2, 3),
-        NODES,
-        np.ones(grid, np.float32),
-        np.ones((len(ears), *grid), np.float32),
-        np.array(emitter, dtype=float),
-        np.array(ears, dtype=float),
-    )
-    return Hearing(head, SYNTHESIS, np.full(len(NODES), absorption), SPEED)
+    return Hearing(OpenHead(emitter, ears, absorption), SYNTHESIS)
+
+
+class OpenHead(Head):
+    """A head whose gains are 1 everywhere."""
+
+    def __init__(self, emitter, ears, absorption):
+        super().__init__(analysis=ANALYSIS)
+        self.__dict__.update(
+            emitter=np.array(emitter, dtype=float),
+            receivers=np.array(ears, dtype=float),
+            speed_of_sound=SPEED,
+            loss=absorption,
+        )
+
+    def __getstate__(self):
+        return self.__dict__
+
+    def tables(self, frequency):
+        grid = (len(frequency), 3, 5)
+        return Ears(
+            np.linspace(-np.pi, np.pi, 5),
+            np.linspace(-np.pi / 2, np.pi / 2, 3),
+            np.asarray(frequency),
+            np.ones(grid, np.float32),
+            np.ones((len(self.receivers), *grid), np.float32),
+            self.emitter,
+            self.receivers,
+        )
+
+    def absorption(self, frequency):
+        return np.full(len(frequency), self.loss)
+
+
+class TableHead(OpenHead):
+    """A head with tables at the nodes of a synthesis."""
+
+    def __init__(self, tables):
+        super().__init__(tables.emitter, tables.positions, 0.0)
+        self.__dict__["given"] = tables
+
+    def tables(self, frequency):
+        return self.given
 
 
 def rays(mesh, material, head=None, **options):

@@ -2,6 +2,7 @@
 import numpy as np
 import pytest
 
+from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.simulation.arrival import Arrival, silence_before
 from tests.simulation.listening import ball, wall
@@ -41,12 +42,11 @@ def heard_near():
     """Return the highest level (dB above m0) of two poses more than 10 mm before the scene."""
     from sononerf.geometry.poses import look_at
     from sononerf.head.decibels import compress
-    from sononerf.settings.schema import validate_settings
-    from sononerf.simulation.simulator import Simulator
+    from sononerf.settings.loading import validate_settings
 
     def level(scene):
         options = {"scene": {"name": "sphere"}, "simulation": {"rays": 30_000, "sources": 200}}
-        found = Simulator.from_settings(scene, validate_settings(options, "test"))
+        found = simulator_of(scene, validate_settings(options, "test"))
         places = np.array([[0.4, 0.02, 0.01], [0.1, -0.25, 0.3]])
         turns = look_at(places, np.zeros((2, 3)))
         found.engine.prepare(places, turns)
@@ -59,7 +59,7 @@ def heard_near():
             emitter, ears = found.engine.hearing.places(places[pose], turns[pose])
             nearest = found.engine.arrival.shortest(emitter[None], ears[None])[0] / 2
             for ear in range(2):
-                early = found.range < nearest[ear] - 0.010
+                early = found.head.range < nearest[ear] - 0.010
                 worst = max(worst, levels[pose, ear][early].max())
         return worst
 

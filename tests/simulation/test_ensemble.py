@@ -11,17 +11,12 @@ import trimesh
 
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
 from sononerf.geometry.poses import Poses, look_at, write_pose_csv
+from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 from sononerf.simulation import ensemble
-from sononerf.simulation.ensemble import (
-    check_poses,
-    check_reach,
-    ensemble_poses,
-    pose_seed,
-    simulate_ensemble,
-)
-from sononerf.simulation.simulator import Simulator
+from sononerf.simulation.ensemble import check_poses, check_reach, pose_seed, simulate_ensemble
+from sononerf.simulation.pose_sets import ensemble_poses
 
 
 def settings(**sections):
@@ -33,11 +28,11 @@ def small():
     found = settings(
         simulation={"rays": 2000, "sources": 60}, poses={"count": 4, "validation": 1, "heldout": 1}
     )
-    return Simulator.from_settings(load_scene("sphere"), found), ensemble_poses(found)[0]
+    return simulator_of(load_scene("sphere"), found), ensemble_poses(found.poses)[0]
 
 
 def test_sets_follow_each_other_at_their_radius():
-    poses, split = ensemble_poses(settings(poses={"count": 7, "validation": 2, "heldout": 3}))
+    poses, split = ensemble_poses(settings(poses={"count": 7, "validation": 2, "heldout": 3}).poses)
     assert split.tolist() == [0] * 7 + [1] * 2 + [2] * 3
     assert split.dtype == np.int8
     np.testing.assert_allclose(np.linalg.norm(poses.positions, axis=1), 0.4)
@@ -46,7 +41,7 @@ def test_sets_follow_each_other_at_their_radius():
 def test_no_set_moves_another_and_the_seed_moves_all():
     def sets(**changes):
         wanted = {"count": 7, "validation": 2, "heldout": 3, **changes}
-        return ensemble_poses(settings(poses=wanted))[0]
+        return ensemble_poses(settings(poses=wanted).poses)[0]
 
     base = sets()
     np.testing.assert_array_equal(base[-3:].rotations, sets(count=20)[-3:].rotations)
@@ -58,7 +53,7 @@ def test_no_set_moves_another_and_the_seed_moves_all():
 
 
 def test_poses_on_the_sphere_are_those_of_the_first_release():
-    poses, split = ensemble_poses(settings())
+    poses, split = ensemble_poses(settings().poses)
     rounded = [(np.round(v, 9) + 0.0).tobytes() for v in (poses.positions, poses.rotations)]
     found = hashlib.sha256(b"".join(rounded) + split.tobytes()).hexdigest()
     assert found == "917fc6f168f229fd2c8784c18f3219f5a59ce2e9f77726648c659fa318f1d5aa"
@@ -71,7 +66,7 @@ VOLUME = {"arrangement": "volume", "radius_max": 0.8}
 @pytest.mark.parametrize("chosen", [CAP, VOLUME, {**VOLUME, "half_angle_deg": 40.0}])
 def test_all_sets_of_an_arrangement_lie_in_the_same_place(chosen):
     wanted = {**chosen, "count": 300, "validation": 200, "heldout": 200, "aim_jitter_deg": 0}
-    poses, split = ensemble_poses(settings(poses=wanted))
+    poses, split = ensemble_poses(settings(poses=wanted).poses)
     assert np.bincount(split).tolist() == [300, 200, 200]
     distance = np.linalg.norm(poses.positions, axis=1)
     axis = np.array(chosen.get("axis", [1.0, 0.0, 0.0]))
@@ -91,9 +86,9 @@ def test_all_sets_of_an_arrangement_lie_in_the_same_place(chosen):
     np.testing.assert_allclose(
         poses.rotations[:, :, 0], -poses.positions / distance[:, None], atol=1e-9
     )
-    more = ensemble_poses(settings(poses={**wanted, "count": 310, "validation": 0}))[0]
+    more = ensemble_poses(settings(poses={**wanted, "count": 310, "validation": 0}).poses)[0]
     np.testing.assert_array_equal(more[310:].positions, poses[500:].positions)
-    other = ensemble_poses(settings(poses={**wanted, "seed": 1}))[0]
+    other = ensemble_poses(settings(poses={**wanted, "seed": 1}).poses)[0]
     assert (other[500:].positions != poses[500:].positions).any(axis=1).all()
 
 
@@ -111,24 +106,26 @@ def flight(tmp_path):
 
 def test_a_path_keeps_its_order_and_gives_rows_to_each_set(flight):
     wanted, flown = flight(50)
-    poses, split = ensemble_poses(settings(poses={**wanted, "validation": 4, "heldout": 6}))
+    poses, split = ensemble_poses(settings(poses={**wanted, "validation": 4, "heldout": 6}).poses)
     np.testing.assert_array_equal(poses.positions, flown.positions)
     np.testing.assert_allclose(poses.rotations, flown.rotations, atol=1e-12)
     assert np.bincount(split).tolist() == [40, 4, 6]
     assert (np.diff(np.flatnonzero(split == 2)) > 1).any()  # drawn, not cut off
     assert (np.diff(np.flatnonzero(split == 1)) > 1).any()
-    more = ensemble_poses(settings(poses={**wanted, "validation": 9, "heldout": 6}))[1]
+    more = ensemble_poses(settings(poses={**wanted, "validation": 9, "heldout": 6}).poses)[1]
     np.testing.assert_array_equal(more == 2, split == 2)
-    other = ensemble_poses(settings(poses={**wanted, "validation": 4, "heldout": 6, "seed": 1}))[1]
+    other = ensemble_poses(
+        settings(poses={**wanted, "validation": 4, "heldout": 6, "seed": 1}).poses
+    )[1]
     assert (other != split).any()
 
 
 def test_a_path_too_short_to_train_on_is_refused(flight):
     wanted, _ = flight(30)
     with pytest.raises(InputError, match=r"flight30\.csv: 30 poses, .* none is left to train on"):
-        ensemble_poses(settings(poses=wanted))
+        ensemble_poses(settings(poses=wanted).poses)
     wanted, _ = flight(31)
-    assert np.bincount(ensemble_poses(settings(poses=wanted))[1]).tolist() == [1, 10, 20]
+    assert np.bincount(ensemble_poses(settings(poses=wanted).poses)[1]).tolist() == [1, 10, 20]
 
 
 def reach(*positions, limits=(0.3, 0.5)):

@@ -4,6 +4,7 @@ import pytest
 
 from sononerf.geometry.poses import rotation_from_euler
 from sononerf.head.ears import beam_gain, ear_gain, ear_tables
+from sononerf.head.head import Head
 from sononerf.head.spectrogram import echo_samples
 from sononerf.settings.schema import EarSettings, SpectrogramSettings
 from sononerf.simulation.hearing import Hearing
@@ -13,14 +14,24 @@ SPEED = 343.0
 ANALYSIS = SpectrogramSettings(range_max=0.4)
 SYNTHESIS = plan_synthesis(ANALYSIS, echo_samples(ANALYSIS, SPEED))
 NODES = SYNTHESIS.nodes
-EARS = ear_tables(EarSettings(left=(-0.01, 0.02, 0.03), emitter=(0.01, 0.0, -0.02)), NODES)
+SETTINGS = EarSettings(left=(-0.01, 0.02, 0.03), emitter=(0.01, 0.0, -0.02))
+EARS = ear_tables(SETTINGS, NODES)
 POSITION = np.array([1.0, -2.0, 0.5])
 ROTATION = rotation_from_euler(1.0, 0.3, -0.2)
 POINT = POSITION + ROTATION @ np.array([[0.3, 0.05, -0.1]])[0]
 
 
 def hearing(absorption=0.0):
-    return Hearing(EARS, SYNTHESIS, np.full(len(NODES), absorption), SPEED)
+    head = Absorbing(ears=SETTINGS, analysis=ANALYSIS)
+    head.__dict__["loss"] = absorption
+    return Hearing(head, SYNTHESIS)
+
+
+class Absorbing(Head):
+    """A head in air with the same absorption at all frequencies."""
+
+    def absorption(self, frequency):
+        return np.full(len(frequency), self.loss)
 
 
 def echo_of(head, ear, level=1.0, **options):

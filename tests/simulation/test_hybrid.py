@@ -4,11 +4,11 @@ import pytest
 import trimesh
 
 from sononerf.geometry.poses import look_at
+from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 from sononerf.simulation.hybrid import Hybrid
 from sononerf.simulation.rays import Rays
-from sononerf.simulation.simulator import Simulator
 from tests.simulation.listening import ball
 
 PLACE = np.array([0.35, 0.05, -0.02])
@@ -18,7 +18,7 @@ POSE = PLACE, look_at(PLACE, np.zeros(3))
 def simulator(scene, **simulation):
     simulation = {"rays": 30_000, "sources": 300, **simulation}
     settings = {"scene": {"name": "sphere"}, "simulation": simulation}
-    return Simulator.from_settings(scene, validate_settings(settings, "test"))
+    return simulator_of(scene, validate_settings(settings, "test"))
 
 
 def levels(found):
@@ -38,7 +38,7 @@ def test_it_is_the_default_and_closer_to_the_truth_than_rays_at_low_frequencies(
     error = {}
     for name, found in (("hybrid", default), ("rays", simulator(scene, engine="rays"))):
         heard = exact > exact.max() - 30
-        heard[..., default.frequency > 0.6 * highest] = False
+        heard[..., default.head.frequency > 0.6 * highest] = False
         error[name] = np.abs(levels(found) - exact)[heard].mean()
     assert error["hybrid"] < 0.5
     assert error["rays"] > 5.0
@@ -48,7 +48,7 @@ def test_high_frequencies_are_those_of_the_rays():
     scene = Scene(ball(0.015))
     found = simulator(scene)
     both, alone = levels(found), levels(simulator(scene, engine="rays"))
-    high = found.frequency > found.engine.low.frequency_max + 40e3  # beyond the window's lobe
+    high = found.head.frequency > found.engine.low.frequency_max + 40e3  # beyond the window's lobe
     loud = (alone > alone.max() - 20) & high
     assert loud.any()
     np.testing.assert_allclose(both[loud], alone[loud], atol=0.3)

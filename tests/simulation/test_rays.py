@@ -18,6 +18,7 @@ from tests.simulation.exact import SPEED, rigid_sphere
 from tests.simulation.listening import (
     NODES,
     SYNTHESIS,
+    TableHead,
     ball,
     box,
     echoes,
@@ -40,7 +41,7 @@ def group_delay(pressure, frequency, expected):
 
 def bat():
     head = ear_tables(EarSettings(), NODES)
-    return Hearing(head, SYNTHESIS, np.zeros(len(NODES)), SPEED)
+    return Hearing(TableHead(head), SYNTHESIS)
 
 
 def difference(one, two, frequency=BAND):

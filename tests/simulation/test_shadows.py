@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from sononerf.run.build import simulator_of
 from sononerf.scene.material import RIGID
 from sononerf.scene.scene import Scene
-from sononerf.settings.schema import validate_settings
-from sononerf.simulation.simulator import Simulator
+from sononerf.settings.loading import validate_settings
 from tests.simulation.listening import ball, echoes, hearing, level_db, rays, spectrum, wall
 
 BAND = np.linspace(40e3, 80e3, 41)
@@ -28,7 +28,7 @@ def bat(mesh, engine):
     wanted["simulation"]["rays"] = 40_000
     if engine == "spheres":
         wanted["simulation"]["frequency_max"] = 100e3
-    simulator = Simulator.from_settings(Scene(mesh, RIGID), validate_settings(wanted, "test"))
+    simulator = simulator_of(Scene(mesh, RIGID), validate_settings(wanted, "test"))
     place, straight = np.zeros((1, 3)), np.eye(3)[None]
     simulator.engine.prepare(place, straight)
     rate = simulator.engine.hearing.synthesis.sampling_rate

@@ -13,10 +13,10 @@ from sononerf.geometry.poses import look_at, rotation_from_euler
 from sononerf.head.air import air_absorption
 from sononerf.head.decibels import compress
 from sononerf.head.directivity.sofa_writer import write_sofa
+from sononerf.run.build import simulator_of
 from sononerf.scene.material import RIGID, Material
 from sononerf.scene.scene import Scene, load_scene
-from sononerf.settings.schema import validate_settings
-from sononerf.simulation.simulator import Simulator
+from sononerf.settings.loading import validate_settings
 from tests.head.directivity.patterns import pair
 
 POINT_HEAD = {
@@ -32,7 +32,7 @@ def simulator(scene, rays=40_000, **sections):
     simulation = {"rays": rays, "sources": 60, **sections.pop("simulation", {})}
     sections["simulation"] = simulation
     settings = validate_settings({"scene": {"name": "test"}, **sections}, "test")
-    return Simulator.from_settings(scene, settings)
+    return simulator_of(scene, settings)
 
 
 def plate(lower, upper):
@@ -62,8 +62,8 @@ def test_first_echo_of_a_sphere_comes_from_its_front():
     # 2 (0.4 - 0.015) m; the mesh lies up to 3 um inside the sphere, a sample is 171 um.
     assert middle * 1e-6 * 343.0 / 2 == pytest.approx(0.385, abs=5e-6)
     magnitude = found.spectrogram(position, look_at(position, np.zeros(3)), seed=0)
-    peak = found.range[magnitude[0, :, 30].argmax()]
-    assert abs(peak - 0.385) <= np.diff(found.range)[0] / 2 + 5e-6
+    peak = found.head.range[magnitude[0, :, 30].argmax()]
+    assert abs(peak - 0.385) <= np.diff(found.head.range)[0] / 2 + 5e-6
 
 
 @pytest.mark.parametrize(("material", "error"), [(PLAIN, 0.04), (WIDE, 0.015)])
@@ -163,7 +163,7 @@ def test_what_a_plate_hides_is_not_heard():
         simulator(Scene(mesh, PLAIN), simulation={"rays": 40_000, "bounces": 1})
         for mesh in (ball, hidden)
     )
-    beyond = open_.range > 0.42
+    beyond = open_.head.range > 0.42
     assert open_.spectrogram(np.zeros(3), np.eye(3), seed=0)[:, beyond].max() > 0
     loud = shut.spectrogram(np.zeros(3), np.eye(3), seed=0)
     assert (
@@ -179,7 +179,7 @@ def test_an_ear_behind_a_plate_hears_next_to_nothing_though_the_other_does():
     apart = {**POINT_HEAD, "left": [0.0, 0.2, 0.0]}
     found = simulator(scene, ears=apart, simulation={"rays": 40_000, "bounces": 1})
     left, right = found.spectrogram(np.zeros(3), np.eye(3), seed=0)
-    beyond = found.range > 0.45  # the ball's echo comes from (0.47 + 0.51) / 2
+    beyond = found.head.range > 0.45  # the ball's echo comes from (0.47 + 0.51) / 2
     # 60 mm inside the shadow of the plate's edge: a knife edge leaves 0.12 at 20 kHz.
     assert left[beyond].max() < 0.13 * right[beyond].max()
 
@@ -221,15 +221,15 @@ def test_a_pickled_simulator_says_the_same():
 
 def test_axes_ears_and_speed_are_those_of_the_settings():
     found = simulator(load_scene("sphere"))
-    assert found.speed_of_sound == 343.0
-    assert (len(found.range), len(found.frequency)) == (875, 47)
-    np.testing.assert_array_equal(found.ears.frequency, found.frequency)
+    assert found.head.speed_of_sound == 343.0
+    assert (len(found.head.range), len(found.head.frequency)) == (875, 47)
+    np.testing.assert_array_equal(found.head.gains.frequency, found.head.frequency)
     pose = np.array([0.4, 0, 0]), look_at([0.4, 0, 0], np.zeros(3))
     magnitude = found.spectrogram(*pose, seed=0)
     assert magnitude.shape == (2, 875, 47)
     assert magnitude.dtype == np.float32
     warm = simulator(load_scene("sphere"), air={"temperature_c": 40.0})
-    assert warm.speed_of_sound == pytest.approx(354.7, abs=0.1)
+    assert warm.head.speed_of_sound == pytest.approx(354.7, abs=0.1)
 
 
 def engines(scene, rays=40_000, **sections):
@@ -251,7 +251,7 @@ def test_both_engines_say_the_same_of_glints(body):
     # Kirchhoff's integral itself errs by up to 1 dB for ka above 12 and 2 dB below.
     for a, b in zip(one, two, strict=True):
         level = 20 * np.log10(a.max(axis=0) / b.max(axis=0))
-        assert np.abs(level[fast.frequency > 40e3]).max() < 1.5
+        assert np.abs(level[fast.head.frequency > 40e3]).max() < 1.5
     loudest = one[0].max(axis=1).argmax(), two[0].max(axis=1).argmax()
     assert abs(loudest[0] - loudest[1]) <= 3  # rows of 0.7 mm
 
@@ -272,12 +272,12 @@ def test_the_call_of_the_settings_is_what_is_emitted():
     sweep = simulator(scene, 5000, ears=POINT_HEAD, call=call)
     swept, dechirped = sweep.receive(*pose, seed=1)
     expected = scipy.signal.fftconvolve(
-        sweep.echo(*pose, seed=1), sweep.reception.waveform[None], axes=1
+        sweep.echo(*pose, seed=1), sweep.head.waveform[None], axes=1
     )
     np.testing.assert_allclose(swept, expected[:, : swept.shape[1]], atol=1e-9)
     # Dechirped, the sphere stands where the impulse shows it.
     rows = [m[0, :, 40].argmax() for m in (magnitude, dechirped)]
-    assert abs(sweep.range[rows[1]] - impulse.range[rows[0]]) < 0.01
+    assert abs(sweep.head.range[rows[1]] - impulse.head.range[rows[0]]) < 0.01
 
 
 def test_the_noise_of_the_settings_is_drawn_from_the_poses_seed():

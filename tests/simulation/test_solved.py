@@ -9,12 +9,12 @@ from sononerf.errors import ResourceError, SettingsError
 from sononerf.geometry.poses import Poses, look_at
 from sononerf.head.air import air_absorption
 from sononerf.head.ears import beam_gain, ear_gain
+from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 from sononerf.simulation import ensemble as ensemble_module
 from sononerf.simulation import solved as solved_module
 from sononerf.simulation.ensemble import simulate_ensemble
-from sononerf.simulation.simulator import Simulator
 from sononerf.simulation.solved import Heads, Solved
 from tests.simulation.exact import SPEED, rigid_sphere
 from tests.simulation.listening import ball, level_db, spectrum
@@ -55,7 +55,7 @@ def simulator(scene=None, head=POINT_HEAD, frequency_max=None, analysis=None, **
     wanted = {"engine": "spheres", "frequency_max": frequency_max}
     sections = {"simulation": wanted, "ears": head, "spectrogram": analysis or {}, **sections}
     settings = validate_settings({"scene": {"name": "test"}, **sections}, "test")
-    return Simulator.from_settings(scene or load_scene("sphere"), settings)
+    return simulator_of(scene or load_scene("sphere"), settings)
 
 
 def glint(scene=None, **options):
@@ -64,8 +64,6 @@ def glint(scene=None, **options):
     found.engine = Glint(
         engine.scene,
         engine.hearing,
-        gains=engine.gains,
-        absorption=engine.absorption,
         frequency_max=engine.frequency_max,
     )
     return found
@@ -147,7 +145,7 @@ def test_the_head_is_that_of_the_settings():
     engine = found.engine
     position = np.array([[0.4, 0.02, 0.01], [0.1, 0.3, 0.2]])
     turns = np.stack([look_at(place, np.array([0.0, 0.05, 0.0])) for place in position])
-    gains = engine.gains(np.array([50e3]))
+    gains = engine.hearing.head.tables(np.array([50e3]))
     emitters = position + turns @ gains.emitter
     ears = position[:, None] + np.einsum("pij,ej->pei", turns, gains.positions)
     heads = Heads(emitters, ears, turns, gains)

@@ -9,10 +9,12 @@ import torch
 import trimesh
 
 from sononerf.geometry.poses import sphere_poses
+from sononerf.run.build import head_of
 from sononerf.scene.scene import Scene
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine.echo_data import Echoes, optics_of
+from sononerf.surface.refine.echo_data import Echoes
+from sononerf.surface.refine.optics import Optics
 
 RADIUS = 0.012
 POSES = 18
@@ -39,8 +41,8 @@ def ball():
 
 
 @pytest.fixture(scope="session")
-def optics(settings, ball):
-    return optics_of(settings, Scene(ball))
+def optics(settings):
+    return Optics(head_of(settings))
 
 
 @pytest.fixture(scope="session")
@@ -53,7 +55,7 @@ def simulated():
     """Spectrograms (P, E, R, F) of a mesh, by the simulator."""
 
     def simulate(mesh, settings, poses):
-        simulator = Simulator.from_settings(Scene(mesh), settings)
+        simulator = Simulator.of(Scene(mesh), head_of(settings), settings.simulation)
         pairs = zip(poses.positions, poses.rotations, strict=True)
         return np.stack([simulator.spectrogram(at, turn, seed=0) for at, turn in pairs])
 

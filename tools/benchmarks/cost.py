@@ -9,19 +9,18 @@ from typing import Any
 
 import numpy as np
 
+from sononerf.run.build import simulator_of
 from sononerf.scene.scene import load_scene
-from sononerf.settings.schema import load_settings
-from sononerf.simulation.ensemble import ensemble_poses, pose_seed
-from sononerf.simulation.simulator import Simulator
+from sononerf.settings.loading import load_settings
+from sononerf.simulation.ensemble import pose_seed
+from sononerf.simulation.pose_sets import ensemble_poses
 
 
 def cost(arguments: argparse.Namespace) -> dict[str, Any]:
     """Take the CPU time of a configuration's poses: solving for all of them, tracing some."""
     settings = load_settings(arguments.config)
-    simulator = Simulator.from_settings(
-        load_scene(settings.scene.name, settings.scene.options), settings
-    )
-    poses, _ = ensemble_poses(settings)
+    simulator = simulator_of(load_scene(settings.scene.name, settings.scene.options), settings)
+    poses, _ = ensemble_poses(settings.poses)
     start = time.process_time()
     simulator.engine.prepare(poses.positions, poses.rotations)
     solved = (time.process_time() - start) / len(poses)

@@ -30,15 +30,16 @@ def exact(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _heard(scene: str, engine: str, poses: int) -> dict[str, Any]:
     """Return spectrograms (P, E, R, F) of the first test poses, and what goes with them."""
+    from sononerf.run.build import simulator_of
     from sononerf.scene.scene import load_scene
-    from sononerf.settings.schema import validate_settings
-    from sononerf.simulation.ensemble import ensemble_poses, pose_seed
-    from sononerf.simulation.simulator import Simulator
+    from sononerf.settings.loading import validate_settings
+    from sononerf.simulation.ensemble import pose_seed
+    from sononerf.simulation.pose_sets import ensemble_poses
 
     data = SETTINGS | {"scene": {"name": scene}, "simulation": {"engine": engine}}
     settings = validate_settings(data, "benchmark exact")
-    simulator = Simulator.from_settings(load_scene(scene), settings)
-    all_poses, split = ensemble_poses(settings)
+    simulator = simulator_of(load_scene(scene), settings)
+    all_poses, split = ensemble_poses(settings.poses)
     chosen = np.flatnonzero(split == 2)[:poses]
     places, turns = all_poses.positions[chosen], all_poses.rotations[chosen]
     started = time.perf_counter()
@@ -57,8 +58,8 @@ def _heard(scene: str, engine: str, poses: int) -> dict[str, Any]:
     return {
         "magnitude": magnitude,
         "reference": 1e-3 * float(magnitude.max()),
-        "range": simulator.range,
-        "frequency": simulator.frequency,
+        "range": simulator.head.range,
+        "frequency": simulator.head.frequency,
         "nearest": nearest,
         "solved_s": solved,
         "pose_s": (time.perf_counter() - started - solved) / len(chosen),

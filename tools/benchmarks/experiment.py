@@ -20,7 +20,8 @@ from sononerf.errors import SonoNerfError
 from sononerf.run.run_folder import RunFolder
 from sononerf.run.simulate import default_store, echo_hash
 from sononerf.scene.scene import load_scene
-from sononerf.settings.schema import Settings, load_settings
+from sononerf.settings.loading import load_settings
+from sononerf.settings.schema import Settings
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "three_spheres.yaml"
 """Nothing but defaults; the scene is laid over it."""

@@ -14,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.head.decibels import compress, mae_db
+from sononerf.run.build import simulator_of
 from sononerf.scene.scene import load_scene
-from sononerf.settings.schema import Settings, validate_settings
-from sononerf.simulation.ensemble import ensemble_poses, pose_seed
-from sononerf.simulation.simulator import Simulator
+from sononerf.settings.loading import validate_settings
+from sononerf.settings.schema import Settings
+from sononerf.simulation.ensemble import pose_seed
+from sononerf.simulation.pose_sets import ensemble_poses
 
 REFERENCE_RATIO = 1e-3  # the reported decibels start 60 dB below the greatest magnitude
 
@@ -63,8 +65,8 @@ def simulate(arguments: argparse.Namespace) -> dict[str, Any]:
     """Time the simulator against Embree alone, pose by pose in turn."""
     settings = settings_for(arguments, rays=arguments.rays)
     scene = load_scene(arguments.scene)
-    simulator = Simulator.from_settings(scene, settings)
-    poses, _ = ensemble_poses(settings)
+    simulator = simulator_of(scene, settings)
+    poses, _ = ensemble_poses(settings.poses)
     # Of the default engine's two halves the one that traces.
     tracer = getattr(simulator.engine, "high", simulator.engine)
     recorder = Recorder(tracer.caster._engine)
@@ -112,11 +114,11 @@ def noise(arguments: argparse.Namespace) -> dict[str, Any]:
     scene = load_scene(arguments.scene)
     default = settings_for(arguments)
     rays = default.simulation.rays
-    poses, split = ensemble_poses(default)
+    poses, split = ensemble_poses(default.poses)
     chosen = np.flatnonzero(split == 2)[: arguments.poses]
 
     def spectrograms(count: int, seed: int) -> NDArray[np.float64]:
-        simulator = Simulator.from_settings(scene, settings_for(arguments, rays=count))
+        simulator = simulator_of(scene, settings_for(arguments, rays=count))
         simulator.engine.prepare(poses.positions[chosen], poses.rotations[chosen])
         return np.stack(
             [

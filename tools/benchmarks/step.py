@@ -38,16 +38,17 @@ from sononerf.field.module import EchoModule
 from sononerf.field.shell import ShellRenderer
 from sononerf.progress import Progress
 from sononerf.run.build import (
-    acquisition,
     data_for,
     echo_region,
     field_and_renderer,
+    head_of,
     module_for,
 )
 from sononerf.run.fit import quiet_lightning, require_accelerator
 from sononerf.run.simulate import default_store, echo_hash, ensemble
 from sononerf.scene.scene import load_scene
-from sononerf.settings.schema import Settings, load_settings
+from sononerf.settings.loading import load_settings
+from sononerf.settings.schema import Settings
 from tools.benchmarks.experiment import CONFIG, Row, aligned, ending
 from tools.benchmarks.record import device_name, keep, ratios
 
@@ -254,13 +255,13 @@ def _measured(
     pair: Pair, settings: Settings, accelerator: str, products: dict[str, float], copy: float
 ) -> Row:
     store = ensemble(settings, progress=Progress())
-    region, possible = echo_region(settings, store)
-    field, renderer = field_and_renderer(settings, region)
+    region, possible = echo_region(settings, head_of(settings), store)
+    field, renderer = field_and_renderer(settings, head_of(settings), region)
     naive = pair.name == NAIVE
     if naive:
         own = renderer.state_dict()
         torch.manual_seed(settings.fit.seed)
-        renderer = EquationSeventeen(region, acquisition(settings), **settings.renderer.options)
+        renderer = EquationSeventeen(region, head_of(settings), **settings.renderer.options)
         renderer.load_state_dict(own)
     options = settings.fit
     data = data_for(settings, store, renderer)
@@ -320,7 +321,7 @@ def _loss_differs(
     module: EchoModule, data: EchoDataModule, settings: Settings, region: Tensor
 ) -> float:
     """Return by how much, of itself, the loss through ``shell`` differs from equation 17's."""
-    shell = ShellRenderer(region, acquisition(settings), **settings.renderer.options)
+    shell = ShellRenderer(region, head_of(settings), **settings.renderer.options)
     shell.load_state_dict(module.renderer.state_dict())
     batch = next(iter(data.train_dataloader()))
     plain = module.cpu().renderer

@@ -19,7 +19,7 @@ from sononerf import storage
 from sononerf.evaluation.metrics import geometry_metrics
 from sononerf.evaluation.true_surface import TrueSurface
 from sononerf.scene.scene import load_scene
-from sononerf.settings.schema import load_settings
+from sononerf.settings.loading import load_settings
 from tools.benchmarks.experiment import (
     CONFIG,
     STOPPED,

@@ -62,8 +62,8 @@ def wave(arguments: argparse.Namespace) -> dict[str, Any]:
 def _heard(scene: Any, engine: str, poses: int) -> dict[str, Any]:
     """Return spectrograms in dB (P, E, R, F), their frequencies, and what they cost."""
     from sononerf.geometry.poses import sphere_poses
-    from sononerf.settings.schema import validate_settings
-    from sononerf.simulation.simulator import Simulator
+    from sononerf.run.build import simulator_of
+    from sononerf.settings.loading import validate_settings
     from sononerf.simulation.solved import Solved
 
     data: dict[str, Any] = {"scene": {"name": "sphere"}, "spectrogram": ANALYSIS}
@@ -71,7 +71,7 @@ def _heard(scene: Any, engine: str, poses: int) -> dict[str, Any]:
     if engine in ("spheres", "bem"):
         data["simulation"]["frequency_max"] = SOLVED
     started = time.perf_counter()
-    simulator = Simulator.from_settings(scene, validate_settings(data, "benchmark wave"))
+    simulator = simulator_of(scene, validate_settings(data, "benchmark wave"))
     generator = np.random.default_rng(0)
     places = sphere_poses(poses, radius=DISTANCE, aim_jitter=0.0, generator=generator)
     solver = simulator.engine
@@ -80,10 +80,10 @@ def _heard(scene: Any, engine: str, poses: int) -> dict[str, Any]:
     for seed, pose in enumerate(zip(places.positions, places.rotations, strict=True)):
         echo = simulator.echo(*pose, seed=seed)
         if not isinstance(solver, Solved):
-            echo = _same_band(echo, simulator.reception.analysis.sampling_rate)
-        magnitude = simulator.reception.receive(echo, seed=seed)[1]
+            echo = _same_band(echo, simulator.head.analysis.sampling_rate)
+        magnitude = simulator.head.receive(echo, seed=seed)[1]
         levels.append(20.0 * np.log10(np.maximum(magnitude, 1e-12)))
-    found = {"level": np.stack(levels), "frequency": simulator.frequency}
+    found = {"level": np.stack(levels), "frequency": simulator.head.frequency}
     found["seconds"] = time.perf_counter() - started
     found["unknowns"] = getattr(solver, "unknowns", None)
     found["frequencies"] = len(getattr(solver, "frequency", ()))

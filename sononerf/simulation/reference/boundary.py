@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
 
 from sononerf.errors import NumericalError, ResourceError
-from sononerf.head.ears import Ears
 from sononerf.memory import available_memory
 from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing
@@ -65,10 +63,6 @@ class Boundary(Solved):
         What is ensonified.
     hearing : Hearing
         Head and air.
-    gains : callable
-        Takes frequencies (K,) in Hz, returns the tables of beam and ears at them.
-    absorption : callable
-        Takes frequencies (K,) in Hz, returns the absorption of the air (K,) in dB/m.
     frequency_max : float, Hz
         Where the response has fallen to zero.
     edges_per_wavelength : float
@@ -95,8 +89,6 @@ class Boundary(Solved):
         scene: Scene,
         hearing: Hearing,
         *,
-        gains: Callable[[NDArray[np.float64]], Ears],
-        absorption: Callable[[NDArray[np.float64]], NDArray[np.float64]],
         frequency_max: float,
         edges_per_wavelength: float = 5.0,
     ) -> None:
@@ -107,9 +99,7 @@ class Boundary(Solved):
             )
         self.edges_per_wavelength = edges_per_wavelength
         self._bodies = closed_bodies(scene.mesh)
-        super().__init__(
-            scene, hearing, gains=gains, absorption=absorption, frequency_max=frequency_max
-        )
+        super().__init__(scene, hearing, frequency_max=frequency_max)
         self._level: tuple[float, Operators] | None = None
         self._unknowns = self._expected(self.frequency_max)
         self._check_size()

@@ -5,21 +5,19 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import eigh_tridiagonal
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.special import spherical_jn
 
 from sononerf.errors import InputError, NumericalError
-from sononerf.head.ears import Ears
 from sononerf.scene.material import Material
 from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing
+from sononerf.simulation.reference.coupling import Ball, Coupling, Link
+from sononerf.simulation.reference.partial_waves import inner_product, wigner
 from sononerf.simulation.solved import Heads, Solved
 
 ROUND = 1e-3  # of the radius, by which vertices may lie beside the sphere
@@ -35,22 +33,6 @@ KEPT = 30  # arrays of the waves' size, while a batch is solved
 SPEED = 6e9  # operations per second of one core
 
 Array = NDArray[np.complex128]
-
-
-@dataclass(frozen=True, eq=False)
-class Ball:
-    """A sphere.
-
-    Attributes
-    ----------
-    centre : (3,) float64, m
-        World frame.
-    radius : float, m
-        Of its surface.
-    """
-
-    centre: NDArray[np.float64]
-    radius: float
 
 
 class Spheres(Solved):
@@ -89,7 +71,7 @@ class Spheres(Solved):
         Rigid spheres that do not touch, as closed meshes.
     hearing : Hearing
         Head and air.
-    gains, absorption, frequency_max
+    frequency_max
         See :class:`Solved`.
     orders : int, optional
         Sum orders of scattering up to this one and solve nothing: 1 leaves out what one sphere
@@ -123,8 +105,6 @@ class Spheres(Solved):
         scene: Scene,
         hearing: Hearing,
         *,
-        gains: Callable[[NDArray[np.float64]], Ears],
-        absorption: Callable[[NDArray[np.float64]], NDArray[np.float64]],
         frequency_max: float,
         orders: int | None = None,
     ) -> None:
@@ -132,9 +112,7 @@ class Spheres(Solved):
             _refuse_soft(material)
         self.balls = find_balls(scene)
         self.orders = orders
-        super().__init__(
-            scene, hearing, gains=gains, absorption=absorption, frequency_max=frequency_max
-        )
+        super().__init__(scene, hearing, frequency_max=frequency_max)
         _refuse_close(self.balls)
         self._links = list(_links(self.balls))
         highest = 2.0 * math.pi * self.frequency[-1] / hearing.speed_of_sound
@@ -261,184 +239,33 @@ class Spheres(Solved):
     def _solved(self, coupling: Coupling, first: Array) -> Array:
         """Solve ``waves - coupling(waves) = first`` for each column by GCR."""
         residual, waves = first.copy(), np.zeros_like(first)
-        scale = np.maximum(np.sqrt(_product(first, first).real), 1e-300)
+        scale = np.maximum(np.sqrt(inner_product(first, first).real), 1e-300)
         basis: list[tuple[Array, Array]] = []
         for _ in range(MOST_ITERATIONS):
-            if (np.sqrt(_product(residual, residual).real) <= TOLERANCE * scale).all():
+            if (np.sqrt(inner_product(residual, residual).real) <= TOLERANCE * scale).all():
                 return waves
             if len(basis) == (KEPT - 8) // 2:
                 basis.clear()
             step = residual.copy()
             image = step - coupling.apply(step)
             for known, known_image in basis:
-                part = _product(known_image, image)
+                part = inner_product(known_image, image)
                 step -= part * known
                 image -= part * known_image
-            length = np.maximum(np.sqrt(_product(image, image).real), 1e-300)
+            length = np.maximum(np.sqrt(inner_product(image, image).real), 1e-300)
             step /= length
             image /= length
             basis.append((step, image))
-            part = _product(image, residual)
+            part = inner_product(image, residual)
             waves += part * step
             residual -= part * image
-        left = float((np.sqrt(_product(residual, residual).real) / scale).max())
+        left = float((np.sqrt(inner_product(residual, residual).real) / scale).max())
         frequency = coupling.wavenumber.real * self.hearing.speed_of_sound / (2.0 * math.pi)
         raise NumericalError(
             f"the spheres' scattering at {frequency / 1e3:.4g} kHz did not converge: after "
             f"{MOST_ITERATIONS} steps {left:.1e} is left, at most {TOLERANCE:.0e} is allowed; move "
             "the spheres farther apart"
         )
-
-
-@dataclass(frozen=True)
-class Link:
-    """The axis between two spheres.
-
-    Attributes
-    ----------
-    one, two : int
-        Numbers of the spheres; the axis points from the first to the second.
-    length : float, m
-        Between the centres.
-    polar, azimuth : float, rad
-        Of the axis.
-    """
-
-    one: int
-    two: int
-    length: float
-    polar: float
-    azimuth: float
-
-
-class Coupling:
-    """What spheres send to one another at one wavenumber.
-
-    Waves are arrays (K, P): for each sphere the harmonics ``n, m`` at row ``n (n + 1) + m`` of its
-    rows, each relative to its Hankel function on the sphere; P poses.
-
-    Parameters
-    ----------
-    balls : list of Ball
-        The spheres.
-    degrees : list of int
-        Highest degree of each.
-    wavenumber : complex, 1/m
-        Of sound in air.
-    links : list of Link
-        The axes between them.
-    turns : list of list of (2 n + 1, 2 n + 1) float64
-        Wigner's matrices of each link by degree.
-    """
-
-    def __init__(
-        self,
-        balls: list[Ball],
-        degrees: list[int],
-        wavenumber: complex,
-        links: list[Link],
-        turns: list[list[NDArray[np.float64]]],
-    ) -> None:
-        self.balls, self.degrees, self.wavenumber = balls, degrees, wavenumber
-        self.links, self.turns = links, turns
-        ends = np.cumsum([0, *((degree + 1) ** 2 for degree in degrees)])
-        self.rows = [slice(start, end) for start, end in itertools.pairwise(ends.tolist())]
-        self.on_ball = [
-            log_outgoing(degree, np.array([wavenumber * ball.radius]))
-            for ball, degree in zip(balls, degrees, strict=True)
-        ]
-        known: dict[tuple[float, ...], list[Array]] = {}
-        self._moves: list[tuple[list[Array], list[Array]]] = []
-        for link in links:
-            both = []
-            for source, target in ((link.one, link.two), (link.two, link.one)):
-                key = (
-                    *(balls[source].radius, degrees[source]),
-                    *(balls[target].radius, degrees[target], link.length),
-                )
-                if key not in known:
-                    known[key] = self._along(source, target, link.length)
-                both.append(known[key])
-            self._moves.append((both[0], both[1]))
-
-    def emitted(self, emitters: NDArray[np.float64]) -> Array:
-        """Return what the emission alone causes on the spheres (K, P), from (P, 3) m."""
-        waves = np.zeros((self.rows[-1].stop, len(emitters)), dtype=np.complex128)
-        for index, (ball, degree) in enumerate(zip(self.balls, self.degrees, strict=True)):
-            distance, around = _seen(emitters - ball.centre, degree)
-            at_head = log_outgoing(
-                degree, np.asarray(self.wavenumber * distance, dtype=np.complex128)
-            )[0]
-            radial = np.exp(at_head - self.on_ball[index][0])  # (N + 1, P)
-            slope = self.wavenumber * _slopes(self.wavenumber * ball.radius, self.on_ball[index][0])
-            share = -1j * self.wavenumber * 4.0 * math.pi * slope * self._answer(index)
-            radial *= share[:, None]
-            order = 2 * np.arange(degree + 1) + 1
-            waves[self.rows[index]] = around.conj() * np.repeat(radial, order, axis=0)
-        return waves
-
-    def heard(self, index: int, waves: Array, ears: NDArray[np.float64]) -> Array:
-        """Return the pressure (P,) that a sphere scatters, at a place (P, 3) m for each pose."""
-        degree = self.degrees[index]
-        distance, around = _seen(ears - self.balls[index].centre, degree)
-        at_ear = log_outgoing(degree, np.asarray(self.wavenumber * distance, dtype=np.complex128))[
-            0
-        ]
-        ratio = np.exp(at_ear - self.on_ball[index][0])
-        order = 2 * np.arange(degree + 1) + 1
-        around = around * waves[self.rows[index]]
-        around *= np.repeat(ratio, order, axis=0)
-        pressure: Array = around.sum(axis=0)
-        return pressure
-
-    def apply(self, waves: Array) -> Array:
-        """Return what waves (K, P) of each sphere cause on all others."""
-        caused = np.zeros_like(waves)
-        for link, turns, moves in zip(self.links, self.turns, self._moves, strict=True):
-            one, two = self.rows[link.one], self.rows[link.two]
-            forward = _into_axis(waves[one], link.azimuth, turns)
-            back = _into_axis(waves[two], link.azimuth, turns)
-            _mirror(back)
-            moved = _move(moves[0], forward, self.degrees[link.two])
-            caused[two] += _out_of_axis(moved, link.azimuth, turns)
-            moved = _move(moves[1], back, self.degrees[link.one])
-            _mirror(moved)
-            caused[one] += _out_of_axis(moved, link.azimuth, turns)
-        return caused
-
-    def _answer(self, index: int) -> Array:
-        """Return the waves (N,) that a slope of pressure on a sphere causes, m."""
-        slope = self.wavenumber * self.on_ball[index][1][:, 0]
-        answer: Array = -1.0 / slope
-        return answer
-
-    def _along(self, source: int, target: int, length: float) -> list[Array]:
-        """Return the matrices (L - m + 1, N - m + 1) that translate along +z, by order m."""
-        given, wanted = self.degrees[source], self.degrees[target]
-        radius = self.balls[target].radius
-        node, weight = np.polynomial.legendre.leggauss(given + wanted + 8)
-        height, across = length + radius * node, radius * np.sqrt(1.0 - node**2)
-        distance = np.hypot(height, across)
-        log_h, slope = log_outgoing(given, self.wavenumber * distance)
-        ratio = np.exp(log_h - self.on_ball[source][0])  # (N, Q)
-        n = np.arange(given + 1)[:, None]
-        bend = length / (radius * distance)  # of the polar angle, over its sine's ratio
-        own = self.wavenumber * slope * ((radius + length * node) / distance)
-        own = ratio * (own + n * (bend * height / distance))
-        below = ratio * bend
-        here = legendre(wanted, node) * (2.0 * math.pi * weight)
-        there = legendre(given, height / distance)
-        answer = self._answer(target)
-        moves = []
-        for m in range(min(given, wanted) + 1):
-            degree = np.arange(m, given + 1)
-            factor = np.sqrt((2 * degree + 1) / np.maximum(2 * degree - 1, 1) * (degree**2 - m**2))
-            field = own[m:] * there[m, m:]
-            field[1:] -= factor[1:, None] * below[m + 1 :] * there[m, m:-1]
-            real = here[m, m:] @ np.ascontiguousarray(field.real.T)
-            imaginary = here[m, m:] @ np.ascontiguousarray(field.imag.T)
-            moves.append(answer[m:, None] * (real + 1j * imaginary))
-        return moves
 
 
 def find_balls(scene: Scene) -> list[Ball]:
@@ -548,189 +375,3 @@ def _links(balls: list[Ball]) -> Iterator[Link]:
             *(one, two, float(np.linalg.norm(axis))),
             *(math.atan2(across, axis[2]), math.atan2(axis[1], axis[0])),
         )
-
-
-def log_outgoing(degree: int, argument: Array) -> tuple[Array, Array]:
-    """Spherical Hankel functions of the second kind, as logarithms.
-
-    The ratio of neighbours follows by the recurrence upwards, which is stable for them
-    (DLMF 10.51.1); functions of degrees far above the argument do not overflow.
-
-    Parameters
-    ----------
-    degree : int
-        Highest, N.
-    argument : (X,) complex128
-        Not zero.
-
-    Returns
-    -------
-    logarithm : (N + 1, X) complex128
-        Of the function, up to multiples of 2 pi j.
-    slope : (N + 1, X) complex128
-        Derivative over function.
-    """
-    logarithm = np.zeros((degree + 1, len(argument)), dtype=np.complex128)
-    slope = np.zeros_like(logarithm)
-    logarithm[0] = np.log(1j / argument) - 1j * argument
-    slope[0] = -1j - 1.0 / argument
-    ratio = 1.0 / argument + 1j
-    for n in range(1, degree + 1):
-        logarithm[n] = logarithm[n - 1] + np.log(ratio)
-        slope[n] = 1.0 / ratio - (n + 1) / argument
-        ratio = (2 * n + 1) / argument - 1.0 / ratio
-    return logarithm, slope
-
-
-def legendre(degree: int, cosine: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Associated Legendre functions, normalised for spherical harmonics, with (-1)^m in them.
-
-    Parameters
-    ----------
-    degree : int
-        Highest, N.
-    cosine : (X,) float64
-        Of the polar angle.
-
-    Returns
-    -------
-    values : (N + 1, N + 1, X) float64
-        By order m, then by degree n; zero where n < m. Times exp(j m phi) they are orthonormal.
-    """
-    values = np.zeros((degree + 1, degree + 1, len(cosine)))
-    sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
-    values[0, 0] = math.sqrt(0.25 / math.pi)
-    for m in range(1, degree + 1):
-        values[m, m] = -math.sqrt((2 * m + 1) / (2 * m)) * sine * values[m - 1, m - 1]
-    for n in range(1, degree + 1):
-        below = np.arange(n)[:, None]
-        values[:n, n] = np.sqrt((4 * n**2 - 1) / (n**2 - below**2)) * cosine * values[:n, n - 1]
-        if n > 1:
-            below = below[: n - 1]
-            before = (2 * n + 1) / (2 * n - 3) * ((n - 1) ** 2 - below**2) / (n**2 - below**2)
-            values[: n - 1, n] -= np.sqrt(before) * values[: n - 1, n - 2]
-    return values
-
-
-def harmonics(degree: int, directions: NDArray[np.float64]) -> Array:
-    """Orthonormal spherical harmonics.
-
-    Parameters
-    ----------
-    degree : int
-        Highest, N.
-    directions : (X, 3) float64
-        Unit vectors.
-
-    Returns
-    -------
-    values : ((N + 1)^2, X) complex128
-        At row n (n + 1) + m.
-    """
-    table = legendre(degree, np.clip(directions[:, 2], -1.0, 1.0))
-    azimuth = np.arctan2(directions[:, 1], directions[:, 0])
-    turn = np.exp(1j * np.arange(degree + 1)[:, None] * azimuth)
-    values = np.zeros(((degree + 1) ** 2, len(directions)), dtype=np.complex128)
-    for n in range(degree + 1):
-        right = table[: n + 1, n] * turn[: n + 1]
-        middle = n * (n + 1)
-        values[middle : middle + n + 1] = right
-        sign = np.where(np.arange(1, n + 1) % 2, -1.0, 1.0)[:, None]
-        values[middle - n : middle] = (sign * right[1:].conj())[::-1]
-    return values
-
-
-def wigner(degree: int, angles: list[float]) -> list[NDArray[np.float64]]:
-    """Matrices of one degree n that turn spherical harmonics about y.
-
-    Parameters
-    ----------
-    degree : int
-        n.
-    angles : list of float, rad
-        Of the turns.
-
-    Returns
-    -------
-    matrices : list of (2 n + 1, 2 n + 1) float64
-        Of exp(-j angle J_y), orders ascending.
-    """
-    m = np.arange(-degree, degree + 1)
-    off = 0.5 * np.sqrt(degree * (degree + 1) - m[:-1] * (m[:-1] + 1.0))
-    values, vectors = eigh_tridiagonal(np.zeros(len(m)), off)
-    # J_y is J_x, which is real, turned by a quarter about z.
-    turned = (1j ** (-(m % 4)))[:, None] * vectors
-    values = np.round(values)
-    return [
-        np.ascontiguousarray(((turned * np.exp(-1j * angle * values)) @ turned.conj().T).real)
-        for angle in angles
-    ]
-
-
-def _slopes(size: complex, log_h: Array) -> Array:
-    """Return derivatives of Bessel functions times Hankel functions (N + 1,) at one argument."""
-    n = np.arange(len(log_h))
-    product: Array = 1j * n / ((2 * n + 1) * size**2)  # their limit far above the argument
-    plain = log_h[:, 0].real < 600.0
-    product[plain] = spherical_jn(n[plain], size, derivative=True) * np.exp(log_h[plain, 0])
-    return product
-
-
-def _seen(away: NDArray[np.float64], degree: int) -> tuple[NDArray[np.float64], Array]:
-    """Distance (P,) of places from a centre, and the harmonics ((N + 1)^2, P) towards them."""
-    distance = np.linalg.norm(away, axis=1)
-    return distance, harmonics(degree, away / distance[:, None])
-
-
-def _orders(degree: int) -> NDArray[np.int64]:
-    """Order m of each row of waves."""
-    return np.concatenate([np.arange(-n, n + 1) for n in range(degree + 1)])
-
-
-def _degree(waves: Array) -> int:
-    return math.isqrt(len(waves)) - 1
-
-
-def _into_axis(waves: Array, azimuth: float, turns: list[NDArray[np.float64]]) -> Array:
-    """Turn waves into the frame whose z is the axis."""
-    turned = np.exp(1j * azimuth * _orders(_degree(waves)))[:, None] * waves
-    return _turned(turned, turns, back=False)
-
-
-def _out_of_axis(waves: Array, azimuth: float, turns: list[NDArray[np.float64]]) -> Array:
-    turned = _turned(waves, turns, back=True)
-    turned *= np.exp(-1j * azimuth * _orders(_degree(waves)))[:, None]
-    return turned
-
-
-def _turned(waves: Array, turns: list[NDArray[np.float64]], *, back: bool) -> Array:
-    turned = np.zeros_like(waves)
-    for n in range(_degree(waves) + 1):
-        rows = slice(n**2, (n + 1) ** 2)
-        matrix = turns[n] if back else turns[n].T
-        # Real and imaginary parts side by side: the matrix is real.
-        np.matmul(matrix, waves[rows].view(np.float64), out=turned[rows].view(np.float64))
-    return turned
-
-
-def _mirror(waves: Array) -> None:
-    """Turn z round, up to the sign of the order, which translations along z leave alone."""
-    for n in range(1, _degree(waves) + 1, 2):
-        waves[n**2 : (n + 1) ** 2] *= -1.0
-
-
-def _move(moves: list[Array], waves: Array, wanted: int) -> Array:
-    """Translate waves of one sphere along the axis to those that they cause on another."""
-    given = _degree(waves)
-    moved = np.zeros(((wanted + 1) ** 2, waves.shape[1]), dtype=np.complex128)
-    for m, matrix in enumerate(moves):
-        source, target = np.arange(m, given + 1), np.arange(m, wanted + 1)
-        for order in {m, -m}:
-            moved[target * (target + 1) + order] = matrix @ waves[source * (source + 1) + order]
-    return moved
-
-
-def _product(one: Array, two: Array) -> Array:
-    """Scalar product (P,) of the columns of two arrays (K, P)."""
-    product: Array = np.einsum("kp,kp->p", one.conj(), two)
-    return product

@@ -12,11 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sononerf.echoes.store import EnsembleStore
-from sononerf.head.reception import effective_window
-from sononerf.scene.scene import Scene
-from sononerf.settings.schema import NoiseSettings, Settings
-from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine.optics import Optics
 
 KEPT_BYTES = 400_000_000
 """Spectrograms that stay in memory."""
@@ -78,23 +73,6 @@ class Echoes:
             order = np.random.default_rng([seed, place // count]).permutation(count)
             wanted.append(self.training[order[place % count]])
         return np.array(wanted, dtype=np.int64)
-
-
-def optics_of(settings: Settings, scene: Scene) -> Optics:
-    """Return the optics that settings describe: air, ears, call and analysis.
-
-    Parameters
-    ----------
-    settings : Settings
-        Of the ensemble.
-    scene : Scene
-        Any; it is not part of the optics.
-    """
-    simulation = settings.simulation.model_copy(update={"engine": "rays"})
-    changed = {"simulation": simulation, "noise": NoiseSettings()}
-    simulator = Simulator.from_settings(scene, settings.model_copy(update=changed))
-    window = effective_window(settings.call, settings.spectrogram)
-    return Optics(simulator.engine.hearing, simulator.reception, window)
 
 
 def on_rows(wholes: list[Tensor], row: Tensor, like: Tensor) -> Tensor:

@@ -18,8 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from sononerf.head.reception import Reception
-from sononerf.head.row_filters import row_filters
+from sononerf.head.head import Head
 from sononerf.simulation.impulse_response import between
 
 FINE = 5.0
@@ -32,8 +31,8 @@ class FilterBank:
 
     Parameters
     ----------
-    reception : Reception
-        Call and analysis.
+    head : Head
+        Its call and analysis.
     nodes : (N,) float64, Hz
         Of the synthesis: odd multiples of half their spacing.
     soft : float, Hz
@@ -49,11 +48,9 @@ class FilterBank:
         Of the nodes.
     """
 
-    def __init__(self, reception: Reception, nodes: NDArray[np.float64], soft: float) -> None:
-        self.reception, self.analysis, self.nodes, self.soft = (
-            reception, reception.analysis, nodes, soft,
-        )  # fmt: skip
-        self.filters = row_filters(self.analysis)
+    def __init__(self, head: Head, nodes: NDArray[np.float64], soft: float) -> None:
+        self.head, self.analysis, self.nodes, self.soft = head, head.analysis, nodes, soft
+        self.filters = head.row_filters
         rate = self.analysis.sampling_rate
         self._band = self.filters.band
         self.spacing = 2.0 * float(nodes[0])
@@ -129,11 +126,11 @@ class FilterBank:
                 for row, envelope in zip(filters.frequency, filters.envelope, strict=True)
             ]
         )
-        call = self.reception.waveform
+        call = self.head.waveform
         rows = rows * (
             np.exp(-2j * np.pi / rate * np.outer(frequency, np.arange(len(call)))) @ call
         )
-        rows = rows * np.exp(2j * np.pi * np.outer(self.reception.delay, frequency))
+        rows = rows * np.exp(2j * np.pi * np.outer(self.head.delay, frequency))
         rows = rows / analysis.hop
         made = [torch.as_tensor(part.astype(np.complex64)) for part in (basis, rows)]
         return made[0].to(like.device), made[1].to(like.device)

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sononerf.scene.scene import Scene
+from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.rays import Rays
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.echo_data import Echoes
@@ -62,16 +63,13 @@ class Tracer:
     """
 
     def __init__(self, optics: Optics, mesh: trimesh.Trimesh, *, rays: int, seed: int) -> None:
-        self._engine = Rays(
-            quiet_scene(mesh),
-            optics.hearing,
+        wanted = SimulationSettings(
+            engine="rays",
             rays=rays,
             bounces=BOUNCES,
             diffraction_points=max(rays // 30, 1),  # as many as the simulator's defaults have
         )
-        self._simulator = Simulator(
-            self._engine, ears=optics.hearing.ears, reception=optics.reception
-        )
+        self._simulator = Simulator.of(quiet_scene(mesh), optics.head, wanted)
         self._optics, self._seed = optics, seed
 
     def spectrogram(
@@ -83,7 +81,9 @@ class Tracer:
     def later(self, position: NDArray[np.float64], rotation: NDArray[np.float64]) -> Later:
         """Return what a pose hears after the first bounce."""
         found = _Collected(self._optics)
-        self._engine.later(found, position, rotation, seed=self._seed)
+        engine = self._simulator.engine
+        assert isinstance(engine, Rays)
+        engine.later(found, position, rotation, seed=self._seed)
         return found.whole()
 
 

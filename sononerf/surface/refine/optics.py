@@ -20,17 +20,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from sononerf.head.reception import Reception
-from sononerf.head.row_filters import row_filters
-from sononerf.head.spectrogram import frequency_axis, range_axis
-from sononerf.simulation.hearing import Hearing
+from sononerf.head.head import Head
+from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.surface.refine.filter_bank import FilterBank, fast_length
 from sononerf.surface.refine.mesh_operators import tangents
 
@@ -82,51 +78,48 @@ class Pieces:
 
 
 class Optics(nn.Module):
-    """Physical optics of one head, call and analysis; constant tensors move with the module.
+    """Physical optics of one head; constant tensors move with the module.
 
     Parameters
     ----------
-    hearing : Hearing
-        Head and air, as the simulator has them.
-    reception : Reception
-        Call and analysis.
-    window : (F, W) float
-        How a point echo looks in each row, :func:`sononerf.head.reception.effective_window`.
+    head : Head
+        What hears; its noise is left out.
+    hearing : Hearing or None
+        Gains at the nodes of a synthesis; those of the simulator where None.
 
     Attributes
     ----------
+    head : Head
+        Without noise.
     wavelength : float, m
         The shortest of the analysed band.
-    resolution : float, m
-        In range: half of the analysis window's length, of a gammatone's that of a Hamming window
-        which is as wide as its rows are on the mean.
     rows, ears : int
         Range slices of a spectrogram, R, and ears, E.
     kept_nodes : (N,) int64
         Which of the synthesis' nodes matter for the band.
     """
 
-    def __init__(self, hearing: Hearing, reception: Reception, window: NDArray[Any]) -> None:
+    def __init__(self, head: Head, hearing: Hearing | None = None) -> None:
         super().__init__()
-        analysis = reception.analysis
-        self.hearing, self.reception, self.analysis = hearing, reception, analysis
-        self.speed_of_sound = hearing.speed_of_sound
+        self.head = head.without_noise()
+        hearing, analysis = hearing or hearing_of(self.head), head.analysis
+        self.analysis = analysis
+        self.speed_of_sound = head.speed_of_sound
         rate = analysis.sampling_rate
-        rows = frequency_axis(analysis)
+        rows = head.frequency
         self.frequencies = rows
-        self.ears = len(hearing.ears.positions)
-        axis = range_axis(analysis, self.speed_of_sound)
+        self.ears = len(head.receivers)
+        axis = head.range
         self.rows = len(axis)
-        filters = row_filters(analysis)
+        filters = head.row_filters
         start = axis[0] * 2.0 * rate / self.speed_of_sound - filters.centre
         self._first = round(start / analysis.hop)
-        self.wavelength = self.speed_of_sound / float(rows[-1])
-        self.resolution = self.speed_of_sound * filters.length / rate / 2.0
+        self.wavelength = head.wavelength
         self._reads = filters.envelope.shape[1]
         self._soft = FADE_FREQUENCY * float(rows[-1])
-        self.bank = FilterBank(reception, hearing.synthesis.nodes, self._soft)
+        self.bank = FilterBank(head, hearing.synthesis.nodes, self._soft)
         self.kept_nodes = self.bank.kept_nodes
-        ring = rate / self.bank.spacing + max(0, window.shape[1] - self._reads) / 2.0
+        ring = rate / self.bank.spacing + max(0, head.window.shape[1] - self._reads) / 2.0
         self._pad = math.ceil(ring)
         nodes = hearing.synthesis.nodes[self.kept_nodes]
         turn = 2.0 * math.pi / self.speed_of_sound

@@ -114,7 +114,7 @@ class Refinement:
         self.echoes, self.optics, self.seed, self.stages = echoes, optics, seed, stages
         like = optics.get_buffer("wavenumber")
         self.level = Level(optics.ears, len(optics.frequencies), like)
-        self.onsets = None if hull is None else OnsetRanges(hull, optics.resolution, seed)
+        self.onsets = None if hull is None else OnsetRanges(hull, optics.head.resolution, seed)
         self.starts = {name: _plain(mesh) for name, mesh in meshes.items()}
         self.candidates: list[trimesh.Trimesh] = []
         self.objectives: list[float] = []

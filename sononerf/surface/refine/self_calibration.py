@@ -227,7 +227,7 @@ class Calibrator:
             self.shared.append(_Column("layer", unit_length))
             self.shared.append(_Column("scale", unit_length / float(mesh.scale)))
         # How far poses may be off, one standard deviation; learned from what is found.
-        self.spread = {"position": optics.resolution / 2.0, "aim": 5.0 * TURN}
+        self.spread = {"position": optics.head.resolution / 2.0, "aim": 5.0 * TURN}
         self.weight = np.ones((optics.ears, 1, len(optics.frequencies)))
         self.error_db: list[float] = []
         self.deviation: dict[str, float] = {}
@@ -328,7 +328,7 @@ class Calibrator:
         )
 
     def _move(self, number: int, step: Array) -> None:
-        limits = {"position": 0.5 * self.optics.resolution, "aim": 5.0 * TURN}
+        limits = {"position": 0.5 * self.optics.head.resolution, "aim": 5.0 * TURN}
         turn = np.zeros(3)
         for column, value in zip(self.local, step, strict=True):
             bounded = float(np.clip(value, -limits[column.name], limits[column.name]))

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 import logging
 import pickle
-from functools import partial
 
 import numpy as np
 import pytest
@@ -12,15 +11,15 @@ from scipy.special import eval_legendre, spherical_jn, spherical_yn
 from sononerf.errors import InputError, ResourceError
 from sononerf.geometry.poses import look_at
 from sononerf.head.ears import Ears
+from sononerf.run.build import simulator_of
 from sononerf.scene.material import MATERIALS, RIGID
 from sononerf.scene.scene import Scene
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 from sononerf.simulation.reference import boundary
 from sononerf.simulation.reference.boundary import Boundary, excitation, radiated
 from sononerf.simulation.reference.boundary_mesh import halved
 from sononerf.simulation.reference.boundary_operators import Operators
 from sononerf.simulation.reference.boundary_panels import Panels
-from sononerf.simulation.simulator import Simulator
 from sononerf.simulation.solved import Heads
 from tests.simulation.exact import SPEED, disc_on_axis, rigid_sphere
 from tests.simulation.listening import ball, box, echoes, hearing, level_db, spectrum, wall
@@ -44,7 +43,7 @@ def gains(frequency, ears=1):
 def engine(mesh, head=None, material=RIGID, **options):
     scene = mesh if isinstance(mesh, Scene) else Scene(mesh, material)
     options = {"frequency_max": 30e3, **options}
-    return Boundary(scene, head or hearing(), gains=gains, absorption=np.zeros_like, **options)
+    return Boundary(scene, head or hearing(), **options)
 
 
 def operators(mesh):
@@ -165,8 +164,6 @@ def test_the_engine_hears_a_sphere_as_the_series_does():
     one = Boundary(
         Scene(round_ball(4), RIGID),
         head,
-        gains=partial(gains, ears=2),
-        absorption=np.zeros_like,
         frequency_max=20e3,
     )
     position = np.array([0.3, 0.0, 0.0])
@@ -219,7 +216,7 @@ def test_settings_choose_the_engine():
     settings = validate_settings(
         {"scene": {"name": "sphere"}, "simulation": {"engine": "bem", "frequency_max": 8e3}}, "here"
     )
-    one = Simulator.from_settings(Scene(ball(RADIUS, subdivisions=2), RIGID), settings)
+    one = simulator_of(Scene(ball(RADIUS, subdivisions=2), RIGID), settings)
     assert isinstance(one.engine, Boundary)
     assert one.engine.frequency_max == 8e3
 
@@ -236,7 +233,7 @@ def test_three_spheres_sound_as_by_partial_waves():
             "simulation": {"engine": name, "frequency_max": 48e3},
             "spectrogram": {"frequency_max": 40e3, "range_max": 0.6},
         }
-        simulator = Simulator.from_settings(scene, validate_settings(data, "here"))
+        simulator = simulator_of(scene, validate_settings(data, "here"))
         positions = 0.35 * np.array([[1.0, 0.0, 0.0], [0.0, 0.8, 0.6], [-0.6, 0.0, -0.8]])
         rotations = np.stack([look_at(position, np.zeros(3)) for position in positions])
         simulator.engine.prepare(positions, rotations)
@@ -246,7 +243,7 @@ def test_three_spheres_sound_as_by_partial_waves():
         levels.append(level_db(np.maximum(np.stack(heard), 1e-12)))  # silence before echoes
     exact, found = levels
     cells = exact > exact.max(axis=(1, 2, 3), keepdims=True) - 30.0
-    cells &= simulator.frequency >= 10e3
+    cells &= simulator.head.frequency >= 10e3
     assert np.abs(found - exact)[cells].mean() < 0.25
 
 

@@ -18,6 +18,7 @@ from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.impulse_response import plan_synthesis
 from sononerf.simulation.reference.kirchhoff import Kirchhoff
 from tests.simulation.exact import SPEED, disc_on_axis, image_source, rigid_sphere
+from tests.simulation.listening import TableHead
 
 ANALYSIS = SpectrogramSettings()
 SYNTHESIS = plan_synthesis(ANALYSIS, echo_samples(ANALYSIS, SPEED))
@@ -39,7 +40,7 @@ def hearing(emitter=(0.0, 0.0, 0.0), ears=((0.0, 0.0, 0.0),), head=None):
             np.array(emitter, dtype=float),
             np.array(ears, dtype=float),
         )
-    return Hearing(head, SYNTHESIS, np.zeros(len(NODES)), SPEED)
+    return Hearing(TableHead(head), SYNTHESIS)
 
 
 def kirchhoff(mesh, head=None, material=None, **options):

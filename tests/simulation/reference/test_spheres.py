@@ -5,12 +5,13 @@ import trimesh
 from scipy.special import sph_harm_y, spherical_jn, spherical_yn
 
 from sononerf.errors import InputError, NumericalError
+from sononerf.run.build import simulator_of
 from sononerf.scene.material import MATERIALS, RIGID
 from sononerf.scene.scene import Scene
-from sononerf.settings.schema import validate_settings
+from sononerf.settings.loading import validate_settings
 from sononerf.simulation.reference import spheres as spheres_module
-from sononerf.simulation.reference.spheres import find_balls, harmonics, log_outgoing, wigner
-from sononerf.simulation.simulator import Simulator
+from sononerf.simulation.reference.partial_waves import harmonics, log_outgoing, wigner
+from sononerf.simulation.reference.spheres import find_balls
 from sononerf.simulation.solved import Heads
 from tests.simulation.exact import SPEED, rigid_sphere
 from tests.simulation.listening import ball, level_db
@@ -42,7 +43,7 @@ def spheres(*bodies, frequency_max=100e3):
     sections = {"scene": {"name": "t"}, "simulation": wanted, "ears": POINT_HEAD}
     analysis = {"frequency_max": 80e3}
     settings = validate_settings({**sections, "spectrogram": analysis}, "test")
-    return Simulator.from_settings(Scene(mesh), settings).engine
+    return simulator_of(Scene(mesh), settings).engine
 
 
 def heard(engine, frequency, emitter, ear):
@@ -186,7 +187,7 @@ def test_what_does_not_converge_is_refused_by_its_frequency(monkeypatch):
 def scene_engine(mesh, material=RIGID, **simulation):
     wanted = {"engine": "spheres", **simulation}
     settings = validate_settings({"scene": {"name": "t"}, "simulation": wanted}, "test")
-    return Simulator.from_settings(Scene(mesh, material), settings).engine
+    return simulator_of(Scene(mesh, material), settings).engine
 
 
 def box():

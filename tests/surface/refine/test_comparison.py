@@ -40,7 +40,7 @@ def test_the_farther_from_the_truth_the_worse(echoes, optics, level):
 
 
 def test_onsets_count_beside_the_echoes(echoes, optics, level):
-    onsets = OnsetRanges(heard(ball(0.02)), optics.resolution, seed=0)
+    onsets = OnsetRanges(heard(ball(0.02)), optics.head.resolution, seed=0)
     mesh = ball(RADIUS)
     without = Comparison(echoes, optics, None, seed=0).objective(mesh, level, smooth=True)
     beside = Comparison(echoes, optics, onsets, seed=0).objective(mesh, level, smooth=True)

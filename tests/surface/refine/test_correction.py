@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from sononerf.simulation.simulator import Simulator
+from sononerf.run.build import simulator_of
 from sononerf.surface.refine.correction import Correction
 from sononerf.surface.refine.descent import Descent
 from sononerf.surface.refine.later_bounces import quiet_scene
@@ -35,7 +35,7 @@ def sphere(ball):
 
 @pytest.fixture(scope="module")
 def simulator(settings, sphere):
-    return Simulator.from_settings(quiet_scene(sphere), settings)
+    return simulator_of(quiet_scene(sphere), settings)
 
 
 @pytest.fixture

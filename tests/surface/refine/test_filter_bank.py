@@ -7,9 +7,9 @@ import torch
 from scipy.fft import next_fast_len
 
 from sononerf.head.call import emit
-from sononerf.head.reception import Reception
+from sononerf.head.head import Head
 from sononerf.head.spectrogram import range_axis, spectrogram
-from sononerf.settings.schema import CallSettings, NoiseSettings, SpectrogramSettings
+from sononerf.settings.schema import CallSettings, SpectrogramSettings
 from sononerf.surface.refine.filter_bank import FilterBank, fast_length
 
 NODES = (np.arange(19) + 0.5) * 8e3
@@ -19,7 +19,7 @@ SOFT = 25e3
 def bank_of(kind, harmonics=(1.0,), analysis_kind="stft", **changes):
     analysis = SpectrogramSettings(range_min=0.2, range_max=0.5, kind=analysis_kind, **changes)
     call = CallSettings(kind=kind, harmonics=harmonics, frequency_end=40e3 / len(harmonics))
-    reception = Reception(call, analysis, NoiseSettings(), speed_of_sound=343.0)
+    reception = Head(call=call, analysis=analysis)
     return FilterBank(reception, NODES, SOFT), reception
 
 

@@ -31,10 +31,10 @@ def test_later_bounces_are_as_loud_as_the_simulator_makes_them(optics, ball):
     tracer = Tracer(optics, pair, rays=20_000, seed=0)
     at, turn = np.array([0.3, 0.0, 0.0]), np.diag([-1.0, -1.0, 1.0])
     engine = tracer._simulator.engine
-    sound = optics.hearing.silence()
+    sound = engine.hearing.silence()
     engine.later(sound, at, turn, seed=0)
-    echo = optics.hearing.echo(sound, engine._basis)
-    wanted = optics.reception.receive(echo, seed=0)[1]
+    echo = engine.hearing.echo(sound, engine._basis)
+    wanted = optics.head.receive(echo, seed=0)[1]
     later = tracer.later(at, turn)
     like = Heard(torch.zeros(1, 2, 512, len(optics.frequencies)), torch.tensor([0]))
     power = optics.later_power(

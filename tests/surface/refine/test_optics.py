@@ -7,9 +7,10 @@ import torch
 import trimesh
 
 from sononerf.geometry.raycast import Occlusion
-from sononerf.scene.scene import Scene
-from sononerf.surface.refine.echo_data import optics_of
+from sononerf.run.build import head_of
+from sononerf.simulation.hearing import hearing_of
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
+from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.visibility import listen
 from tests.surface.conftest import RADIUS, given
 
@@ -47,7 +48,7 @@ def whole(optics, heard, like):
 )
 def test_a_sphere_sounds_as_the_simulator_says(call, front, ball, poses, simulated):
     settings = given(call=call, spectrogram={"range_min": 0.2, "range_max": 0.4, "kind": front})
-    optics = optics_of(settings, Scene(ball))
+    optics = Optics(head_of(settings))
     fine = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     wanted = simulated(fine, settings, poses)
     pieces, heads, points, area = hear(optics, fine, poses)
@@ -103,7 +104,7 @@ def test_a_plate_seen_straight_on_is_at_its_mirror_point_and_one_on_edge_is_not(
 
 
 def test_gains_are_those_of_the_tables(optics):
-    ears = optics.hearing.ears
+    ears = hearing_of(optics.head).ears
     row, column = 40, 100
     level = np.cos(ears.elevation[row])
     way = [

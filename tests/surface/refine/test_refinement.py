@@ -9,7 +9,9 @@ import torch
 import trimesh
 
 from sononerf.errors import InputError
-from sononerf.simulation.simulator import Simulator
+from sononerf.head.head import Head
+from sononerf.run.build import simulator_of
+from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.surface.refine import comparison
 from sononerf.surface.refine import refinement as module
 from sononerf.surface.refine.descent import Descent
@@ -127,7 +129,7 @@ def simulated_stage(settings):
 
     def simulate(mesh):
         changed = settings.model_copy(update={"simulation": few})
-        return Simulator.from_settings(quiet_scene(mesh), changed)
+        return simulator_of(quiet_scene(mesh), changed)
 
     last = dataclasses.replace(SHORT[1], beyond="simulate")
     return {"simulate": simulate, "stages": (SHORT[0], last)}
@@ -164,7 +166,7 @@ def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
     bumpy, echoes, optics, settings
 ):
     factor = 3.0
-    old = optics.hearing
+    old = hearing_of(optics.head)
     analysis = settings.spectrogram
     slow = analysis.model_copy(
         update={
@@ -175,21 +177,28 @@ def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
             "range_max": analysis.range_max * factor,
         }
     )
-    none = np.zeros_like(old.absorption)
+
+    class Scaled(Head):
+        """The same head, larger by a factor, in air that absorbs nothing."""
+
+        scale = 1.0
+
+        def tables(self, frequency):
+            return dataclasses.replace(
+                old.ears,
+                frequency=old.ears.frequency / self.scale,
+                emitter=old.ears.emitter * self.scale,
+                positions=old.ears.positions * self.scale,
+            )
+
+        def absorption(self, frequency):
+            return np.zeros(len(frequency))
 
     def optics_at(scale, spectrogram):
-        ears = dataclasses.replace(
-            old.ears,
-            frequency=old.ears.frequency / scale,
-            emitter=old.ears.emitter * scale,
-            positions=old.ears.positions * scale,
-        )
+        head = Scaled(ears=settings.ears, analysis=spectrogram)
+        head.__dict__.update(scale=scale, window=np.zeros((1, analysis.window)))
         synthesis = dataclasses.replace(old.synthesis, nodes=old.synthesis.nodes / scale)
-        hearing = dataclasses.replace(old, ears=ears, synthesis=synthesis, absorption=none)
-        reception = type(optics.reception)(
-            settings.call, spectrogram, settings.noise, speed_of_sound=old.speed_of_sound
-        )
-        return Optics(hearing, reception, np.zeros((1, analysis.window)))
+        return Optics(head, Hearing(head, synthesis))
 
     def moved(scale, spectrogram):
         world = Echoes(

@@ -14,31 +14,24 @@ from numpy.typing import NDArray
 from sononerf.echoes.detection import RANK
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import Poses
-from sononerf.head.air import speed_in
 from sononerf.head.call import call_content, call_waveform
-from sononerf.head.ears import Ears, ear_tables
-from sononerf.head.reception import Reception, warn_of_band
-from sononerf.head.spectrogram import echo_samples, frequency_axis
+from sononerf.head.head import Head
+from sononerf.head.reception import warn_of_band
+from sononerf.head.spectrogram import echo_samples
 from sononerf.recordings.airsas import read_airsas
 from sononerf.recordings.arrays import read_numpy
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.folder import read_folder
 from sononerf.recordings.import_calibration import calibrated
-from sononerf.recordings.import_ranges import reception_of, with_ranges
+from sononerf.recordings.import_ranges import found_ranges
 from sononerf.recordings.pings import Cutter, check_numbers, clipped_pings, mix
 from sononerf.recordings.recording import Recording
 from sononerf.recordings.sonotrace import read_sononerf_matlab, read_sonotracelab
 from sononerf.recordings.splits import assign_split
+from sononerf.run.build import head_of
 from sononerf.settings.import_schema import ImportSettings, read_import_settings
-from sononerf.settings.schema import (
-    FILE_SECTIONS,
-    HEAD_SECTIONS,
-    CallSettings,
-    Settings,
-    apply_override,
-    read_yaml,
-    validate_settings,
-)
+from sononerf.settings.loading import apply_override, read_yaml, validate_settings
+from sononerf.settings.schema import FILE_SECTIONS, HEAD_SECTIONS, CallSettings, Settings
 
 Array = NDArray[np.float64]
 
@@ -68,8 +61,8 @@ class Understood:
         How it was read.
     cutter : Cutter
         Cuts and calibrates pings.
-    ears : Ears
-        Places of emitter and receivers.
+    head : Head
+        Of these settings.
     pings : (P,) int
         Which of the recording's pings are kept.
     poses : Poses
@@ -91,7 +84,7 @@ class Understood:
     settings: Settings
     wanted: ImportSettings
     cutter: Cutter
-    ears: Ears
+    head: Head
     pings: NDArray[np.int64]
     poses: Poses
     split: NDArray[np.int8]
@@ -99,16 +92,6 @@ class Understood:
     level_db: float
     calibration: dict[str, Any]
     notes: tuple[str, ...]
-
-    @property
-    def reception(self) -> Reception:
-        """Call and analysis."""
-        return reception_of(self.settings)
-
-    @property
-    def speed_of_sound(self) -> float:
-        """Of the air, m/s."""
-        return speed_in(self.settings.air)
 
 
 def understand(
@@ -153,9 +136,8 @@ def understand(
     wanted = read_import_settings(data.pop("import", None) or {}, where)
     recording = READERS[form](source, wanted)
     settings = _complete(data, recording, wanted, output, where)
-    ears = ear_tables(settings.ears, frequency_axis(settings.spectrogram))
-    places = settings.ears.receivers
-    receivers = len(ears.positions) if places is None else len(places)
+    head = head_of(settings)
+    receivers = len(head.receivers)
     heard = len(mix(np.zeros((recording.read(0).shape[0], 1)), wanted.channels))
     if heard != receivers:
         raise InputError(
@@ -166,16 +148,20 @@ def understand(
     poses = to_poses(recording.columns, wanted)
     if len(poses) != len(recording):
         raise InputError(f"{recording.path}: {len(recording)} pings and {len(poses)} poses")
-    cutter, calibration = calibrated(recording, wanted, settings, ears, folder)
+    cutter, calibration = calibrated(recording, wanted, head, folder)
     if wanted.compress:
         warn_of_band(settings.call, settings.spectrogram)
         cutter = replace(cutter, call=call_waveform(settings.call, recording.sampling_rate))
         calibration["compressed"] = call_content(settings.call)
         settings = settings.model_copy(update={"call": CallSettings()})
     check_numbers(recording, cutter, 0)
-    settings, power = with_ranges(settings, cutter, recording, data)
-    check_numbers(recording, cutter, reception_of(settings).samples)
-    kept, clipped = _without_clipped(recording, cutter, settings, wanted)
+    limits, power = found_ranges(head_of(settings), cutter, recording, data.get("spectrogram", {}))
+    plain = settings.plain()
+    plain["spectrogram"] |= limits
+    settings = validate_settings(plain, settings.source or "import")
+    head = head_of(settings)
+    check_numbers(recording, cutter, head.samples)
+    kept, clipped = _without_clipped(recording, cutter, head, wanted)
     split = assign_split(
         poses[kept],
         recording.columns.take(kept).split(),
@@ -192,7 +178,7 @@ def understand(
         settings=settings,
         wanted=wanted,
         cutter=cutter,
-        ears=ears,
+        head=head,
         pings=kept,
         poses=poses,
         split=split,
@@ -266,12 +252,12 @@ def _mixed(known: dict[str, Any], wanted: ImportSettings) -> dict[str, Any]:
 
 
 def _without_clipped(
-    recording: Recording, cutter: Cutter, settings: Settings, wanted: ImportSettings
+    recording: Recording, cutter: Cutter, head: Head, wanted: ImportSettings
 ) -> tuple[NDArray[np.int64], int]:
     """Return the pings to keep, and how many are clipped where their echoes are."""
     if not wanted.reject_clipped:
         return np.arange(len(recording)), 0
-    analysis, speed = settings.spectrogram, speed_in(settings.air)
+    analysis, speed = head.analysis, head.speed_of_sound
     first = int(analysis.range_min * 2.0 / speed * analysis.sampling_rate - analysis.window / 2.0)
     last = echo_samples(analysis, speed)
     found = [cutter.clipped(index, max(first, 0), last) for index in range(len(recording))]

@@ -9,11 +9,12 @@ import pytest
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
 from sononerf.head.call import call_waveform
-from sononerf.recordings.understand import understand
 from sononerf.recordings.writer import wav_bytes
 from sononerf.run.import_recordings import echo_hash, import_understood, spectrogram_of
 from sononerf.run.store_settings import with_store
-from sononerf.settings.schema import CallSettings, validate_settings
+from sononerf.run.understand import understand
+from sononerf.settings.loading import validate_settings
+from sononerf.settings.schema import CallSettings
 from tests.recordings.recorded import CALL, EARS, RATE, SETTINGS, arrays, waveforms
 
 
@@ -43,7 +44,7 @@ def test_the_rate_and_the_band_come_from_recording_and_call(recorded):
         80e3,
     )
     assert (analysis.window, analysis.hop, analysis.fft) == (16, 1, 128)
-    assert found.speed_of_sound == 343.0
+    assert found.head.speed_of_sound == 343.0
 
 
 @pytest.mark.parametrize(
@@ -54,14 +55,14 @@ def test_another_band_runs_with_no_setting_but_the_band(recorded, rate, low, hig
     given = (f"spectrogram.frequency_min={low}", f"spectrogram.frequency_max={high}")
     found = recorded(*given, settings=SETTINGS[:1], sampling_rate=rate)
     assert found.settings.spectrogram.window == window
-    assert found.reception.samples <= 1600
+    assert found.head.samples <= 1600
 
 
 def test_settings_lie_beside_the_recordings(recorded, tmp_path):
     (tmp_path / "import.yaml").write_text("import: {heldout: 7}\nair: {temperature_c: 20}\n")
     found = recorded()
     assert np.bincount(found.split).tolist() == [16, 1, 7]
-    assert found.speed_of_sound == pytest.approx(343.2)
+    assert found.head.speed_of_sound == pytest.approx(343.2)
     (tmp_path / "other.yaml").write_text("import: {heldout: 5}\n")
     found = recorded("import.validation=2", settings_file=tmp_path / "other.yaml")
     assert np.bincount(found.split).tolist() == [17, 2, 5]

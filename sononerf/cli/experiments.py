@@ -1,0 +1,318 @@
+# SPDX-License-Identifier: MIT
+"""Commands of an experiment: simulate, fit, predict, reconstruct, evaluate, compare, report."""
+
+from __future__ import annotations
+
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sononerf.cli.options import (
+    Accelerator,
+    Config,
+    Json,
+    OnWhat,
+    Overrides,
+    Registration,
+    Run,
+    Split,
+    SurfaceMethod,
+    app,
+    optional,
+    print_json,
+    say,
+)
+from sononerf.errors import SettingsError
+
+
+@app.command()
+def simulate(
+    config: Config,
+    overrides: Overrides = None,
+    output: Annotated[
+        Path | None, typer.Option(help="The store; data/<scene>-<hash> by default.")
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, help="Processes; as many as cores by default.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler to use instead.")
+    ] = None,
+    preview: Annotated[
+        Path | None, typer.Option(help="Draw the scene with its poses into this folder.")
+    ] = None,
+    waveforms: Annotated[
+        Path | None,
+        typer.Option(help="Also write what the receivers hear, as WAV files with a table."),
+    ] = None,
+) -> None:
+    """Simulate the echoes of a scene at all poses of an experiment."""
+    from sononerf.settings.loading import load_settings
+
+    settings = load_settings(config, overrides or ())
+    from sononerf.progress import Progress
+    from sononerf.run.run_folder import results_folder
+    from sononerf.run.scenes import draw_ensemble
+    from sononerf.run.simulate import simulate as run
+
+    if workers is not None and scheduler is not None:
+        raise SettingsError("--workers and --scheduler exclude each other; give one")
+    # A folder that cannot be written is told before minutes of simulation.
+    with results_folder(preview) if preview is not None else nullcontext():
+        store = run(
+            settings, output=output, workers=workers, scheduler=scheduler, progress=Progress()
+        )
+        say(f"wrote {store.path} ({len(store)} poses)")
+        if preview is not None:
+            for path in draw_ensemble(settings, store, preview):
+                say(f"wrote {path}")
+    if waveforms is not None:
+        from sononerf.run.waveforms import write_waveforms
+
+        for path in write_waveforms(settings, waveforms, progress=Progress()):
+            say(f"wrote {path}")
+
+
+@app.command()
+def fit(
+    config: Config,
+    overrides: Overrides = None,
+    output: Annotated[
+        Path | None, typer.Option(help="The run's folder; runs/<config's name> by default.")
+    ] = None,
+    accelerator: OnWhat = Accelerator.auto,
+    devices: Annotated[int | None, typer.Option(min=1, help="How many devices.")] = None,
+    num_nodes: Annotated[int, typer.Option(min=1, help="How many machines.")] = 1,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed of the fit (fit.seed).")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes that simulate.")] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Move a run that is there aside.")
+    ] = False,
+) -> None:
+    """Simulate where needed, fit, reconstruct, predict the test poses and evaluate.
+
+    The same command goes on where an interrupted one stopped.
+    """
+    from sononerf.settings.loading import load_settings
+
+    extra = [] if seed is None else [f"fit.seed={seed}"]
+    settings = load_settings(config, [*(overrides or ()), *extra])
+    from sononerf.progress import Progress
+    from sononerf.run.finish import finish, is_finished
+    from sononerf.run.fit import fit as run
+    from sononerf.run.fit import follows
+
+    folder = output or Path("runs") / config.stem
+    progress = Progress()
+    done = run(
+        settings,
+        folder,
+        accelerator=accelerator.value,
+        devices=devices or "auto",
+        num_nodes=num_nodes,
+        overwrite=overwrite,
+        workers=workers,
+        progress=progress,
+    )
+    if follows():
+        return  # the first process does the rest
+    if is_finished(folder):
+        say(f"{folder}: is finished; --overwrite fits it anew")
+        metrics = done.read_metrics()
+    else:
+        metrics = finish(folder, accelerator=accelerator.value, progress=progress)
+    _summary(folder, metrics)
+
+
+def _summary(folder: Path, metrics: dict[str, Any]) -> None:
+    prediction = metrics.get("prediction") or {}
+    if prediction:
+        say(
+            f"prediction of {prediction['poses']} held-out poses: {prediction['mae_db']:.2f} dB "
+            f"over all cells (mean spectrogram: {prediction['mean_predictor_mae_db']:.2f} dB)"
+            + optional(prediction, "mae_db_active", "; {:.1f} dB over active cells")
+        )
+    geometry = metrics.get("geometry") or {}
+    if geometry:
+        scores = geometry["fscore"]
+        say(
+            f"geometry: Chamfer {1000 * geometry['chamfer_m']:.2f} mm, F-score "
+            f"{scores['0.002']:.2f} at 2 mm and {scores['0.005']:.2f} at 5 mm, "
+            f"{geometry['components']} part{'s' * (geometry['components'] != 1)} "
+            f"(true: {geometry['components_true']})"
+        )
+        target = geometry.get("target")
+        if target:
+            near = target["fscore"]
+            say(
+                f"the target alone: F-score {near['0.002']:.2f} at 2 mm and "
+                f"{near['0.005']:.2f} at 5 mm"
+            )
+        other = (metrics.get("baseline") or {}).get("backprojection")
+        if other:
+            say(
+                f"backprojection instead: Chamfer {1000 * other['chamfer_m']:.2f} mm, F-score "
+                f"{other['fscore']['0.002']:.2f} at 2 mm and {other['fscore']['0.005']:.2f} at 5 mm"
+            )
+    say(f"mesh:        {folder / 'reconstruction' / 'mesh.ply'}")
+    say(f"pictures:    {folder / 'reconstruction' / 'view.png'}, {folder / 'prediction'}")
+    say(f"numbers:     {folder / 'metrics.json'}")
+    say(f"TensorBoard: tensorboard --logdir {folder}")
+
+
+@app.command()
+def predict(
+    run: Run,
+    split: Annotated[
+        Split | None, typer.Option(help="Which poses of the ensemble; test by default.")
+    ] = None,
+    poses: Annotated[
+        Path | None, typer.Option(help="CSV of your own poses: x,y,z,yaw,pitch,roll (m, degrees).")
+    ] = None,
+    output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
+    accelerator: OnWhat = Accelerator.auto,
+) -> None:
+    """Predict the spectrograms of poses that were never heard."""
+    if split is not None and poses is not None:
+        raise SettingsError("--split and --poses exclude each other; give one")
+    from sononerf.progress import Progress
+    from sononerf.run.predict import predict as predict_run
+
+    folder = predict_run(
+        run,
+        split="test" if split is None else split.value,
+        poses_csv=poses,
+        output=output,
+        accelerator=accelerator.value,
+        progress=Progress(),
+    )
+    say(f"wrote {folder}")
+
+
+@app.command()
+def reconstruct(
+    run: Run,
+    spacing: Annotated[float | None, typer.Option(help="Voxel size in metres.")] = None,
+    method: Annotated[
+        SurfaceMethod | None,
+        typer.Option(
+            help="How the surface is read out. open, filled, hull, sheet: from field and first "
+            "echoes; open opens hollows and gaps, filled leaves them closed, hull takes the first "
+            "echoes alone, sheet is for a thin sheet. isosurface: where the field has one value. "
+            "auto: the best of the first four, refined. A method other than auto is not refined."
+        ),
+    ] = None,
+    level: Annotated[
+        str | None,
+        typer.Option(
+            help="Level of an iso-surface: auto, or a number. With a number the surface is an "
+            "iso-surface and is not refined."
+        ),
+    ] = None,
+    output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
+    accelerator: OnWhat = Accelerator.auto,
+) -> None:
+    """Read mesh, volume and projections out of a fitted field, and refine the mesh."""
+    import math
+    from typing import Literal
+
+    number: float | Literal["auto"] | None = "auto" if level == "auto" else None
+    if level is not None and level != "auto":
+        try:
+            number = float(level)
+        except ValueError:
+            raise SettingsError(f"--level: found {level!r}; give auto or a number") from None
+        if not (math.isfinite(number) and number >= 0):
+            raise SettingsError(f"--level: found {level!r}; give auto or a number from 0 on")
+    if spacing is not None and not (math.isfinite(spacing) and spacing > 0):
+        raise SettingsError(f"--spacing: found {spacing}; give metres above zero")
+    from sononerf.progress import Progress
+    from sononerf.run.reconstruct import reconstruct as reconstruct_run
+
+    folder = reconstruct_run(
+        run,
+        spacing=spacing,
+        level=number,
+        method=None if method is None else method.value,
+        output=output,
+        accelerator=accelerator.value,
+        progress=Progress(),
+    )
+    say(f"wrote {folder}")
+
+
+@app.command()
+def evaluate(
+    run: Run,
+    truth: Annotated[
+        Path | None, typer.Option(help="Mesh of the true surface; the scene's own by default.")
+    ] = None,
+    registration: Annotated[
+        Registration | None,
+        typer.Option(
+            help="Lays the mesh over the truth: none, rigid, or with one scale (similarity)."
+        ),
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare a run's mesh with the true surface, and show all its numbers."""
+    from sononerf.progress import Progress
+    from sononerf.run.evaluate import evaluate as evaluate_run
+
+    metrics = evaluate_run(
+        run,
+        truth=truth,
+        registration=None if registration is None else registration.value,
+        progress=Progress(quiet=as_json),
+    )
+    if as_json:
+        print_json(metrics)
+    else:
+        _summary(run, metrics)
+
+
+@app.command()
+def compare(
+    run_a: Annotated[Path, typer.Argument(help="Folder of a run.")],
+    run_b: Annotated[Path, typer.Argument(help="Folder of the run without it.")],
+    output: Annotated[
+        Path | None, typer.Option(help="Folder of the results; RUN_A/compare-B where none.")
+    ] = None,
+    accelerator: OnWhat = Accelerator.auto,
+) -> None:
+    """Show what is heard in RUN_A and not in RUN_B, and where: a prey on a leaf."""
+    from sononerf import storage
+    from sononerf.progress import Progress
+    from sononerf.run.compare import compare_runs
+
+    folder = compare_runs(
+        run_a, run_b, output=output, accelerator=accelerator.value, progress=Progress()
+    )
+    found = storage.read_json(folder / "comparison.json")
+    if found["strongest_m"] is None:
+        say(f"nothing is stronger in {run_a} than in {run_b}")
+    else:
+        place = ", ".join(f"{1e3 * x:.1f}" for x in found["strongest_m"])
+        found["distance_mm"] = None if found["distance_m"] is None else 1e3 * found["distance_m"]
+        away = optional(found, "distance_mm", "; {:.1f} mm from the middle of what was added")
+        say(f"strongest difference at ({place}) mm, {found['score']:.2f} of the maximum{away}")
+    say(f"wrote {folder}")
+
+
+@app.command()
+def report(
+    run: Run,
+    paper: Annotated[
+        bool, typer.Option("--paper", help="Also draw the counterparts of the paper's figures.")
+    ] = False,
+    output: Annotated[
+        Path | None, typer.Option(help="Folder of the page; RUN/report where none.")
+    ] = None,
+) -> None:
+    """Write one page of a run: numbers beside the baselines', pictures, settings."""
+    from sononerf.progress import Progress
+    from sononerf.run.report_run import report as report_run
+
+    say(f"wrote {report_run(run, paper=paper, output=output, progress=Progress())}")

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: MIT
+"""Commands around an experiment: scenes, import, export and self-calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sononerf.cli.options import (
+    Exported,
+    Json,
+    Overrides,
+    app,
+    print_json,
+    say,
+)
+from sononerf.errors import SettingsError
+
+
+@app.command()
+def scenes(
+    name: Annotated[
+        str | None, typer.Argument(help="One of them, to be told of its options.")
+    ] = None,
+    as_json: Json = False,
+    preview: Annotated[Path | None, typer.Option(help="Draw every scene into this folder.")] = None,
+) -> None:
+    """List the scenes that are installed, built-in and everyone's, or the options of one."""
+    from sononerf.run.scenes import (
+        describe_scene,
+        describe_scenes,
+        draw_scenes,
+        option_table,
+        scene_table,
+    )
+
+    if name is not None:
+        if preview is not None:
+            raise SettingsError("--preview draws all scenes; leave NAME out, or simulate --preview")
+        scene = describe_scene(name)
+        if as_json:
+            print_json(scene)
+            return
+        for line in option_table(scene):
+            typer.echo(line)
+        return
+    if preview is not None:
+        written, skipped = draw_scenes(preview)
+        for path in written:
+            say(f"wrote {path}")
+        for line in skipped:
+            say(f"not drawn: {line}")
+    rows = describe_scenes()
+    if as_json:
+        print_json({"scenes": rows})
+        return
+    for line in scene_table(rows):
+        typer.echo(line)
+
+
+@app.command()
+def new_scene(
+    name: Annotated[str, typer.Argument(help="Of the scene, such as my_bar.")],
+    output: Annotated[
+        Path | None, typer.Option(help="A new folder; NAME in the working directory by default.")
+    ] = None,
+) -> None:
+    """Write a scene of one's own to start from: a plugin of two files, and its test."""
+    import shlex
+
+    from sononerf.run.new_scene import new_scene as write
+
+    written = write(name, output)
+    for path in written:
+        say(f"wrote {path}")
+    folder, scene = shlex.quote(str(written[0].parent)), written[1].stem
+    say("next:")
+    say(f"  python -m pip install -e {folder if '/' in folder else './' + folder}")
+    say(f"  python -m pytest {folder}")
+    say("  sononerf scenes")
+    say(f"  echo 'scene: {{name: {scene}}}' > {scene}.yaml")
+    say(f"  sononerf fit {scene}.yaml")
+
+
+@app.command(name="import")
+def import_(
+    form: Annotated[
+        str,
+        typer.Argument(
+            metavar="FORMAT", help="recordings, numpy, sonotracelab, sononerf-matlab or airsas."
+        ),
+    ],
+    source: Annotated[Path, typer.Argument(help="Folder or file of the recordings.")],
+    overrides: Overrides = None,
+    output: Annotated[Path | None, typer.Option(help="The store.")] = None,
+    settings: Annotated[
+        Path | None,
+        typer.Option(help="Settings of the import; import.yaml beside the recordings by default."),
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say and draw what was understood.")
+    ] = False,
+    preview: Annotated[
+        Path | None, typer.Option(help="Draw poses and the first pings into this folder.")
+    ] = None,
+) -> None:
+    """Make a store of recordings, for `fit CONFIG data.store=STORE`."""
+    if output is None:
+        raise SettingsError("--output is missing; name the store, such as --output data/recorded")
+    from sononerf.progress import Progress
+    from sononerf.run.import_recordings import (
+        check_before,
+        describe,
+        draw,
+        import_understood,
+    )
+    from sononerf.run.run_folder import results_folder
+    from sononerf.run.understand import understand
+
+    known = understand(form, source, output, settings_file=settings, overrides=overrides or ())
+    for line in describe(known):
+        say(line)
+    if dry_run and preview is None:
+        preview = output.with_name(f"{output.name}-preview")
+    if preview is not None:
+        with results_folder(preview):
+            say(f"wrote {draw(known, preview)}")
+    if dry_run:
+        verdict = check_before(known, progress=Progress())
+    else:
+        store, verdict = import_understood(known, output, progress=Progress())
+        say(f"wrote {store.path} ({len(store)} poses)")
+    if verdict.message:
+        say(f"warning: {verdict.message}")
+    elif dry_run:
+        say("check:      no other convention of poses explains the first echoes better")
+
+
+@app.command()
+def export(
+    source: Annotated[Path, typer.Argument(help="A store, or the folder of a run.")],
+    output: Annotated[Path, typer.Argument(help="File to write: .mat, .h5, .nc or .csv.")],
+    what: Annotated[
+        Exported,
+        typer.Option(
+            help="auto: echoes of a store; of a run, points for .csv and else the prediction."
+        ),
+    ] = Exported.auto,
+) -> None:
+    """Write echoes, predictions, volumes or surface points for other programs."""
+    from sononerf.run.export import export as export_part
+
+    say(f"wrote {export_part(source, output, what=what.value)}")
+
+
+@app.command()
+def calibrate(
+    run: Annotated[Path, typer.Argument(help="Folder of a run with a surface.")],
+    kinds: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="ERROR...", help="gain, range_offset, speed_of_sound, position, aim."
+        ),
+    ],
+    output: Annotated[Path | None, typer.Option(help="The corrected store.")] = None,
+) -> None:
+    """Find errors of a recording by a run's surface, and write a corrected store."""
+    from sononerf.progress import Progress
+    from sononerf.run.calibrate import calibrate as find_errors
+
+    if output is None:
+        raise SettingsError("--output is missing; name the store, such as --output data/corrected")
+    found = find_errors(run, output, kinds, progress=Progress())
+    for line in found.lines:
+        say(line)
+    for line in found.warnings:
+        say(f"warning: {line}")
+    say(f"wrote {found.store.path} ({len(found.store)} poses)")

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: MIT
+"""Arguments and options that several commands share, and how they print."""
+
+from __future__ import annotations
+
+import json
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+app = typer.Typer(
+    name="sononerf",
+    help="Three-dimensional hearing: simulate echoes, fit a reflectivity field, predict, "
+    "reconstruct.",
+    invoke_without_command=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+
+
+class Accelerator(StrEnum):
+    """What to compute on."""
+
+    auto = "auto"
+    cpu = "cpu"
+    gpu = "gpu"
+
+
+class SurfaceMethod(StrEnum):
+    """How a surface is read out."""
+
+    auto = "auto"
+    open = "open"
+    filled = "filled"
+    hull = "hull"
+    sheet = "sheet"
+    isosurface = "isosurface"
+
+
+class Registration(StrEnum):
+    """How a mesh is laid over the true surface."""
+
+    none = "none"
+    rigid = "rigid"
+    similarity = "similarity"
+
+
+class Exported(StrEnum):
+    """Part of a store or a run."""
+
+    auto = "auto"
+    echoes = "echoes"
+    prediction = "prediction"
+    volume = "volume"
+    points = "points"
+
+
+class Split(StrEnum):
+    """Poses of an ensemble."""
+
+    test = "test"
+    val = "val"
+    train = "train"
+
+
+Config = Annotated[Path, typer.Argument(help="Settings file, such as configs/three_spheres.yaml.")]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Argument(metavar="[KEY=VALUE]...", help="Settings by dotted key, such as fit.epochs=5."),
+]
+Run = Annotated[Path, typer.Argument(help="Folder of a run.")]
+Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
+OnWhat = Annotated[Accelerator, typer.Option(help="What to compute on.")]
+
+
+def say(text: str) -> None:
+    """Print a line for people, on standard error."""
+    typer.echo(text, err=True)
+
+
+def print_json(data: Any) -> None:
+    """Print one JSON object on standard output."""
+    typer.echo(json.dumps(data, indent=2, allow_nan=False))
+
+
+def optional(values: dict[str, Any], key: str, template: str) -> str:
+    """Return a value in a template; nothing where there is no value."""
+    value = values.get(key)
+    return "" if value is None else template.format(value)

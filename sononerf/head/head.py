@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: MIT
+"""The head: emitter, receivers, air, call, noise and front end in one object.
+
+The simulator, the renderers, the refinement, the detection of echoes and the import of recordings
+all use this object.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.errors import InputError, SettingsError
+from sononerf.head.air import absorption_in, speed_in
+from sononerf.head.call import call_waveform, covered, emit, sweep_delay
+from sononerf.head.call_file import load_call
+from sononerf.head.ears import Ears, analysed_ears, ear_tables, receiver_places
+from sononerf.head.noise import draw_noise, loudest_power, noise_level, target_gain
+from sononerf.head.point_echo import PointEcho
+from sononerf.head.reception import effective_window, within_band
+from sononerf.head.row_filters import RowFilters, row_filters
+from sononerf.head.spectrogram import echo_samples, frequency_axis, range_axis, spectrogram
+from sononerf.settings.schema import (
+    AirSettings,
+    CallSettings,
+    EarSettings,
+    NoiseSettings,
+    SpectrogramSettings,
+)
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Head:
+    """Emitter and receivers in air, the call, and the analysis that makes spectrograms.
+
+    What costs time is computed when it is first asked for, and kept.
+
+    Attributes
+    ----------
+    ears : EarSettings
+        Places and directivities of emitter and receivers.
+    call : CallSettings
+        What is emitted.
+    air : AirSettings
+        Speed of sound and absorption.
+    analysis : SpectrogramSettings
+        Front end: filters, hop, range limits.
+    noise : NoiseSettings
+        Noise of the receivers.
+
+    Raises
+    ------
+    InputError
+        If a file of the call or of the directivity cannot be used.
+    SettingsError
+        If receivers of settings and file do not fit, or noise is set for two of others.
+    """
+
+    ears: EarSettings = dataclasses.field(default_factory=EarSettings)
+    call: CallSettings = dataclasses.field(default_factory=CallSettings)
+    air: AirSettings = dataclasses.field(default_factory=AirSettings)
+    analysis: SpectrogramSettings = dataclasses.field(default_factory=SpectrogramSettings)
+    noise: NoiseSettings = dataclasses.field(default_factory=NoiseSettings)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.noise.snr_db, tuple) and len(self.receivers) != 2:
+            raise SettingsError(
+                f"noise.snr_db: gives 2 levels, but {self.ears.file} holds {len(self.receivers)} "
+                "receivers; give one level for all"
+            )
+        if self.call.file is not None:
+            self._check_band()
+
+    def __getstate__(self) -> dict[str, object]:
+        # Other processes compute again what they need of it; the tables are large.
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+
+    def without_noise(self) -> Head:
+        """Return the same head with receivers that have no noise."""
+        return (
+            self if self.noise.snr_db is None else dataclasses.replace(self, noise=NoiseSettings())
+        )
+
+    @cached_property
+    def emitter(self) -> Array:
+        """Place of the emitter (3,), m, head frame."""
+        return np.asarray(self.ears.emitter, dtype=np.float64)
+
+    @cached_property
+    def receivers(self) -> Array:
+        """Places of the receivers (E, 3), m, head frame."""
+        return receiver_places(self.ears)
+
+    def places(self, positions: ArrayLike, rotations: ArrayLike) -> tuple[Array, Array]:
+        """Return emitters (..., 3) and receivers (..., E, 3), m, world frame.
+
+        Parameters
+        ----------
+        positions : (..., 3) float64, m
+            Of the head, world frame.
+        rotations : (..., 3, 3) float64
+            Head to world.
+        """
+        at, turn = np.asarray(positions, np.float64), np.asarray(rotations, np.float64)
+        return at + turn @ self.emitter, at[..., None, :] + self.receivers @ turn.swapaxes(-1, -2)
+
+    @cached_property
+    def speed_of_sound(self) -> float:
+        """Speed of sound, m/s."""
+        return speed_in(self.air)
+
+    def absorption(self, frequency: ArrayLike) -> Array:
+        """Return the absorption of the air (F,), dB/m, at frequencies (F,), Hz."""
+        return absorption_in(self.air, frequency)
+
+    @cached_property
+    def row_absorption(self) -> Array:
+        """Amplitude loss of the air at the frequencies of the rows (F,), Np/m."""
+        return self.absorption(self.frequency) * (math.log(10.0) / 20.0)
+
+    @property
+    def sampling_rate(self) -> float:
+        """Of waveforms, Hz."""
+        return self.analysis.sampling_rate
+
+    @cached_property
+    def frequency(self) -> Array:
+        """Frequencies of the spectrogram's rows (F,), Hz."""
+        return frequency_axis(self.analysis)
+
+    @cached_property
+    def range(self) -> Array:
+        """Ranges of the spectrogram's slices (R,), m.
+
+        Raises
+        ------
+        ValueError
+            If no analysis frame lies within the limits.
+        """
+        return range_axis(self.analysis, self.speed_of_sound)
+
+    @property
+    def wavelength(self) -> float:
+        """Shortest wavelength of the analysed band, m."""
+        return self.speed_of_sound / float(self.frequency[-1])
+
+    @cached_property
+    def row_filters(self) -> RowFilters:
+        """Filters of the spectrogram's rows."""
+        return row_filters(self.analysis)
+
+    @cached_property
+    def point_echo(self) -> PointEcho:
+        """The echo of a single point in the spectrogram."""
+        return PointEcho.of(self.call, self.analysis, self.speed_of_sound)
+
+    @property
+    def resolution(self) -> float:
+        """Range resolution, m: -6 dB width of a point echo over range, averaged over the band."""
+        return self.point_echo.resolution
+
+    @cached_property
+    def window(self) -> Array:
+        """Magnitude of a point echo in each row (F, W), one value per sample, 1 in the middle."""
+        return effective_window(self.call, self.analysis)
+
+    def tables(self, frequency: ArrayLike) -> Ears:
+        """Return the gains of emitter and receivers at frequencies (F,), Hz."""
+        return ear_tables(self.ears, frequency)
+
+    @cached_property
+    def gains(self) -> Ears:
+        """The gains at the frequencies of the rows, as they are."""
+        return self.tables(self.frequency)
+
+    @cached_property
+    def _smeared(self) -> tuple[Ears, NDArray[np.float32] | None]:
+        return analysed_ears(self.ears, self.call, self.analysis)
+
+    @property
+    def row_gains(self) -> Ears:
+        """The gains that the rows measure: smeared over the bandwidth of each row's filter."""
+        return self._smeared[0]
+
+    @property
+    def lag(self) -> NDArray[np.float32] | None:
+        """How much farther off (E, F, L, A), m, rows hear an echo, beam included; None: impulse."""
+        lag = self._smeared[1]
+        return None if lag is None else lag * np.float32(self.speed_of_sound / 2.0)
+
+    @cached_property
+    def mean_lag(self) -> float:
+        """Mean of the lag over rows and directions as a range, m, weighted by power.
+
+        Rows that are nearly silent in a direction may lag by many times as much, but they have no
+        part in the onset.
+        """
+        if self.lag is None:
+            return 0.0
+        known = self.row_gains
+        power = np.square((known.beam * known.ears).astype(np.float64))
+        power *= np.cos(known.elevation)[:, None]
+        return float((power * self.lag).sum() / power.sum())
+
+    @cached_property
+    def waveform(self) -> Array:
+        """The call (N,), pressure at 1 m."""
+        return call_waveform(self.call, self.sampling_rate)
+
+    @cached_property
+    def delay(self) -> Array:
+        """Time (F,), s, at which the call emits the frequency of each row."""
+        return sweep_delay(self.call, self.frequency)
+
+    @cached_property
+    def samples(self) -> int:
+        """Number of samples from the emission to the end of the last frame."""
+        return echo_samples(self.analysis, self.speed_of_sound, float(self.delay.max()))
+
+    def receive(self, impulse_responses: ArrayLike, *, seed: int) -> tuple[Array, Array]:
+        """Return the pressure at the receivers, noise included, and its spectrogram.
+
+        Parameters
+        ----------
+        impulse_responses : (E, S) float
+            Pressure for a call that is one sample of height 1. They should have ``samples``
+            samples; of shorter ones, down to the last frame of an impulse, the last rows lack
+            what the window lets in from behind.
+        seed : int
+            Of the pose; the noise is drawn from it.
+
+        Returns
+        -------
+        waveform : (E, S) float64
+            From the start of the emission on.
+        magnitude : (E, R, F) float64
+            Linear.
+
+        Raises
+        ------
+        ValueError
+            If the impulse responses are too short.
+        """
+        waveform = emit(impulse_responses, self.waveform)[:, : self.samples]
+        if self.noise.snr_db is not None:
+            if self.noise.relative_to == "pose":
+                power = loudest_power(waveform, self.analysis, self._stretch)
+            else:
+                power = np.repeat(self._target_power, len(waveform))
+            level = noise_level(self.noise, power, self.analysis)
+            waveform = waveform + draw_noise(level, waveform.shape[-1], seed=seed)
+        return waveform, self.analyse(waveform)
+
+    def analyse(self, waveform: Array) -> Array:
+        """Return the spectrogram (E, R, F) of a waveform (E, S) that starts at the emission.
+
+        Raises
+        ------
+        ValueError
+            If the waveform is shorter than ``samples``.
+        """
+        return spectrogram(waveform, self.analysis, self.speed_of_sound, self.delay)
+
+    @cached_property
+    def _stretch(self) -> int:
+        """Length of the stretch over which the power of an echo is averaged, samples."""
+        return max(self.row_filters.length, len(self.waveform))
+
+    @cached_property
+    def _target_power(self) -> Array:
+        """Power (1,) of the target that the noise is relative to."""
+        target = target_gain(self.noise.target_strength_db, self.noise.target_distance)
+        return loudest_power(target * self.waveform[None], self.analysis, self._stretch)
+
+    def _check_band(self) -> None:
+        analysis = self.analysis
+        if covered(self.call, within_band(analysis)).any():
+            return
+        assert self.call.file is not None
+        bands = load_call(self.call.file).bands
+        held = ", ".join(f"{low / 1e3:.1f} to {high / 1e3:.1f}" for low, high in bands)
+        raise InputError(
+            f"{self.call.file}: holds sound at {held} kHz, nothing within spectrogram.frequency_min"
+            f" to frequency_max ({analysis.frequency_min / 1e3:g} to "
+            f"{analysis.frequency_max / 1e3:g} kHz); change these, or take another call"
+        )
