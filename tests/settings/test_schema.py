@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 
 from sononerf.errors import SettingsError
-from sononerf.settings import schema as config
+from sononerf.settings import loading, setting_faults
 from sononerf.settings.loading import apply_override, load_settings, read_yaml, validate_settings
 from sononerf.settings.schema import Settings
 
@@ -52,7 +52,7 @@ def test_what_is_dumped_reads_back(write):
     settings = load_settings(
         write(SCENE), ["fit.learning_rate=3e-3", "region.lower=[0,0,0]", "region.upper=[1,1,1]"]
     )
-    assert load_settings(write(config.dump_yaml(settings), "b.yaml")) == settings
+    assert load_settings(write(loading.dump_yaml(settings), "b.yaml")) == settings
     assert Settings.model_validate(settings.plain()) == settings
 
 
@@ -67,10 +67,10 @@ def test_settings_know_their_file_and_are_the_same_from_another(write):
 
 
 def test_later_faults_name_the_file():
-    with pytest.raises(SettingsError) as caught, config.faults_of("mine.yaml"):
+    with pytest.raises(SettingsError) as caught, setting_faults.faults_of("mine.yaml"):
         raise SettingsError("one\ntwo")
     assert str(caught.value) == "mine.yaml: one\nmine.yaml: two"
-    with pytest.raises(SettingsError, match=r"^one$"), config.faults_of(None):
+    with pytest.raises(SettingsError, match=r"^one$"), setting_faults.faults_of(None):
         raise SettingsError("one")
 
 
@@ -79,7 +79,7 @@ def test_off_is_a_word_and_no_truth_value(write):
     settings = load_settings(path)
     assert settings.prediction.traced == "off"
     assert load_settings(write(SCENE, "b.yaml"), ["prediction.traced=off"]) == settings
-    assert load_settings(write(config.dump_yaml(settings), "c.yaml")) == settings
+    assert load_settings(write(loading.dump_yaml(settings), "c.yaml")) == settings
 
 
 def test_settings_do_not_change(write):
