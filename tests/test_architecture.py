@@ -369,3 +369,16 @@ def test_every_folder_is_packaged(project):
     folders = {path.parent for path in sources()}
     names = {".".join(folder.relative_to(ROOT).parts) for folder in folders}
     assert {*names, "sononerf_scenes"} == set(project["tool"]["setuptools"]["packages"])
+
+
+def test_the_settings_of_an_experiment_stay_with_those_who_turn_them_into_objects():
+    allowed = {"settings", "run", "cli"}
+    found = [
+        f"{name_of(path)}:{node.lineno}"
+        for path in sources()
+        if room_of(path) not in allowed
+        for node in ast.walk(parse(path))
+        if (isinstance(node, ast.Name) and node.id == "Settings")
+        or (isinstance(node, ast.alias) and node.name == "Settings")
+    ]
+    assert found == []

@@ -4,13 +4,16 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from sononerf.echoes import onsets
+from sononerf.echoes.consistency import ACCURACY
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.onsets import Onsets, asked_poses, find_onsets
 from sononerf.echoes.region import WITNESS_GAIN
@@ -35,7 +38,12 @@ from sononerf.run.build import (
 )
 from sononerf.run.simulate import simulate
 from sononerf.settings import plugins
+from sononerf.settings.loading import load_settings
+from sononerf.surface.refine.echo_data import Echoes
+from sononerf.surface.refine.optics import Optics
+from sononerf.surface.refine.refinement import Refinement
 
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 BOX = torch.tensor([[-0.05] * 3, [0.05] * 3])
 
 
@@ -329,3 +337,26 @@ def test_what_is_possible_is_what_the_hull_leaves(tiny, echoes):
     empty = EchoHull(hull.emitters, hull.receivers, hull.first + 1.0, hull.axes)
     _, possible = echo_region(tiny(region=box), head_of(tiny()), store, empty)
     assert possible(places, 0.002).all()
+
+
+@pytest.mark.parametrize("config", ["sweep", "recorded", "three_spheres"])
+def test_renderer_and_refinement_have_the_range_resolution_of_the_head(config):
+    head = head_of(load_settings(CONFIGS / f"{config}.yaml"))
+    hull = EchoHull(
+        emitters=np.zeros((1, 3)),
+        receivers=np.zeros((1, 1, 3)),
+        first=np.full((1, 1), 0.4),
+        axes=np.array([[1.0, 0.0, 0.0]]),
+        within=0.5,
+    )
+    poses = np.zeros((1, 3)), np.eye(3)[None], np.array([0]), np.array([0])
+    work = Refinement(
+        {"filled": trimesh.creation.icosphere()},
+        Echoes(*poses, lambda number: None),
+        Optics(head),
+        hull=hull,
+        simulate=lambda mesh: None,
+        seed=0,
+    )
+    assert work.onsets.scale == ACCURACY * head.resolution
+    assert ProfileRenderer(BOX, head, surroundings=1.0).surroundings == head.resolution
