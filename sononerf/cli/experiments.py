@@ -100,12 +100,10 @@ def fit(
     extra = [] if seed is None else [f"fit.seed={seed}"]
     settings = load_settings(config, [*(overrides or ()), *extra])
     from sononerf.progress import Progress
-    from sononerf.run.finish import finish, is_finished
     from sononerf.run.fit import fit as run
     from sononerf.run.fit import follows
 
     folder = output or Path("runs") / config.stem
-    progress = Progress()
     done = run(
         settings,
         folder,
@@ -114,16 +112,11 @@ def fit(
         num_nodes=num_nodes,
         overwrite=overwrite,
         workers=workers,
-        progress=progress,
+        finishes=True,
+        progress=Progress(),
     )
-    if follows():
-        return  # the first process does the rest
-    if is_finished(folder):
-        say(f"{folder}: is finished; --overwrite fits it anew")
-        metrics = done.read_metrics()
-    else:
-        metrics = finish(folder, accelerator=accelerator.value, progress=progress)
-    _summary(folder, metrics)
+    if not follows():  # the first process does the rest
+        _summary(folder, done.read_metrics())
 
 
 def _summary(folder: Path, metrics: dict[str, Any]) -> None:

@@ -1,21 +1,117 @@
 # SPDX-License-Identifier: MIT
-"""How close predicted spectrograms are to measured ones, in decibels."""
+"""Predicted spectrograms, and how close they are to measured ones, in decibels."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.echoes.echoes import Echoes
+from sononerf.evaluation.mixture import mix
+from sononerf.evaluation.traced import Traced, trace_poses
+from sononerf.field.fitting import FittedField, render_poses
+from sononerf.field.range_slices import WholePoses
 from sononerf.head.decibels import (
     ACTIVE_DB,
     RANGE_DB,
+    compress,
     mae_all_and_active,
+    mae_db,
     pose_chunks,
     same_shape,
 )
+from sononerf.progress import Progress
+from sononerf.settings.schema import SimulationSettings
 
 SSIM_WINDOW = 11
 """Side of the window over which SSIM compares, cells; smaller spectrograms have no SSIM."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Spectrograms of poses, (P, E, R, F) linear magnitude.
+
+    Attributes
+    ----------
+    magnitude : (P, E, R, F) float32
+        The mean of rendered and traced levels.
+    rendered : (P, E, R, F) float32
+        The field's own rendering.
+    traced_weight : float
+        Mean weight of the traced echoes.
+    reference : float
+        Magnitude m0 of the reported decibels.
+    """
+
+    magnitude: NDArray[np.float32]
+    rendered: NDArray[np.float32]
+    traced_weight: float
+    reference: float
+
+    def numbers(self, echoes: Echoes, measured: NDArray[np.floating]) -> dict[str, Any]:
+        """Compare with what the same poses measured, (P, E, R, F) linear magnitude.
+
+        The mean spectrogram of the training poses and the noise floor of the echoes stand beside.
+        """
+        store = echoes.store
+        train = store.indices("train")
+        mean = np.zeros(self.magnitude.shape[1:])
+        for index in train:
+            mean += compress(store.read_pose(int(index)), self.reference) / len(train)
+        level, predicted, alone = (
+            compress(part, self.reference) for part in (measured, self.magnitude, self.rendered)
+        )
+        floor = ("noise_floor_mae_db", "noise_floor_mae_db_active")
+        return {
+            "poses": len(level),
+            **prediction_metrics(level, predicted, mean_db=mean),
+            **{key: store.attributes.get(key) for key in floor},
+            "rendered_mae_db": mae_db(level, alone),
+            "rendered_mae_db_active": mae_db(level, alone, active=True),
+            "traced_weight": self.traced_weight,
+        }
+
+
+def predict(
+    fitted: FittedField,
+    traced: Traced | None,
+    poses: WholePoses,
+    simulation: SimulationSettings,
+    *,
+    seed: int,
+    accelerator: str = "auto",
+    progress: Progress,
+) -> Prediction:
+    """Predict the spectrograms of poses.
+
+    Parameters
+    ----------
+    fitted : FittedField
+        What is rendered.
+    traced : Traced or None
+        Surface that echoes are traced off as well.
+    poses : WholePoses
+        Where to hear.
+    simulation : SimulationSettings
+        Of the surface's echoes; engine and number of rays are replaced.
+    seed : int
+        Of the rays.
+    accelerator : {"auto", "cpu", "gpu"}
+        What to render on.
+    progress : Progress
+        Where to show it.
+    """
+    rendered = render_poses(fitted, poses, accelerator=accelerator, progress=progress)
+    reference, magnitude = fitted.module.reference, rendered
+    if traced is not None and traced.weight.any():
+        found = trace_poses(traced, fitted.head, poses, simulation, seed=seed, progress=progress)
+        level = mix(compress(rendered, reference), compress(found, reference), traced.weight)
+        magnitude = (reference * (10 ** (level / 20) - 1)).astype(np.float32)
+    weight = 0.0 if traced is None else float(traced.weight.mean())
+    return Prediction(magnitude, rendered, weight, reference)
 
 
 def prediction_metrics(

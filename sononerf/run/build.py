@@ -8,10 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sononerf.echoes.consistency import weighted
-from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.onsets import Onsets, find_onsets
-from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
 from sononerf.field.datamodule import EchoDataModule
@@ -53,53 +50,8 @@ def simulator_of(scene: Scene, settings: Settings) -> Simulator:
     return Simulator.of(scene, head_of(settings), settings.simulation)
 
 
-def echo_hull(head: Head, store: EnsembleStore, heard: Onsets | None = None) -> EchoHull:
-    """Return the space that the onsets of the asked poses leave, outliers of weight zero.
-
-    Parameters
-    ----------
-    head : Head
-        What heard the echoes.
-    store : EnsembleStore
-        The echoes.
-    heard : Onsets or None
-        What is detected in them; detected anew where None.
-    """
-    heard = heard or find_onsets(store, head.point_echo)
-    positions = np.asarray(store.positions, dtype=np.float64)[heard.poses]
-    rotations = np.asarray(store.rotations, dtype=np.float64)[heard.poses]
-    emitters, receivers = head.places(positions, rotations)
-    hull = EchoHull(
-        emitters=emitters,
-        receivers=receivers,
-        first=heard.first - head.mean_lag,
-        axes=rotations[:, :, 0],
-        within=head.row_gains.cone(WITNESS_GAIN),
-    )
-    return weighted(hull, head.resolution)
-
-
-def echo_region(
-    settings: Settings,
-    head: Head,
-    store: EnsembleStore,
-    hull: EchoHull | None = None,
-    heard: Onsets | None = None,
-) -> tuple[Tensor, Possible]:
+def region_of(settings: Settings, echoes: Echoes) -> tuple[Tensor, Possible]:
     """Return the box that is fitted, from the settings or the echoes, and what is possible in it.
-
-    Parameters
-    ----------
-    settings : Settings
-        The experiment.
-    head : Head
-        What heard the echoes.
-    store : EnsembleStore
-        Its echoes.
-    hull : EchoHull or None
-        What the onsets leave; found anew where None.
-    heard : Onsets or None
-        What is detected in the echoes; detected anew where None.
 
     Returns
     -------
@@ -107,14 +59,15 @@ def echo_region(
         Lower and upper corner.
     possible : callable
         Which places the echoes leave possible, given how far a place speaks for its surroundings.
+
+    Raises
+    ------
+    NumericalError
+        If no pose heard anything, or no more than noise gives.
     """
-    heard = heard or find_onsets(store, head.point_echo)
-    hull = hull or echo_hull(head, store, heard)
-    rotations = np.asarray(store.rotations, dtype=np.float64)[heard.poses]
-    found = EchoRegion(heard, hull, head.gains, rotations, head.resolution)
-    set_region = settings.region
-    if set_region.lower is not None and set_region.upper is not None:
-        box = np.asarray((set_region.lower, set_region.upper))
+    found, wanted = echoes.region, settings.region
+    if wanted.lower is not None and wanted.upper is not None:
+        box = np.asarray((wanted.lower, wanted.upper))
     else:
         box = found.box()
 

@@ -15,17 +15,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sononerf import storage
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.sealing import seal
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import IncompatibleError, InputError, SettingsError
+from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
 from sononerf.run.attached import attach
-from sononerf.run.fitted import Fitted, load_fitted, store_of
-from sononerf.run.reconstruct import read_mesh
+from sononerf.run.fitted import Fitted
+from sononerf.run.run_folder import RunFolder
 from sononerf.settings.schema import HEAD_SECTIONS, SpectrogramSettings
-from sononerf.surface.refine.echo_data import Echoes
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.self_calibration import KINDS, Calibration, Calibrator, Estimate, Kind
 
@@ -107,30 +107,23 @@ def calibrate(
     """
     progress = progress or Progress(quiet=True)
     wanted = kinds_of(kinds)
-    fitted = load_fitted(run)
-    file = run / "reconstruction" / "mesh.ply"
-    if not file.is_file():
-        raise InputError(f"{file}: there is no surface; make one with `sononerf reconstruct`")
+    opened = RunFolder.of(run)
+    fitted, mesh = opened.fitted, opened.mesh()
     if output.exists() and any(output.iterdir()):
         raise IncompatibleError(f"{output}: holds something already; choose another --output")
     storage.probe_writable(output)
-    store, mesh = store_of(fitted), read_mesh(file)
-    estimate = _estimate(fitted.head, store, mesh, wanted, progress)
+    store = opened.echoes.store
+    estimate = _estimate(opened.echoes, mesh, wanted, progress)
     corrected = _write(fitted, store, output, estimate.calibration, wanted, progress)
     lines, warnings = describe(fitted.head, store, mesh, estimate, wanted)
     return Calibrated(corrected, estimate, lines, warnings)
 
 
 def _estimate(
-    head: Head,
-    store: EnsembleStore,
-    mesh: trimesh.Trimesh,
-    kinds: Sequence[Kind],
-    progress: Progress,
+    echoes: Echoes, mesh: trimesh.Trimesh, kinds: Sequence[Kind], progress: Progress
 ) -> Estimate:
-    work = Calibrator(
-        mesh, Echoes.of(store), Optics(head), kinds, dependent=dependent_cells(head.analysis)
-    )
+    head = echoes.head
+    work = Calibrator(mesh, echoes, Optics(head), kinds, dependent=dependent_cells(head.analysis))
     with progress.task("calibrating", STEPS * len(work.poses)) as task:
         for _ in range(STEPS):
             work.step(task.advance)

@@ -14,13 +14,14 @@ from sononerf import storage
 from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.evaluation.baseline import backprojection
 from sononerf.evaluation.difference_of_runs import added_part, compare
+from sononerf.field.fitting import render_poses
 from sononerf.field.range_slices import WholePoses
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.difference_picture import difference_pngs, overlay_png
-from sononerf.run.fitted import Fitted, all_poses, load_fitted, render_poses
-from sononerf.run.run_folder import differing_keys, results_folder
+from sononerf.run.fitted import Fitted, all_poses
+from sononerf.run.run_folder import RunFolder, differing_keys, results_folder
 from sononerf.run.truth import true_mesh
 from sononerf.simulation.pose_sets import TRAIN
 from sononerf.surface.start.volume import Volume, vti_bytes
@@ -80,7 +81,8 @@ def compare_runs(
         If both are silent.
     """
     progress = progress or Progress(quiet=True)
-    runs = [load_fitted(path) for path in (first, second)]
+    run = RunFolder(first)
+    runs = [run.fitted, RunFolder(second).fitted]
     if first.resolve() == second.resolve():
         raise SettingsError(
             f"{first} and {second} are the same run; give as the second a run without what is "
@@ -88,7 +90,7 @@ def compare_runs(
         )
     differing = [
         key
-        for key in differing_keys(*(run.settings for run in runs))
+        for key in differing_keys(*(one.settings for one in runs))
         if key.split(".")[0] in HEARING
     ]
     if differing:
@@ -96,21 +98,21 @@ def compare_runs(
             f"{first} and {second} hear differently ({', '.join(differing)}); fit both alike"
         )
     folder = output or first / f"compare-{second.resolve().name}"
-    with results_folder(folder):
-        corners = np.array([run.module.field.region.double().cpu().numpy() for run in runs])
+    with run.locked(folder), results_folder(folder):
+        corners = np.array([one.module.field.region.double().cpu().numpy() for one in runs])
         box = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
-        reference = max(run.module.reference for run in runs)
+        reference = max(one.module.reference for one in runs)
         poses = _common_poses(runs)
-        one, other = (_heard(run, poses, reference, *box, accelerator, progress) for run in runs)
+        one, other = (_heard(each, poses, reference, *box, accelerator, progress) for each in runs)
         found = compare(one, other)
-        surfaces = [true_mesh(run.settings) for run in runs]
+        surfaces = [true_mesh(each.settings) for each in runs]
         truth = _added(*surfaces)
         names = first.resolve().name, second.resolve().name
         missing = -float(found.difference.values.min())
         if missing > WRONG_WAY * found.score:
             progress.say(
-                f"{names[1]} has up to {missing:.2f} of the maximum that {names[0]} has not; "
-                "what is looked for belongs into the first run"
+                f"{names[1]} has up to {missing:.2f} of the maximum that {names[0]} has not: the "
+                "runs look swapped; pass the run with the target first"
             )
         for name in ("first", "second", "difference"):
             storage.commit_bytes(folder / f"{name}.vti", vti_bytes(getattr(found, name), "level"))

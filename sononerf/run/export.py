@@ -15,7 +15,7 @@ from sononerf.echoes.named_arrays import FileType, Named, file_bytes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import Poses, write_pose_csv
-from sononerf.run.reconstruct import read_mesh
+from sononerf.run.run_folder import RunFolder
 from sononerf.run.store_settings import complete_store
 
 What = Literal["auto", "echoes", "prediction", "volume", "points"]
@@ -174,7 +174,7 @@ def _volume(source: Path) -> Part:
 
 
 def _points(source: Path) -> Part:
-    mesh = read_mesh(_reconstructed(source, "mesh.ply"))
+    mesh = RunFolder(source).mesh()
     raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
     count = len(mesh.vertices)
     heard = np.zeros(count, np.int32)

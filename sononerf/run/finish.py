@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What follows a fit: surface, weight of its echoes, prediction, numbers; in this order."""
+"""The stages after a fit: surface, weight of its echoes, prediction, numbers; in this order."""
 
 from __future__ import annotations
 
@@ -7,32 +7,24 @@ from pathlib import Path
 from typing import Any
 
 from sononerf.errors import NumericalError
+from sononerf.evaluation.traced import Traced, learn_traced
 from sononerf.progress import Progress
 from sononerf.run.evaluate import evaluate
-from sononerf.run.fitted import has_heldout, load_fitted
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
-from sononerf.run.traced import NAME as TRACED_NAME
-from sononerf.run.traced import learn_traced
-
-
-def is_finished(path: Path) -> bool:
-    """Tell whether a run has all that follows its fit."""
-    # The baselines are written last. Another mesh removes the numbers of its geometry.
-    has_numbers = {"geometry", "baseline"} <= RunFolder(path).read_metrics().keys()
-    files = path / TRACED_NAME, path / "reconstruction" / "mesh.ply"
-    return has_numbers and all(file.is_file() for file in files)
 
 
 def finish(
-    path: Path, *, accelerator: str = "auto", progress: Progress | None = None
+    run: Path | RunFolder, *, accelerator: str = "auto", progress: Progress | None = None
 ) -> dict[str, Any]:
     """Reconstruct, find the weight of the surface's echoes, predict held-out poses, evaluate.
 
+    Stages that are done are left out, so that an interrupted call goes on with its own stage.
+
     Parameters
     ----------
-    path : Path
+    run : Path or RunFolder
         A fitted run.
     accelerator : {"auto", "cpu", "gpu"}
         What to render on.
@@ -50,15 +42,39 @@ def finish(
         If the field has no surface; its predictions are written all the same.
     """
     progress = progress or Progress(quiet=True)
+    run = RunFolder.of(run)
+    shown: dict[str, Any] = {"accelerator": accelerator, "progress": progress}
     no_surface: NumericalError | None = None
-    fitted = load_fitted(path)
-    try:
-        reconstruct(path, accelerator=accelerator, progress=progress)
-        learn_traced(path, accelerator=accelerator, progress=progress)
-    except NumericalError as error:
-        no_surface = error
-    if has_heldout(fitted):
-        predict(path, accelerator=accelerator, progress=progress)
-    if no_surface is not None:
-        raise no_surface
-    return evaluate(path, progress=progress)
+    with run.locked():
+        try:
+            if not run.is_done("surface"):
+                reconstruct(run, **shown)
+            if not run.is_done("traced"):
+                _learn_traced(run, accelerator, progress)
+        except NumericalError as error:
+            no_surface = error
+        if not run.is_done("prediction"):
+            predict(run, **shown)
+        if no_surface is not None:
+            raise no_surface
+        if not run.is_done("evaluation"):
+            evaluate(run, progress=progress)
+    return run.read_metrics()
+
+
+def _learn_traced(run: RunFolder, accelerator: str, progress: Progress) -> None:
+    settings, mesh = run.fitted.settings, run.mesh()
+    run.begin("traced")
+    if settings.prediction.traced == "off":
+        traced = Traced.none(mesh, run.fitted.head)
+    else:
+        traced = learn_traced(
+            run.fitted,
+            run.echoes,
+            mesh,
+            settings.simulation,
+            seed=settings.fit.seed,
+            accelerator=accelerator,
+            progress=progress,
+        )
+    run.keep_traced(traced)

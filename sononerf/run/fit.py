@@ -3,15 +3,13 @@
 
 from __future__ import annotations
 
-import logging
 import resource
 import sys
 import time
-import warnings
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
-import lightning
 import numpy as np
 import torch
 from lightning.fabric.utilities.rank_zero import rank_zero_only
@@ -23,25 +21,24 @@ from sononerf.callbacks.preview import PreviewCallback
 from sononerf.callbacks.progress_bar import ProgressCallback
 from sononerf.callbacks.spectrogram_images import SpectrogramImages
 from sononerf.callbacks.threads import ThreadsCallback
-from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.onsets import find_onsets
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import NumericalError, ResourceError, StoppedError
+from sononerf.errors import StoppedError
 from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import EchoDataModule
-from sononerf.field.module import EchoModule
+from sononerf.field.fitting import FittedField, require_accelerator
+from sononerf.field.fitting import fit as fit_field
 from sononerf.field.weights import save_weights
-from sononerf.head.head import Head
 from sononerf.progress import Progress
 from sononerf.run.build import (
     check_plugins,
     data_for,
-    echo_hull,
-    echo_region,
     field_and_renderer,
     head_of,
     module_for,
+    region_of,
 )
+from sononerf.run.finish import finish
 from sononerf.run.run_folder import RunFolder
 from sononerf.run.simulate import (
     background_path,
@@ -60,37 +57,6 @@ LINE = (
     "all training poses lie on a straight line: the echoes do not tell the angle around it, so the "
     "surface may be drawn out around the line; fly another way as well"
 )
-
-
-def quiet_lightning() -> None:
-    """Leave out Lightning's advertising and hints about what we do on purpose."""
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):
-        logging.getLogger(name).setLevel(logging.ERROR)
-    for pattern in (
-        r".*does not have many workers.*",  # the ensemble lies in memory
-        r".*GPU available but not used.*",  # the user chose
-        r".*resumed from a checkpoint that ended before the epoch.*",  # ours go by the step
-        r".*\.*Checkpoint directory .* exists and is not empty.*",
-        r".*`max_epochs` was not set.*",
-        r".*treespec, LeafSpec.* is deprecated.*",  # Lightning's own call of torch
-    ):
-        warnings.filterwarnings("ignore", message=pattern)
-
-
-def require_accelerator(accelerator: str) -> None:
-    """Refuse a GPU that is not there.
-
-    Raises
-    ------
-    ResourceError
-        If ``gpu`` was asked for and there is none.
-    """
-    if accelerator == "gpu" and not (
-        torch.cuda.is_available() or torch.backends.mps.is_available()
-    ):
-        raise ResourceError("no GPU that torch can use; take --accelerator cpu, or auto")
 
 
 def follows() -> bool:
@@ -123,6 +89,7 @@ def fit(
     num_nodes: int = 1,
     overwrite: bool = False,
     workers: int | None = None,
+    finishes: bool = False,
     progress: Progress | None = None,
 ) -> RunFolder:
     """Simulate where needed, or open the store of ``data.store``; fit, and keep the fitted field.
@@ -145,6 +112,8 @@ def fit(
         Move a folder that is there aside.
     workers : int or None
         Processes that simulate.
+    finishes : bool
+        Whether all stages after the fit follow, see :func:`sononerf.run.finish.finish`.
     progress : Progress or None
         Where to show it.
 
@@ -164,10 +133,11 @@ def fit(
     settings = with_store(settings)
     head = head_of(settings)
     check_plugins(settings, head)
+    hardware = {"accelerator": accelerator, "devices": devices, "num_nodes": num_nodes}
     if follows():
         # The first process holds the lock, simulates and writes; the others only compute.
-        store = _wait_for_store(settings)
-        _fit(settings, head, run, store, accelerator, devices, num_nodes, Progress(quiet=True))
+        echoes = Echoes(_wait_for_store(settings), head)
+        _fit(settings, run, echoes, hardware, Progress(quiet=True))
         return run
     if overwrite:
         aside = run.move_aside()
@@ -175,20 +145,23 @@ def fit(
             progress.say(f"moved the old run to {aside}")
     created = storage.probe_writable(path)
     try:
-        with storage.lock(path):
+        with run.locked():
             run.check(settings)
-            if run.is_fitted:
-                return run
-            started = time.monotonic()
-            store = ensemble(settings, workers=workers, progress=progress)
-            simulated = time.monotonic() - started
-            run.begin(settings)
-            run.write_provenance(
-                echo_hash=store.attributes["echo_hash"], threads=torch.get_num_threads()
-            )
-            if "simulate_s" not in run.read_metrics().get("cost", {}):
-                run.write_metrics("cost", {"simulate_s": simulated}, merge=True)
-            _fit(settings, head, run, store, accelerator, devices, num_nodes, progress)
+            if not run.is_done("fit"):
+                started = time.monotonic()
+                store = ensemble(settings, workers=workers, progress=progress)
+                simulated = time.monotonic() - started
+                run.begin_fit(settings)
+                run.write_provenance(
+                    echo_hash=store.attributes["echo_hash"], threads=torch.get_num_threads()
+                )
+                if "simulate_s" not in run.read_metrics().get("cost", {}):
+                    run.write_metrics("cost", {"simulate_s": simulated}, merge=True)
+                _fit(settings, run, Echoes(store, head), hardware, progress)
+            if finishes and run.is_finished:
+                progress.say(f"{path}: is finished; --overwrite fits it anew")
+            elif finishes:
+                finish(run, accelerator=accelerator, progress=progress)
     finally:
         storage.remove_if_empty(created)  # those stay that something came of
     return run
@@ -206,32 +179,25 @@ def _length(settings: Settings, per_pass: int) -> tuple[int, int]:
 
 def _fit(
     settings: Settings,
-    head: Head,
     run: RunFolder,
-    store: EnsembleStore,
-    accelerator: str,
-    devices: int | str,
-    num_nodes: int,
+    echoes: Echoes,
+    hardware: dict[str, Any],
     progress: Progress,
 ) -> None:
-    quiet_lightning()
     keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
-    heard = find_onsets(store, head.point_echo)
-    hull = echo_hull(head, store, heard)
-    region, possible = echo_region(settings, head, store, hull, heard)
+    region, possible = region_of(settings, echoes)
     corners = (1000 * region).round().int().tolist()
     progress.say(f"region {corners[0]} to {corners[1]} mm")
-    if hull.width < head.resolution:
+    if echoes.hull.width < echoes.head.resolution:
         progress.say(LINE)
-    field, renderer = field_and_renderer(settings, head, region)
-    options = settings.fit
-    data = data_for(settings, store, renderer)
+    field, renderer = field_and_renderer(settings, echoes.head, region)
+    data = data_for(settings, echoes.store, renderer)
     per_epoch, total = _length(settings, data.stream().batches_per_pass)
     module = module_for(
         settings,
         field,
         renderer,
-        reference=float(store.attributes["reference"]),
+        reference=echoes.reference,
         possible=possible,
         total_steps=total,
         steps_per_epoch=per_epoch,
@@ -240,18 +206,10 @@ def _fit(
     if not resumed and not follows():
         run.clear_previews()
     with progress.task("fitting", total) as task, keeper.watching():
-        trainer = lightning.Trainer(
-            accelerator=accelerator,
-            devices=devices,
-            num_nodes=num_nodes,
-            max_epochs=-1,
-            max_steps=total,
-            val_check_interval=per_epoch,
-            check_val_every_n_epoch=None,
-            limit_val_batches=1.0 if len(store.indices("val")) else 0,
-            num_sanity_val_steps=0,
-            gradient_clip_val=options.gradient_clip,
-            logger=TensorBoardLogger(run.path, name="tensorboard", version=""),
+        fitted = fit_field(
+            echoes,
+            module,
+            data,
             callbacks=[
                 ProgressCallback(task),
                 ThreadsCallback(),
@@ -264,16 +222,14 @@ def _fit(
                 SpectrogramImages(data.whole("val"), renderer.range, renderer.frequency),
                 keeper,
             ],
-            plugins=[DurableCheckpointIO()],
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            use_distributed_sampler=False,
-            log_every_n_steps=5,
-            default_root_dir=run.path,
+            gradient_clip=settings.fit.gradient_clip,
+            logger=TensorBoardLogger(run.path, name="tensorboard", version=""),
+            folder=run.path,
+            checkpoint=run.checkpoint if resumed else None,
+            **hardware,
         )
-        trainer.fit(module, data, ckpt_path=run.checkpoint if resumed else None, weights_only=True)
-        _finish(settings, run, store, hull, module, keeper.elapsed, trainer)
+        if module.trainer.is_global_zero:
+            _keep(settings, run, echoes, fitted, keeper.elapsed)
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         # What follows is for the first process alone; metrics would wait for the others.
         torch.distributed.destroy_process_group()
@@ -292,20 +248,11 @@ def _resume(run: RunFolder, data: EchoDataModule) -> bool:
     return True
 
 
-def _finish(
-    settings: Settings,
-    run: RunFolder,
-    store: EnsembleStore,
-    hull: EchoHull,
-    module: EchoModule,
-    seconds: float,
-    trainer: lightning.Trainer,
+def _keep(
+    settings: Settings, run: RunFolder, echoes: Echoes, fitted: FittedField, seconds: float
 ) -> None:
-    bad = [n for n, p in module.named_parameters() if not bool(p.isfinite().all())]
-    if bad:
-        raise NumericalError(f"the fitted {bad[0]} is not finite; lower fit.learning_rate")
-    if not trainer.is_global_zero:
-        return
+    """Write the fitted field and what it cost."""
+    module, hull = fitted.module, fitted.hull
     state = {f"field.{k}": v for k, v in module.field.state_dict().items()}
     state |= {f"renderer.{k}": v for k, v in module.renderer.state_dict().items()}
     state |= {f"hull.{f.name}": _double(getattr(hull, f.name)) for f in fields(hull)}
@@ -313,10 +260,10 @@ def _finish(
         "cost",
         {
             "fit_s": seconds,
-            "steps": trainer.global_step,
+            "steps": module.trainer.global_step,
             "points_evaluated": int(module.renderer.points_evaluated),
             "parameters": sum(p.numel() for p in module.parameters()),
-            "device": str(trainer.strategy.root_device.type),
+            "device": str(module.trainer.strategy.root_device.type),
             "peak_memory_bytes": peak_memory_bytes(),
         },
         merge=True,
@@ -326,8 +273,8 @@ def _finish(
         state,
         {
             "settings": settings.plain(),
-            "reference": float(store.attributes["reference"]),
-            "echo_hash": store.attributes["echo_hash"],
+            "reference": echoes.reference,
+            "echo_hash": echoes.store.attributes["echo_hash"],
         },
     )
 

@@ -1,49 +1,45 @@
 # SPDX-License-Identifier: MIT
-"""A fitted run: what it was fitted with, and what it renders."""
+"""A fitted field read back from a run's two files, and the echoes that it was fitted to."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import lightning
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch.utils.data import DataLoader
 
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, SettingsError
-from sononerf.field.module import EchoModule
-from sononerf.field.range_slices import PoseReader, WholePoses
-from sononerf.field.renderer import Renderer
+from sononerf.field.fitting import FittedField
 from sononerf.field.weights import DESCRIPTION_NAME, load_weights
 from sononerf.geometry.poses import Poses
-from sononerf.head.head import Head
-from sononerf.progress import Progress
 from sononerf.run.attached import with_attached
 from sononerf.run.build import field_and_renderer, head_of, module_for
-from sononerf.run.fit import quiet_lightning, require_accelerator
 from sononerf.run.simulate import default_store, open_ensemble
 from sononerf.settings.loading import validate_settings
 from sononerf.settings.schema import Settings
 from sononerf.simulation.pose_sets import ensemble_poses
 
-Split = Literal["train", "val", "test"]
-
 
 @dataclass(frozen=True)
-class Fitted:
-    """A fitted field as its run's two files describe it."""
+class Fitted(FittedField):
+    """A fitted field as its run's two files describe it.
+
+    Attributes
+    ----------
+    settings : Settings
+        Of the experiment.
+    echo_hash : str
+        Of the echoes that were fitted to.
+    """
 
     settings: Settings
-    head: Head
-    module: EchoModule
     echo_hash: str
-    hull: EchoHull  # where the training poses were, and what their first echoes leave
 
 
 def load_fitted(path: Path) -> Fitted:
@@ -90,7 +86,7 @@ def load_fitted(path: Path) -> Fitted:
                 f"{settings.renderer.kind} of this version: {str(error).splitlines()[-1].strip()}"
             ) from None
     module.eval()
-    return Fitted(settings, head, module, echoes, hull)
+    return Fitted(module, head, hull, settings, echoes)
 
 
 def _hull(state: dict[str, torch.Tensor]) -> EchoHull:
@@ -100,15 +96,15 @@ def _hull(state: dict[str, torch.Tensor]) -> EchoHull:
     return EchoHull(**{**read, "within": float(read["within"])})
 
 
-def store_of(fitted: Fitted) -> EnsembleStore:
-    """Open the ensemble that a field was fitted to.
+def echoes_of(fitted: Fitted) -> Echoes:
+    """Open the echoes that a field was fitted to.
 
     Raises
     ------
     InputError
-        If it is not where the settings say.
+        If they are not where the settings say.
     IncompatibleError
-        If another one lies there.
+        If others lie there.
     """
     settings = fitted.settings
     path = settings.data.store or default_store(settings, fitted.echo_hash)
@@ -125,66 +121,19 @@ def store_of(fitted: Fitted) -> EnsembleStore:
     store = open_ensemble(settings, path)
     if store.attributes.get("echo_hash") != fitted.echo_hash:
         raise IncompatibleError(f"{path}: holds other echoes than those of this run")
-    return store
+    return Echoes(store, fitted.head, fitted.hull)
 
 
 def has_heldout(fitted: Fitted) -> bool:
     """Tell whether poses were held out of the fit."""
     if fitted.settings.scene is not None:
         return fitted.settings.poses.heldout > 0
-    return len(store_of(fitted).indices("test")) > 0
+    return len(echoes_of(fitted).store.indices("test")) > 0
 
 
 def all_poses(fitted: Fitted) -> tuple[Poses, NDArray[np.int8]]:
     """Return the poses of a run's ensemble and what each is for (P,): 0 train, 1 val, 2 test."""
     if fitted.settings.scene is not None:
         return ensemble_poses(fitted.settings.poses)
-    store = store_of(fitted)
+    store = echoes_of(fitted).store
     return Poses(store.positions, store.rotations), store.split
-
-
-def poses_of(store: EnsembleStore, split: Split, renderer: Renderer) -> WholePoses:
-    """Return the poses of a split, one by one, with what was measured there."""
-    numbers = torch.as_tensor(store.indices(split))
-    return WholePoses(
-        torch.as_tensor(store.positions)[numbers],
-        torch.as_tensor(store.rotations)[numbers],
-        len(renderer.range),
-        len(renderer.frequency),
-        PoseReader(store, 1),
-        numbers,
-    )
-
-
-def render_poses(
-    fitted: Fitted, poses: WholePoses, *, accelerator: str = "auto", progress: Progress
-) -> NDArray[np.float32]:
-    """Render poses one by one, (P, E, R, F) linear magnitude."""
-    quiet_lightning()
-    require_accelerator(accelerator)
-    rendered: list[NDArray[np.float32]] = []
-
-    class Gather(lightning.Callback):
-        def on_predict_batch_end(
-            self,
-            trainer: lightning.Trainer,
-            pl_module: lightning.LightningModule,
-            outputs: torch.Tensor,
-            *rest: object,
-        ) -> None:
-            del trainer, pl_module, rest
-            rendered.append(outputs.float().cpu().numpy())
-            task.advance()
-
-    with progress.task("predicting", len(poses)) as task:
-        trainer = lightning.Trainer(
-            accelerator=accelerator,
-            devices=1,
-            logger=False,
-            callbacks=[Gather()],
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-        )
-        trainer.predict(fitted.module, DataLoader(poses, batch_size=None), return_predictions=False)
-    return np.concatenate(rendered)

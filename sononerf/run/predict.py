@@ -12,31 +12,21 @@ import torch
 from numpy.typing import NDArray
 
 from sononerf import storage
-from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError
-from sononerf.evaluation.mixture import mix
-from sononerf.evaluation.prediction import prediction_metrics
+from sononerf.evaluation.prediction import predict as predict_poses
+from sononerf.field.fitting import Split, poses_of
 from sononerf.field.range_slices import WholePoses
-from sononerf.field.renderer import Renderer
 from sononerf.geometry.poses import Poses, read_pose_csv
-from sononerf.head.decibels import compress, mae_db
+from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.spectrogram_picture import spectrogram_png
-from sononerf.run.fitted import (
-    Fitted,
-    Split,
-    load_fitted,
-    poses_of,
-    render_poses,
-    store_of,
-)
+from sononerf.run.fitted import Fitted
 from sononerf.run.run_folder import RunFolder, results_folder
-from sononerf.run.traced import NAME as TRACED_NAME
-from sononerf.run.traced import load_traced, trace_poses
+from sononerf.run.traced_file import NAME as TRACED_NAME
 
 
 def predict(
-    path: Path,
+    run: Path | RunFolder,
     *,
     split: Split = "test",
     poses_csv: Path | None = None,
@@ -48,7 +38,7 @@ def predict(
 
     Parameters
     ----------
-    path : Path
+    run : Path or RunFolder
         A fitted run.
     split : {"test", "val", "train"}
         Which poses of the ensemble.
@@ -73,61 +63,62 @@ def predict(
         is a run's.
     """
     progress = progress or Progress(quiet=True)
-    run = RunFolder(path)
+    run = RunFolder.of(run)
     own = read_pose_csv(poses_csv) if poses_csv else None
-    fitted = load_fitted(path)
+    fitted, settings = run.fitted, run.fitted.settings
     renderer = fitted.module.renderer
-    folder = output or path / (
-        "prediction"
-        if own is None and split == "test"
-        else f"prediction-{'poses' if own is not None else split}"
-    )
+    kind = "" if own is None and split == "test" else f"-{'poses' if own is not None else split}"
+    folder = output or run.path / f"prediction{kind}"
     if own is not None:
         _check_poses(own, poses_csv, fitted, progress)
-    store = None if own is not None else store_of(fitted)
-    surface = load_traced(path)
-    known = (run.read_metrics().get("prediction") or {}).get("traced_weight", 0)
-    if surface is None and known > 0:
-        progress.say(
-            f"{path / TRACED_NAME} is missing: the prediction is rendered from the field alone; "
-            f"the run's own also has echoes traced off its surface (weight {known:.2f})"
+        poses = WholePoses(
+            torch.as_tensor(own.positions),
+            torch.as_tensor(own.rotations),
+            len(renderer.range),
+            len(renderer.frequency),
         )
-    poses = _poses_to_render(store, own, split, renderer)
-    with results_folder(folder):
-        rendered = render_poses(fitted, poses, accelerator=accelerator, progress=progress)
-        magnitude, reference = rendered, fitted.module.reference
-        if surface is not None and surface.weight.any():
-            traced = trace_poses(fitted, surface, poses, progress=progress)
-            both = compress(rendered, reference), compress(traced, reference)
-            level = mix(*both, surface.weight)
-            magnitude = (reference * (10 ** (level / 20) - 1)).astype(np.float32)
+    else:
+        poses = poses_of(run.echoes, split, renderer)
+        if not len(poses):
+            raise InputError(
+                f"{run.echoes.store.path}: holds no {split} poses; choose another --split"
+            )
+    traced = run.traced()
+    known = (run.read_metrics().get("prediction") or {}).get("traced_weight", 0)
+    if traced is None and known > 0:
+        progress.say(
+            f"{run.path / TRACED_NAME} is missing: the prediction is rendered from the field "
+            "alone; the run's own also has echoes traced off its surface "
+            f"(weight {known:.2f})"
+        )
+    with run.locked(folder), results_folder(folder):
+        found = predict_poses(
+            fitted,
+            traced,
+            poses,
+            settings.simulation,
+            seed=settings.fit.seed,
+            accelerator=accelerator,
+            progress=progress,
+        )
         axes = {
             "range_m": renderer.range.double().numpy(),
             "frequency_hz": renderer.frequency.double().numpy(),
         }
-        arrays = {"predicted": magnitude, "pose": poses.numbers.numpy(), **axes}
-        measured = None
-        if store is not None:
+        arrays = {"predicted": found.magnitude, "pose": poses.numbers.numpy(), **axes}
+        if own is None:
+            store = run.echoes.store
             arrays["measured"] = np.stack([store.read_pose(int(i)) for i in poses.numbers])
-            measured = compress(arrays["measured"], reference)
         arrays["position"] = poses.positions.numpy()
         arrays["rotation"] = poses.rotations.numpy()
-        arrays["reference"] = np.asarray(reference)
+        arrays["reference"] = np.asarray(found.reference)
         storage.commit(folder / "spectrograms.npz", lambda file: _save_npz(file, arrays))
-        predicted = compress(magnitude, reference)
+        predicted = compress(found.magnitude, found.reference)
+        measured = compress(arrays["measured"], found.reference) if own is None else None
         _pictures(folder, poses, measured, predicted, axes, progress)
-    if store is not None and measured is not None and output is None and split == "test":
-        figures = _numbers(store, split, measured, predicted, reference)
-        alone = compress(rendered, reference)
-        run.write_metrics(
-            "prediction",
-            {
-                **figures,
-                "rendered_mae_db": mae_db(measured, alone),
-                "rendered_mae_db_active": mae_db(measured, alone, active=True),
-                "traced_weight": 0.0 if surface is None else float(surface.weight.mean()),
-            },
-        )
+        if own is None and output is None and split == "test":
+            numbers = found.numbers(run.echoes, arrays["measured"])
+            run.write_metrics("prediction", {"split": split, **numbers})
     return folder
 
 
@@ -161,24 +152,6 @@ def _save_npz(file: BinaryIO, arrays: dict[str, NDArray[np.generic]]) -> None:
     file.write(buffer.getbuffer())
 
 
-def _poses_to_render(
-    store: EnsembleStore | None, own: Poses | None, split: Split, renderer: Renderer
-) -> WholePoses:
-    if own is not None:
-        return WholePoses(
-            torch.as_tensor(own.positions),
-            torch.as_tensor(own.rotations),
-            len(renderer.range),
-            len(renderer.frequency),
-        )
-    if store is None:
-        raise InputError("neither an ensemble nor poses to predict")
-    poses = poses_of(store, split, renderer)
-    if not len(poses):
-        raise InputError(f"{store.path}: holds no {split} poses; choose another --split")
-    return poses
-
-
 def _pictures(
     folder: Path,
     poses: WholePoses,
@@ -198,23 +171,3 @@ def _pictures(
             )
             storage.commit_bytes(folder / f"pose_{number:04d}.png", picture)
             task.advance()
-
-
-def _numbers(
-    store: EnsembleStore,
-    split: Split,
-    measured: NDArray[np.float64],
-    predicted: NDArray[np.float64],
-    reference: float,
-) -> dict[str, object]:
-    train = store.indices("train")
-    mean = np.zeros(measured.shape[1:])
-    for index in train:
-        mean += compress(store.read_pose(int(index)), reference) / len(train)
-    floor = ("noise_floor_mae_db", "noise_floor_mae_db_active")
-    return {
-        "split": split,
-        "poses": len(measured),
-        **prediction_metrics(measured, predicted, mean_db=mean),
-        **{key: store.attributes.get(key) for key in floor},
-    }

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Read a fitted field out to files, and compare it with the true scene."""
+"""Reconstruct a run's surface: read start surfaces out of the field, and refine the best."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
@@ -15,36 +15,41 @@ import torch
 import trimesh
 
 from sononerf import storage
-from sononerf.errors import InputError, NumericalError
-from sononerf.progress import Progress, Task
+from sononerf.errors import InputError, SettingsError
+from sononerf.progress import Progress
 from sononerf.report.mesh_files import MeshFormat, mesh_bytes
 from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png, side_by_side_png
 from sononerf.report.pictures.mip_picture import mip_pngs
-from sononerf.run.fitted import Fitted, load_fitted, store_of
-from sononerf.run.refine import refine_surface
+from sononerf.run.refine import check_state, refine_surface
 from sononerf.run.run_folder import RunFolder, results_folder
 from sononerf.run.truth import true_mesh
-from sononerf.surface.refine.refinement import Refined
-from sononerf.surface.start.read_out import Method, Reconstruction, judged
-from sononerf.surface.start.read_out import reconstruct as read_out
+from sononerf.surface.start.read_out import (
+    FieldReading,
+    Method,
+    StartMethod,
+    read_field,
+    read_isosurface,
+    start_surfaces,
+)
 from sononerf.surface.start.volume import vti_bytes
+from sononerf.surface.surface import Surface, finished_surface
 
 OPEN = {
     "sheet": "the surface is a sheet: {0.thin_share:.0%} of it has its other side right behind it",
     "one-sided": "the surface is open: {0.unseen_share:.0%} of it, which no pose heard, is "
     "left out",
 }
-"""What is said of surfaces that do not enclose a body."""
-REFINED: tuple[Method, ...] = ("open", "filled", "hull", "sheet")
+"""Messages about surfaces that do not enclose a body."""
+REFINED: tuple[StartMethod, ...] = ("open", "filled", "hull", "sheet")
 """Start surfaces: the one that explains the validation poses best is refined, see
 :class:`~sononerf.surface.refine.refinement.Refinement`."""
-UNREFINED: tuple[Method, ...] = ("filled", "hull")
+UNREFINED: tuple[StartMethod, ...] = ("filled", "hull")
 """Without refinement the first of these that gives a surface is taken."""
 FORMATS: tuple[MeshFormat, ...] = ("ply", "stl", "glb")
 
 
 def reconstruct(
-    path: Path,
+    run: Path | RunFolder,
     *,
     spacing: float | None = None,
     level: float | Literal["auto"] | None = None,
@@ -60,7 +65,7 @@ def reconstruct(
 
     Parameters
     ----------
-    path : Path
+    run : Path or RunFolder
         A fitted run.
     spacing : float or None, m
         Voxel size; the settings' where None.
@@ -78,164 +83,128 @@ def reconstruct(
     Returns
     -------
     folder : Path
+
+    Raises
+    ------
+    NumericalError
+        If the field has no surface.
+    IncompatibleError
+        If another version interrupted a refinement of this run.
     """
     progress = progress or Progress(quiet=True)
+    run = RunFolder.of(run)
     started = time.monotonic()
-    fitted = load_fitted(path)
-    folder = output or path / "reconstruction"
-    options = fitted.settings.reconstruction
+    options = run.fitted.settings.reconstruction
+    folder = output or run.reconstruction
+    own = folder.resolve() == run.reconstruction.resolve()
     # What the caller gives replaces both settings.
     if method is None:
         method = options.method if level in (None, "auto") else "isosurface"
     if level is None:
         level = options.level if method in ("auto", "isosurface") else "auto"
-    methods: tuple[Method, ...]
-    refines = False
-    if method != "auto":
-        methods = (method,)
-    elif level != "auto":
-        methods = ("isosurface",)
-    else:
-        refines = options.refine
-        methods = REFINED if refines else UNREFINED
-    with results_folder(folder):
-        starts = _read_out(
-            fitted,
-            methods=methods,
-            several=refines,
-            spacing=spacing or options.spacing,
-            level=level,
-            progress=progress,
-        )
-        if folder.resolve() == (path / "reconstruction").resolve():
-            RunFolder(path).drop_metrics("geometry")  # of the mesh that is replaced
-        found, refined = starts[0], None
+    if method == "auto" and level != "auto":
+        method = "isosurface"
+    if level != "auto" and method != "isosurface":
+        raise SettingsError(f"method {method} has no level; leave out one of the two")
+    refines = method == "auto" and options.refine and _has_echoes(run, progress)
+    with run.locked(None if refines else folder), results_folder(folder):
         if refines:
-            meshes: dict[str, trimesh.Trimesh] = {start.method: start.mesh for start in starts}
-            refined = _refined(path, fitted, meshes, accelerator, progress)
-        if refined is not None:
-            start = next(start for start in starts if start.method == refined.start)
-            found = replace(start, mesh=refined.mesh)
-        found = judged(found, None if refined is None else refined.support.round().astype(np.int32))
-        _write(folder, found, refined, true_mesh(fitted.settings))
-    if found.openness is not None and found.openness.kind in OPEN:
-        progress.say(OPEN[found.openness.kind].format(found.openness))
-    if output is None:
-        RunFolder(path).write_metrics(
-            "cost", {"reconstruct_s": time.monotonic() - started}, merge=True
-        )
+            check_state(run)
+        if method == "isosurface":
+            surface = _isosurface(run, spacing, level, progress)
+        else:
+            with _task(progress) as shown:
+                reading = read_field(
+                    run.fitted.module.field,
+                    run.fitted.hull,
+                    resolution=run.fitted.head.resolution,
+                    spacing=spacing or options.spacing,
+                    directions=options.directions,
+                    progress=shown,
+                )
+            if refines:
+                surface = _refined(run, reading, accelerator, progress)
+            else:
+                methods = UNREFINED if method == "auto" else (method,)
+                chosen, mesh = next(start_surfaces(reading, methods))
+                surface = finished_surface(mesh, chosen, reading)
+        if own:
+            run.begin("surface")
+        _write(folder, surface, true_mesh(run.fitted.settings))
+        if surface.openness is not None and surface.openness.kind in OPEN:
+            progress.say(OPEN[surface.openness.kind].format(surface.openness))
+        if output is None:
+            run.write_metrics("cost", {"reconstruct_s": time.monotonic() - started}, merge=True)
     return folder
 
 
-def _read_out(
-    fitted: Fitted,
-    *,
-    methods: Sequence[Method],
-    several: bool,
-    spacing: float | None,
-    level: float | Literal["auto"],
-    progress: Progress,
-) -> list[Reconstruction]:
-    """Read surfaces out of the field by some methods: all of them, or the first that gives one.
+@contextmanager
+def _task(progress: Progress) -> Iterator[Callable[[int, int], None]]:
+    """Show how far a field is read out."""
+    with progress.task("reconstructing", 1000) as task, torch.inference_mode():
+        yield lambda done, total: task.advance(1000 * done // total - task.done)
 
-    Raises
-    ------
-    NumericalError
-        If none gives a surface.
-    """
-    options = fitted.settings.reconstruction
-    found: list[Reconstruction] = []
-    error: NumericalError | None = None
-    for method in methods:
-        if found and not several:
-            break
-        try:
-            with progress.task("reconstructing", 1000) as task, torch.inference_mode():
 
-                def shown(done: int, total: int, task: Task = task) -> None:
-                    task.advance(1000 * done // total - task.done)
+def _has_echoes(run: RunFolder, progress: Progress) -> bool:
+    """Tell whether the run's echoes are there to refine against; say so where they are not."""
+    try:
+        return run.echoes is not None
+    except InputError as error:
+        progress.say(f"the surface is not refined: {error}")
+        return False
 
-                one = read_out(
-                    fitted.module.field,
-                    hull=fitted.hull,
-                    spacing=spacing,
-                    level=level,
-                    method=method,
-                    directions=options.directions,
-                    smoothing=options.smoothing if method == "isosurface" else 0.0,
-                    resolution=fitted.head.resolution,
-                    earlier=found[-1] if found else None,
-                    judge=False,
-                    progress=shown,
-                )
-            found.append(one)
-        except NumericalError as raised:
-            error = error or raised
-    if error is not None and not found:
-        raise error
-    return found
+
+def _isosurface(
+    run: RunFolder, spacing: float | None, level: float | Literal["auto"], progress: Progress
+) -> Surface:
+    options = run.fitted.settings.reconstruction
+    with _task(progress) as shown:
+        mesh, volume, found = read_isosurface(
+            run.fitted.module.field,
+            spacing=spacing or options.spacing,
+            level=level,
+            directions=options.directions,
+            smoothing=options.smoothing,
+            progress=shown,
+        )
+    return Surface(mesh, volume, "isosurface", level=found)
 
 
 def _refined(
-    path: Path,
-    fitted: Fitted,
-    starts: Mapping[str, trimesh.Trimesh],
-    accelerator: str,
-    progress: Progress,
-) -> Refined | None:
-    """Return the refined surface; None where the run's echoes are not there."""
-    try:
-        store_of(fitted)
-    except InputError as error:
-        progress.say(f"the surface is not refined: {error}")
-        return None
-    return refine_surface(path, fitted, starts, accelerator=accelerator, progress=progress)
-
-
-def _write(
-    folder: Path,
-    found: Reconstruction,
-    refined: Refined | None,
-    truth: trimesh.Trimesh | None,
-) -> None:
-    seen = found.support
-    for kind in FORMATS:
-        data = mesh_bytes(found.mesh, kind, confidence=seen)
-        storage.commit_bytes(folder / f"mesh.{kind}", data)
-    if seen is not None:
-        storage.commit_bytes(folder / "confidence.png", confidence_png(found.mesh, seen))
-    storage.commit_bytes(folder / "volume.vti", vti_bytes(found.volume))
-    for axis, picture in mip_pngs(found.volume).items():
-        storage.commit_bytes(folder / f"mip_{axis}.png", picture)
-    view = mesh_png(found.mesh) if truth is None else side_by_side_png(truth, found.mesh)
-    storage.commit_bytes(folder / "view.png", view)
-    storage.commit_json(
-        folder / "read_out.json",
-        {
-            "method": found.method,
-            "level": found.level,
-            "spacing_m": found.volume.spacing,
-            "surface": None if found.openness is None else found.openness.kind,
-            "refined": refined is not None and refined.kept,
-            "validation_error_db": None
-            if refined is None or not math.isfinite(refined.error_db)
-            else refined.error_db,
-        },
+    run: RunFolder, reading: FieldReading, accelerator: str, progress: Progress
+) -> Surface:
+    starts = dict(start_surfaces(reading, REFINED))
+    refined = refine_surface(run, starts, accelerator=accelerator, progress=progress)
+    return finished_surface(
+        refined.mesh,
+        refined.start,
+        reading,
+        support=refined.support.round().astype(np.int32),
+        refined=refined.kept,
+        error_db=refined.error_db if math.isfinite(refined.error_db) else None,
     )
 
 
-def read_mesh(path: Path) -> trimesh.Trimesh:
-    """Read a reconstructed surface back.
-
-    Raises
-    ------
-    InputError
-        If it is damaged or empty.
-    """
-    try:
-        mesh = trimesh.load_mesh(path, file_type="ply")
-    except Exception as error:  # trimesh's readers raise whatever they met first
-        raise InputError(f"{path}: damaged ({error}); reconstruct again") from error
-    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-        raise InputError(f"{path}: holds no surface; reconstruct again")
-    return mesh
+def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None) -> None:
+    mesh, seen = surface.mesh, surface.support
+    for kind in FORMATS:
+        storage.commit_bytes(folder / f"mesh.{kind}", mesh_bytes(mesh, kind, confidence=seen))
+    if seen is not None:
+        storage.commit_bytes(folder / "confidence.png", confidence_png(mesh, seen))
+    storage.commit_bytes(folder / "volume.vti", vti_bytes(surface.volume))
+    for axis, picture in mip_pngs(surface.volume).items():
+        storage.commit_bytes(folder / f"mip_{axis}.png", picture)
+    view = mesh_png(mesh) if truth is None else side_by_side_png(truth, mesh)
+    storage.commit_bytes(folder / "view.png", view)
+    # Last: a reconstruction without this file is not complete.
+    storage.commit_json(
+        folder / "read_out.json",
+        {
+            "method": surface.method,
+            "level": surface.level,
+            "spacing_m": surface.volume.spacing,
+            "surface": None if surface.openness is None else surface.openness.kind,
+            "refined": surface.refined,
+            "validation_error_db": surface.error_db,
+        },
+    )

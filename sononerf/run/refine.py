@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Refine a run's surface against the echoes that it was fitted to; interruptible and resumable."""
+"""Refine a run's surface; an interrupted refinement goes on from its saved state."""
 
 from __future__ import annotations
 
@@ -13,44 +13,47 @@ import safetensors.torch
 import torch
 import trimesh
 from safetensors import SafetensorError, safe_open
+from torch import Tensor
 
 from sononerf import storage
+from sononerf.errors import IncompatibleError
+from sononerf.field.fitting import require_accelerator
 from sononerf.field.weights import model_checksum
-from sononerf.head.head import Head
 from sononerf.progress import Progress
-from sononerf.run.fit import require_accelerator
-from sononerf.run.fitted import Fitted, store_of
-from sononerf.settings.schema import SimulationSettings
+from sononerf.run.run_folder import RunFolder
 from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine.echo_data import Echoes
-from sononerf.surface.refine.later_bounces import quiet_scene
+from sononerf.surface.refine import stages
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.refinement import Refined, Refinement
+from sononerf.surface.refine.refinement import (
+    STATE_VERSION,
+    Refined,
+    Refinement,
+    number_of_steps,
+    refine,
+)
+from sononerf.surface.start.read_out import StartMethod
 
 STATE = Path("checkpoints") / "surface.safetensors"
-"""Where a refinement that was interrupted goes on, in the run's folder."""
+"""Where the state of an interrupted refinement is kept, in the run's folder."""
 RAYS = 20_000
 """Per pose, for the correction of the last stage."""
 
 
 def refine_surface(
-    path: Path,
-    fitted: Fitted,
-    starts: Mapping[str, trimesh.Trimesh],
+    run: RunFolder,
+    starts: Mapping[StartMethod, trimesh.Trimesh],
     *,
     accelerator: str = "auto",
     progress: Progress,
 ) -> Refined:
-    """Refine a surface; the same call goes on where an interrupted one stopped.
+    """Refine start surfaces of a run, or go on where an interrupted refinement stopped.
 
     Parameters
     ----------
-    path : Path
-        The run's folder; the state is kept there until the refinement is done.
-    fitted : Fitted
-        The run.
+    run : RunFolder
+        Keeps the state until the refinement is done.
     starts : mapping of str to Trimesh
-        Surfaces to start from, m, by the method that they were read out by.
+        Start surfaces, m, by their method.
     accelerator : {"auto", "cpu", "gpu"}
         What to compute on.
     progress : Progress
@@ -64,43 +67,56 @@ def refine_surface(
         If ``gpu`` was asked for and there is none.
     """
     require_accelerator(accelerator)
-    settings = fitted.settings
-    store = store_of(fitted)
-    optics = Optics(fitted.head).to(_device(accelerator))
-    work = Refinement(
-        starts,
-        Echoes.of(store),
-        optics,
-        hull=fitted.hull,
-        simulate=partial(surface_simulator, fitted.head, settings.simulation, rays=RAYS),
-        seed=settings.fit.seed,
-        # The level of a recording is that of its microphone and its amplifier.
-        calibrated=store.attributes.get("origin") == "simulated",
-    )
+    settings, head = run.fitted.settings, run.fitted.head
     digest = hashlib.sha256(b"".join(mesh.vertices.tobytes() for mesh in starts.values()))
-    identity = f"{model_checksum(path)} {digest.hexdigest()}"
-    file = path / STATE
-    _restore(file, work, identity)
+    belongs = {**_version(), "of": f"{model_checksum(run.path)} {digest.hexdigest()}"}
+    file = run.path / STATE
     saved = time.monotonic()
-    with progress.task("refining", work.total) as task:
-        task.advance(work.drawn)
-        while not work.done:
-            mismatch = work.advance()
+    with progress.task("refining", number_of_steps(starts)) as task:
+
+        def after_step(work: Refinement, mismatch: float) -> None:
+            nonlocal saved
             task.advance(work.drawn - task.done, f"mismatch {mismatch:.2f} dB")
             if time.monotonic() - saved > settings.fit.checkpoint_seconds and not work.done:
-                _save(file, work, identity)
+                tensors = {name: p.cpu().clone().contiguous() for name, p in work.state().items()}
+                data = safetensors.torch.save(tensors, metadata=belongs)
+                storage.commit_bytes(file, data)
                 saved = time.monotonic()
-    refined = work.result()
+
+        refined = refine(
+            starts,
+            run.echoes,
+            optics=Optics(head).to(_device(accelerator)),
+            simulate=partial(
+                Simulator.of_surface, head=head, options=settings.simulation, rays=RAYS
+            ),
+            seed=settings.fit.seed,
+            state=_saved_state(file, belongs),
+            after_step=after_step,
+        )
     storage.remove_file(file)
     return refined
 
 
-def surface_simulator(
-    head: Head, options: SimulationSettings, mesh: trimesh.Trimesh, *, rays: int
-) -> Simulator:
-    """Return the default engine on a surface, with a number of rays and without noise."""
-    wanted = options.model_copy(update={"engine": "hybrid", "rays": rays})
-    return Simulator.of(quiet_scene(mesh), head.without_noise(), wanted)
+def check_state(run: RunFolder) -> None:
+    """Refuse the state of a refinement that went through other stages than those of this version.
+
+    Raises
+    ------
+    IncompatibleError
+        If such a state is in the run.
+    """
+    file = run.path / STATE
+    found = _metadata(file)
+    if found is not None and any(found.get(key) != value for key, value in _version().items()):
+        raise IncompatibleError(
+            f"{file}: the refinement was interrupted in another version of sononerf; finish it "
+            "with that version, or remove this file to refine from the beginning"
+        )
+
+
+def _version() -> dict[str, str]:
+    return {"version": str(STATE_VERSION), "stages": repr(stages.STAGES)}
 
 
 def _device(accelerator: str) -> torch.device:
@@ -110,17 +126,18 @@ def _device(accelerator: str) -> torch.device:
     return torch.device("cpu")
 
 
-def _save(file: Path, work: Refinement, identity: str) -> None:
-    tensors = {name: part.cpu().clone().contiguous() for name, part in work.state().items()}
-    storage.commit_bytes(file, safetensors.torch.save(tensors, metadata={"of": identity}))
-
-
-def _restore(file: Path, work: Refinement, identity: str) -> None:
-    """Take up the state of an interrupted refinement of the same start; ignore any other."""
+def _metadata(file: Path) -> dict[str, str] | None:
+    """Return what a state says of itself; None where there is none, or it is damaged."""
     try:
         with safe_open(str(file), "pt") as opened:
-            if (opened.metadata() or {}).get("of") != identity:
-                return
-            work.load({name: opened.get_tensor(name) for name in opened.keys()})
-    except (SafetensorError, OSError, KeyError, ValueError):
-        return  # the state only saves time; the refinement starts from the beginning
+            return opened.metadata() or {}
+    except (SafetensorError, OSError):
+        return None  # the state only saves time; the refinement starts from the beginning
+
+
+def _saved_state(file: Path, belongs: dict[str, str]) -> dict[str, Tensor] | None:
+    """Return the state of an interrupted refinement of the same starts, or None."""
+    if _metadata(file) != belongs:
+        return None
+    with safe_open(str(file), "pt") as opened:
+        return {name: opened.get_tensor(name) for name in opened.keys()}

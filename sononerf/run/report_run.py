@@ -19,11 +19,11 @@ from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.mesh_picture import mesh_png
 from sononerf.report.pictures.scene_picture import scene_png
-from sononerf.run.fitted import Fitted, all_poses, has_heldout, load_fitted
+from sononerf.run.fitted import Fitted, all_poses, has_heldout
 from sononerf.run.run_folder import RunFolder, results_folder
 from sononerf.run.truth import true_mesh
 from sononerf.settings.loading import dump_yaml
-from sononerf.surface.start.read_out import reconstruct as read_out
+from sononerf.surface.start.read_out import read_isosurface
 
 PAGE = "report.md"
 Table = list[tuple[str, ...]]
@@ -66,13 +66,14 @@ def report(
     .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, figures 4 to 8.
     """
     progress = progress or Progress(quiet=True)
-    fitted = load_fitted(path)
+    run = RunFolder(path)
+    fitted = run.fitted
     folder = output or path / "report"
     heldout = has_heldout(fitted)
     pictures: dict[str, bytes] = {}
-    with results_folder(folder):
+    with run.locked(folder), results_folder(folder):
         parts = [f"# {path.resolve().name}"]
-        with _damage_named(RunFolder(path).metrics):
+        with _damage_named(run.metrics):
             parts += [_made(path, fitted), *_numbers(path, heldout)]
         if heldout:
             parts += _predictions(path, pictures)
@@ -277,24 +278,23 @@ def _isosurface(fitted: Fitted, pictures: dict[str, bytes], progress: Progress) 
     level = options.level
     try:
         with progress.task("reading out", 1000) as task, torch.inference_mode():
-            found = read_out(
+            mesh, volume, found = read_isosurface(
                 fitted.module.field,
                 spacing=options.spacing,
                 level=level,
-                method="isosurface",
                 directions=options.directions,
                 smoothing=options.smoothing,
                 progress=lambda done, total: task.advance(1000 * done // total - task.done),
             )
-        pictures["isosurface.png"] = mesh_png(found.mesh)
+        pictures["isosurface.png"] = mesh_png(mesh)
     except NumericalError as error:
         yield f"None: {error}."
         return
     yield (
         f"Sum over {options.directions} directions, voxels of "
-        f"{1e3 * found.volume.spacing:.3g} mm, level "
+        f"{1e3 * volume.spacing:.3g} mm, level "
         + ("by Otsu's rule" if level == "auto" else "as set")
-        + f": {found.level:.3g}."
+        + f": {found:.3g}."
     )
     yield "![isosurface](isosurface.png)"
 

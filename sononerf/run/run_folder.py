@@ -1,21 +1,29 @@
 # SPDX-License-Identifier: MIT
-"""What a run's folder holds, and which of it is whose."""
+"""A run on disk: its lock, its stages, and what is loaded from it, each thing once."""
 
 from __future__ import annotations
 
+import hashlib
 import importlib.metadata
 import os
 import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+import trimesh
 
 from sononerf import __version__, storage
+from sononerf.echoes.echoes import Echoes
 from sononerf.errors import IncompatibleError, InputError
+from sononerf.evaluation.traced import Traced
 from sononerf.field.weights import DESCRIPTION_NAME
 from sononerf.run.attached import attach
+from sononerf.run.fitted import Fitted, echoes_of, has_heldout, load_fitted
+from sononerf.run.traced_file import load_traced, save_traced, traced_belongs
 from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
 from sononerf.settings.schema import Settings
 
@@ -28,6 +36,10 @@ FREE_KEYS = (
     "fit.checkpoint_seconds",
 )
 """What may change between two calls of one run: it changes nothing that is fitted."""
+Stage = Literal["fit", "surface", "traced", "prediction", "evaluation"]
+STAGES: tuple[Stage, ...] = ("fit", "surface", "traced", "prediction", "evaluation")
+"""Stages of a run, in order: the fit; the reconstruction; gain and weight of echoes traced off it;
+the prediction of held-out poses; the comparison with the true surface and the baselines."""
 RECORDED = ("torch", "lightning", "numpy", "scipy", "trimesh", "embreex", "zarr")
 
 
@@ -87,6 +99,111 @@ class RunFolder:
         self.config = path / "config.yaml"
         self.metrics = path / "metrics.json"
         self.checkpoint = path / "checkpoints" / "last.ckpt"
+        self.reconstruction = path / "reconstruction"
+        self._locks = 0
+
+    @classmethod
+    def of(cls, run: Path | RunFolder) -> RunFolder:
+        """Return the run of a path, or the same run."""
+        return run if isinstance(run, RunFolder) else cls(run)
+
+    @contextmanager
+    def locked(self, output: Path | None = None) -> Iterator[None]:
+        """Hold the run against other processes; within one process it can be held repeatedly.
+
+        Parameters
+        ----------
+        output : Path or None
+            Where results go; outside of the run's folder no lock is needed.
+
+        Raises
+        ------
+        LockedError
+            If another process holds the run.
+        StorageError
+            If the lock file cannot be written.
+        """
+        elsewhere = output is not None and not output.resolve().is_relative_to(self.path.resolve())
+        if self._locks or elsewhere:
+            yield
+            return
+        with storage.lock(self.path):
+            self._locks += 1
+            try:
+                yield
+            finally:
+                self._locks -= 1
+
+    @cached_property
+    def fitted(self) -> Fitted:
+        """The fitted field; raises as :func:`sononerf.run.fitted.load_fitted`."""
+        return load_fitted(self.path)
+
+    @cached_property
+    def echoes(self) -> Echoes:
+        """What was fitted to; raises as :func:`sononerf.run.fitted.echoes_of`."""
+        return echoes_of(self.fitted)
+
+    def mesh(self) -> trimesh.Trimesh:
+        """Read the reconstructed surface.
+
+        Raises
+        ------
+        InputError
+            If it is missing, damaged or empty.
+        """
+        file = self.reconstruction / "mesh.ply"
+        if not file.is_file():
+            raise InputError(
+                f"{file}: there is no surface; make one with `sononerf reconstruct {self.path}`"
+            )
+        try:
+            mesh = trimesh.load_mesh(file, file_type="ply")
+        except Exception as error:  # trimesh's readers raise whatever they met first
+            raise InputError(f"{file}: damaged ({error}); reconstruct again") from error
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+            raise InputError(f"{file}: holds no surface; reconstruct again")
+        return mesh
+
+    def traced(self) -> Traced | None:
+        """Return the surface that echoes are traced off, and their weight; None without them."""
+        return load_traced(self.path)
+
+    def keep_traced(self, traced: Traced) -> None:
+        """Write what was learned of the reconstructed surface."""
+        save_traced(self.path, traced, self._mesh_checksum())
+
+    def _mesh_checksum(self) -> str:
+        file = self.reconstruction / "mesh.ply"
+        return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+
+    def is_done(self, stage: Stage) -> bool:
+        """Tell whether a stage came to its end, with the results of the stages before it."""
+        if stage == "fit":
+            return (self.path / DESCRIPTION_NAME).is_file()
+        if stage == "surface":
+            # The description is written after all else.
+            names = ("mesh.ply", "read_out.json")
+            return all((self.reconstruction / name).is_file() for name in names)
+        if stage == "traced":
+            return traced_belongs(self.path, self._mesh_checksum())
+        found = self.read_metrics().keys()
+        if stage == "prediction":
+            return "prediction" in found or not has_heldout(self.fitted)
+        return {"geometry", "baseline"} <= found
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether all stages came to their end."""
+        return all(self.is_done(stage) for stage in STAGES)
+
+    def begin(self, stage: Literal["surface", "traced"]) -> None:
+        """Forget the ends of a stage and of those that depend on its result."""
+        if stage == "surface":
+            storage.remove_file(self.reconstruction / "read_out.json")
+            self.drop_metrics("geometry")
+        else:
+            self.drop_metrics("prediction")
 
     def open(self) -> Settings:
         """Return the settings of a run that is there.
@@ -128,7 +245,7 @@ class RunFolder:
                 f"{self.path}: holds {sorted(foreign)[0]!r} and is no run; choose another --output"
             )
 
-    def begin(self, settings: Settings) -> None:
+    def begin_fit(self, settings: Settings) -> None:
         """Write the settings of a new run, or make sure that an old one has the same.
 
         Raises
@@ -169,11 +286,6 @@ class RunFolder:
             except OSError as error:
                 raise storage.storage_error("cannot be moved aside", path, error) from error
         return aside
-
-    @property
-    def is_fitted(self) -> bool:
-        """Whether the fit came to its end."""
-        return (self.path / "model.json").is_file()
 
     def read_metrics(self) -> dict[str, Any]:
         """Return what ``metrics.json`` holds so far."""

@@ -291,7 +291,7 @@ def _fill(
     again: dict[int, NDArray[np.float32]] = {}
     seed = settings.simulation.seed
     wanted = [*missing, *test]
-    prepare(simulator, poses.positions[wanted], poses.rotations[wanted], progress)
+    simulator.prepare(poses.positions[wanted], poses.rotations[wanted], progress)
     with progress.task("simulating", len(missing) + len(test)) as task:
         # The second simulation of the test poses goes first where it can share the processes.
         def keep(index: int, spectrogram: NDArray[np.float32]) -> None:
@@ -318,28 +318,3 @@ def _fill(
         )
     limits = settings.spectrogram.range_min, settings.spectrogram.range_max
     seal(store, {int(i): again[int(i)] for i in test}, silent=deaf(*limits))
-
-
-def prepare(
-    simulator: Simulator,
-    positions: NDArray[np.float64],
-    rotations: NDArray[np.float64],
-    progress: Progress,
-) -> None:
-    """Let the engine do what it does for all poses at once, and show how far it is.
-
-    Parameters
-    ----------
-    simulator : Simulator
-        Scene and head.
-    positions : (P, 3) float64, m
-        Of the head, world frame.
-    rotations : (P, 3, 3) float64
-        Head to world.
-    progress : Progress
-        Where to show it.
-    """
-    engine = simulator.engine
-    if len(positions) and engine.parts:
-        with progress.task("solving", engine.parts) as task:
-            engine.prepare(positions, rotations, lambda *_: task.advance())

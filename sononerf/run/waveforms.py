@@ -12,7 +12,6 @@ from sononerf.errors import InputError, SettingsError
 from sononerf.progress import Progress
 from sononerf.recordings.writer import pose_table, wav_bytes
 from sononerf.run.build import simulator_of
-from sononerf.run.simulate import prepare
 from sononerf.run.understand import OWN_SETTINGS
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
@@ -70,7 +69,7 @@ def write_waveforms(
         raise InputError(f"{folder}: is not empty; choose another folder for the recordings")
     simulator = simulator_of(scene, settings)
     poses, split = ensemble_poses(settings.poses)
-    prepare(simulator, poses.positions, poses.rotations, progress)
+    simulator.prepare(poses.positions, poses.rotations, progress)
     digits = max(4, len(str(len(poses) - 1)))
     names = [f"ping_{index:0{digits}d}.wav" for index in range(len(poses))]
     with progress.task("recording", len(poses)) as task:

@@ -7,10 +7,12 @@ import logging
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
+from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SimulationSettings, SpectrogramSettings
 from sononerf.simulation.arrival import silence_before
@@ -87,6 +89,52 @@ class Simulator:
         lowest, most = analysis.frequency_min, options.sources
         return cls(hybrid(scene, hearing, sources=most, frequency_min=lowest, **rays))
 
+    @classmethod
+    def of_surface(
+        cls, mesh: trimesh.Trimesh, head: Head, options: SimulationSettings, *, rays: int
+    ) -> Simulator:
+        """Return the hybrid engine on a reconstructed surface, without noise.
+
+        Parameters
+        ----------
+        mesh : Trimesh
+            m.
+        head : Head
+            What hears.
+        options : SimulationSettings
+            Engine and number of rays are replaced.
+        rays : int
+            Per pose.
+
+        Raises
+        ------
+        InputError
+            If the surface cannot be simulated.
+        """
+        wanted = options.model_copy(update={"engine": "hybrid", "rays": rays})
+        return cls.of(quiet_scene(mesh), head.without_noise(), wanted)
+
+    def prepare(
+        self,
+        positions: NDArray[np.float64],
+        rotations: NDArray[np.float64],
+        progress: Progress,
+    ) -> None:
+        """Let the engine do its work for all poses at once, and show how far it is.
+
+        Parameters
+        ----------
+        positions : (P, 3) float64, m
+            Of the head, world frame.
+        rotations : (P, 3, 3) float64
+            Head to world.
+        progress : Progress
+            Where to show it.
+        """
+        if len(positions) and self.engine.parts:
+            with progress.task("solving", self.engine.parts) as task:
+                self.engine.prepare(positions, rotations, lambda *_: task.advance())
+
     def hits(
         self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -156,6 +204,17 @@ class Simulator:
         """
         echo = self.echo(position, rotation, seed=seed)
         return self.head.receive(echo, seed=seed)
+
+
+def quiet_scene(mesh: trimesh.Trimesh) -> Scene:
+    """Return the scene of a mesh that the program made itself, without warnings about it."""
+    talker = logging.getLogger("sononerf")
+    before = talker.level
+    talker.setLevel(logging.ERROR)
+    try:
+        return Scene(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
+    finally:
+        talker.setLevel(before)
 
 
 def solved_frequency(wanted: SimulationSettings, analysis: SpectrogramSettings) -> float:

@@ -20,18 +20,21 @@ def asked(monkeypatch):
     """What was read out, each taking longer than the one before: 1, 2, 3, ... s."""
     given, clock = [], [0.0]
 
-    def read_out(field, **options):
-        given.append(options)
+    def read_field(field, hull, **options):
+        given.append({"hull": hull, **options})
         clock[0] += len(given)
-        volume = SimpleNamespace(values=np.zeros((10, 20, 6)))
-        return SimpleNamespace(volume=volume, method=options["method"])
+        return SimpleNamespace(volume=SimpleNamespace(values=np.zeros((10, 20, 6))))
 
     settings = validate_settings({"scene": {"name": "ua"}}, "test")
     field = SimpleNamespace(resolution=0.004)
     fitted = SimpleNamespace(
-        settings=settings, hull="the hull", module=SimpleNamespace(field=field)
+        settings=settings,
+        hull="the hull",
+        head=SimpleNamespace(resolution=0.005),
+        module=SimpleNamespace(field=field),
     )
-    monkeypatch.setattr(module, "read_out", read_out)
+    monkeypatch.setattr(module, "read_field", read_field)
+    monkeypatch.setattr(module, "start_surfaces", lambda reading, methods: [])
     monkeypatch.setattr(module, "load_fitted", lambda run: fitted)
     monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
     return given
@@ -52,8 +55,8 @@ def test_the_median_of_five(asked, tmp_path):
     (row,) = found["rows"]
     # Of 1, 2, 3, 4 and 5 s; 1,200 voxels.
     assert (row["reconstruct_s"], row["voxels"], row["voxels_per_s"]) == (3.0, 1200, 400.0)
-    assert (row["name"], row["method"]) == ("a, 2 mm", "auto")
-    assert text.splitlines()[1].split() == ["a,", "2", "mm", "auto", "1,200", "3.00", "400"]
+    assert (row["name"], row["method"]) == ("a, 2 mm", "filled")
+    assert text.splitlines()[1].split() == ["a,", "2", "mm", "filled", "1,200", "3.00", "400"]
 
 
 def test_a_run_with_a_voxel_size_of_its_own_is_read_by_that(asked, tmp_path, monkeypatch):

@@ -9,11 +9,12 @@ import lightning
 import pytest
 from lightning.pytorch.loggers import TensorBoardLogger
 
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import EchoDataModule
-from sononerf.run.build import echo_region, field_and_renderer, head_of, module_for
-from sononerf.run.fit import quiet_lightning
+from sononerf.field.fitting import quiet_lightning
+from sononerf.run.build import field_and_renderer, head_of, module_for, region_of
 from sononerf.run.simulate import simulate
 from sononerf.settings.loading import validate_settings
 
@@ -45,7 +46,7 @@ def training(ensemble, tmp_path):
         quiet_lightning()
         store = EnsembleStore.open(path)
         head = head_of(settings)
-        region, possible = echo_region(settings, head, store)
+        region, possible = region_of(settings, Echoes(store, head))
         module = module_for(
             settings,
             *field_and_renderer(settings, head, region),

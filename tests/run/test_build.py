@@ -12,10 +12,12 @@ import pytest
 import torch
 import trimesh
 
+from sononerf.echoes import echoes as echoes_module
 from sononerf.echoes import onsets
 from sononerf.echoes.consistency import ACCURACY
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.onsets import Onsets, asked_poses, find_onsets
+from sononerf.echoes.onsets import Onsets, asked_poses
 from sononerf.echoes.region import WITNESS_GAIN
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
@@ -26,22 +28,20 @@ from sononerf.field.profile import ProfileRenderer
 from sononerf.field.shell import ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.reception import effective_window
-from sononerf.run import build
 from sononerf.run.build import (
     check_plugins,
     data_for,
-    echo_hull,
-    echo_region,
     field_and_renderer,
     head_of,
     module_for,
+    region_of,
 )
 from sononerf.run.simulate import simulate
 from sononerf.settings import plugins
 from sononerf.settings.loading import load_settings
-from sononerf.surface.refine.echo_data import Echoes
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.refinement import Refinement
+from tests.memory import echoes_of
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 BOX = torch.tensor([[-0.05] * 3, [0.05] * 3])
@@ -135,14 +135,14 @@ def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeyp
     store = SimpleNamespace(
         positions=np.array([[9.0, 9.0, 9.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]),
         rotations=np.array([np.eye(3), left, np.eye(3)]),
-        indices=lambda split: {"train": np.array([1, 2])}[split],
+        indices=lambda split: {"train": np.array([1, 2]), "val": np.array([0])}[split],
     )
     heard = np.array([[0.4, 0.41], [-np.inf, 0.39]])
     found = Onsets(np.array([1, 2]), np.ones(3), np.ones((2, 2, 3)), np.ones((2, 2, 3)), heard)
     asked = []
-    monkeypatch.setattr(build, "find_onsets", lambda *given: asked.append(given) or found)
-    monkeypatch.setattr(build, "weighted", lambda hull, resolution: hull)
-    hull = echo_hull(head, store)
+    monkeypatch.setattr(echoes_module, "find_onsets", lambda *given: asked.append(given) or found)
+    monkeypatch.setattr(echoes_module, "weighted", lambda hull, resolution: hull)
+    hull = Echoes(store, head).hull
     expected = [[1.0, 2.002, 2.99], [0.002, 0.0, -0.01]]
     np.testing.assert_allclose(hull.emitters, expected, rtol=0, atol=1e-7)
     expected = [[0.99, 1.99, 3.005], [1.004, 1.99, 3.005]]
@@ -165,13 +165,15 @@ def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeyp
     assert silent.any()
     head.__dict__["_smeared"] = (head.row_gains, np.where(silent, 0.05, 0.001) * 2.0 / 343.0)
     head.__dict__.pop("mean_lag")
-    np.testing.assert_allclose(echo_hull(head, store).first, heard - 0.001, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(Echoes(store, head).hull.first, heard - 0.001, rtol=0, atol=2e-6)
 
 
 def test_the_hull_is_weighted_by_the_range_resolution(tiny, echoes, monkeypatch):
     asked = []
-    monkeypatch.setattr(build, "weighted", lambda *given: asked.append(given) or "the others")
-    assert echo_hull(head_of(tiny()), EnsembleStore.open(echoes)) == "the others"
+    monkeypatch.setattr(
+        echoes_module, "weighted", lambda *given: asked.append(given) or "the others"
+    )
+    assert Echoes(EnsembleStore.open(echoes), head_of(tiny())).hull == "the others"
     ((hull, resolution),) = asked
     assert hull.first.shape == (8, 2)
     assert resolution == head_of(tiny()).resolution == pytest.approx(0.0058, abs=1e-4)
@@ -179,7 +181,7 @@ def test_the_hull_is_weighted_by_the_range_resolution(tiny, echoes, monkeypatch)
 
 def test_the_hull_of_a_sphere_holds_it_and_little_more(tiny, echoes):
     """The front of a sphere is its nearest point."""
-    hull = echo_hull(head_of(tiny()), EnsembleStore.open(echoes))
+    hull = Echoes(EnsembleStore.open(echoes), head_of(tiny())).hull
     assert hull.first.shape == (8, 2)
     front = hull.clearance(0.02 * hull.sources / np.linalg.norm(hull.sources, axis=1)[:, None])[0]
     # Beam and ears lengthen an echo, so it rises a little earlier, which is the safe side.
@@ -266,8 +268,8 @@ def test_a_plugin_that_makes_something_else(tiny, monkeypatch):
 
 
 def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):
-    store = EnsembleStore.open(echoes)
-    region, possible = echo_region(tiny(), head_of(tiny()), store)
+    heard = Echoes(EnsembleStore.open(echoes), head_of(tiny()))
+    region, possible = region_of(tiny(), heard)
     assert bool((region[0] < -0.015).all())
     assert bool((region[1] > 0.015).all())  # the sphere's radius is 20 mm
     assert bool((region.abs() < 0.2).all())
@@ -276,7 +278,7 @@ def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):
     assert found.shape == (500,)
     assert 0 < int(found.sum()) < 500
     box = tiny(region={"lower": (-0.1, -0.1, -0.1), "upper": (0.1, 0.2, 0.3)})
-    chosen, _ = echo_region(box, head_of(box), store)
+    chosen, _ = region_of(box, heard)
     torch.testing.assert_close(chosen[1], torch.tensor([0.1, 0.2, 0.3]))
 
 
@@ -287,9 +289,8 @@ def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
     def heard(name, **noise):
         settings = tiny(poses=poses, noise=noise, data={"store": str(tmp_path / name)})
         store = simulate(settings, workers=1)
-        return echo_region(settings, head_of(settings), store)[0], echo_hull(
-            head_of(settings), store
-        )
+        found = Echoes(store, head_of(settings))
+        return region_of(settings, found)[0], found.hull
 
     box, _ = heard("plain")
     for snr_db, error in ((40, 0.001), (20, 0.002), (10, 0.003)):
@@ -303,24 +304,24 @@ def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
 
 def test_of_many_poses_hull_and_region_ask_the_same_ones(tiny, echoes, monkeypatch):
     store = EnsembleStore.open(echoes)
-    whole = echo_region(tiny(), head_of(tiny()), store)[0]
+    whole = region_of(tiny(), Echoes(store, head_of(tiny())))[0]
     monkeypatch.setattr(onsets, "MOST_POSES", 6)
     asked = asked_poses(store)
-    heard = find_onsets(store, head_of(tiny()).point_echo)
-    hull = echo_hull(head_of(tiny()), store, heard)
+    heard = Echoes(store, head_of(tiny()))
+    hull = heard.hull
     assert hull.first.shape == (6, 2)
     assert len(asked) < len(store.indices("train"))
-    np.testing.assert_array_equal(heard.poses, asked)
+    np.testing.assert_array_equal(heard.onsets.poses, asked)
     np.testing.assert_allclose(hull.axes, store.rotations[asked][:, :, 0])
-    few = echo_region(tiny(), head_of(tiny()), store, hull, heard)[0]
+    few = region_of(tiny(), heard)[0]
     assert (few[0] <= whole[0] + 0.002).all()
     assert (few[1] >= whole[1] - 0.002).all()
 
 
 def test_what_is_possible_is_what_the_hull_leaves(tiny, echoes):
     store = EnsembleStore.open(echoes)
-    hull = echo_hull(head_of(tiny()), store)
-    own, given = (echo_region(tiny(), head_of(tiny()), store, each) for each in (None, hull))
+    hull = Echoes(store, head_of(tiny())).hull
+    own, given = (region_of(tiny(), Echoes(store, head_of(tiny()), each)) for each in (None, hull))
     torch.testing.assert_close(own[0], given[0])
     places = own[0][0] + torch.rand(2000, 3) * (own[0][1] - own[0][0])
     found = given[1](places, 0.002)
@@ -335,7 +336,7 @@ def test_what_is_possible_is_what_the_hull_leaves(tiny, echoes):
     # A hull that leaves nothing is not believed over the settings' own box.
     box = {"lower": (-0.1,) * 3, "upper": (0.1,) * 3}
     empty = EchoHull(hull.emitters, hull.receivers, hull.first + 1.0, hull.axes)
-    _, possible = echo_region(tiny(region=box), head_of(tiny()), store, empty)
+    _, possible = region_of(tiny(region=box), Echoes(store, head_of(tiny()), empty))
     assert possible(places, 0.002).all()
 
 
@@ -349,12 +350,10 @@ def test_renderer_and_refinement_have_the_range_resolution_of_the_head(config):
         axes=np.array([[1.0, 0.0, 0.0]]),
         within=0.5,
     )
-    poses = np.zeros((1, 3)), np.eye(3)[None], np.array([0]), np.array([0])
     work = Refinement(
         {"filled": trimesh.creation.icosphere()},
-        Echoes(*poses, lambda number: None),
+        echoes_of(head, np.zeros((1, 3)), np.eye(3)[None], None, [0], hull),
         Optics(head),
-        hull=hull,
         simulate=lambda mesh: None,
         seed=0,
     )

@@ -14,7 +14,7 @@ from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.head.spectrogram import range_axis
 from sononerf.run import calibrate as module
 from sononerf.run.calibrate import calibrate, dependent_cells, describe, kinds_of, moved
-from sononerf.run.fitted import load_fitted, store_of
+from sononerf.run.fitted import echoes_of, load_fitted
 from sononerf.run.store_settings import with_store
 from sononerf.settings.schema import SpectrogramSettings
 from sononerf.surface.refine.self_calibration import Calibration, Estimate
@@ -34,7 +34,7 @@ def run(fitted_run, tmp_path, monkeypatch):
 
 
 def test_a_gain_is_taken_off_a_copy(run, tmp_path, tiny_settings):
-    store = store_of(load_fitted(run))
+    store = echoes_of(load_fitted(run)).store
     loud = tmp_path / "loud"
     shutil.copytree(store.path, loud)
     found = calibrate(run, tmp_path / "corrected", ["gain"])
@@ -56,7 +56,7 @@ def test_a_gain_is_taken_off_a_copy(run, tmp_path, tiny_settings):
 
 def test_the_speed_of_sound_changes_the_ranges(run, tmp_path):
     found = calibrate(run, tmp_path / "corrected", ["speed_of_sound"])
-    store = store_of(load_fitted(run))
+    store = echoes_of(load_fitted(run)).store
     ratio = found.store.attributes["speed_of_sound"] / store.attributes["speed_of_sound"]
     np.testing.assert_allclose(found.store.range, np.asarray(store.range) * ratio, rtol=1e-6)
     analysis = SpectrogramSettings(**found.store.attributes["settings"]["spectrogram"])
@@ -70,7 +70,7 @@ def test_the_speed_of_sound_changes_the_ranges(run, tmp_path):
 
 def test_poses_are_corrected_but_those_held_out(run, tmp_path):
     found = calibrate(run, tmp_path / "corrected", ["position", "aim"])
-    store = store_of(load_fitted(run))
+    store = echoes_of(load_fitted(run)).store
     off = np.linalg.norm(found.store.positions - store.positions, axis=1)
     assert (off[store.split == 2] == 0.0).all()
     assert (off[store.split != 2] > 0.0).any()
@@ -78,7 +78,7 @@ def test_poses_are_corrected_but_those_held_out(run, tmp_path):
 
 def test_what_is_not_determined_is_said(run):
     fitted = load_fitted(run)
-    store = store_of(fitted)
+    store = echoes_of(fitted).store
     kinds = ("gain", "range_offset", "speed_of_sound", "position")
     estimate = Estimate(
         Calibration.none(2, len(store)),

@@ -85,11 +85,11 @@ def test_runs_that_look_turned_round_are_said_to_be(run, tmp_path, capsys):
         score, said = numbers(folder)["score"], capsys.readouterr().err
         if first is one:
             assert score > 0.99
-            assert "belongs into the first run" not in said
+            assert "runs look swapped" not in said
         else:
             assert score < 1e-3
             assert "one has up to 1.00 of the maximum that silent has not" in said
-            assert "belongs into the first run" in said
+            assert "runs look swapped" in said
 
 
 def test_poses_of_both_runs_are_listened_from(run):

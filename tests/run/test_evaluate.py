@@ -13,7 +13,7 @@ from PIL import Image
 
 from sononerf.errors import InputError, NumericalError
 from sononerf.evaluation import baseline
-from sononerf.run import evaluate as evaluate_module
+from sononerf.evaluation import geometry as geometry_module
 from sononerf.run import truth
 from sononerf.run.evaluate import evaluate
 from sononerf.run.reconstruct import reconstruct
@@ -35,11 +35,11 @@ GEOMETRY = {
 @pytest.fixture
 def few_samples(monkeypatch):
     """A hundred thousand samples of each surface are for the reports, and so are pictures."""
-    metrics = functools.partial(evaluate_module.geometry_metrics, samples=2000)
-    monkeypatch.setattr(evaluate_module, "geometry_metrics", metrics)
-    of_target = functools.partial(evaluate_module.target_metrics, samples=2000)
-    monkeypatch.setattr(evaluate_module, "target_metrics", of_target)
-    monkeypatch.setattr(evaluate_module, "BASELINE_VOXELS", 24)
+    metrics = functools.partial(geometry_module.geometry_metrics, samples=2000)
+    monkeypatch.setattr(geometry_module, "geometry_metrics", metrics)
+    of_target = functools.partial(geometry_module.target_metrics, samples=2000)
+    monkeypatch.setattr(geometry_module, "target_metrics", of_target)
+    monkeypatch.setattr(geometry_module, "BASELINE_VOXELS", 24)
     monkeypatch.setattr(baseline, "LEVEL_SAMPLES", 300)
 
 

@@ -16,7 +16,8 @@ from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import read_pose_csv
 from sononerf.run.export import export
 from sononerf.run.predict import predict
-from sononerf.run.reconstruct import read_mesh, reconstruct
+from sononerf.run.reconstruct import reconstruct
+from sononerf.run.run_folder import RunFolder
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +62,7 @@ def test_prediction_volume_and_points_of_a_run(run, tmp_path):
     lines = export(run, tmp_path / "points.csv").read_text().splitlines()
     assert lines[0] == "x,y,z,nx,ny,nz,poses"
     table = np.loadtxt(io.StringIO("\n".join(lines[1:])), delimiter=",")
-    assert len(table) == len(read_mesh(run / "reconstruction" / "mesh.ply").vertices)
+    assert len(table) == len(RunFolder(run).mesh().vertices)
     assert (table[:, :3] * table[:, 3:6]).sum(axis=1).mean() > 0  # normals look outward
 
 

@@ -1,20 +1,30 @@
 # SPDX-License-Identifier: MIT
-"""What follows a fit comes in its order, and a field without a surface predicts all the same."""
+"""The stages after a fit come in their order, each once, and an interrupted call goes on."""
 
 from __future__ import annotations
 
 import shutil
+import threading
 
 import pytest
+import safetensors.torch
 import trimesh
 
-from sononerf.errors import NumericalError
+from sononerf import storage
+from sononerf.errors import LockedError, NumericalError
 from sononerf.field.weights import load_weights, save_weights
 from sononerf.progress import Progress
 from sononerf.run import finish as finish_module
-from sononerf.run.finish import finish, is_finished
-from sononerf.run.run_folder import RunFolder
-from sononerf.run.traced import NAME, learn_traced
+from sononerf.run import fitted as fitted_module
+from sononerf.run import run_folder as run_module
+from sononerf.run.evaluate import evaluate
+from sononerf.run.finish import finish
+from sononerf.run.predict import predict
+from sononerf.run.reconstruct import reconstruct
+from sononerf.run.run_folder import STAGES, RunFolder
+from sononerf.run.traced_file import NAME
+
+SPHERE = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
 
 
 class Heard(Progress):
@@ -39,26 +49,93 @@ def run(fitted_run, tmp_path):
 
 @pytest.fixture
 def steps(monkeypatch):
-    """Let every step say its name and nothing more."""
+    """Let every stage say its name and leave what tells that it is done."""
     called = []
-    for name in ("learn_traced", "predict"):
-        monkeypatch.setattr(
-            finish_module,
-            name,
-            lambda path, *, accelerator, progress, name=name: called.append((name, accelerator)),
-        )
-    for name in ("reconstruct", "evaluate"):
-        monkeypatch.setattr(
-            finish_module,
-            name,
-            lambda path, *, progress, name=name, **given: called.append(name) or given,
-        )
+
+    def reconstruct_quickly(run, **options):
+        called.append("surface")
+        run.reconstruction.mkdir(exist_ok=True)
+        (run.reconstruction / "mesh.ply").write_bytes(SPHERE.export(file_type="ply"))
+        storage.commit_json(run.reconstruction / "read_out.json", {"level": None})
+
+    def learn_quickly(fitted, echoes, mesh, simulation, **options):
+        called.append("traced")
+        return finish_module.Traced.none(mesh, fitted.head)
+
+    def predict_quickly(run, **options):
+        called.append("prediction")
+        run.write_metrics("prediction", {})
+
+    def evaluate_quickly(run, **options):
+        called.append("evaluation")
+        run.write_metrics("geometry", None)
+        run.write_metrics("baseline", {})
+
+    for name, made in (
+        ("reconstruct", reconstruct_quickly),
+        ("learn_traced", learn_quickly),
+        ("predict", predict_quickly),
+        ("evaluate", evaluate_quickly),
+    ):
+        monkeypatch.setattr(finish_module, name, made)
     return called
 
 
-def test_traces_are_learned_off_the_mesh_before_anything_is_predicted(run, steps):
+ALL = list(STAGES[1:])
+STEPS = {
+    "surface": "reconstruct",
+    "traced": "learn_traced",
+    "prediction": "predict",
+    "evaluation": "evaluate",
+}
+
+
+def test_each_stage_is_done_once_and_in_its_order(run, steps):
+    assert not RunFolder(run).is_finished
     finish(run, accelerator="cpu")
-    assert steps == ["reconstruct", ("learn_traced", "cpu"), ("predict", "cpu"), "evaluate"]
+    assert steps == ALL
+    assert RunFolder(run).is_finished
+    finish(run, accelerator="cpu")
+    assert steps == ALL
+
+
+@pytest.mark.parametrize("stage", ALL)
+def test_an_interrupt_repeats_its_own_stage_alone(run, steps, stage):
+    with pytest.MonkeyPatch.context() as patch:
+
+        def interrupted(*given, **options):
+            raise KeyboardInterrupt
+
+        patch.setattr(finish_module, STEPS[stage], interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            finish(run, accelerator="cpu")
+    assert steps == ALL[: ALL.index(stage)]
+    finish(run, accelerator="cpu")
+    assert steps == ALL
+
+
+def test_another_surface_repeats_what_depends_on_it(run, steps):
+    finish(run, accelerator="cpu")
+    opened = RunFolder(run)
+    opened.begin("surface")
+    assert [stage for stage in STAGES if opened.is_done(stage)] == ["fit", "traced", "prediction"]
+    bumpy = SPHERE.copy().apply_scale(1.01)
+    (opened.reconstruction / "mesh.ply").write_bytes(bumpy.export(file_type="ply"))
+    storage.commit_json(opened.reconstruction / "read_out.json", {"level": None})
+    del steps[:]
+    finish(run, accelerator="cpu")
+    assert steps == ["traced", "prediction", "evaluation"]
+
+
+def test_a_run_of_before_is_finished_where_its_traces_name_no_mesh(run, steps):
+    finish(run, accelerator="cpu")
+    tensors = safetensors.torch.load_file(run / NAME)
+    with safetensors.safe_open(str(run / NAME), "pt") as opened:
+        model = opened.metadata()["model"]
+    (run / NAME).write_bytes(safetensors.torch.save(tensors, {"model": model}))
+    assert RunFolder(run).is_finished
+    (run / NAME).write_bytes(safetensors.torch.save(tensors, {"model": "of another fit"}))
+    assert not RunFolder(run).is_finished
 
 
 def test_nothing_is_predicted_where_nothing_is_held_out(run, steps):
@@ -66,52 +143,74 @@ def test_nothing_is_predicted_where_nothing_is_held_out(run, steps):
     description["settings"]["poses"]["heldout"] = 0
     save_weights(run, state, description)
     finish(run)
-    assert steps == ["reconstruct", ("learn_traced", "auto"), "evaluate"]
+    assert steps == ["surface", "traced", "evaluation"]
+    assert RunFolder(run).is_finished
 
 
-@pytest.mark.parametrize("name", ["reconstruct", "learn_traced"])
-def test_a_field_without_a_surface_predicts_before_it_is_told(run, steps, monkeypatch, name):
-    def silent(path, **options):
+@pytest.mark.parametrize("stage", ["surface", "traced"])
+def test_a_field_without_a_surface_predicts_before_it_is_told(run, steps, monkeypatch, stage):
+    def silent(*given, **options):
         raise NumericalError("the field is silent everywhere")
 
-    monkeypatch.setattr(finish_module, name, silent)
+    monkeypatch.setattr(finish_module, STEPS[stage], silent)
     with pytest.raises(NumericalError, match="silent everywhere"):
         finish(run)
-    assert steps[-1] == ("predict", "auto")
+    assert steps[-1] == "prediction"
 
 
 def test_a_surface_that_cannot_be_traced_is_told_and_no_fault(run, steps, monkeypatch):
-    def speck(path, **given):
-        mesh = trimesh.creation.icosphere(radius=1e-5)
-        (path / "reconstruction").mkdir()
-        (path / "reconstruction" / "mesh.ply").write_bytes(mesh.export(file_type="ply"))
-
-    monkeypatch.setattr(finish_module, "reconstruct", speck)
-    monkeypatch.setattr(finish_module, "learn_traced", learn_traced)
+    monkeypatch.undo()
+    opened = RunFolder(run)
+    opened.reconstruction.mkdir()
+    speck = trimesh.creation.icosphere(radius=1e-5)
+    (opened.reconstruction / "mesh.ply").write_bytes(speck.export(file_type="ply"))
     progress = Heard()
-    finish(run, accelerator="cpu", progress=progress)
+    finish_module._learn_traced(opened, "cpu", progress)
     assert any(text.startswith("no echoes are traced off the surface: ") for text in progress.said)
-    assert steps == [("predict", "cpu"), "evaluate"]
+    assert not opened.traced().weight.any()
 
 
-def test_a_run_is_finished_when_its_mesh_and_all_that_comes_of_it_are_there(run):
-    assert not is_finished(run)
-    numbers = RunFolder(run)
-    mesh = run / "reconstruction" / "mesh.ply"
-    mesh.parent.mkdir()
-    mesh.touch()
-    numbers.write_metrics("geometry", None)  # of a scene that is not installed here
-    numbers.write_metrics("baseline", {})
-    assert not is_finished(run)  # as a run of before echoes were traced
-    (run / NAME).touch()
-    assert is_finished(run)
-    mesh.unlink()
-    assert not is_finished(run)
-    mesh.touch()
-    for section in ("geometry", "baseline"):
-        numbers.drop_metrics(section)
-        assert not is_finished(run)
-        numbers.write_metrics(section, {})
-        assert is_finished(run)
-    (run / "metrics.json").unlink()
-    assert not is_finished(run)
+def test_one_call_loads_field_and_echoes_once(run, monkeypatch):
+    loaded = []
+    for name in ("load_fitted", "echoes_of"):
+        real = getattr(fitted_module, name)
+        monkeypatch.setattr(
+            run_module, name, lambda given, real=real, name=name: loaded.append(name) or real(given)
+        )
+    monkeypatch.setattr(
+        finish_module, "learn_traced", lambda f, e, m, s, **o: finish_module.Traced.none(m, f.head)
+    )
+    finish(run, accelerator="cpu")
+    assert sorted(loaded) == ["echoes_of", "load_fitted"]
+
+
+@pytest.mark.parametrize("command", [reconstruct, predict, evaluate, finish])
+def test_a_run_in_use_is_left_alone(run, command):
+    before = sorted(run.rglob("*"))
+    caught = []
+
+    def elsewhere():
+        with pytest.raises(LockedError) as error:
+            command(run)
+        caught.append(error.value)
+
+    with storage.lock(run):
+        other = threading.Thread(target=elsewhere)
+        other.start()
+        other.join()
+    assert "in use by process" in str(caught[0])
+    assert sorted(run.rglob("*")) == before
+
+
+def test_the_lock_is_held_until_the_last_number_is_written(run, steps, monkeypatch):
+    written = []
+    real = RunFolder.write_metrics
+
+    def watched(self, *given, **options):
+        written.append((self.path / ".lock").is_file())
+        return real(self, *given, **options)
+
+    monkeypatch.setattr(RunFolder, "write_metrics", watched)
+    finish(run, accelerator="cpu")
+    assert written
+    assert all(written)

@@ -21,6 +21,7 @@ from sononerf import storage
 from sononerf.callbacks.checkpoint import SIGNALS, CheckpointCallback
 from sononerf.callbacks.preview import PreviewCallback
 from sononerf.callbacks.progress_bar import ProgressCallback
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import (
@@ -32,12 +33,13 @@ from sononerf.errors import (
     StoppedError,
 )
 from sononerf.field.checkpoint_io import DurableCheckpointIO
+from sononerf.field.fitting import require_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.head.directivity.sofa_writer import write_sofa
 from sononerf.progress import Progress
 from sononerf.run import fit as fit_module
-from sononerf.run.build import echo_hull, head_of
-from sononerf.run.fit import fit, peak_memory_bytes, require_accelerator
+from sononerf.run.build import head_of
+from sononerf.run.fit import fit, peak_memory_bytes
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
 from tests.head.directivity.patterns import pair
@@ -271,7 +273,7 @@ def finished(tiny_settings, without_pictures, tmp_path_factory):
 def test_a_finished_run_is_left_as_it_is(tiny, finished):
     before = files(finished)
     found = run(tiny(data={"memory_bytes": 10**9}, fit={"checkpoint_seconds": 5}), finished)
-    assert found.is_fitted
+    assert found.is_done("fit")
     assert files(finished) == before
 
 
@@ -422,7 +424,7 @@ def test_of_poses_on_a_line_it_is_said_what_they_do_not_tell(tmp_path, tiny, mon
 
 
 def test_a_run_holds_what_its_training_poses_heard_first(finished, echoes, tiny):
-    hull = echo_hull(head_of(tiny()), EnsembleStore.open(echoes))
+    hull = Echoes(EnsembleStore.open(echoes), head_of(tiny())).hull
     held = safetensors.torch.load_file(finished / "model.safetensors")
     names = {name for name in held if name.startswith("hull.")}
     assert names == {f"hull.{name}" for name in vars(hull)}

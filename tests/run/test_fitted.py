@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 import torch
 
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
+from sononerf.field.fitting import poses_of, render_poses
 from sononerf.field.weights import load_weights, save_weights
 from sononerf.progress import Progress
-from sononerf.run.build import echo_hull, head_of
+from sononerf.run.build import head_of
 from sononerf.run.fit import fit
-from sononerf.run.fitted import load_fitted, poses_of, render_poses, store_of
+from sononerf.run.fitted import echoes_of, load_fitted
 from sononerf.settings.loading import validate_settings
 
 QUIET = Progress(quiet=True)
@@ -85,7 +87,7 @@ def test_weights_without_what_is_needed_are_told(run, name):
 
 def test_what_is_loaded_knows_what_first_echoes_leave(run, echoes, tiny):
     """An ear that heard nothing goes with the weights like all others."""
-    hull = echo_hull(head_of(tiny()), EnsembleStore.open(echoes))
+    hull = Echoes(EnsembleStore.open(echoes), head_of(tiny())).hull
     state, description = load_weights(run)
     state["hull.first"][3, 1] = -torch.inf
     save_weights(run, state, description)
@@ -150,27 +152,28 @@ def test_damaged_or_missing_weights_are_told(run, tmp_path):
 
 def test_the_ensemble_is_found_where_the_settings_or_its_hash_say(run, echoes, tmp_path):
     fitted = load_fitted(run)
-    assert store_of(fitted).path == echoes
+    assert echoes_of(fitted).store.path == echoes
     section = fitted.settings.data.model_dump()
     plain = {**fitted.settings.plain(), "data": {**section, "store": None}}
     change(run, settings=validate_settings(plain, "plain").plain())
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
         with pytest.raises(InputError, match=rf"sphere-{fitted.echo_hash[:8]}\w*: .*is not there"):
-            store_of(load_fitted(run))
+            echoes_of(load_fitted(run))
 
 
 def test_an_ensemble_of_other_echoes_is_refused(run):
     change(run, echo_hash="0" * 64)
     with pytest.raises(IncompatibleError, match="holds other echoes"):
-        store_of(load_fitted(run))
+        echoes_of(load_fitted(run))
 
 
 @pytest.mark.parametrize(("split", "count"), [("train", 8), ("val", 2), ("test", 2)])
 def test_poses_of_a_split_with_what_was_measured_there(run, split, count):
     fitted = load_fitted(run)
-    store = store_of(fitted)
-    poses = poses_of(store, split, fitted.module.renderer)
+    heard = echoes_of(fitted)
+    store = heard.store
+    poses = poses_of(heard, split, fitted.module.renderer)
     numbers = store.indices(split)
     assert len(poses) == len(numbers) == count
     for row, number in enumerate(numbers.tolist()):
@@ -184,15 +187,15 @@ def test_poses_of_a_split_with_what_was_measured_there(run, split, count):
 
 def test_a_split_without_poses_has_none(run, monkeypatch):
     fitted = load_fitted(run)
-    store = store_of(fitted)
-    monkeypatch.setattr(store, "indices", lambda split: np.zeros(0, dtype=np.int64))
-    assert len(poses_of(store, "val", fitted.module.renderer)) == 0
+    heard = echoes_of(fitted)
+    monkeypatch.setattr(heard.store, "indices", lambda split: np.zeros(0, dtype=np.int64))
+    assert len(poses_of(heard, "val", fitted.module.renderer)) == 0
 
 
 def test_rendering_goes_pose_by_pose_and_in_order(run):
     fitted = load_fitted(run)
     renderer = fitted.module.renderer
-    poses = poses_of(store_of(fitted), "train", renderer).only(torch.tensor([4, 1, 6]))
+    poses = poses_of(echoes_of(fitted), "train", renderer).only(torch.tensor([4, 1, 6]))
     rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
     assert rendered.dtype == np.float32
     assert rendered.shape == (3, 2, len(renderer.range), len(renderer.frequency))
@@ -206,18 +209,18 @@ def test_rendering_goes_pose_by_pose_and_in_order(run):
 
 def test_rendering_does_not_look_at_what_was_measured(run, monkeypatch):
     fitted = load_fitted(run)
-    poses = poses_of(store_of(fitted), "val", fitted.module.renderer)
+    poses = poses_of(echoes_of(fitted), "val", fitted.module.renderer)
     rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
     read = EnsembleStore.read_pose
     monkeypatch.setattr(EnsembleStore, "read_pose", lambda *given: 0 * read(*given))
-    again = poses_of(store_of(fitted), "val", fitted.module.renderer)
+    again = poses_of(echoes_of(fitted), "val", fitted.module.renderer)
     deaf = render_poses(fitted, again, accelerator="cpu", progress=QUIET)
     np.testing.assert_array_equal(deaf, rendered)
 
 
 def test_a_gpu_that_is_not_there(run, monkeypatch):
     fitted = load_fitted(run)
-    poses = poses_of(store_of(fitted), "val", fitted.module.renderer)
+    poses = poses_of(echoes_of(fitted), "val", fitted.module.renderer)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     with pytest.raises(ResourceError):
@@ -241,11 +244,11 @@ def test_what_was_fitted_without_its_background_is_measured_without_it(run, tiny
     alone.seal()
     fitted = load_fitted(run)
     settings = tiny(data={"background": str(tmp_path / "alone")})
-    store = store_of(dataclasses.replace(fitted, settings=settings))
+    store = echoes_of(dataclasses.replace(fitted, settings=settings)).store
     np.testing.assert_allclose(
         store.read_pose(1), np.sqrt(0.75) * heard.read_pose(1), rtol=1e-5, atol=1e-9
     )
-    assert type(store_of(fitted)) is EnsembleStore
+    assert type(echoes_of(fitted).store) is EnsembleStore
     path = tmp_path / "fitted"
     fit(settings, path)
     reference = load_fitted(path).module.reference

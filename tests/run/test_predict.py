@@ -16,6 +16,7 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
 from sononerf.progress import Progress
 from sononerf.run import predict as predict_module
+from sononerf.run import run_folder as run_module
 from sononerf.run.fit import fit
 from sononerf.run.fitted import load_fitted
 from sononerf.run.predict import predict
@@ -109,7 +110,7 @@ def test_poses_of_ones_own_need_neither_store_nor_scene(run, tmp_path, monkeypat
     def gone(*given):
         raise AssertionError("asked for the ensemble")
 
-    monkeypatch.setattr(predict_module, "store_of", gone)
+    monkeypatch.setattr(run_module, "echoes_of", gone)
     (tmp_path / "poses.csv").write_text(CSV)
     folder = predict(run, poses_csv=tmp_path / "poses.csv", accelerator="cpu")
     assert folder == run / "prediction-poses"
@@ -157,9 +158,10 @@ def test_poses_within_the_region_are_told(run, tmp_path, no_pictures, monkeypatc
     csv.write_text(f"{CSV}{x},{y},{z},0,0,0\n")
     fitted = load_fitted(run)
     fitted.module.renderer.range[0] = 0.0
-    monkeypatch.setattr(predict_module, "load_fitted", lambda path: fitted)
+    within = RunFolder(run)
+    within.fitted = fitted
     monkeypatch.setattr(Progress, "say", lambda self, text: told.append(text))
-    predict(run, poses_csv=csv, accelerator="cpu")
+    predict(within, poses_csv=csv, accelerator="cpu")
     assert len(told) == 1
     assert told[0].endswith("within the fitted region, where no pose was trained, lie poses 2")
 

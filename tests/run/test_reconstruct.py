@@ -5,21 +5,21 @@ from __future__ import annotations
 
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
 
-from sononerf.errors import NumericalError
+from sononerf.errors import NumericalError, SettingsError
 from sononerf.progress import Progress
 from sononerf.run import reconstruct as reconstruct_module
 from sononerf.run.fitted import load_fitted
 from sononerf.run.reconstruct import reconstruct
+from sononerf.surface import surface as surface_module
 from sononerf.surface.openness import Openness
 from sononerf.surface.start import read_out as read_out_module
-from sononerf.surface.start.read_out import Reconstruction
-from sononerf.surface.start.volume import Volume
 
 
 def read_out(folder):
@@ -69,54 +69,49 @@ def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
     assert not (run / "metrics.json").exists()
 
 
-@pytest.fixture
-def judged(run, tmp_path, no_projections, monkeypatch):
-    """Reconstruct a ball, judged as asked; return the folder and what was said."""
-    ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
-    volume = Volume(np.zeros((2, 2, 2), np.float32), np.zeros(3), 0.01)
-
-    def make(openness, **given):
-        found = Reconstruction(ball, volume, None, "filled", openness)
-
-        def noted(*field, **options):
-            make.asked = options
-            return found
-
-        monkeypatch.setattr(reconstruct_module, "read_out", noted)
-        monkeypatch.setattr(reconstruct_module, "side_by_side_png", lambda *meshes: b"")
-        said = []
-        progress = Progress(quiet=True)
-        monkeypatch.setattr(progress, "say", said.append)
-        name = "none" if openness is None else openness.kind
-        return reconstruct(run, output=tmp_path / name, progress=progress, **given), said
-
-    return make
-
-
-def test_what_kind_of_surface_it_is_is_written_and_of_open_ones_it_is_said(judged):
-    nothing = np.zeros(0, dtype=bool)
-    folder, said = judged(Openness(nothing, unseen_share=0.384, thin_share=0.01))
-    assert read_out(folder)["surface"] == "one-sided"
-    assert said == ["the surface is open: 38% of it, which no pose heard, is left out"]
-    folder, said = judged(Openness(nothing, unseen_share=0.02, thin_share=0.926))
-    assert read_out(folder)["surface"] == "sheet"
-    assert said == ["the surface is a sheet: 93% of it has its other side right behind it"]
-    for openness, name in ((Openness(nothing, 0.02, 0.01), "closed"), (None, None)):
-        folder, said = judged(openness)
-        assert read_out(folder)["surface"] == name
-        assert said == []
+@pytest.mark.parametrize(
+    ("openness", "name", "said"),
+    [
+        (
+            {"unseen_share": 0.384, "thin_share": 0.01},
+            "one-sided",
+            ["the surface is open: 38% of it, which no pose heard, is left out"],
+        ),
+        (
+            {"unseen_share": 0.02, "thin_share": 0.926},
+            "sheet",
+            ["the surface is a sheet: 93% of it has its other side right behind it"],
+        ),
+        ({"unseen_share": 0.02, "thin_share": 0.01}, "closed", []),
+    ],
+)
+def test_what_kind_of_surface_it_is_is_written_and_of_open_ones_it_is_said(
+    run, tmp_path, no_projections, monkeypatch, openness, name, said
+):
+    kind = Openness(np.zeros(0, dtype=bool), **openness)
+    real = reconstruct_module.finished_surface
+    monkeypatch.setattr(
+        reconstruct_module,
+        "finished_surface",
+        lambda *given, **more: replace(real(*given, **more), openness=kind),
+    )
+    heard, progress = [], Progress(quiet=True)
+    monkeypatch.setattr(progress, "say", heard.append)
+    folder = reconstruct(run, spacing=0.012, output=tmp_path / "out", progress=progress)
+    assert read_out(folder)["surface"] == name
+    assert heard == said
 
 
 def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, monkeypatch):
     asked = []
-    plain = read_out_module.judge_openness
+    plain = surface_module.judge_openness
 
     def judge(mesh, sources, *, resolution):
         asked.append(sources)
         assert resolution == load_fitted(run).head.resolution
         return plain(mesh, sources, resolution=resolution)
 
-    monkeypatch.setattr(read_out_module, "judge_openness", judge)
+    monkeypatch.setattr(surface_module, "judge_openness", judge)
     folder = reconstruct(run, spacing=0.012)
     np.testing.assert_allclose(asked[0], load_fitted(run).hull.sources)
     assert len(asked) == 1
@@ -132,19 +127,32 @@ def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, mo
         ({}, {}, "filled"),
         ({"method": "open"}, {}, "open"),
         ({"method": "open"}, {"method": "hull"}, "hull"),
-        ({"method": "open"}, {"level": 0.4}, "isosurface"),
-        ({"level": 0.4}, {}, "isosurface"),
-        ({"level": 0.4}, {"method": "hull"}, "hull"),
-        ({"level": 0.4}, {"level": "auto"}, "filled"),
+        ({"method": "open"}, {"level": "found"}, "isosurface"),
+        ({"level": "found"}, {}, "isosurface"),
+        ({"level": "found"}, {"method": "hull"}, "hull"),
+        ({"level": "found"}, {"level": "auto"}, "filled"),
     ],
 )
-def test_what_the_caller_gives_replaces_the_settings(judged, run, settings, given, expected):
+def test_what_the_caller_gives_replaces_the_settings(
+    run, tmp_path, no_projections, settings, given, expected
+):
+    plain = reconstruct(run, spacing=0.012, method="isosurface", output=tmp_path / "plain")
+    level = read_out(plain)["level"]
+    settings, given = (
+        {key: level if value == "found" else value for key, value in part.items()}
+        for part in (settings, given)
+    )
     description = json.loads((run / "model.json").read_text())
     description["settings"]["reconstruction"] |= settings
     (run / "model.json").write_text(json.dumps(description))
-    judged(None, **given)
-    assert judged.asked["method"] == expected
-    assert judged.asked["level"] == (0.4 if expected == "isosurface" else "auto")
+    found = read_out(reconstruct(run, spacing=0.012, output=tmp_path / "out", **given))
+    assert found["method"] == expected
+    assert found["level"] == (level if expected == "isosurface" else None)
+
+
+def test_only_an_isosurface_has_a_level(run):
+    with pytest.raises(SettingsError, match="method hull has no level"):
+        reconstruct(run, method="hull", level=0.5)
 
 
 def test_a_level_above_everything_has_no_surface(run):
@@ -155,15 +163,15 @@ def test_a_level_above_everything_has_no_surface(run):
 def test_the_hull_of_first_echoes_is_the_surface_where_the_field_has_none(
     run, no_projections, monkeypatch
 ):
-    real, asked = reconstruct_module.read_out, []
+    real, asked = read_out_module.estimate_occupancy, []
 
-    def only_the_hull(field, *, method, **options):
-        asked.append(method)
-        if method != "hull":
+    def only_the_hull(known, belief):
+        asked.append(belief)
+        if belief != "hull":
             raise NumericalError("no surface: the lattice is empty")
-        return real(field, method=method, **options)
+        return real(known, belief)
 
-    monkeypatch.setattr(reconstruct_module, "read_out", only_the_hull)
+    monkeypatch.setattr(read_out_module, "estimate_occupancy", only_the_hull)
     folder = reconstruct(run)
     assert asked == ["filled", "hull"]
     assert read_out(folder)["method"] == "hull"

@@ -3,23 +3,26 @@
 
 from __future__ import annotations
 
+import json
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 import trimesh
 
-from sononerf.errors import ResourceError
+from sononerf.errors import IncompatibleError, ResourceError
 from sononerf.progress import Progress
 from sononerf.run import reconstruct as reconstruct_module
 from sononerf.run import refine as module
-from sononerf.run.fitted import load_fitted
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.refine import STATE, refine_surface
+from sononerf.run.run_folder import RunFolder
 from sononerf.storage import read_json
 from sononerf.surface.refine import comparison as core
+from sononerf.surface.refine import refinement as refinement_module
+from sononerf.surface.refine import stages
 from sononerf.surface.refine.refinement import Refinement
 from sononerf.surface.refine.stages import Stage
 
@@ -48,70 +51,49 @@ class Heard(Progress):
 def run(fitted_run, tmp_path, monkeypatch):
     for where, name in ((core, "RAYS"), (module, "RAYS")):
         monkeypatch.setattr(where, name, 500)
-    real = Refinement.__init__
-
-    def short(self, *given, **named):
-        real(self, *given, **{**named, "stages": SHORT})
-
-    monkeypatch.setattr(Refinement, "__init__", short)
+    for where in (refinement_module, stages):
+        monkeypatch.setattr(where, "STAGES", SHORT)
+    for name in ("mesh_png", "side_by_side_png", "confidence_png"):
+        monkeypatch.setattr(reconstruct_module, name, lambda *given: b"")
     path = tmp_path / "run"
     shutil.copytree(fitted_run, path)
     return path
 
 
-def refined(path, start=BUMPY, progress=QUIET):
-    return refine_surface(
-        path, load_fitted(path), {"filled": start}, accelerator="cpu", progress=progress
-    )
+def with_settings(run, section, **values):
+    description = json.loads((run / "model.json").read_text())
+    description["settings"][section] |= values
+    (run / "model.json").write_text(json.dumps(description))
 
 
-def test_a_run_has_its_refined_surface(run, monkeypatch):
-    monkeypatch.setattr(reconstruct_module, "mesh_png", lambda *given: b"")
-    monkeypatch.setattr(reconstruct_module, "side_by_side_png", lambda *given: b"")
-    fitted = load_fitted(run)
-    options = fitted.settings.reconstruction.model_copy(update={"refine": True})
-    wanted = fitted.settings.model_copy(update={"reconstruction": options})
-    asked = []
+def refined(path, start=BUMPY):
+    return refine_surface(RunFolder(path), {"filled": start}, accelerator="cpu", progress=QUIET)
 
-    def noted(path, fitted, starts, *, accelerator, progress):
-        asked.append(accelerator)
-        return refine_surface(
-            path, fitted, {"filled": BUMPY}, accelerator=accelerator, progress=progress
-        )
 
-    monkeypatch.setattr(reconstruct_module, "refine_surface", noted)
-    monkeypatch.setattr(
-        reconstruct_module,
-        "load_fitted",
-        lambda path: replace(fitted, settings=wanted),
-    )
+def test_a_run_has_its_refined_surface(run, no_projections):
+    with_settings(run, "reconstruction", refine=True)
     folder = reconstruct(run, accelerator="cpu", spacing=0.008)
-    assert asked == ["cpu"]
     found = read_json(folder / "read_out.json")
     assert isinstance(found["refined"], bool)
     assert found["validation_error_db"] > 0
-    reconstruct(run, level=0.3, spacing=0.008, accelerator="cpu")
-    assert asked == ["cpu"]  # a level of the user's is not refined away
+    again = reconstruct(run, method="filled", spacing=0.008, accelerator="cpu")
+    assert read_json(again / "read_out.json")["validation_error_db"] is None
 
 
-def test_without_its_echoes_a_surface_is_not_refined(run, monkeypatch):
-    description = (run / "model.json").read_text()
-    store = load_fitted(run).settings.data.store
-    (run / "model.json").write_text(description.replace(str(store), str(store) + "-gone"))
+def test_without_its_echoes_a_surface_is_not_refined(run, no_projections):
+    with_settings(run, "reconstruction", refine=True)
+    with_settings(run, "data", store=str(run.parent / "gone"))
     heard = Heard()
-    fitted = load_fitted(run)
-    assert reconstruct_module._refined(run, fitted, {"filled": BUMPY}, "cpu", heard) is None
-    (line,) = heard.said
-    assert line.startswith("the surface is not refined: ")
-    assert "is not there" in line
+    folder = reconstruct(run, accelerator="cpu", spacing=0.008, progress=heard)
+    assert heard.said[0].startswith("the surface is not refined: ")
+    assert "is not there" in heard.said[0]
+    assert read_json(folder / "read_out.json")["method"] == "filled"
 
 
-def test_an_interrupted_refinement_goes_on_to_the_same_surface(run, monkeypatch):
-    whole = refined(run)
-    assert not (run / STATE).exists()
-    fitted = load_fitted(run)
-    often = fitted.settings.fit.model_copy(update={"checkpoint_seconds": 1e-9})
-    hasty = replace(fitted, settings=fitted.settings.model_copy(update={"fit": often}))
+@pytest.fixture
+def interrupted(run, monkeypatch):
+    """A run whose refinement was interrupted after four steps."""
+    with_settings(run, "fit", checkpoint_seconds=1e-9)
     real, steps = Refinement.advance, []
 
     def stops(self):
@@ -120,38 +102,61 @@ def test_an_interrupted_refinement_goes_on_to_the_same_surface(run, monkeypatch)
         steps.append(self.drawn)
         return real(self)
 
-    monkeypatch.setattr(Refinement, "advance", stops)
-    with pytest.raises(KeyboardInterrupt):
-        refine_surface(run, hasty, {"filled": BUMPY}, accelerator="cpu", progress=QUIET)
+    with monkeypatch.context() as patch:
+        patch.setattr(Refinement, "advance", stops)
+        with pytest.raises(KeyboardInterrupt):
+            refined(run)
     assert (run / STATE).is_file()
-    more = []
+    return run
+
+
+def test_an_interrupted_refinement_goes_on_to_the_same_surface(interrupted, monkeypatch):
+    real, more = Refinement.advance, []
     monkeypatch.setattr(Refinement, "advance", lambda self: more.append(self.drawn) or real(self))
-    again = refine_surface(run, hasty, {"filled": BUMPY}, accelerator="cpu", progress=QUIET)
+    again = refined(interrupted)
     assert more == [4, 5, 6, 7, 8]  # the first stage is done twice
+    assert not (interrupted / STATE).exists()
+    whole = refined(interrupted)
     np.testing.assert_array_equal(again.mesh.vertices, whole.mesh.vertices)
-    assert not (run / STATE).exists()
 
 
 @pytest.mark.parametrize("what", ["another start", "damaged"])
-def test_a_state_that_does_not_fit_is_ignored(run, what):
-    (run / STATE).parent.mkdir(exist_ok=True)
+def test_a_state_that_does_not_fit_is_ignored(interrupted, what):
     if what == "damaged":
-        (run / STATE).write_bytes(b"nonsense")
+        (interrupted / STATE).write_bytes(b"nonsense")
+        wanted = BUMPY
     else:
-        fitted = load_fitted(run)
-        work = module.Refinement(
-            {"filled": BUMPY.copy().apply_scale(1.1)},
-            module.Echoes.of(module.store_of(fitted)),
-            module.Optics(fitted.head),
-            simulate=lambda mesh: None,
-            seed=0,
-        )
-        work.advance()
-        module._save(run / STATE, work, "of another start")
-    assert refined(run).mesh is not None
+        wanted = BUMPY.copy().apply_scale(1.1)
+    found = refined(interrupted, wanted)
+    (interrupted / STATE).unlink(missing_ok=True)
+    np.testing.assert_array_equal(found.mesh.vertices, refined(interrupted, wanted).mesh.vertices)
+
+
+def as_other_version(file):
+    file.write_bytes(safetensors.torch.save(safetensors.torch.load_file(file), {"of": "a start"}))
+
+
+def as_other_stages(file):
+    with safetensors.safe_open(str(file), "pt") as opened:
+        said = {**opened.metadata(), "stages": "()"}
+    file.write_bytes(safetensors.torch.save(safetensors.torch.load_file(file), said))
+
+
+@pytest.mark.parametrize("change", [as_other_version, as_other_stages])
+def test_a_state_of_another_version_is_refused_before_anything_is_written(
+    interrupted, change, no_projections
+):
+    with_settings(interrupted, "reconstruction", refine=True)
+    change(interrupted / STATE)
+    before = {p: p.read_bytes() for p in interrupted.rglob("*") if p.is_file()}
+    with pytest.raises(IncompatibleError, match=r"surface\.safetensors: .* remove this file"):
+        reconstruct(interrupted, accelerator="cpu", spacing=0.008)
+    assert {p: p.read_bytes() for p in interrupted.rglob("*") if p.is_file()} == before
+    (interrupted / STATE).unlink()
+    assert reconstruct(interrupted, accelerator="cpu", spacing=0.008).is_dir()
 
 
 def test_a_gpu_that_is_not_there_is_refused(run, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ResourceError, match="no GPU"):
-        refine_surface(run, load_fitted(run), {"filled": BUMPY}, accelerator="gpu", progress=QUIET)
+        refine_surface(RunFolder(run), {"filled": BUMPY}, accelerator="gpu", progress=QUIET)

@@ -176,7 +176,7 @@ def test_without_a_surface_the_page_says_so(finished, monkeypatch):
     def nothing(*given, **options):
         raise NumericalError("no surface: the field is silent everywhere")
 
-    monkeypatch.setattr(report_module, "read_out", nothing)
+    monkeypatch.setattr(report_module, "read_isosurface", nothing)
     text = report(finished, paper=True).read_text()
     assert "None: no surface: the field is silent everywhere." in text
     assert f"`sononerf compare {finished} OTHER`" in text
@@ -210,7 +210,9 @@ def test_numbers_that_are_none_are_named(finished, section, holds):
 def test_a_damaged_comparison_is_told_before_the_long_work(finished, monkeypatch, text):
     (finished / "compare-a").mkdir()
     (finished / "compare-a" / "comparison.json").write_text(text)
-    monkeypatch.setattr(report_module, "read_out", lambda *given, **more: pytest.fail("read out"))
+    monkeypatch.setattr(
+        report_module, "read_isosurface", lambda *given, **more: pytest.fail("read out")
+    )
     with pytest.raises(InputError, match=r"comparison\.json"):
         report(finished, paper=True)
     assert not (finished / "report").exists()  # nor pictures without a page
@@ -236,12 +238,11 @@ def test_the_isosurface_is_drawn_as_the_settings_say(finished, monkeypatch, meth
         asked.update(options)
         mesh = trimesh.creation.icosphere()
         volume = SimpleNamespace(spacing=options["spacing"])
-        return SimpleNamespace(mesh=mesh, volume=volume, level=2.5)
+        return mesh, volume, 2.5
 
-    monkeypatch.setattr(report_module, "read_out", read_out)
+    monkeypatch.setattr(report_module, "read_isosurface", read_out)
     assert said in report(finished, paper=True).read_text()
     assert asked["level"] == level
-    assert asked["method"] == "isosurface"
     assert (asked["spacing"], asked["directions"]) == (0.005, 12)
     assert asked["smoothing"] == own.get("smoothing", 0.0)
 

@@ -17,7 +17,7 @@ def run(tiny, tmp_path):
     path = tmp_path / "run"
     path.mkdir()
     run = RunFolder(path)
-    run.begin(tiny())
+    run.begin_fit(tiny())
     return run
 
 
@@ -43,14 +43,14 @@ def test_a_run_holds_its_settings_whole(run, tiny):
 
 
 def test_the_same_settings_begin_it_again_and_others_do_not(run, tiny):
-    run.begin(tiny())
+    run.begin_fit(tiny())
     with pytest.raises(IncompatibleError, match=r"\(fit\.seed\).*--output.*--overwrite"):
-        run.begin(tiny(fit={"seed": 9}))
+        run.begin_fit(tiny(fit={"seed": 9}))
     many = tiny(
         poses={"count": 9, "radius": 0.5, "seed": 1, "heldout": 1}, fit={"seed": 9, "epochs": 1}
     )
     with pytest.raises(IncompatibleError, match=r"poses\.radius, \.\.\.\)"):
-        run.begin(many)
+        run.begin_fit(many)
     assert run.open() == tiny()
 
 
@@ -59,7 +59,7 @@ def test_a_folder_of_something_else_is_refused(tiny, tmp_path):
     RunFolder(tmp_path).check(tiny())
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(InputError, match=r"holds 'thesis\.tex' and is no run"):
-        RunFolder(tmp_path).begin(tiny())
+        RunFolder(tmp_path).begin_fit(tiny())
     assert not (tmp_path / "config.yaml").exists()
 
 
@@ -72,7 +72,7 @@ def test_no_run(tmp_path):
 def test_damaged_settings_of_a_run_are_told(run, tiny):
     run.config.write_text("fit: [")
     with pytest.raises(SettingsError, match=r"config\.yaml"):
-        run.begin(tiny())
+        run.begin_fit(tiny())
 
 
 def test_sections_of_the_metrics_do_not_touch_each_other(run):

@@ -65,7 +65,7 @@ def test_a_fit_of_a_store_needs_no_scene(alone, tmp_path):
     assert metrics["geometry"] is None
     assert (run / "reconstruction" / "mesh.ply").is_file()
     again = fit(alone(evaluation={"registration": "rigid"}), run, accelerator="cpu")
-    assert again.is_fitted
+    assert again.is_done("fit")
 
 
 def test_an_unfinished_or_silent_store_is_refused(alone, echoes, tmp_path):

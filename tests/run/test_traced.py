@@ -16,17 +16,21 @@ import trimesh
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError
+from sononerf.evaluation import traced as traced_module
 from sononerf.evaluation.mixture import mix
+from sononerf.evaluation.traced import Traced
+from sononerf.field.fitting import poses_of, render_poses
 from sononerf.field.weights import load_weights, save_weights
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
+from sononerf.run import finish as finish_module
 from sononerf.run import predict as predict_module
-from sononerf.run import traced as traced_module
+from sononerf.run import run_folder as run_module
 from sononerf.run.build import head_of, simulator_of
-from sononerf.run.fitted import load_fitted, poses_of, render_poses, store_of
+from sononerf.run.fitted import echoes_of, load_fitted
 from sononerf.run.predict import predict
-from sononerf.run.reconstruct import read_mesh
-from sononerf.run.traced import NAME, Traced, learn_traced, load_traced, trace_poses
+from sononerf.run.run_folder import RunFolder
+from sononerf.run.traced_file import NAME, load_traced
 from sononerf.scene.scene import Scene
 from sononerf.simulation.simulator import Simulator
 
@@ -67,8 +71,16 @@ def run(fitted_run, tmp_path, monkeypatch):
     return path
 
 
-def learn(path, **options):
-    return learn_traced(path, accelerator="cpu", **options)
+def learn(path, progress=QUIET):
+    finish_module._learn_traced(RunFolder(path), "cpu", progress)
+    return load_traced(path).weight
+
+
+def trace_poses(fitted, surface, poses, *, progress):
+    simulation, seed = fitted.settings.simulation, fitted.settings.fit.seed
+    return traced_module.trace_poses(
+        surface, fitted.head, poses, simulation, seed=seed, progress=progress
+    )
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +130,7 @@ def test_echoes_of_the_true_surface_have_a_great_weight(run):
     np.testing.assert_array_equal(found.weight, weight)
     # Both are simulated; 500 rays give a level to some tenths of a decibel.
     np.testing.assert_allclose(found.gain_db, 0, atol=0.5)
-    surface = read_mesh(run / "reconstruction" / "mesh.ply")
+    surface = RunFolder(run).mesh()
     np.testing.assert_array_equal(found.mesh.vertices, surface.vertices)
     np.testing.assert_array_equal(found.mesh.faces, surface.faces)
 
@@ -143,8 +155,9 @@ def test_the_regression_has_the_validation_poses_alone(run, monkeypatch):
     assert (learn(run) == 0.4).all()
     fitted, surface = load_fitted(run), load_traced(run)
     assert (surface.weight == 0.4).all()
-    store, reference = store_of(fitted), fitted.module.reference
-    poses = poses_of(store, "val", fitted.module.renderer)
+    heard, reference = echoes_of(fitted), fitted.module.reference
+    store = heard.store
+    poses = poses_of(heard, "val", fitted.module.renderer)
     measured = [store.read_pose(int(i)) for i in store.indices("val")]
     np.testing.assert_array_equal(given["measured"], compress(measured, reference))
     rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
@@ -282,7 +295,7 @@ def test_a_mesh_that_is_gone_or_damaged_is_an_error(run):
 def traceable(run):
     """A fitted run, what is traced off, and where."""
     fitted = load_fitted(run)
-    poses = poses_of(store_of(fitted), "val", fitted.module.renderer)
+    poses = poses_of(echoes_of(fitted), "val", fitted.module.renderer)
     rows = len(fitted.module.renderer.frequency)
     return fitted, Traced(SPHERE, np.zeros((2, rows)), np.ones(rows)), poses
 
@@ -362,7 +375,8 @@ def test_it_says_which_fit_it_belongs_to(run):
     learn(run)
     with safetensors.safe_open(str(run / NAME), "pt") as file:
         digest = hashlib.sha256((run / "model.safetensors").read_bytes()).hexdigest()
-        assert file.metadata() == {"model": digest}
+        mesh = hashlib.sha256((run / "reconstruction" / "mesh.ply").read_bytes()).hexdigest()
+        assert file.metadata() == {"model": digest, "mesh": mesh}
 
 
 DAMAGED = {
@@ -449,7 +463,7 @@ def test_a_prediction_is_traced_as_far_as_it_is_believed(run, believe, share):
     believe(run, share)
     arrays, numbers = arrays_and_numbers(run)
     fitted = load_fitted(run)
-    poses = poses_of(store_of(fitted), "test", fitted.module.renderer)
+    poses = poses_of(echoes_of(fitted), "test", fitted.module.renderer)
     rendered, traced, reference = parts(run, poses)
     assert arrays["predicted"].dtype == np.float32
     level = mix(compress(rendered, reference), compress(traced, reference), share)
@@ -469,7 +483,7 @@ def test_a_prediction_is_traced_as_far_as_it_is_believed(run, believe, share):
 def test_a_prediction_without_belief_is_the_rendering(run, believe):
     never_learned, numbers = arrays_and_numbers(run)
     fitted = load_fitted(run)
-    poses = poses_of(store_of(fitted), "test", fitted.module.renderer)
+    poses = poses_of(echoes_of(fitted), "test", fitted.module.renderer)
     rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
     np.testing.assert_array_equal(never_learned["predicted"], rendered)
     believe(run, 0.0)
@@ -489,7 +503,7 @@ def test_poses_of_ones_own_are_traced_off_the_run_without_store_or_scene(
     believe(run, 1.0)
     (run / "reconstruction" / "mesh.ply").unlink()
     monkeypatch.setattr(EnsembleStore, "read_pose", never)
-    monkeypatch.setattr(predict_module, "store_of", never)
+    monkeypatch.setattr(run_module, "echoes_of", never)
     (tmp_path / "poses.csv").write_text(CSV)
     arrays, numbers = arrays_and_numbers(run, poses_csv=tmp_path / "poses.csv")
     assert numbers is None

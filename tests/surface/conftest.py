@@ -13,8 +13,8 @@ from sononerf.run.build import head_of
 from sononerf.scene.scene import Scene
 from sononerf.settings.loading import validate_settings
 from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine.echo_data import Echoes
 from sononerf.surface.refine.optics import Optics
+from tests.memory import deaf_hull, echoes_of
 
 RADIUS = 0.012
 POSES = 18
@@ -66,8 +66,8 @@ def simulated():
 def echoes(settings, ball, poses, simulated):
     fine = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS)
     heard = simulated(fine, settings, poses)
-    numbers = np.arange(POSES)
-    return Echoes(poses.positions, poses.rotations, numbers[:-3], numbers[-3:], lambda i: heard[i])
+    at = poses.positions, poses.rotations
+    return echoes_of(head_of(settings), *at, lambda i: heard[i], hull=deaf_hull())
 
 
 @pytest.fixture(autouse=True)

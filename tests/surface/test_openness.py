@@ -13,7 +13,7 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.field.fourier import FourierField
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.lattice import Lattice
-from sononerf.surface import openness
+from sononerf.surface import openness, surface
 from sononerf.surface.openness import (
     FACING,
     THIN,
@@ -336,22 +336,18 @@ def read(monkeypatch):
 
     monkeypatch.setattr(read_out, "gather_evidence", gathered)
     monkeypatch.setattr(
-        read_out, "poses_that_heard", lambda mesh, *given: np.arange(len(mesh.vertices))
+        surface, "poses_that_heard", lambda mesh, *given: np.arange(len(mesh.vertices))
     )
     monkeypatch.setattr(read_out, "estimate_occupancy", body)
-    monkeypatch.setattr(read_out, "isosurface", lambda *given: sphere())
 
-    def make(hull, method="filled"):
-        return read_out.reconstruct(
-            field, hull=hull, spacing=0.02, method=method, directions=2, resolution=RESOLUTION
+    def make(hull):
+        reading = read_out.read_field(
+            field, hull, spacing=0.02, directions=2, resolution=RESOLUTION
         )
+        ((method, mesh),) = read_out.start_surfaces(reading, ["filled"])
+        return surface.finished_surface(mesh, method, reading)
 
     return make
-
-
-def test_a_surface_is_of_the_occupancy_where_poses_are_known(read):
-    assert read(hull_over(all_around()), method="auto").method == "filled"
-    assert read(None, method="auto").method == "isosurface"
 
 
 def test_a_closed_surface_is_read_out_whole(read):
@@ -382,11 +378,4 @@ def test_a_hole_of_a_closed_surface_stays_closed(read):
     found = read(hull_over(cap(np.radians(60))))
     assert found.openness.unseen.any()
     assert found.openness.kind == "closed"
-    assert found.mesh.is_watertight
-
-
-def test_an_isosurface_is_not_judged(read):
-    assert read(None, method="auto").openness is None
-    found = read(hull_over(cap()), method="isosurface")
-    assert found.openness is None
     assert found.mesh.is_watertight

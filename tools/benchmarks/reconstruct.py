@@ -13,7 +13,7 @@ import torch
 
 from sononerf import storage
 from sononerf.run.fitted import load_fitted
-from sononerf.surface.start.read_out import reconstruct as read_out
+from sononerf.surface.start.read_out import StartMethod, read_field, start_surfaces
 from tools.benchmarks.experiment import Row, aligned, ending
 from tools.benchmarks.record import keep, ratios
 
@@ -41,26 +41,25 @@ def reconstruct(arguments: argparse.Namespace) -> str:
 def _timed(run: Path, spacing: float) -> Row:
     fitted = load_fitted(run)
     options = fitted.settings.reconstruction
-    method = options.method
+    method: StartMethod = "filled" if options.method in ("auto", "isosurface") else options.method
     seconds = []
     for _ in range(REPEATS):
         began = time.perf_counter()
         with torch.inference_mode():
-            found = read_out(
+            reading = read_field(
                 fitted.module.field,
-                hull=fitted.hull,
+                fitted.hull,
+                resolution=fitted.head.resolution,
                 spacing=spacing,
-                level=options.level,
-                method=method,
                 directions=options.directions,
-                smoothing=options.smoothing if method == "isosurface" else 0.0,
             )
+            list(start_surfaces(reading, [method]))
         seconds.append(time.perf_counter() - began)
     median = statistics.median(seconds)
-    voxels = found.volume.values.size
+    voxels = reading.volume.values.size
     return {
         "name": f"{run.resolve().name}, {1e3 * spacing:g} mm",
-        "method": found.method,
+        "method": method,
         "voxels": voxels,
         "reconstruct_s": median,
         "voxels_per_s": voxels / median,

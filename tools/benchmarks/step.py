@@ -31,20 +31,21 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from sononerf import storage
 from sononerf.callbacks.threads import ThreadsCallback
+from sononerf.echoes.echoes import Echoes
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.field import Field
+from sononerf.field.fitting import quiet_lightning, require_accelerator
 from sononerf.field.fourier import FourierField
 from sononerf.field.module import EchoModule
 from sononerf.field.shell import ShellRenderer
 from sononerf.progress import Progress
 from sononerf.run.build import (
     data_for,
-    echo_region,
     field_and_renderer,
     head_of,
     module_for,
+    region_of,
 )
-from sononerf.run.fit import quiet_lightning, require_accelerator
 from sononerf.run.simulate import default_store, echo_hash, ensemble
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
@@ -255,7 +256,7 @@ def _measured(
     pair: Pair, settings: Settings, accelerator: str, products: dict[str, float], copy: float
 ) -> Row:
     store = ensemble(settings, progress=Progress())
-    region, possible = echo_region(settings, head_of(settings), store)
+    region, possible = region_of(settings, Echoes(store, head_of(settings)))
     field, renderer = field_and_renderer(settings, head_of(settings), region)
     naive = pair.name == NAIVE
     if naive:

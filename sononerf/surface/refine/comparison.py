@@ -10,10 +10,10 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 
+from sononerf.echoes.echoes import Echoes
 from sononerf.errors import SonoNerfError
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.surface.refine.descent import ONSETS
-from sononerf.surface.refine.echo_data import Echoes
 from sononerf.surface.refine.later_bounces import Tracer
 from sononerf.surface.refine.objective import FLOOR_DB, Level
 from sononerf.surface.refine.onset_ranges import OnsetRanges
@@ -41,25 +41,14 @@ class Comparison:
         What was measured.
     optics : Optics
         The head.
-    onsets : OnsetRanges or None
+    onsets : OnsetRanges
         Onsets of the training poses.
     seed : int
         Of the rays.
-    calibrated : bool
-        Whether the measured level is absolute. If it is not, each surface gets one gain first.
     """
 
-    def __init__(
-        self,
-        echoes: Echoes,
-        optics: Optics,
-        onsets: OnsetRanges | None,
-        seed: int,
-        *,
-        calibrated: bool = True,
-    ) -> None:
+    def __init__(self, echoes: Echoes, optics: Optics, onsets: OnsetRanges, seed: int) -> None:
         self.echoes, self.optics, self.onsets, self.seed = echoes, optics, onsets, seed
-        self.calibrated = calibrated
         chosen = np.linspace(0, len(echoes.validation) - 1, min(ASKED, len(echoes.validation)))
         self.poses = echoes.validation[chosen.astype(np.int64)]
 
@@ -91,13 +80,12 @@ class Comparison:
         weights = [math.sqrt(float(one.max())) for one in heard]
         if not sum(weights) > 0:
             return math.inf
-        common = 1.0 if self.calibrated else _common_gain(heard, rendered)
+        # Without an absolute level each surface gets one gain first.
+        common = 1.0 if self.echoes.calibrated else _common_gain(heard, rendered)
         errors = [_difference(a, common * b) for a, b in zip(heard, rendered, strict=True)]
-        found = float(np.average(errors, weights=weights))
-        if self.onsets is not None:
-            vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
-            found += ONSETS * self.onsets.misfit(vertices)
-        return found
+        vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
+        misfit = self.onsets.misfit(vertices)
+        return float(np.average(errors, weights=weights)) + ONSETS * misfit
 
 
 def _common_gain(heard: list[NDArray[np.float32]], rendered: list[NDArray[np.float32]]) -> float:

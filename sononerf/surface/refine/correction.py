@@ -23,11 +23,12 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.raycast import Occlusion
 from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine.echo_data import Echoes, on_rows
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
 from sononerf.surface.refine.optics import Heard, Optics
+from sononerf.surface.refine.rows import on_rows
 from sononerf.surface.refine.visibility import listen
 
 

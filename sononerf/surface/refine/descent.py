@@ -10,9 +10,9 @@ import torch
 import trimesh
 from torch import Tensor
 
+from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.raycast import Occlusion
 from sononerf.surface.refine.correction import Correction
-from sononerf.surface.refine.echo_data import Echoes
 from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
 from sononerf.surface.refine.objective import Level, measured, mismatch

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,11 +12,10 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sononerf.scene.scene import Scene
+from sononerf.echoes.echoes import Echoes
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.rays import Rays
-from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine.echo_data import Echoes
+from sononerf.simulation.simulator import Simulator, quiet_scene
 from sononerf.surface.refine.optics import Heard, Optics
 
 BOUNCES = 3
@@ -157,14 +155,3 @@ class _Collected:
         loud = weight.max(axis=1)
         kept = loud > FAINT * loud.max(initial=0.0)
         return Later(ear[kept], delay[kept], weight[kept])
-
-
-def quiet_scene(mesh: trimesh.Trimesh) -> Scene:
-    """Return a scene of a mesh of ours; what a user should know of a mesh is of no use here."""
-    talker = logging.getLogger("sononerf")
-    before = talker.level
-    talker.setLevel(logging.ERROR)
-    try:
-        return Scene(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
-    finally:
-        talker.setLevel(before)

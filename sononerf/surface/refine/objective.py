@@ -9,9 +9,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from sononerf.echoes.echoes import Echoes
 from sononerf.head.decibels import ACTIVE_DB
-from sononerf.surface.refine.echo_data import Echoes, on_rows
 from sononerf.surface.refine.optics import Heard
+from sononerf.surface.refine.rows import on_rows
 
 FLOOR_DB = 20.0
 """What counts lies within this of a pose's loudest cell; fainter ones are later bounces."""

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Refine a surface against measured spectrograms: stages from coarse to fine, the best is kept."""
+"""Refine a surface against measured spectrograms in stages from coarse to fine; keep the best."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -13,19 +13,19 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.echoes import Echoes
 from sononerf.errors import SonoNerfError
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.comparison import Comparison
 from sononerf.surface.refine.correction import Correction
 from sononerf.surface.refine.descent import Descent, poses_that_hear
-from sononerf.surface.refine.echo_data import Echoes
 from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.onset_ranges import OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.remesh import finer, remesh
 from sononerf.surface.refine.stages import SHARP, STAGES, Stage
+from sononerf.surface.start.read_out import StartMethod
 
 SIMULATED = 96
 """Training poses for which a surface is simulated; each is drawn about three times."""
@@ -33,6 +33,8 @@ Simulate = Callable[[trimesh.Trimesh], Simulator]
 TOLERATED = 1.15
 """Objectives of validation poses that differ by less than this factor differ by chance. A later
 stage, and a sheet, are preferred up to it."""
+STATE_VERSION = 1
+"""Version of :meth:`Refinement.state`; to be raised when its tensors change."""
 Way = Literal["blurred", "sharp", "sheet"]
 """How a surface goes through the stages: with the blur and the edges of each stage; without blur on
 fine triangles; or as a sheet, whose triangles stay as they are because a signed distance on voxels
@@ -65,10 +67,53 @@ class Refined:
     mesh: trimesh.Trimesh
     gain: NDArray[np.float64]
     support: NDArray[np.float64]
-    start: str
+    start: StartMethod
     kept: bool
     error_db: float
     history: list[dict[str, Any]]
+
+
+def refine(
+    starts: Mapping[StartMethod, trimesh.Trimesh],
+    echoes: Echoes,
+    *,
+    optics: Optics | None = None,
+    simulate: Simulate,
+    seed: int,
+    state: dict[str, Tensor] | None = None,
+    after_step: Callable[[Refinement, float], None] | None = None,
+) -> Refined:
+    """Refine start surfaces against echoes.
+
+    Parameters
+    ----------
+    starts, echoes, simulate, seed
+        As of :class:`Refinement`.
+    optics : Optics or None
+        On the device of the computation; that of the echoes' head on the CPU where None.
+    state : dict or None
+        Where an interrupted refinement of the same starts and echoes goes on.
+    after_step : callable, optional
+        Called after each step with the refinement and the step's mismatch, dB.
+    """
+    work = Refinement(starts, echoes, optics or Optics(echoes.head), simulate=simulate, seed=seed)
+    if state is not None:
+        work.load(state)
+    while not work.done:
+        mismatch = work.advance()
+        if after_step is not None:
+            after_step(work, mismatch)
+    return work.result()
+
+
+def number_of_steps(starts: Iterable[str], stages: tuple[Stage, ...] = STAGES) -> int:
+    """Return the steps of a refinement of these start methods; each way has a first stage."""
+    return (len(_ways(starts)) - 1) * stages[0].steps + sum(stage.steps for stage in stages)
+
+
+def _ways(starts: Iterable[str]) -> list[Way]:
+    ways: list[Way] = ["blurred", "sharp"] if set(starts) - {"sheet"} else []
+    return [*ways, "sheet"] if "sheet" in starts else ways
 
 
 class Refinement:
@@ -80,61 +125,48 @@ class Refinement:
         Where to start, m; of several the one that explains the validation poses best. One that is
         called ``sheet`` is a sheet: it takes part in the first stage beside the best of the others.
     echoes : Echoes
-        What was measured.
+        Measured spectrograms and onsets; the surface must begin at the onsets. If their level is
+        absolute, gains are learned in the last stage alone: a rough surface is too faint, and a
+        gain would hide that. Otherwise gains are learned from the first stage on.
     optics : Optics
         The head; its device is that of the computation.
-    hull : EchoHull or None
-        Onsets of the training poses; the surface must begin there.
     simulate : callable
         Makes the simulator of a surface, for the stages that are corrected by it.
     seed : int
         Of the order of poses and of traced rays.
-    stages : tuple of Stage
-        From coarse to fine.
-    calibrated : bool
-        Whether the measured level is absolute, as the simulator's is. Then gains are learned in
-        the last stage alone: a rough surface is too faint, and a gain would excuse it. The level of
-        a recording differs by frequency as well, so there they are learned from the first stage on.
+    stages : tuple of Stage or None
+        From coarse to fine; ``STAGES`` where None.
     """
 
     def __init__(
         self,
-        meshes: Mapping[str, trimesh.Trimesh],
+        meshes: Mapping[StartMethod, trimesh.Trimesh],
         echoes: Echoes,
         optics: Optics,
         *,
-        hull: EchoHull | None = None,
         simulate: Simulate,
         seed: int,
-        stages: tuple[Stage, ...] = STAGES,
-        calibrated: bool = True,
+        stages: tuple[Stage, ...] | None = None,
     ) -> None:
         self.simulate = simulate
-        self.calibrated = calibrated
-        self.echoes, self.optics, self.seed, self.stages = echoes, optics, seed, stages
+        self.echoes, self.optics, self.seed = echoes, optics, seed
+        self.stages = stages or STAGES
         like = optics.get_buffer("wavenumber")
         self.level = Level(optics.ears, len(optics.frequencies), like)
-        self.onsets = None if hull is None else OnsetRanges(hull, optics.head.resolution, seed)
+        self.onsets = OnsetRanges(echoes.hull, optics.head.resolution, seed)
         self.starts = {name: _plain(mesh) for name, mesh in meshes.items()}
         self.candidates: list[trimesh.Trimesh] = []
         self.objectives: list[float] = []
-        self.start: str | None = None
+        self.start: StartMethod | None = None
         self.stage, self.step, self.drawn = 0, 0, 0
-        ways: list[Way] = ["blurred", "sharp"] if set(meshes) - {"sheet"} else []
-        self.ways: list[Way] = [*ways, "sheet"] if "sheet" in meshes else ways
+        self.ways = _ways(meshes)
         self.way = self.ways[0]
         self.history: list[dict[str, Any]] = []
         self._rivals: list[trimesh.Trimesh] = []  # what the first stage made in each way
         self._descent: Descent | None = None
         self._later: LaterBounces | None = None
         self._source = 0  # the candidate whose later bounces are added
-        self.comparison = Comparison(echoes, optics, self.onsets, seed, calibrated=calibrated)
-
-    @property
-    def total(self) -> int:
-        """Number of steps of all stages."""
-        repeated = (len(self.ways) - 1) * self.stages[0].steps
-        return repeated + sum(stage.steps for stage in self.stages)
+        self.comparison = Comparison(echoes, optics, self.onsets, seed)
 
     @property
     def done(self) -> bool:
@@ -197,27 +229,24 @@ class Refinement:
         if self.ways[-1] == "sheet" and found[-1] <= TOLERATED * found[best]:
             best = len(found) - 1
             if self.start != "sheet":
-                self._begin({"sheet": self.starts["sheet"]})
+                self._begin(["sheet"])
         self.way = self.ways[best]
         return self._rivals[best], found[best]
 
     def _choose(self) -> None:
         """Begin with the start that explains the validation poses best."""
-        bodies = {name: mesh for name, mesh in self.starts.items() if name != "sheet"}
-        self._begin(bodies or self.starts)
+        self._begin([name for name in self.starts if name != "sheet"] or list(self.starts))
 
-    def _begin(self, starts: dict[str, trimesh.Trimesh]) -> None:
-        objectives = {
-            name: self.comparison.objective(mesh, self.level, smooth=False)
-            for name, mesh in starts.items()
-        }
-        self.start = min(objectives, key=lambda name: objectives[name])
-        self.candidates, self.objectives = [starts[self.start]], [objectives[self.start]]
+    def _begin(self, names: list[StartMethod]) -> None:
+        meshes = [self.starts[name] for name in names]
+        found = [self.comparison.objective(mesh, self.level, smooth=False) for mesh in meshes]
+        best = int(np.argmin(found))
+        self.start, self.candidates, self.objectives = names[best], [meshes[best]], [found[best]]
 
     def _descend(self, mesh: trimesh.Trimesh) -> Descent:
         stage = self.stages[self.stage]
         last = self.stage == len(self.stages) - 1
-        self.level.learns = "none" if self.calibrated and not last else "each"
+        self.level.learns = "none" if self.echoes.calibrated and not last else "each"
         correction = None
         if stage.beyond == "simulate":
             self._later, correction = None, self._correction(mesh)

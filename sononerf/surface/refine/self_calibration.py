@@ -28,9 +28,9 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.raycast import Occlusion
 from sononerf.head.decibels import ACTIVE_DB
-from sononerf.surface.refine.echo_data import Echoes
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
 from sononerf.surface.refine.objective import FLOOR_DB, TRUST
 from sononerf.surface.refine.optics import Optics

@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from sononerf.run.build import simulator_of
+from sononerf.scene.scene import Scene
 from sononerf.surface.refine.correction import Correction
 from sononerf.surface.refine.descent import Descent
-from sononerf.surface.refine.later_bounces import quiet_scene
 from sononerf.surface.refine.objective import Level, measured, mismatch
 from sononerf.surface.refine.remesh import remesh
+from tests.memory import changed
 from tests.surface.conftest import RADIUS
 
 POSES = [3, 7]
@@ -35,7 +36,7 @@ def sphere(ball):
 
 @pytest.fixture(scope="module")
 def simulator(settings, sphere):
-    return simulator_of(quiet_scene(sphere), settings)
+    return simulator_of(Scene(sphere), settings)
 
 
 @pytest.fixture
@@ -90,9 +91,7 @@ def test_a_simulator_of_another_level_moves_nothing(optics, sphere, simulator, e
         number: double.spectrogram(echoes.positions[number], echoes.rotations[number], seed=0)
         for number in echoes.training.tolist()
     }
-    same = type(echoes)(
-        echoes.positions, echoes.rotations, echoes.training, echoes.validation, loud.__getitem__
-    )
+    same = changed(echoes, read=loud.__getitem__)
     work = Descent(
         sphere,
         same,

@@ -10,6 +10,7 @@ from sononerf.surface.refine.descent import Descent, poses_that_hear
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.onset_ranges import OnsetRanges
 from sononerf.surface.refine.remesh import remesh
+from tests.memory import changed
 from tests.surface.conftest import RADIUS
 from tests.surface.refine.test_onset_ranges import heard as onsets_of
 
@@ -43,7 +44,9 @@ def test_a_sphere_that_is_too_large_shrinks_to_what_is_heard(too_large, echoes, 
 def test_where_nobody_listens_nothing_moves(too_large, echoes, optics):
     places = echoes.positions[echoes.training]
     some = echoes.training[places[:, 2] > 0.1]
-    upper = type(echoes)(echoes.positions, echoes.rotations, some, echoes.validation, echoes.read)
+    split = np.full(len(echoes.positions), 1)
+    split[some] = 0
+    upper = changed(echoes, split=split)
     work = descent_on(too_large, upper, optics)
     start = work.vertices.clone()
     for number in range(6):

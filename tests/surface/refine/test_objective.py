@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 import torch
 
-from sononerf.surface.refine.echo_data import Echoes
 from sononerf.surface.refine.objective import Level, measured, mismatch
 from sononerf.surface.refine.optics import Heard
+from tests.memory import echoes_of
 
 
 def example(gain=1.0, poses=3):
@@ -15,10 +15,7 @@ def example(gain=1.0, poses=3):
     heard = Heard(power, torch.tensor([4] * poses))
     whole = np.zeros((poses, 2, 20, 4), np.float32)
     whole[:, :, 4:16] = gain * power.sqrt().numpy()
-    numbers = np.arange(poses)
-    echoes = Echoes(
-        np.zeros((poses, 3)), np.zeros((poses, 3, 3)), numbers, numbers[:0], lambda i: whole[i]
-    )
+    echoes = echoes_of(None, np.zeros((poses, 3)), np.zeros((poses, 3, 3)), lambda i: whole[i])
     return heard, echoes
 
 

@@ -10,17 +10,17 @@ import trimesh
 
 from sononerf.errors import InputError
 from sononerf.head.head import Head
-from sononerf.run.build import simulator_of
+from sononerf.run.build import head_of
 from sononerf.simulation.hearing import Hearing, hearing_of
+from sononerf.simulation.simulator import Simulator, quiet_scene
 from sononerf.surface.refine import comparison
 from sononerf.surface.refine import refinement as module
 from sononerf.surface.refine.descent import Descent
-from sononerf.surface.refine.echo_data import Echoes
-from sononerf.surface.refine.later_bounces import quiet_scene
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.refinement import Refinement
+from sononerf.surface.refine.refinement import Refinement, number_of_steps
 from sononerf.surface.refine.stages import Stage
+from tests.memory import changed, deaf_hull
 from tests.surface.conftest import RADIUS
 
 
@@ -49,8 +49,9 @@ SHORT = (
 
 def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, echoes, optics):
     tilt = np.linspace(0.3, 3.0, len(optics.frequencies)).astype(np.float32)
-    own = (echoes.positions, echoes.rotations, echoes.training, echoes.validation)
-    tilted = Echoes(*own, lambda pose: echoes.read(pose) * tilt)
+    tilted = changed(
+        echoes, read=lambda n: echoes.store.read_pose(n) * tilt, hull=deaf_hull(), origin="recorded"
+    )
     work = Refinement(
         {"body": bumpy},
         tilted,
@@ -58,7 +59,6 @@ def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, e
         simulate=unasked,
         seed=1,
         stages=SHORT,
-        calibrated=False,
     )
     while work.stage == 0:
         work.advance()
@@ -128,8 +128,7 @@ def simulated_stage(settings):
     few = settings.simulation.model_copy(update={"rays": 2000})
 
     def simulate(mesh):
-        changed = settings.model_copy(update={"simulation": few})
-        return simulator_of(quiet_scene(mesh), changed)
+        return Simulator.of(quiet_scene(mesh), head_of(settings), few)
 
     last = dataclasses.replace(SHORT[1], beyond="simulate")
     return {"simulate": simulate, "stages": (SHORT[0], last)}
@@ -201,12 +200,10 @@ def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
         return Optics(head, Hearing(head, synthesis))
 
     def moved(scale, spectrogram):
-        world = Echoes(
-            echoes.positions * scale,
-            echoes.rotations,
-            echoes.training,
-            echoes.validation,
-            lambda number: echoes.read(number) / np.float32(scale),
+        world = changed(
+            echoes,
+            positions=echoes.positions * scale,
+            read=lambda number: echoes.store.read_pose(number) / np.float32(scale),
         )
         heard = optics_at(scale, spectrogram)
         mesh = trimesh.Trimesh(bumpy.vertices * scale, bumpy.faces, process=False)
@@ -264,7 +261,7 @@ def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
         )
         while not work.done:
             work.advance()
-        assert work.drawn == work.total
+        assert work.drawn == number_of_steps(starts, SHORT)
         assert work.start == start
         again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
         again.load(work.state())

@@ -8,8 +8,8 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from sononerf.surface.refine.echo_data import Echoes
 from sononerf.surface.refine.self_calibration import Body, Calibrator
+from tests.memory import echoes_of
 from tests.surface.conftest import RADIUS
 
 COUNT = 14
@@ -36,8 +36,8 @@ def heard(body, optics, poses):
             positions, rotations, np.full(count, np.exp(-speed)), np.full(count, 2 * offset)
         )
         magnitude = magnitude * np.exp(np.asarray(gain, dtype=np.float32))[:, None, None]
-        numbers = np.arange(count)
-        return Echoes(positions, rotations, numbers, numbers[:0], lambda pose: magnitude[pose])
+        split = np.zeros(count, dtype=int)
+        return echoes_of(optics.head, positions, rotations, lambda pose: magnitude[pose], split)
 
     return make
 

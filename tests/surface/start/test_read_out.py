@@ -8,7 +8,13 @@ from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field, sphere_directions
 from sononerf.field.grid import GridField
 from sononerf.surface.start import read_out
-from sononerf.surface.start.read_out import energy_volume, reconstruct
+from sononerf.surface.start.read_out import (
+    energy_volume,
+    read_field,
+    read_isosurface,
+    start_surfaces,
+)
+from sononerf.surface.surface import Surface, finished_surface
 
 FREQUENCY = torch.tensor([30e3, 50e3, 70e3])
 RADIUS, SPACING = 0.015, 0.003
@@ -84,10 +90,18 @@ def deaf(sources):
     return EchoHull(sources, sources[:, None], np.full((count, 1), -np.inf), 0 * sources)
 
 
-def read(field, hull=None, **options):
+def read(field, hull=None, method="filled", **options):
     """Read out at once, with the range resolution that fits the blur of the field."""
     hull = hull_of_the_sphere() if hull is None else hull
-    return reconstruct(field, hull=hull, **{"resolution": 0.005, **options})
+    reading = read_field(field, hull, **{"resolution": 0.005, **options})
+    ((found, mesh),) = start_surfaces(reading, [method])
+    return finished_surface(mesh, found, reading)
+
+
+def cut(field, **options):
+    """Return the iso-surface of a field."""
+    mesh, volume, level = read_isosurface(field, **options)
+    return Surface(mesh, volume, "isosurface", level=level)
 
 
 @pytest.mark.parametrize("method", ["open", "filled", "hull"])
@@ -108,20 +122,18 @@ def whole():
     return read(sounding(RADIUS))
 
 
-def test_volume_and_evidence_serve_all_methods(whole):
-    earlier = read(sounding(RADIUS), method="hull", judge=False)
-    together = read(sounding(RADIUS), earlier=earlier)
-    assert together.gathered is earlier.gathered
-    assert together.volume is earlier.volume
-    assert earlier.openness is None
-    assert together.openness.kind == "closed"
-    np.testing.assert_array_equal(whole.mesh.vertices, together.mesh.vertices)
+def test_one_reading_serves_all_methods(whole):
+    reading = read_field(sounding(RADIUS), hull_of_the_sphere(), resolution=0.005)
+    found = dict(start_surfaces(reading, ["hull", "filled"]))
+    assert list(found) == ["hull", "filled"]
+    np.testing.assert_array_equal(whole.mesh.vertices, found["filled"].vertices)
 
 
-@pytest.mark.parametrize("method", ["open", "filled", "hull"])
-def test_an_occupancy_needs_to_know_where_the_field_was_heard_from(method):
-    with pytest.raises(SettingsError, match=f"method {method}: it is not known where"):
-        reconstruct(sounding(RADIUS), method=method)
+def test_a_method_without_a_surface_is_left_out_where_another_one_has_one():
+    reading = read_field(sounding(RADIUS), hull_of_the_sphere(), resolution=0.005)
+    assert [name for name, _ in start_surfaces(reading, ["sheet", "filled"])] == ["filled"]
+    with pytest.raises(NumericalError, match="one sheet"):
+        list(start_surfaces(reading, ["sheet"]))
 
 
 def test_where_the_field_is_silent_the_surface_lies_along_the_onsets():
@@ -178,7 +190,7 @@ def test_a_volume_too_coarse_to_meet_the_field_does_not_matter_to_the_occupancy(
     monkeypatch.setattr(read_out, "volume_from_function", missed)
     assert read(sounding(RADIUS)).mesh.is_watertight
     with pytest.raises(NumericalError, match="no surface: the field is silent everywhere"):
-        read(sounding(RADIUS), method="isosurface")
+        cut(sounding(RADIUS))
 
 
 def test_few_poses_leave_a_body_that_holds_the_true_one():
@@ -187,19 +199,6 @@ def test_few_poses_leave_a_body_that_holds_the_true_one():
     # Between 20 heads, 0.8 rad apart, the hull rises by 0.5² / 2 of the radius.
     assert RADIUS - 0.001 < radii(found.mesh).min()
     assert radii(found.mesh).max() < 1.2 * RADIUS
-
-
-@pytest.mark.parametrize("method", ["open", "filled", "hull"])
-def test_only_an_isosurface_has_a_level(method):
-    with pytest.raises(SettingsError, match=f"method {method} has no level"):
-        read(sounding(RADIUS), method=method, level=0.5)
-
-
-def test_a_level_asks_for_an_isosurface():
-    found = read(sounding(RADIUS), level=1.0, directions=8)
-    assert (found.method, found.level) == ("isosurface", 1.0)
-    assert found.openness is None
-    assert found.support is None
 
 
 def test_the_volume_holds_the_energy_where_it_is():
@@ -232,18 +231,17 @@ def test_the_size_of_the_region_does_not_matter(whole):
 
 
 def test_a_field_without_lobes_is_read_at_a_level():
-    found = reconstruct(Blob(), spacing=0.0025, directions=8)
-    assert found.method == "isosurface"
+    found = cut(Blob(), spacing=0.0025, directions=8)
     # Magnitudes of 8 directions and 3 frequencies, summed.
     assert found.volume.values.max() == pytest.approx(24, rel=1e-3)
     # The automatic level lies somewhere on the slope, which is 1 mm wide.
     assert np.average(radii(found.mesh)) == pytest.approx(RADIUS, abs=0.001)
-    half = reconstruct(Blob(), spacing=0.0025, directions=8, level=12.0)
+    half = cut(Blob(), spacing=0.0025, directions=8, level=12.0)
     assert half.level == 12.0
     # Linear interpolation between voxels across a steep slope.
     np.testing.assert_allclose(radii(half.mesh), RADIUS, atol=0.0003)
     assert half.mesh.volume == pytest.approx(4 / 3 * np.pi * RADIUS**3, rel=0.03)
-    low = reconstruct(Blob(), spacing=0.0025, directions=8, level=1.0)
+    low = cut(Blob(), spacing=0.0025, directions=8, level=1.0)
     assert low.mesh.volume > half.mesh.volume
 
 
@@ -252,9 +250,9 @@ def test_a_field_without_lobes_is_read_at_a_level():
     [(0.0025, 1), (0.0075, 3), (0.009, 3), (0.0125, 5), (0.045, 19)],  # of voxels of 2.5 mm
 )
 def test_a_box_may_be_averaged_over_before_the_surface_is_drawn(smoothing, width):
-    options = {"spacing": 0.0025, "directions": 2, "method": "isosurface"}
-    plain = reconstruct(Blob(), **options).volume.values
-    smooth = reconstruct(Blob(), smoothing=smoothing, **options).volume.values
+    options = {"spacing": 0.0025, "directions": 2}
+    plain = cut(Blob(), **options).volume.values
+    smooth = cut(Blob(), smoothing=smoothing, **options).volume.values
     # Beyond the grid its outermost values go on, as in MATLAB's smooth3.
     half = width // 2
     padded = np.pad(np.asarray(plain, dtype=np.float64), half, mode="edge")
@@ -266,14 +264,13 @@ def test_a_box_may_be_averaged_over_before_the_surface_is_drawn(smoothing, width
 def test_finer_voxels_come_nearer():
     errors = []
     for spacing in (0.006, 0.003, 0.0015):
-        mesh = reconstruct(Blob(), spacing=spacing, directions=2, level=3.0).mesh
+        mesh = cut(Blob(), spacing=spacing, directions=2, level=3.0).mesh
         errors.append(np.abs(radii(mesh) - RADIUS).mean())
     assert errors[0] > errors[1] > errors[2]
 
 
-def test_the_method_may_be_chosen():
-    found = reconstruct(lobes_on_a_sphere(), method="isosurface", directions=30)
-    assert found.method == "isosurface"
+def test_an_isosurface_of_lobes_is_a_shell():
+    found = cut(lobes_on_a_sphere(), directions=30)
     # A shell: its outer side lies outside of the sphere, its inner side is a cavity.
     assert radii(found.mesh).min() < RADIUS - 0.0005 < RADIUS + 0.0005 < radii(found.mesh).max()
 
@@ -304,11 +301,11 @@ def test_a_silent_field_is_an_error():
         if isinstance(field, GridField):
             field.occupancy.zero_()
         with pytest.raises(NumericalError, match="silent everywhere"):
-            reconstruct(field, directions=4)
+            cut(field, directions=4)
 
 
 def test_a_spacing_larger_than_the_region_is_said_to_be_so():
     region = torch.tensor([[-0.02] * 3, [0.02] * 3])
     field = GridField(region, torch.tensor([20e3, 40e3]), spacing=0.01, levels=1)
     with pytest.raises(SettingsError, match="larger than the region"):
-        reconstruct(field, spacing=2.0)
+        cut(field, spacing=2.0)

@@ -3,9 +3,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from sononerf.echoes import echoes as module
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
-from sononerf.surface.refine import echo_data
-from sononerf.surface.refine.echo_data import Echoes
+from tests.memory import echoes_of
 
 
 def store_of(path, split):
@@ -25,24 +26,24 @@ def store_of(path, split):
 
 
 def test_poses_come_from_their_splits(tmp_path):
-    echoes = Echoes.of(store_of(tmp_path / "s", [0, 0, 1, 2, 0]))
+    echoes = Echoes(store_of(tmp_path / "s", [0, 0, 1, 2, 0]), None)
     assert echoes.training.tolist() == [0, 1, 4]
     assert echoes.validation.tolist() == [2]
     assert float(echoes.magnitude(4).mean()) == 4.0
 
 
 def test_without_validation_poses_some_of_training_are_held_back(tmp_path):
-    echoes = Echoes.of(store_of(tmp_path / "s", [0] * 25))
+    echoes = Echoes(store_of(tmp_path / "s", [0] * 25), None)
     assert len(echoes.validation) >= 2
     assert len(echoes.training) + len(echoes.validation) == 25
     assert not set(echoes.training) & set(echoes.validation)
 
 
 def test_all_training_poses_come_in_turn_and_the_step_alone_decides():
-    numbers = np.arange(20)
-    echoes = Echoes(np.zeros((20, 3)), np.zeros((20, 3, 3)), numbers, numbers[:0], lambda i: None)
+    numbers, split = np.arange(23), [0] * 20 + [1] * 3
+    echoes = echoes_of(None, np.zeros((23, 3)), np.zeros((23, 3, 3)), None, split)
     drawn = np.concatenate([echoes.batch(3, step, 8) for step in range(5)])
-    assert sorted(drawn[:20]) == sorted(drawn[20:40]) == numbers.tolist()
+    assert sorted(drawn[:20]) == sorted(drawn[20:40]) == numbers[:20].tolist()
     assert drawn[:20].tolist() != drawn[20:40].tolist()
     assert echoes.batch(3, 4, 8).tolist() == drawn[32:].tolist()
     assert echoes.batch(4, 0, 8).tolist() != drawn[:8].tolist()
@@ -56,9 +57,8 @@ def test_memory_is_bounded(monkeypatch):
         reads.append(number)
         return np.zeros((2, 5, 3), np.float32)
 
-    numbers = np.arange(3)
-    echoes = Echoes(np.zeros((3, 3)), np.zeros((3, 3, 3)), numbers, numbers[:0], read)
-    monkeypatch.setattr(echo_data, "KEPT_BYTES", 2 * 2 * 5 * 3 * 4)
+    echoes = echoes_of(None, np.zeros((3, 3)), np.zeros((3, 3, 3)), read)
+    monkeypatch.setattr(module, "KEPT_BYTES", 2 * 2 * 5 * 3 * 4)
     for _ in range(2):
         for number in range(3):
             echoes.magnitude(number)

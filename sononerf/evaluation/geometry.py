@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""A reconstructed surface, and the baselines that need no learning, beside the true surface."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from sononerf.echoes.echoes import Echoes
+from sononerf.errors import NumericalError
+from sononerf.evaluation.baseline import backprojection, best_level_surface
+from sononerf.evaluation.metrics import geometry_metrics, target_metrics
+from sononerf.evaluation.registration import Kind, Registration, register
+from sononerf.evaluation.true_surface import TrueSurface
+from sononerf.evaluation.voxels import voxel_fit
+from sononerf.scene.scene import Scene
+from sononerf.surface.start.volume import Volume
+
+BASELINE_VOXELS = 64
+"""Voxels of a baseline along the region's longest side: finer than the window in any scene of
+ours."""
+
+
+class Truth:
+    """A true surface, laid over a reconstruction.
+
+    Parameters
+    ----------
+    true : Trimesh
+        The true surface, m.
+    mesh : Trimesh
+        The reconstruction, m.
+    kind : {"none", "rigid", "similarity"}
+        What lays the reconstruction over the truth; baselines are moved alike.
+    """
+
+    def __init__(self, true: trimesh.Trimesh, mesh: trimesh.Trimesh, kind: Kind) -> None:
+        self.surface = TrueSurface(true)
+        self.kind: Kind = kind
+        self.motion: Registration = register(mesh, true, kind)
+        self.mesh = self.motion.of(mesh)
+        # The truth in the frame of the reconstruction, in which levels of baselines are chosen.
+        self._near = self.surface if kind == "none" else TrueSurface(self.motion.inverse().of(true))
+
+    def of_reconstruction(self, scene: Scene | None = None) -> dict[str, Any]:
+        """Return the metrics of the reconstruction; of a scene with a target, also of that alone.
+
+        The README's table names them.
+        """
+        found = geometry_metrics(self.mesh, self.surface)
+        if self.kind != "none":
+            found["registration"] = {
+                "kind": self.kind,
+                "scale": self.motion.scale,
+                "matrix": self.motion.matrix.tolist(),
+            }
+        surroundings = None if scene is None else scene.surface(background=True)
+        target = None if scene is None else scene.surface(background=False)
+        if surroundings is not None and target is not None:
+            found["target"] = target_metrics(self.mesh, target, surroundings)
+        return found
+
+    def of_volume(self, volume: Volume) -> dict[str, Any] | None:
+        """Return the metrics of a baseline at its best level; None where it has no surface."""
+        try:
+            mesh, level = best_level_surface(volume, self._near)
+        except NumericalError:
+            return None
+        return {**geometry_metrics(self.motion.of(mesh), self.surface), "level": level}
+
+
+def baselines(
+    echoes: Echoes, lower: NDArray[np.float64], upper: NDArray[np.float64]
+) -> Iterator[tuple[str, Volume]]:
+    """Yield names and volumes of what needs no learning: backprojection and voxel fit.
+
+    Parameters
+    ----------
+    echoes : Echoes
+        Whose training poses are used.
+    lower, upper : (3,) float64, m
+        Corners of the region.
+    """
+    store, head = echoes.store, echoes.head
+    train = store.indices("train")
+    given = (
+        echoes.positions[train],
+        echoes.rotations[train],
+        store.range,
+        lower,
+        upper,
+        float((upper - lower).max()) / BASELINE_VOXELS,
+    )
+
+    def heard() -> Iterator[NDArray[np.float32]]:
+        return (store.read_pose(int(index)) for index in train)
+
+    places = head.emitter, head.receivers
+    back = backprojection(heard(), *given, emitter_offset=places[0], ear_offsets=places[1])
+    yield "backprojection", back
+    voxels = voxel_fit(
+        heard(),
+        *given,
+        emitter_offset=places[0],
+        ear_offsets=places[1],
+        # Of a sweep each row has a window of its own; where rows are added up, their mean.
+        window=np.square(head.window).mean(axis=0),
+        window_step=head.speed_of_sound / head.sampling_rate / 2,
+    )
+    yield "voxels", voxels

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: MIT
+"""``RUN/traced.safetensors``: the surface that a prediction traces echoes off, and their weight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+import trimesh
+from safetensors import SafetensorError, safe_open
+
+from sononerf import storage
+from sononerf.errors import InputError
+from sononerf.evaluation.traced import Traced
+from sononerf.field.weights import model_checksum
+
+NAME = "traced.safetensors"
+
+
+def save_traced(path: Path, traced: Traced, mesh_checksum: str) -> None:
+    """Write what was learned of a run's mesh; ``mesh_checksum`` is the SHA-256 of its file."""
+    tensors = {
+        "vertices": torch.as_tensor(np.array(traced.mesh.vertices, dtype=np.float64)),
+        "faces": torch.as_tensor(np.array(traced.mesh.faces, dtype=np.int64)),
+        "gain_db": torch.as_tensor(traced.gain_db),
+        "weight": torch.as_tensor(traced.weight),
+    }
+    belongs = {"model": model_checksum(path), "mesh": mesh_checksum}
+    storage.commit_bytes(path / NAME, safetensors.torch.save(tensors, metadata=belongs))
+
+
+def traced_belongs(path: Path, mesh_checksum: str) -> bool:
+    """Tell whether the file belongs to the run's field and mesh; older files name no mesh."""
+    try:
+        with safe_open(str(path / NAME), "pt") as opened:
+            found = opened.metadata() or {}
+    except (SafetensorError, OSError):
+        return False
+    wanted = {"model": model_checksum(path), "mesh": mesh_checksum}
+    return "model" in found and all(wanted[key] == found[key] for key in wanted & found.keys())
+
+
+def load_traced(path: Path) -> Traced | None:
+    """Read ``RUN/traced.safetensors``; None where there is none, or it belongs to another fit.
+
+    Raises
+    ------
+    InputError
+        If it is damaged.
+    """
+    file = path / NAME
+    if not file.is_file():
+        return None
+    try:
+        with safe_open(str(file), "pt") as opened:
+            found = {name: opened.get_tensor(name).numpy() for name in opened.keys()}
+            model = (opened.metadata() or {}).get("model")
+        if model != model_checksum(path):
+            return None
+        faces, vertices = found["faces"], found["vertices"]
+        gain, weight = found["gain_db"], found["weight"]
+        if not (np.isfinite(vertices).all() and np.isfinite(gain).all()):
+            raise ValueError("numbers that are not finite")
+        if not ((weight >= 0) & (weight <= 1)).all():
+            raise ValueError("weights outside 0 to 1")
+        if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
+            raise ValueError("a triangle names a vertex that is not there")
+        return Traced(trimesh.Trimesh(vertices, faces, process=False), gain, weight)
+    except (SafetensorError, KeyError, ValueError, OSError) as error:
+        raise InputError(
+            f"{file}: damaged ({error}); remove it, and `sononerf fit` makes it again"
+        ) from None
