@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import torch
 import torch.nn.functional as F
@@ -25,16 +25,6 @@ UNEVEN_FLOOR = -14.0
 to a twentieth of an echo's energy."""
 
 
-COHERENT_AFTER = 0.5
-"""Mode ``coherent`` sums with phase after this share of the fit: before, it would find no way."""
-
-
-OPAQUE = 0.05
-"""A place casts a shadow where it has this part of the strongest energy in its surroundings."""
-FREE = 0.012
-"""So far in front of a place nothing shades it, m: a surface is some places thick."""
-
-
 class ProfileRenderer(Renderer):
     r"""Power of a fine range profile, seen through the squared analysis window.
 
@@ -48,12 +38,6 @@ class ProfileRenderer(Renderer):
     off. Spreading and absorption are known physics and stay out of the field. The kernel
     :math:`W_f` starts as the square of a point echo in its row, the analysis window or what that
     makes of a sweep, and is learned on; it has two equal sides where the point echoes have.
-    Summing power ignores interference between glints inside one window. Mode ``coherent`` sums
-    pressures instead, each with the phase of its own way, through the root of the kernel:
-
-    .. math::
-        S_e(f, r)^2 = n_f^2 + g^2 \left|\sum_i \sqrt{W_f(r - r_i)}\, \rho(x_i, u_i, f)
-        \frac{B(f) E_e(f) e^{-\alpha_f (d_i + d_i^e)}}{d_i\, d_i^e} e^{-4 \pi j f r_i / c}\right|^2
 
     Parameters
     ----------
@@ -61,12 +45,6 @@ class ProfileRenderer(Renderer):
         Lower and upper corner of the box that holds the field.
     head : Head
         What heard the spectra.
-    mode : {"power", "coherent"}
-        What is summed. ``coherent`` costs about twice as much, starts as ``power``, and asks for
-        places that are right to a fraction of a wavelength.
-    occlusion : bool
-        Whether strong places hide from a pose what lies behind them. Where lobes are learned from
-        all around they have learned that already.
     oversampling : int
         Bins of the profile per range slice.
     points : int
@@ -88,21 +66,16 @@ class ProfileRenderer(Renderer):
 
     lattice: Tensor
     alive: Tensor
-    opaque: Tensor
     energy: Tensor
     spacing: Tensor
     absorption: Tensor
     lag: Tensor | None
-    phased: Tensor
-    wave: Tensor
 
     def __init__(
         self,
         region: Tensor,
         head: Head,
         *,
-        mode: Literal["power", "coherent"] = "power",
-        occlusion: bool = False,
         oversampling: Annotated[int, Option(ge=1, le=16)] = 2,
         points: Annotated[int, Option(ge=1)] = 25_000,
         uniform: Annotated[float, Option(gt=0, le=1)] = 0.4,
@@ -115,13 +88,7 @@ class ProfileRenderer(Renderer):
         self.points, self.uniform, self.start = points, uniform, start
         self.prune_every, self.prune_below = prune_every, prune_below
         self.surroundings = surroundings * head.resolution
-        self.occlusion = occlusion
-        self._turned = False
-        self._summed = (torch.zeros(0), -1, False)  # phased, as of when, and what it said
         self.oversampling = oversampling
-        self.mode = mode
-        self.register_buffer("phased", torch.zeros(()))
-        self.register_buffer("wave", 4 * math.pi * self.frequency / head.speed_of_sound)
         step = float(self.range[1] - self.range[0])
         self.bin = step / oversampling
         per_sample = head.speed_of_sound / head.sampling_rate / 2
@@ -151,13 +118,15 @@ class ProfileRenderer(Renderer):
         self.register_buffer("lattice", torch.zeros(0, 3))
         self.register_buffer("alive", torch.zeros(0, dtype=torch.bool))
         self.register_buffer("energy", torch.zeros(0))
-        self.register_buffer("opaque", torch.zeros(0, dtype=torch.bool))
         self.register_buffer("spacing", torch.zeros(()))
         self._living = (self.alive, -1, self.lattice)  # which, as of when, and where they are
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
+        # Runs of before had modes that are gone; these buffers of theirs were never used in others.
+        for name in ("phased", "wave", "opaque"):
+            state_dict.pop(prefix + name, None)
         # The lattice's size is found by the fit, so a loaded one replaces ours whole.
-        for name in ("lattice", "alive", "opaque", "energy"):
+        for name in ("lattice", "alive", "energy"):
             if prefix + name in state_dict:
                 found = getattr(self, name).new_zeros(state_dict[prefix + name].shape)
                 setattr(self, name, found)
@@ -168,23 +137,6 @@ class ProfileRenderer(Renderer):
         """How many places a step evaluates per pose."""
         return min(len(self._there()), self.points) if len(self.alive) else None
 
-    @property
-    def _sums_phase(self) -> bool:
-        """What ``phased`` says, asked for only where it has changed."""
-        phased, version, said = self._summed
-        if phased is not self.phased or version != self.phased._version:
-            said = bool(self.phased)
-            self._summed = (self.phased, self.phased._version, said)
-        return said
-
-    def advance(self, step: int, total: int) -> None:
-        """Sum with phase from some step on, if at all."""
-        self._turned = (
-            self.mode == "coherent" and not self._sums_phase and step >= COHERENT_AFTER * total
-        )
-        if self._turned:
-            self.phased.fill_(1.0)
-
     @torch.no_grad()
     def prepare(self, field: Field, possible: Possible | None, step: int) -> bool:
         """Lay the lattice at the first step; drop what has no energy and refine every so often."""
@@ -192,14 +144,14 @@ class ProfileRenderer(Renderer):
             self._lay(field, possible)
             return True
         if not self.prune_every or not step or step % self.prune_every:
-            return self._turned
+            return False
         self._prune(field)
         field.keep(self.lattice[self.alive], float(self.spacing))
         if float(self.spacing) > 1.5 * field.resolution:
             self._refine(possible)
             field.keep(self.lattice, float(self.spacing))
             return True
-        return self._turned
+        return False
 
     def _lay(self, field: Field, possible: Possible | None) -> None:
         """Begin as finely as ``start`` allows; to ask about every fine place would take long."""
@@ -237,7 +189,6 @@ class ProfileRenderer(Renderer):
     def _replace(self, places: Tensor, spacing: float) -> None:
         self.lattice = places
         self.alive = places.new_ones(len(places), dtype=torch.bool)
-        self.opaque = torch.zeros_like(self.alive)
         self.energy = places.new_ones(len(places))
         self.spacing = self.spacing.new_tensor(spacing)
 
@@ -253,28 +204,6 @@ class ProfileRenderer(Renderer):
         most = most.scatter_reduce(0, flat, self.energy, "amax").reshape(1, 1, *size[::-1])
         most = F.max_pool3d(most, 3, 1, 1).reshape(-1)[flat]
         self.alive = self.alive & (self.energy > self.prune_below * most)
-        self.opaque = self.alive & (self.energy > OPAQUE * most)
-
-    def _hidden(self, places: Tensor, towards: Tensor, way: Tensor) -> Tensor:
-        """Return which of (M, 3) places have an opaque one within (M,) m towards (M, 3)."""
-        if not bool(self.opaque.any()):
-            return torch.zeros(len(places), dtype=torch.bool, device=places.device)
-        size = ((self.region[1] - self.region[0]) / self.spacing).round().long() + 1
-        stride = torch.stack((size[1] * size[2], size[2], torch.ones_like(size[2])))
-        shadow = torch.zeros(int(size.prod()), dtype=torch.bool, device=places.device)
-        cell = ((self.lattice[self.opaque] - self.region[0]) / self.spacing).round().long()
-        shadow[(cell.clamp(min=0).minimum(size - 1) * stride).sum(-1)] = True
-        length = float((self.region[1] - self.region[0]).norm())
-        hidden = torch.zeros(len(places), dtype=torch.bool, device=places.device)
-        free = FREE + float(self.spacing) * math.sqrt(3) / 2  # a place stands for its cell
-        for far in torch.arange(free, length, float(self.spacing)).tolist():
-            cell = ((places + far * towards - self.region[0]) / self.spacing).round().long()
-            inside = ((cell >= 0) & (cell < size)).all(dim=-1)
-            if not bool(inside.any()):
-                break
-            index = (cell.clamp(min=0).minimum(size - 1) * stride).sum(-1)
-            hidden |= inside & (far < way) & shadow[index]
-        return hidden
 
     def _there(self) -> Tensor:
         """Return the places that are alive, (L, 3): the same tensor until others are."""
@@ -308,13 +237,11 @@ class ProfileRenderer(Renderer):
         if bins is None:
             bins = torch.arange(len(self.frequency), device=self.frequency.device)
         profile, slices = self._profile(field, which, weight, position, rotation, bins)
-        phased = self._sums_phase
-        half = (self.log_kernel.index_select(0, bins) / (2 if phased else 1)).exp()
+        half = self.log_kernel.index_select(0, bins).exp()
         before, after = (half, half) if self._even else half.chunk(2, dim=1)
         # A place nearer than a slice is heard there after its own time.
         kernel = torch.cat((after.flip(1), torch.ones_like(half[:, :1]), before), dim=1)
-        heard = Window.apply(profile, kernel, self.oversampling)  # (1 or 2, E, B, P, n)
-        heard = heard.square().sum(0) if phased else heard[0]
+        heard = Window.apply(profile, kernel, self.oversampling)[0]  # (E, B, P, n)
         heard = F.pad(heard, (slices.start, len(self.range) - slices.stop))
         gain = (2 * (self.log_gain + self.log_spectrum[bins])).exp()
         noise = (2 * self.log_noise[bins]).exp()
@@ -336,15 +263,11 @@ class ProfileRenderer(Renderer):
         rotation: Tensor,
         bins: Tensor,
     ) -> tuple[Tensor, range]:
-        """Return what fine range bins hold, and which slices see them; all others see nothing.
-
-        Power (1, E, B, P, K) or pressure (2, E, B, P, K).
-        """
+        """Return the power in fine range bins (1, E, B, P, K), and the slices that see them."""
         emitters = position + rotation @ self.emitter  # (P, 3)
         there = self._there()
         code = field.code_of_lattice(there, which)
         places = there if which is None else there[which]
-        phased = self._sums_phase
         with torch.no_grad():
             # Ears, vectors and frequencies come first in memory, pairs run along it: see LobeField.
             if self.may_ask:
@@ -356,30 +279,20 @@ class ProfileRenderer(Renderer):
             # From here on a column for each pair of a pose and a place that answers it.
             ray = places.T.index_select(1, place) - emitters.T.index_select(1, pose)
             out = _length(ray)
-            if self.occlusion:
-                free = ~self._hidden(places[place], (ray / -out).T, out)
-                pair, pose, place = pair[free], pose[free], place[free]
-                ray, out = ray[:, free], out[free]
             unit = ray / -out
             # All places in all heads are turned at once: sooner done than pair by pair.
             turn = rotation.permute(2, 0, 1)  # (3, P, 3), world to head
             in_head = turn.reshape(-1, 3) @ places.T - (turn * position).sum(-1).reshape(-1, 1)
             in_head = in_head.reshape(3, -1).index_select(1, pair)
-            known, way, middle = self._paths(in_head, out, bins)
-            if not phased:
-                known.square_()
+            known, middle = self._paths(in_head, out, bins)
+            known.square_()
             if weight is not None:
                 known *= weight.index_select(0, place)
         response, lead = field.echo(places, unit.T, bins, place, code)  # (M, B), (M,)
         response = response.T
         self.points_evaluated += len(place)
-        if phased:
-            turned = self.wave[bins, None] * (way / 2 - lead)[:, None]
-            pressure = response * torch.polar(known, -turned)
-            echoes = torch.stack((pressure.real, pressure.imag))
-        else:
-            squared = response.abs().square() if response.is_complex() else response.square()
-            echoes = (squared * known)[None]
+        squared = response.abs().square() if response.is_complex() else response.square()
+        echoes = (squared * known)[None]
         at = middle - lead / self.bin
         slices = self._sounding(at)
         held = (len(slices) - 1) * self.oversampling + self._taps
@@ -399,7 +312,7 @@ class ProfileRenderer(Renderer):
         first = min(max(first, 0), last)
         return range(first, min(max(end, first), last) + 1)
 
-    def _paths(self, in_head: Tensor, out: Tensor, bins: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _paths(self, in_head: Tensor, out: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
         """Return what the way to places and back does to pressure.
 
         Parameters
@@ -415,15 +328,13 @@ class ProfileRenderer(Renderer):
         -------
         known : (E, B, M) float
             By beam, ears, air and spreading.
-        way : (E, M) float, m
-            There and back.
         middle : (E, 1, M) or (E, B, M) float
             The bin of the profile that the echo is heard in.
         """
         ray = in_head - self.ear_positions[..., None]  # (E, 3, M)
         back = _length(ray)
         head = (ray / back[:, None]).mT
-        way = out + back  # (E, M)
+        way = out + back  # (E, M) m, there and back
         # Each pass over all of it is made once, and in place: memory is what they wait for.
         known = look_up(self.ears.index_select(1, bins), head).mT
         ray = (in_head - self.emitter[:, None]) / out
@@ -435,7 +346,7 @@ class ProfileRenderer(Renderer):
         middle = ((way / 2 - self.first) / self.bin)[:, None]
         if self.lag is not None:
             middle = middle + look_up(self.lag.index_select(1, bins), head).mT / self.bin
-        return known, way, middle
+        return known, middle
 
 
 def _length(vectors: Tensor) -> Tensor:

@@ -15,14 +15,6 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import SettingsError
 
 
-class RangeSlice(NamedTuple):
-    """One slice: what both ears hear from one range at one pose."""
-
-    pose: int
-    range: float  # m
-    spectrum: Tensor  # (E, F) linear magnitude
-
-
 class RangeSlices(NamedTuple):
     """A batch of slices, the same number from each of its poses."""
 
@@ -196,10 +188,6 @@ class SliceStream(Dataset[RangeSlices]):
                 ]
             )
         return RangeSlices(pose, self.positions[pose], self.rotations[pose], rows, bins, spectrum)
-
-    def slice(self, pose: int, row: int) -> RangeSlice:
-        """Return one slice of one pose."""
-        return RangeSlice(pose, float(self.axis[row]), self.reader[pose][:, row])
 
 
 class WholePoses(Dataset[RangeSlices]):

@@ -30,7 +30,6 @@ from sononerf.settings.schema import Settings
 from sononerf.simulation.ensemble import check_poses, check_reach, deaf, simulate_ensemble
 from sononerf.simulation.pose_sets import ensemble_poses
 from sononerf.simulation.simulator import VERSION, Simulator
-from sononerf.simulation.validity import expected_error_db
 
 HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")
 MOST_WORKERS = 8
@@ -252,17 +251,12 @@ def simulate(
 
 def _attributes(settings: Settings, wanted: str, simulator: Simulator) -> dict[str, object]:
     plain = settings.plain()
-    engine = simulator.engine
-    error = expected_error_db(engine, engine.scene, simulator.head.frequency)
     return {
         "echo_hash": wanted,
         "origin": "simulated",
         "scene": plain["scene"],
         "settings": {name: plain[name] for name in ("poses", *HASHED_SECTIONS)},
         "speed_of_sound": simulator.head.speed_of_sound,
-        "expected_error_db": None
-        if error is None
-        else [round(value, 2) for value in error.tolist()],
         "units": {
             "spectrogram": "linear magnitude, sound pressure over that of the call at 1 m",
             "position": "m",

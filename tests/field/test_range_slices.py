@@ -190,12 +190,6 @@ def test_memory_is_bounded_and_the_longest_unused_goes_first(store, monkeypatch)
     assert small[4] is small[4]
 
 
-def test_one_slice(store):
-    found = stream(store).slice(5, 3)
-    assert (found.pose, found.range) == (5, pytest.approx(0.23))
-    assert found.spectrum[1].tolist() == [value(5, 1, 3, f) for f in range(FREQUENCIES)]
-
-
 def test_whole_poses_with_and_without_measurements(store):
     positions, rotations = torch.rand(2, 3), torch.rand(2, 3, 3)
     given = WholePoses(positions, rotations, RANGES, FREQUENCIES)

@@ -14,7 +14,6 @@ import trimesh
 
 from sononerf.echoes import echoes as echoes_module
 from sononerf.echoes import onsets
-from sononerf.echoes.consistency import ACCURACY
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.onsets import Onsets, asked_poses
@@ -39,6 +38,7 @@ from sononerf.run.build import (
 from sononerf.run.simulate import simulate
 from sononerf.settings import plugins
 from sononerf.settings.loading import load_settings
+from sononerf.surface.refine.onset_ranges import SCALE
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.refinement import Refinement
 from tests.memory import echoes_of
@@ -357,5 +357,5 @@ def test_renderer_and_refinement_have_the_range_resolution_of_the_head(config):
         simulate=lambda mesh: None,
         seed=0,
     )
-    assert work.onsets.scale == ACCURACY * head.resolution
+    assert work.onsets.scale == SCALE * head.resolution
     assert ProfileRenderer(BOX, head, surroundings=1.0).surroundings == head.resolution

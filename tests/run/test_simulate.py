@@ -234,9 +234,6 @@ def test_a_killed_worker_costs_nothing(tiny, tmp_path, monkeypatch):
 def test_the_noise_floor_is_that_of_other_rays(echoes, tiny, tmp_path):
     store = EnsembleStore.open(echoes)
     train = max(float(store.read_pose(int(i)).max()) for i in store.indices("train"))
-    error = np.array(store.attributes["expected_error_db"])
-    assert error.shape == store.frequency.shape
-    assert error[0] > error[-1] > 0.0
     assert store.attributes["reference"] == pytest.approx(train / 1000)
     coarse = store.attributes["noise_floor_mae_db"]
     fine = simulate(

@@ -5,7 +5,7 @@ The nearest point of a body always sends an echo, even if it is an edge or a cor
 range over the surface must be the onset. Physical optics alone does not ensure this: if a pose
 hears only a quiet edge, the descent can make the edge quieter by cutting it off.
 
-Up to the accuracy of the detector the misfit is quadratic, beyond it is linear (Huber's loss).
+Up to ``SCALE`` the misfit is quadratic, beyond it is linear (Huber's loss).
 """
 
 from __future__ import annotations
@@ -15,9 +15,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sononerf.echoes.consistency import ACCURACY
 from sononerf.echoes.free_space import EchoHull
 
+SCALE = 0.19
+"""Misfit at which Huber's loss turns linear, range resolutions. At 0.1, the accuracy of the
+detector, the onsets outweigh the spectrograms: the Chamfer distance of ua rises from 0.94 mm to
+1.25 mm (means of two seeds of the refinement)."""
 _POSES = 64  # drawn per step, to bound the time
 
 
@@ -35,7 +38,7 @@ class OnsetRanges:
     """
 
     def __init__(self, hull: EchoHull, resolution: float, seed: int) -> None:
-        self.scale, self.seed = ACCURACY * resolution, seed
+        self.scale, self.seed = SCALE * resolution, seed
         known = np.isfinite(hull.trusted)
         pose, ear = np.nonzero(known)
         self._first = hull.trusted[known]

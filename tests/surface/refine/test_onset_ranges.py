@@ -6,9 +6,8 @@ import pytest
 import torch
 import trimesh
 
-from sononerf.echoes.consistency import ACCURACY
 from sononerf.echoes.free_space import EchoHull
-from sononerf.surface.refine.onset_ranges import OnsetRanges
+from sononerf.surface.refine.onset_ranges import SCALE, OnsetRanges
 
 RESOLUTION = 0.006
 
@@ -36,7 +35,7 @@ def box():
 def test_the_body_itself_has_no_misfit_and_a_smaller_one_has(box):
     onsets = OnsetRanges(heard(box), RESOLUTION, seed=0)
     assert onsets.misfit(vertices_of(box)) == pytest.approx(0.0, abs=1e-9)
-    off = 2.0 * ACCURACY * RESOLUTION
+    off = 2.0 * SCALE * RESOLUTION
     smaller = box.copy()
     smaller.vertices *= 1 - off / 0.04
     assert 0.5 < onsets.misfit(vertices_of(smaller)) < 2.5
