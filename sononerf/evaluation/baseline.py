@@ -121,12 +121,8 @@ def coherent_backprojection(
     ----------
     waveforms : iterable of (E, S) float
         Recordings from the start of the emission on, one per pose in order; read one at a time.
-    positions : (P, 3) float, m
-        Heads, world frame.
-    rotations : (P, 3, 3) float
-        Head to world.
-    lower, upper : (3,) float, m
-        The box.
+    positions, rotations, lower, upper, emitter_offset, ear_offsets
+        As of :func:`backprojection`.
     spacing : float, m
         Voxel size; a quarter of the shortest wavelength shows all there is.
     call : (N,) float
@@ -135,10 +131,6 @@ def coherent_backprojection(
         Of recordings and call.
     speed_of_sound : float, m/s
         Of the medium.
-    emitter_offset : (3,) float, m
-        Emitter in the head frame.
-    ear_offsets : (E, 3) float, m
-        Ears in the head frame.
 
     Returns
     -------

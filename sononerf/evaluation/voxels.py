@@ -52,22 +52,9 @@ def voxel_fit(
 
     Parameters
     ----------
-    spectrograms : iterable of (E, R, F) float
-        Linear magnitude, one per pose in order; read one at a time.
-    positions : (P, 3) float, m
-        Heads, world frame.
-    rotations : (P, 3, 3) float
-        Head to world.
-    ranges : (R,) float, m
-        Evenly spaced; half the way from emitter over echo to ear.
-    lower, upper : (3,) float, m
-        The box.
-    spacing : float, m
-        Voxel size.
-    emitter_offset : (3,) float, m
-        Emitter in the head frame; near the ears against the ranges.
-    ear_offsets : (E, 3) float, m
-        Ears in the head frame.
+    spectrograms, positions, rotations, ranges, lower, upper, spacing, emitter_offset, ear_offsets
+        As of :func:`sononerf.evaluation.baseline.backprojection`; the emitter is near the ears
+        against the ranges.
     window : (W,) float
         Energy that a point echo leaves around its range.
     window_step : float, m

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf import __version__, storage
-from sononerf.echoes.onsets import find_onsets
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.sealing import seal
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError
@@ -178,7 +178,7 @@ def _attributes(known: Understood, wanted: str) -> dict[str, Any]:
 
 def verdict(known: Understood, store: EnsembleStore) -> Verdict:
     """Return what the first echoes of the training poses say of the conventions of poses."""
-    heard = find_onsets(store, known.head.point_echo)
+    heard = Echoes(store, known.head).onsets
     columns = known.recording.columns.take(known.pings[heard.poses])
     return check_poses(
         heard.first,

@@ -5,19 +5,15 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sononerf import __version__, storage
-from sononerf.echoes.sealing import seal
 from sononerf.echoes.store import EnsembleStore
 from sononerf.echoes.subtracted import SubtractedStore
 from sononerf.errors import IncompatibleError, SettingsError
-from sononerf.geometry.poses import Poses
 from sononerf.head.call import call_content
 from sononerf.head.ears import directivity_content
 from sononerf.head.reception import warn_of_call
@@ -27,14 +23,12 @@ from sononerf.run.build import head_of
 from sononerf.run.store_settings import complete_store
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import Settings
-from sononerf.simulation.ensemble import check_poses, check_reach, deaf, simulate_ensemble
+from sononerf.simulation.ensemble import check_poses, check_reach
+from sononerf.simulation.ensemble import simulate as simulate_poses
 from sononerf.simulation.pose_sets import ensemble_poses
 from sononerf.simulation.simulator import VERSION, Simulator
 
 HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")
-MOST_WORKERS = 8
-WORTH_WORKERS = 64
-"""Fewer poses than this are simulated before other processes have even started."""
 
 
 def echo_hash(settings: Settings, scene: Scene) -> str:
@@ -245,7 +239,15 @@ def simulate(
             receivers=len(head.receivers),
         )
         attach(settings, path)
-        _fill(store, simulator, poses, settings, workers, scheduler, progress)
+        simulate_poses(
+            simulator,
+            poses,
+            store,
+            settings.simulation,
+            workers=workers,
+            scheduler=scheduler,
+            progress=progress,
+        )
     return EnsembleStore.open(path)
 
 
@@ -265,50 +267,3 @@ def _attributes(settings: Settings, wanted: str, simulator: Simulator) -> dict[s
         },
         "sononerf": __version__,
     }
-
-
-def _fill(
-    store: EnsembleStore,
-    simulator: Simulator,
-    poses: Poses,
-    settings: Settings,
-    workers: int | None,
-    scheduler: str | None,
-    progress: Progress,
-) -> None:
-    missing = store.missing()
-    if workers is None:
-        cores = min(len(os.sched_getaffinity(0)), MOST_WORKERS)
-        alone = simulator.engine.prepares or len(missing) < WORTH_WORKERS
-        workers = 1 if alone else cores
-    test = store.indices("test")[: settings.simulation.noise_floor_poses]
-    again: dict[int, NDArray[np.float32]] = {}
-    seed = settings.simulation.seed
-    wanted = [*missing, *test]
-    simulator.prepare(poses.positions[wanted], poses.rotations[wanted], progress)
-    with progress.task("simulating", len(missing) + len(test)) as task:
-        # The second simulation of the test poses goes first where it can share the processes.
-        def keep(index: int, spectrogram: NDArray[np.float32]) -> None:
-            if index < len(poses):
-                store.write_pose(index, spectrogram)
-            else:
-                again[int(test[index - len(poses)])] = spectrogram
-            task.advance()
-
-        both = Poses(
-            np.concatenate((poses.positions, poses.positions[test])),
-            np.concatenate((poses.rotations, poses.rotations[test])),
-        )
-        # A pose's seed is a function of its number, so the second time has other rays.
-        extra = range(len(poses), len(poses) + len(test))
-        simulate_ensemble(
-            simulator,
-            both,
-            [*missing, *extra],
-            keep,
-            seed=seed,
-            workers=workers,
-            scheduler=scheduler,
-        )
-    limits = settings.spectrogram.range_min, settings.spectrogram.range_max
-    seal(store, {int(i): again[int(i)] for i in test}, silent=deaf(*limits))

@@ -117,14 +117,7 @@ class Engine:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Places that send sound straight back, and how much.
 
-        Parameters
-        ----------
-        position : (3,) float64, m
-            Of the head, world frame.
-        rotation : (3, 3) float64
-            Head to world.
-        seed : int
-            Of whatever is random.
+        Position, rotation and seed are those of :meth:`echo`.
 
         Returns
         -------

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import signal
 import warnings
 from collections import Counter, deque
@@ -15,12 +16,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.echoes.echoes import Echoes
+from sononerf.echoes.sealing import seal
+from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
 from sononerf.geometry.inside import winding_numbers
-from sononerf.geometry.poses import (
-    Poses,
-)
+from sononerf.geometry.poses import Poses
+from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
+from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -29,8 +33,10 @@ if TYPE_CHECKING:
 logger = logging.getLogger("sononerf")
 
 Write = Callable[[int, NDArray[np.float32]], None]
-Progress = Callable[[int, int], None]
 
+MOST_WORKERS = 8
+WORTH_WORKERS = 64
+"""Fewer poses than this are simulated before other processes have even started."""
 CONNECT_SECONDS = 30  # a scheduler across a network answers in one
 QUEUED_PER_WORKER = 4  # results wait in memory; more than this would only fill it
 PATIENCE_SECONDS = 10  # without a result, before workers are looked for
@@ -132,6 +138,87 @@ def deaf(range_min: float, range_max: float) -> str:
     )
 
 
+def simulate(
+    simulator: Simulator,
+    poses: Poses,
+    store: EnsembleStore,
+    options: SimulationSettings,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress,
+) -> Echoes:
+    """Simulate what is missing of a store, and seal it.
+
+    The test poses are simulated twice, with other rays, which gives the noise floor.
+
+    Parameters
+    ----------
+    simulator : Simulator
+        Scene and head.
+    poses : Poses
+        Those of the store.
+    store : EnsembleStore
+        Opened for writing.
+    options : SimulationSettings
+        Seed, and number of test poses for the noise floor.
+    workers : int or None
+        Processes; as many as there are cores, at most 8, where None.
+    scheduler : str or None
+        Address of a Dask scheduler to use instead.
+    progress : Progress
+        Where to show it.
+
+    Raises
+    ------
+    SonoNerfError
+        If a pose fails, naming it.
+    NumericalError
+        If no pose hears anything.
+    StorageError
+        If the store cannot be written.
+    ResourceError
+        If the workers cannot be reached.
+    """
+    missing = store.missing()
+    if workers is None:
+        cores = min(len(os.sched_getaffinity(0)), MOST_WORKERS)
+        alone = simulator.engine.prepares or len(missing) < WORTH_WORKERS
+        workers = 1 if alone else cores
+    test = store.indices("test")[: options.noise_floor_poses]
+    again: dict[int, NDArray[np.float32]] = {}
+    wanted = [*missing, *test]
+    simulator.prepare(poses.positions[wanted], poses.rotations[wanted], progress)
+    with progress.task("simulating", len(missing) + len(test)) as task:
+        # The second simulation of the test poses goes first where it can share the processes.
+        def keep(index: int, spectrogram: NDArray[np.float32]) -> None:
+            if index < len(poses):
+                store.write_pose(index, spectrogram)
+            else:
+                again[int(test[index - len(poses)])] = spectrogram
+            task.advance()
+
+        both = Poses(
+            np.concatenate((poses.positions, poses.positions[test])),
+            np.concatenate((poses.rotations, poses.rotations[test])),
+        )
+        # A pose's seed is a function of its number, so the second time has other rays.
+        extra = range(len(poses), len(poses) + len(test))
+        simulate_ensemble(
+            simulator,
+            both,
+            [*missing, *extra],
+            keep,
+            seed=options.seed,
+            workers=workers,
+            scheduler=scheduler,
+        )
+    analysis = simulator.head.analysis
+    silent = deaf(analysis.range_min, analysis.range_max)
+    seal(store, {int(i): again[int(i)] for i in test}, silent=silent)
+    return Echoes(store, simulator.head)
+
+
 def simulate_ensemble(
     simulator: Simulator,
     poses: Poses,
@@ -141,8 +228,6 @@ def simulate_ensemble(
     seed: int,
     workers: int = 1,
     scheduler: str | None = None,
-    progress: Progress | None = None,
-    preparing: Progress | None = None,
 ) -> None:
     """Simulate poses and hand over each spectrogram as it comes.
 
@@ -164,11 +249,6 @@ def simulate_ensemble(
         Processes on this machine; one means this process.
     scheduler : str, optional
         Address of a Dask scheduler whose workers are used instead.
-    progress : callable, optional
-        Takes how many are done and how many there are.
-    preparing : callable, optional
-        The same of the parts of an engine that solves for all poses at once; see
-        :meth:`Engine.prepare`. Such an engine works in this process.
 
     Raises
     ------
@@ -185,27 +265,16 @@ def simulate_ensemble(
             type(engine).__name__,
         )
         workers, scheduler = 1, None
-    engine.prepare(poses.positions[wanted], poses.rotations[wanted], preparing)
+    engine.prepare(poses.positions[wanted], poses.rotations[wanted])
     if scheduler is None and workers <= 1:
-        results = _simulate_here(simulator, poses, wanted, seed)
-        _hand_over(results, len(wanted), write, progress)
+        for index, spectrogram in _simulate_here(simulator, poses, wanted, seed):
+            write(index, spectrogram)
     elif wanted:
         with _workers(workers, scheduler) as client:
             ours = scheduler is None
             results = _simulate_there(client, simulator, poses, wanted, seed, ours=ours)
-            _hand_over(results, len(wanted), write, progress)
-
-
-def _hand_over(
-    results: Iterator[tuple[int, NDArray[np.float32]]],
-    total: int,
-    write: Write,
-    progress: Progress | None,
-) -> None:
-    for done, (index, spectrogram) in enumerate(results, start=1):
-        write(index, spectrogram)
-        if progress is not None:
-            progress(done, total)
+            for index, spectrogram in results:
+                write(index, spectrogram)
 
 
 def _failed(index: int, error: BaseException) -> SonoNerfError:

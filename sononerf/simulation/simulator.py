@@ -165,14 +165,7 @@ class Simulator:
     ) -> NDArray[np.float32]:
         """Magnitude of what both ears hear, over range and frequency.
 
-        Parameters
-        ----------
-        position : (3,) float64, m
-            Of the head, world frame.
-        rotation : (3, 3) float64
-            Head to world.
-        seed : int
-            Of whatever is random.
+        Position, rotation and seed are those of :meth:`Engine.echo`.
 
         Returns
         -------
@@ -186,14 +179,7 @@ class Simulator:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return what both ears hear of the call, noise included, and its spectrogram.
 
-        Parameters
-        ----------
-        position : (3,) float64, m
-            Of the head, world frame.
-        rotation : (3, 3) float64
-            Head to world.
-        seed : int
-            Of whatever is random.
+        Position, rotation and seed are those of :meth:`Engine.echo`.
 
         Returns
         -------
