@@ -14,9 +14,8 @@ from sononerf.callbacks.epoch import EpochCallback
 from sononerf.errors import NumericalError
 from sononerf.field.module import EchoModule
 from sononerf.report.mesh_files import mesh_bytes
-from sononerf.report.mip import maximum_intensity_projections
 from sononerf.report.pictures.figure import png_from_pixels
-from sononerf.report.pictures.mip_picture import mip_image
+from sononerf.report.pictures.mip_picture import maximum_intensity_projections, mip_image
 from sononerf.surface.start.isosurface import automatic_level, isosurface
 from sononerf.surface.start.read_out import energy_volume
 

@@ -10,9 +10,9 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sononerf.evaluation.layered_depth import volumes
 from sononerf.evaluation.nearest import Nearest
 from sononerf.evaluation.prediction import prediction_metrics
-from sononerf.evaluation.shared_volume import volumes
 from sononerf.evaluation.solid import (
     Solid,
     count_parts,

@@ -124,7 +124,7 @@ def known_part(
         m.
     heard : (V,) int32
         How many poses heard the surface around each vertex, see
-        :func:`~sononerf.surface.start.support.poses_that_heard`.
+        :func:`~sononerf.surface.start.reliability.poses_that_heard`.
     hull : EchoHull
         The onsets.
     resolution : float, m

@@ -18,7 +18,7 @@ from sononerf.surface.openness import (
 )
 from sononerf.surface.start.occupancy import QUIET
 from sononerf.surface.start.read_out import FieldReading, Method
-from sononerf.surface.start.support import poses_that_heard
+from sononerf.surface.start.reliability import poses_that_heard
 from sononerf.surface.start.volume import Volume
 
 

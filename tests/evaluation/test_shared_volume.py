@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.evaluation.shared_volume import volumes
+from sononerf.evaluation.layered_depth import volumes
 from sononerf.evaluation.solid import solid_from_mesh
 
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import NumericalError
-from sononerf.report.mip import maximum_intensity_projections
+from sononerf.report.pictures.mip_picture import maximum_intensity_projections
 from sononerf.surface.start.volume import Volume
 
 

@@ -5,8 +5,8 @@ import trimesh
 from sononerf_scenes.bodies import EDGE
 
 from sononerf.errors import SettingsError
-from sononerf.geometry.crossing import surfaces_cross
 from sononerf.geometry.faults import surface_faults
+from sononerf.scene.composition import surfaces_cross
 from sononerf.scene.scene import MATERIALS, load_scene
 
 SPHERE = {"target": "sphere", "target_options": {"radius": 0.04}}

@@ -8,9 +8,9 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.evaluation.difference_of_runs import Comparison
-from sononerf.report.mip import maximum_intensity_projections
 from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
 from sononerf.report.pictures.mesh_picture import mesh_png
+from sononerf.report.pictures.mip_picture import maximum_intensity_projections
 from sononerf.report.pictures.shading import DEFAULT_VIEW
 
 LEVEL_COLOURS, DIFFERENCE_COLOURS = "magma", "RdBu_r"

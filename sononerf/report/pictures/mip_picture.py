@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import NumericalError
-from sononerf.report.mip import maximum_intensity_projections
 from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
-from sononerf.surface.start.volume import Volume
+from sononerf.surface.start.volume import Volume, require_finite
 
 # Reflectivity spans decades; what lies further below the greatest value is drawn black.
 RANGE_DB = 40.0
@@ -153,3 +152,25 @@ def mip_pngs(volume: Volume, *, scale: Scale = "db") -> dict[str, bytes]:
             scale=scale,
         )
     return pictures
+
+
+def maximum_intensity_projections(volume: Volume) -> dict[str, NDArray[np.floating]]:
+    """Return the greatest value along each axis.
+
+    Parameters
+    ----------
+    volume : Volume
+        Values (X, Y, Z).
+
+    Returns
+    -------
+    projections : dict
+        ``"x"`` (Y, Z), ``"y"`` (X, Z) and ``"z"`` (X, Y), named by the axis looked along.
+
+    Raises
+    ------
+    NumericalError
+        If a value is not finite.
+    """
+    require_finite(volume)
+    return {name: volume.values.max(axis=axis) for axis, name in enumerate("xyz")}

@@ -27,8 +27,8 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.raycast import Occlusion
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
+from sononerf.surface.refine.objective import on_rows
 from sononerf.surface.refine.optics import Heard, Optics
-from sononerf.surface.refine.rows import on_rows
 from sononerf.surface.refine.visibility import listen
 
 

@@ -12,7 +12,6 @@ from torch import Tensor
 from sononerf.echoes.echoes import Echoes
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.surface.refine.optics import Heard
-from sononerf.surface.refine.rows import on_rows
 
 FLOOR_DB = 20.0
 """What counts lies within this of a pose's loudest cell; fainter ones are later bounces."""
@@ -178,3 +177,31 @@ def _learn(
     ratio = torch.where(loud, ratio, torch.nan)
     step = ratio.movedim(1, 0).movedim(3, 1).flatten(2).nanmedian(dim=2).values
     level.gain = level.gain + rate * torch.nan_to_num(step)
+
+
+def on_rows(wholes: list[Tensor], row: Tensor, like: Tensor) -> Tensor:
+    """Return the range slices of whole spectrograms from given rows on.
+
+    Parameters
+    ----------
+    wholes : list of (E, R, F) float32
+        One per pose.
+    row : (P,) int64
+        Each pose's first row; may lie before the axis.
+    like : (P, E, W, F) Tensor
+        Whose width and device the result has.
+
+    Returns
+    -------
+    parts : (P, E, W, F) float32
+        Zero beyond the axis.
+    """
+    width = like.shape[2]
+    parts = []
+    for whole, start in zip(wholes, row.tolist(), strict=True):
+        first, last = max(start, 0), min(start + width, whole.shape[1])
+        part = torch.zeros(whole.shape[0], width, whole.shape[2])
+        if last > first:
+            part[:, first - start : last - start] = whole[:, first:last]
+        parts.append(part)
+    return torch.stack(parts).to(like.device)

@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
+from scipy import fft, ndimage
 
 from sononerf.geometry.lattice import Grid, Lattice
-from sononerf.surface.start.winding import winding_number
 
 Array = NDArray[np.float64]
 _DENSE = 0.2  # density, over the median at the points, at which a plane has half of its full weight
@@ -122,3 +123,40 @@ def winding_of(lattice: Lattice, points: Array, normals: Array, weight: Array) -
         for along in normals.T
     ]
     return np.asarray(ndimage.gaussian_filter(winding_number(flux), 1.0), dtype=np.float32)
+
+
+_AIR = 0.25  # fraction of the longest side, empty on each side: periodic images must stay apart
+
+
+def winding_number(flux: Sequence[Grid]) -> Grid:
+    """Return the winding number of a density of surface.
+
+    Parameters
+    ----------
+    flux : three (X, Y, Z) float, 1/voxel
+        Area per volume along outward normals: across a surface it adds up to one.
+
+    Returns
+    -------
+    winding : (X, Y, Z) float
+        Zero far away.
+    """
+    shape = flux[0].shape
+    air = 2 * round(_AIR * max(shape))
+    size = [int(fft.next_fast_len(n + air, real=True)) for n in shape]
+    square = np.zeros(1, np.float32)
+    total = np.zeros(1, np.complex64)
+    for axis, n in enumerate(size):
+        frequency = np.fft.rfftfreq(n) if axis == 2 else np.fft.fftfreq(n)
+        wave = (2 * np.pi * frequency).astype(np.float32)
+        wave = wave.reshape([-1 if a == axis else 1 for a in range(3)])
+        square = square + wave**2
+        total = total + wave * fft.rfftn(flux[axis], s=size)
+    square[0, 0, 0] = 1.0  # the mean is set below
+    found = fft.irfftn(1j * total / square, s=size)
+    far = [
+        found.take((inner + whole) // 2, axis).mean()
+        for axis, (inner, whole) in enumerate(zip(shape, size, strict=True))
+    ]
+    x, y, z = shape
+    return np.asarray(found[:x, :y, :z] - np.mean(far), dtype=np.float32)

@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from sononerf.surface.refine.sides import Sides
+from sononerf.surface.refine.descent import Sides
 
 THICK = 1e-3
 

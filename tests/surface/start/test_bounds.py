@@ -3,7 +3,7 @@ import numpy as np
 
 from sononerf.echoes.free_space import EchoHull
 from sononerf.geometry.lattice import Lattice
-from sononerf.surface.start.bounds import clearance_grid
+from sononerf.surface.start.occupancy import clearance_grid
 
 
 def test_the_clearance_is_exact_near_the_surface_and_has_the_right_sign_elsewhere():

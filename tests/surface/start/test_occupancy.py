@@ -12,7 +12,7 @@ from sononerf.field.field import Field, sphere_directions
 from sononerf.geometry.lattice import Lattice
 from sononerf.surface.start import occupancy
 from sononerf.surface.start.occupancy import estimate_occupancy, gather_evidence
-from sononerf.surface.start.support import poses_that_heard
+from sononerf.surface.start.reliability import poses_that_heard
 
 RADIUS, RESOLUTION, SPACING, FAR = 0.012, 0.006, 0.002, 0.4
 LOWER, UPPER = np.array([-0.05, -0.03, -0.03]), np.array([0.05, 0.03, 0.03])

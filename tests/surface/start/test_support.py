@@ -3,10 +3,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.surface.start import support
+from sononerf.surface.start import reliability as support
 from sononerf.surface.start.evidence import Evidence
-from sononerf.surface.start.reliability import ALIGNED, REACH
-from sononerf.surface.start.support import poses_that_heard
+from sononerf.surface.start.reliability import ALIGNED, REACH, poses_that_heard
 
 RADIUS, RESOLUTION = 0.03, 0.005
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.geometry.crossing import surfaces_cross
+from sononerf.scene.composition import surfaces_cross
 
 
 def box(size, centre):
