@@ -124,13 +124,6 @@ def echoes_of(fitted: Fitted) -> Echoes:
     return Echoes(store, fitted.head, fitted.hull)
 
 
-def has_heldout(fitted: Fitted) -> bool:
-    """Tell whether poses were held out of the fit."""
-    if fitted.settings.scene is not None:
-        return fitted.settings.poses.heldout > 0
-    return len(echoes_of(fitted).store.indices("test")) > 0
-
-
 def all_poses(fitted: Fitted) -> tuple[Poses, NDArray[np.int8]]:
     """Return the poses of a run's ensemble and what each is for (P,): 0 train, 1 val, 2 test."""
     if fitted.settings.scene is not None:

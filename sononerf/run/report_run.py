@@ -19,7 +19,7 @@ from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.mesh_picture import mesh_png
 from sononerf.report.pictures.scene_picture import scene_png
-from sononerf.run.fitted import Fitted, all_poses, has_heldout
+from sononerf.run.fitted import Fitted, all_poses
 from sononerf.run.run_folder import RunFolder, results_folder
 from sononerf.run.truth import true_mesh
 from sononerf.settings.loading import dump_yaml
@@ -69,7 +69,7 @@ def report(
     run = RunFolder(path)
     fitted = run.fitted
     folder = output or path / "report"
-    heldout = has_heldout(fitted)
+    heldout = run.has_heldout
     pictures: dict[str, bytes] = {}
     with run.locked(folder), results_folder(folder):
         parts = [f"# {path.resolve().name}"]

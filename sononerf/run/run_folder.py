@@ -22,7 +22,7 @@ from sononerf.errors import IncompatibleError, InputError
 from sononerf.evaluation.traced import Traced
 from sononerf.field.weights import DESCRIPTION_NAME
 from sononerf.run.attached import attach
-from sononerf.run.fitted import Fitted, echoes_of, has_heldout, load_fitted
+from sononerf.run.fitted import Fitted, echoes_of, load_fitted
 from sononerf.run.traced_file import load_traced, save_traced, traced_belongs
 from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
 from sononerf.settings.schema import Settings
@@ -144,6 +144,14 @@ class RunFolder:
         """What was fitted to; raises as :func:`sononerf.run.fitted.echoes_of`."""
         return echoes_of(self.fitted)
 
+    @property
+    def has_heldout(self) -> bool:
+        """Whether poses were held out of the fit."""
+        settings = self.fitted.settings
+        if settings.scene is not None:
+            return settings.poses.heldout > 0
+        return len(self.echoes.store.indices("test")) > 0
+
     def mesh(self) -> trimesh.Trimesh:
         """Read the reconstructed surface.
 
@@ -189,7 +197,7 @@ class RunFolder:
             return traced_belongs(self.path, self._mesh_checksum())
         found = self.read_metrics().keys()
         if stage == "prediction":
-            return "prediction" in found or not has_heldout(self.fitted)
+            return "prediction" in found or not self.has_heldout
         return {"geometry", "baseline"} <= found
 
     @property

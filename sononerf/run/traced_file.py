@@ -39,7 +39,8 @@ def traced_belongs(path: Path, mesh_checksum: str) -> bool:
     except (SafetensorError, OSError):
         return False
     wanted = {"model": model_checksum(path), "mesh": mesh_checksum}
-    return "model" in found and all(wanted[key] == found[key] for key in wanted & found.keys())
+    known = wanted.keys() & found.keys()
+    return "model" in found and all(wanted[key] == found[key] for key in known)
 
 
 def load_traced(path: Path) -> Traced | None:
