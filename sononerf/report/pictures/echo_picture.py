@@ -90,10 +90,6 @@ def echo_png(
     title : str
         One line above.
 
-    Returns
-    -------
-    data : bytes
-        A PNG file.
 
     Raises
     ------

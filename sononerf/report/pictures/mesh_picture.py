@@ -47,10 +47,6 @@ def mesh_png(
     colours : (3,) or (V, 3) float, optional
         Colour in 0 to 1, one for all or one per vertex.
 
-    Returns
-    -------
-    data : bytes
-        A PNG file.
 
     Raises
     ------
@@ -85,10 +81,6 @@ def side_by_side_png(
     view : (3,) float
         Direction to the camera, world frame.
 
-    Returns
-    -------
-    data : bytes
-        A PNG file.
 
     Raises
     ------
@@ -130,10 +122,6 @@ def confidence_png(
     view : (3,) float
         Direction from the mesh to the camera, world frame; z is up.
 
-    Returns
-    -------
-    data : bytes
-        A PNG file.
 
     Raises
     ------

@@ -67,10 +67,6 @@ def mip_png(
     scale : {"db", "linear"}
         Decibels below the greatest value (10 log10, 40 dB shown), or linear from zero.
 
-    Returns
-    -------
-    data : bytes
-        A PNG file.
 
     Raises
     ------

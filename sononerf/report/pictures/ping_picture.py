@@ -47,11 +47,6 @@ def pings_png(
         Ascending.
     poses : Poses
         Of all pings; the first ones are marked.
-
-    Returns
-    -------
-    data : bytes
-        A PNG file.
     """
     rows = len(labels)
     with figure(10.5, 3.4 + 2.2 * rows, 100, layout="constrained") as drawn:

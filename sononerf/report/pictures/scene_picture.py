@@ -61,10 +61,6 @@ def scene_png(
     view : (3,) float
         Direction to the camera, world frame.
 
-    Returns
-    -------
-    data : bytes
-        A PNG file.
 
     Raises
     ------

@@ -45,10 +45,6 @@ def spectrogram_png(
     title : str
         One line above.
 
-    Returns
-    -------
-    data : bytes
-        A PNG file.
 
     Raises
     ------
