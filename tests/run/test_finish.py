@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import shutil
 import threading
 
@@ -12,6 +13,8 @@ import trimesh
 
 from sononerf import storage
 from sononerf.errors import LockedError, NumericalError
+from sononerf.evaluation import baseline
+from sononerf.evaluation import geometry as geometry_module
 from sononerf.field.weights import load_weights, save_weights
 from sononerf.progress import Progress
 from sononerf.run import finish as finish_module
@@ -170,7 +173,11 @@ def test_a_surface_that_cannot_be_traced_is_told_and_no_fault(run, steps, monkey
     assert not opened.traced().weight.any()
 
 
-def test_one_call_loads_field_and_echoes_once(run, monkeypatch):
+def test_one_call_loads_field_and_echoes_once(run, no_projections, monkeypatch):
+    metrics = functools.partial(geometry_module.geometry_metrics, samples=2000)
+    monkeypatch.setattr(geometry_module, "geometry_metrics", metrics)
+    monkeypatch.setattr(geometry_module, "BASELINE_VOXELS", 16)
+    monkeypatch.setattr(baseline, "LEVEL_SAMPLES", 300)
     loaded = []
     for name in ("load_fitted", "echoes_of"):
         real = getattr(fitted_module, name)
