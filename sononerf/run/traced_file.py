@@ -26,21 +26,27 @@ def save_traced(path: Path, traced: Traced, mesh_checksum: str) -> None:
         "faces": torch.as_tensor(np.array(traced.mesh.faces, dtype=np.int64)),
         "gain_db": torch.as_tensor(traced.gain_db),
         "weight": torch.as_tensor(traced.weight),
+        # Not beside the model's in the metadata, whose entries have no fixed order in the file.
+        "mesh_sha256": _bytes_of(mesh_checksum),
     }
-    belongs = {"model": model_checksum(path), "mesh": mesh_checksum}
-    storage.commit_bytes(path / NAME, safetensors.torch.save(tensors, metadata=belongs))
+    data = safetensors.torch.save(tensors, metadata={"model": model_checksum(path)})
+    storage.commit_bytes(path / NAME, data)
 
 
 def traced_belongs(path: Path, mesh_checksum: str) -> bool:
     """Tell whether the file belongs to the run's field and mesh; older files name no mesh."""
     try:
         with safe_open(str(path / NAME), "pt") as opened:
-            found = opened.metadata() or {}
+            model = (opened.metadata() or {}).get("model")
+            named = "mesh_sha256" in opened.keys()
+            mesh = opened.get_tensor("mesh_sha256") if named else _bytes_of(mesh_checksum)
     except (SafetensorError, OSError):
         return False
-    wanted = {"model": model_checksum(path), "mesh": mesh_checksum}
-    known = wanted.keys() & found.keys()
-    return "model" in found and all(wanted[key] == found[key] for key in known)
+    return model == model_checksum(path) and torch.equal(mesh, _bytes_of(mesh_checksum))
+
+
+def _bytes_of(checksum: str) -> torch.Tensor:
+    return torch.tensor(list(bytes.fromhex(checksum)), dtype=torch.uint8)
 
 
 def load_traced(path: Path) -> Traced | None:
