@@ -113,7 +113,7 @@ def fit(
     workers : int or None
         Processes that simulate.
     finishes : bool
-        Whether all stages after the fit follow, see :func:`sononerf.run.finish.finish`.
+        True also runs the stages after the fit, see :func:`sononerf.run.finish.finish`.
     progress : Progress or None
         Where to show it.
 

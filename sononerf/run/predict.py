@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sononerf import storage
 from sononerf.errors import InputError
 from sononerf.evaluation.prediction import predict as predict_poses
+from sononerf.evaluation.traced import Traced
 from sononerf.field.fitting import Split, poses_of
 from sononerf.field.range_slices import WholePoses
 from sononerf.geometry.poses import Poses, read_pose_csv
@@ -83,6 +84,41 @@ def predict(
             raise InputError(
                 f"{run.echoes.store.path}: holds no {split} poses; choose another --split"
             )
+    with run.locked(folder):
+        traced = _traced(run, progress)
+        with results_folder(folder):
+            found = predict_poses(
+                fitted,
+                traced,
+                poses,
+                settings.simulation,
+                seed=settings.fit.seed,
+                accelerator=accelerator,
+                progress=progress,
+            )
+            axes = {
+                "range_m": renderer.range.double().numpy(),
+                "frequency_hz": renderer.frequency.double().numpy(),
+            }
+            arrays = {"predicted": found.magnitude, "pose": poses.numbers.numpy(), **axes}
+            if own is None:
+                store = run.echoes.store
+                arrays["measured"] = np.stack([store.read_pose(int(i)) for i in poses.numbers])
+            arrays["position"] = poses.positions.numpy()
+            arrays["rotation"] = poses.rotations.numpy()
+            arrays["reference"] = np.asarray(found.reference)
+            storage.commit(folder / "spectrograms.npz", lambda file: _save_npz(file, arrays))
+            predicted = compress(found.magnitude, found.reference)
+            measured = compress(arrays["measured"], found.reference) if own is None else None
+            _pictures(folder, poses, measured, predicted, axes, progress)
+            if own is None and output is None and split == "test":
+                numbers = found.numbers(run.echoes, arrays["measured"])
+                run.write_metrics("prediction", {"split": split, **numbers})
+    return folder
+
+
+def _traced(run: RunFolder, progress: Progress) -> Traced | None:
+    """Return the surface that echoes are traced off; warn where the run has lost its own."""
     traced = run.traced()
     known = (run.read_metrics().get("prediction") or {}).get("traced_weight", 0)
     if traced is None and known > 0:
@@ -91,35 +127,7 @@ def predict(
             "alone; the run's own also has echoes traced off its surface "
             f"(weight {known:.2f})"
         )
-    with run.locked(folder), results_folder(folder):
-        found = predict_poses(
-            fitted,
-            traced,
-            poses,
-            settings.simulation,
-            seed=settings.fit.seed,
-            accelerator=accelerator,
-            progress=progress,
-        )
-        axes = {
-            "range_m": renderer.range.double().numpy(),
-            "frequency_hz": renderer.frequency.double().numpy(),
-        }
-        arrays = {"predicted": found.magnitude, "pose": poses.numbers.numpy(), **axes}
-        if own is None:
-            store = run.echoes.store
-            arrays["measured"] = np.stack([store.read_pose(int(i)) for i in poses.numbers])
-        arrays["position"] = poses.positions.numpy()
-        arrays["rotation"] = poses.rotations.numpy()
-        arrays["reference"] = np.asarray(found.reference)
-        storage.commit(folder / "spectrograms.npz", lambda file: _save_npz(file, arrays))
-        predicted = compress(found.magnitude, found.reference)
-        measured = compress(arrays["measured"], found.reference) if own is None else None
-        _pictures(folder, poses, measured, predicted, axes, progress)
-        if own is None and output is None and split == "test":
-            numbers = found.numbers(run.echoes, arrays["measured"])
-            run.write_metrics("prediction", {"split": split, **numbers})
-    return folder
+    return traced
 
 
 def _check_poses(poses: Poses, csv: Path | None, fitted: Fitted, progress: Progress) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import os
 import platform
@@ -14,6 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 import trimesh
 
 from sononerf import __version__, storage
@@ -23,7 +23,7 @@ from sononerf.evaluation.traced import Traced
 from sononerf.field.weights import DESCRIPTION_NAME
 from sononerf.run.attached import attach
 from sononerf.run.fitted import Fitted, echoes_of, load_fitted
-from sononerf.run.traced_file import load_traced, save_traced, traced_belongs
+from sononerf.run.traced_file import load_traced, save_traced
 from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
 from sononerf.settings.schema import Settings
 
@@ -179,11 +179,19 @@ class RunFolder:
 
     def keep_traced(self, traced: Traced) -> None:
         """Write what was learned of the reconstructed surface."""
-        save_traced(self.path, traced, self._mesh_checksum())
+        save_traced(self.path, traced)
 
-    def _mesh_checksum(self) -> str:
-        file = self.reconstruction / "mesh.ply"
-        return hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
+    def _traces_its_mesh(self) -> bool:
+        """Tell whether the traced surface is that of the reconstruction."""
+        try:
+            traced, mesh = self.traced(), self.mesh()
+        except InputError:
+            return False
+        return (
+            traced is not None
+            and np.array_equal(traced.mesh.vertices, mesh.vertices)
+            and np.array_equal(traced.mesh.faces, mesh.faces)
+        )
 
     def is_done(self, stage: Stage) -> bool:
         """Tell whether a stage came to its end, with the results of the stages before it."""
@@ -194,7 +202,7 @@ class RunFolder:
             names = ("mesh.ply", "read_out.json")
             return all((self.reconstruction / name).is_file() for name in names)
         if stage == "traced":
-            return traced_belongs(self.path, self._mesh_checksum())
+            return self._traces_its_mesh()
         found = self.read_metrics().keys()
         if stage == "prediction":
             return "prediction" in found or not self.has_heldout
@@ -206,7 +214,7 @@ class RunFolder:
         return all(self.is_done(stage) for stage in STAGES)
 
     def begin(self, stage: Literal["surface", "traced"]) -> None:
-        """Forget the ends of a stage and of those that depend on its result."""
+        """Mark a stage as not done, and the evaluation or prediction that depends on it."""
         if stage == "surface":
             storage.remove_file(self.reconstruction / "read_out.json")
             self.drop_metrics("geometry")

@@ -19,34 +19,16 @@ from sononerf.field.weights import model_checksum
 NAME = "traced.safetensors"
 
 
-def save_traced(path: Path, traced: Traced, mesh_checksum: str) -> None:
-    """Write what was learned of a run's mesh; ``mesh_checksum`` is the SHA-256 of its file."""
+def save_traced(path: Path, traced: Traced) -> None:
+    """Write what was learned of the surface of a run."""
     tensors = {
         "vertices": torch.as_tensor(np.array(traced.mesh.vertices, dtype=np.float64)),
         "faces": torch.as_tensor(np.array(traced.mesh.faces, dtype=np.int64)),
         "gain_db": torch.as_tensor(traced.gain_db),
         "weight": torch.as_tensor(traced.weight),
-        # Not beside the model's in the metadata, whose entries have no fixed order in the file.
-        "mesh_sha256": _bytes_of(mesh_checksum),
     }
     data = safetensors.torch.save(tensors, metadata={"model": model_checksum(path)})
     storage.commit_bytes(path / NAME, data)
-
-
-def traced_belongs(path: Path, mesh_checksum: str) -> bool:
-    """Tell whether the file belongs to the run's field and mesh; older files name no mesh."""
-    try:
-        with safe_open(str(path / NAME), "pt") as opened:
-            model = (opened.metadata() or {}).get("model")
-            named = "mesh_sha256" in opened.keys()
-            mesh = opened.get_tensor("mesh_sha256") if named else _bytes_of(mesh_checksum)
-    except (SafetensorError, OSError):
-        return False
-    return model == model_checksum(path) and torch.equal(mesh, _bytes_of(mesh_checksum))
-
-
-def _bytes_of(checksum: str) -> torch.Tensor:
-    return torch.tensor(list(bytes.fromhex(checksum)), dtype=torch.uint8)
 
 
 def load_traced(path: Path) -> Traced | None:
