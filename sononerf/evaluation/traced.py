@@ -22,8 +22,8 @@ from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.simulator import Simulator
 
 RAYS = 100_000
-"""Per pose. Off the true three spheres they differ from 300,000 by 0.1 dB over active cells, and
-30,000 by 0.2 dB."""
+"""Rays per pose. Echoes of the true three spheres differ from those of 300,000 rays by 0.1 dB over
+active cells; with 30,000 rays by 0.2 dB."""
 GAIN_POSES = 12
 """Number of training poses that give the gain."""
 
@@ -37,9 +37,9 @@ class Traced:
     mesh : Trimesh
         The surface, m.
     gain_db : (E, F) float, dB
-        Is added to the traced level.
+        Level that is added to the traced echoes.
     weight : (F,) float
-        Of the traced echoes in the mean with the rendered ones, 0 to 1.
+        Weight of the traced echoes in the mean with the rendered ones, 0 to 1.
     """
 
     mesh: trimesh.Trimesh
@@ -107,7 +107,7 @@ def learn_traced(
         traced = compress(_trace(simulator, some, seed, progress), reference)
         gain = gain_db(compress(_measured(some), reference), traced)
         traced = _trace(simulator, validation, seed, progress)
-    except SonoNerfError as error:  # the simulator asks more of a mesh than a picture does
+    except SonoNerfError as error:  # some meshes can be drawn but not simulated
         progress.say(f"no echoes are traced off the surface: {error}")
         return nothing
     traced = compress(traced * 10 ** (gain[:, None] / 20), reference)

@@ -50,7 +50,7 @@ class FittedField:
 
 
 def quiet_lightning() -> None:
-    """Leave out Lightning's advertising and hints about what we do on purpose."""
+    """Silence Lightning's tips and the warnings about settings that are chosen on purpose."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     for name in ("lightning.pytorch.utilities.rank_zero", "lightning.fabric.utilities.rank_zero"):

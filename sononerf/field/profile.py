@@ -122,7 +122,7 @@ class ProfileRenderer(Renderer):
         self._living = (self.alive, -1, self.lattice)  # which, as of when, and where they are
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        # Runs of before had modes that are gone; these buffers of theirs were never used in others.
+        # Older runs hold buffers of removed modes, which the default mode never used.
         for name in ("phased", "wave", "opaque"):
             state_dict.pop(prefix + name, None)
         # The lattice's size is found by the fit, so a loaded one replaces ours whole.

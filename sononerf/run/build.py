@@ -74,7 +74,7 @@ def region_of(settings: Settings, echoes: Echoes) -> tuple[Tensor, Possible]:
     def possible(places: Tensor, tolerance: float) -> Tensor:
         left = found.possible(places.double().cpu().numpy(), tolerance)
         if not left.any():
-            left[:] = True  # the box is right by the user's word
+            left[:] = True  # the user's own box is kept whole
         return torch.as_tensor(left, device=places.device)
 
     return _tensor(box), possible

@@ -51,7 +51,7 @@ from sononerf.settings.schema import Settings
 
 WAIT_SECONDS = 0.5
 LEAST_STEPS = 60
-"""A pass over few poses takes fewer steps than a field needs: an epoch is then several."""
+"""Least steps of an epoch: few poses give a shorter pass, and an epoch is then several passes."""
 
 LINE = (
     "all training poses lie on a straight line: the echoes do not tell the angle around it, so the "
@@ -163,7 +163,7 @@ def fit(
             elif finishes:
                 finish(run, accelerator=accelerator, progress=progress)
     finally:
-        storage.remove_if_empty(created)  # those stay that something came of
+        storage.remove_if_empty(created)  # folders with results stay
     return run
 
 

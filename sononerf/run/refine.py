@@ -36,7 +36,7 @@ from sononerf.surface.start.read_out import StartMethod
 STATE = Path("checkpoints") / "surface.safetensors"
 """Where the state of an interrupted refinement is kept, in the run's folder."""
 RAYS = 20_000
-"""Per pose, for the correction of the last stage."""
+"""Rays per pose, for the correction of the last stage."""
 
 
 def refine_surface(
@@ -132,7 +132,7 @@ def _metadata(file: Path) -> dict[str, str] | None:
         with safe_open(str(file), "pt") as opened:
             return opened.metadata() or {}
     except (SafetensorError, OSError):
-        return None  # the state only saves time; the refinement starts from the beginning
+        return None  # without a state the refinement starts from the beginning
 
 
 def _saved_state(file: Path, belongs: dict[str, str]) -> dict[str, Tensor] | None:

@@ -35,7 +35,7 @@ FREE_KEYS = (
     "evaluation",
     "fit.checkpoint_seconds",
 )
-"""What may change between two calls of one run: it changes nothing that is fitted."""
+"""Settings that may change between two calls of one run: they do not change the fit."""
 Stage = Literal["fit", "surface", "traced", "prediction", "evaluation"]
 STAGES: tuple[Stage, ...] = ("fit", "surface", "traced", "prediction", "evaluation")
 """Stages of a run, in order: the fit; the reconstruction; gain and weight of echoes traced off it;
@@ -56,7 +56,7 @@ def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 @contextmanager
 def results_folder(folder: Path) -> Iterator[None]:
-    """Make a folder for results; if nothing comes into it, it is gone afterwards.
+    """Make a folder for results; remove it afterwards if it is empty.
 
     Raises
     ------

@@ -36,7 +36,7 @@ Write = Callable[[int, NDArray[np.float32]], None]
 
 MOST_WORKERS = 8
 WORTH_WORKERS = 64
-"""Fewer poses than this are simulated before other processes have even started."""
+"""Number of poses from which other processes save time: fewer are done before these start."""
 CONNECT_SECONDS = 30  # a scheduler across a network answers in one
 QUEUED_PER_WORKER = 4  # results wait in memory; more than this would only fill it
 PATIENCE_SECONDS = 10  # without a result, before workers are looked for
