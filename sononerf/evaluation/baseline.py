@@ -12,8 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import NumericalError
 from sononerf.evaluation.nearest import Nearest
-from sononerf.evaluation.solid import sample_surface
-from sononerf.evaluation.true_surface import TrueSurface
+from sononerf.evaluation.solid import Solid, sample_surface
 from sononerf.head.matched_filter import matched_filter
 from sononerf.surface.start.isosurface import isosurface
 from sononerf.surface.start.volume import Volume, grid_over
@@ -273,7 +272,7 @@ def _interpolated(
 
 
 def best_level_surface(
-    volume: Volume, truth: trimesh.Trimesh | TrueSurface
+    volume: Volume, truth: trimesh.Trimesh | Solid
 ) -> tuple[trimesh.Trimesh, float]:
     """Extract the surface at the level that suits a baseline best, *knowing the truth*.
 
@@ -285,7 +284,7 @@ def best_level_surface(
     ----------
     volume : Volume
         Greater values are inside.
-    truth : Trimesh or TrueSurface
+    truth : Trimesh or Solid
         The true surface.
 
     Returns
@@ -300,7 +299,7 @@ def best_level_surface(
     NumericalError
         If no level gives a surface.
     """
-    true = truth if isinstance(truth, TrueSurface) else TrueSurface(truth)
+    true = truth if isinstance(truth, Solid) else Solid(truth)
     target, _ = true.samples(LEVEL_SAMPLES, 0)
     best: tuple[float, trimesh.Trimesh, float] | None = None
     for level in np.unique(np.quantile(volume.values, 1 - LEVEL_SHARES)):
@@ -308,7 +307,7 @@ def best_level_surface(
             mesh = isosurface(volume, float(level))
         except NumericalError:
             continue
-        points, _ = sample_surface(mesh, LEVEL_SAMPLES, np.random.default_rng(0))
+        points, _ = sample_surface(mesh, LEVEL_SAMPLES, 0)
         precision = true.nearest.near(points, LEVEL_DISTANCE).mean()
         recall = Nearest(mesh).near(target, LEVEL_DISTANCE).mean()
         score = float(2 * precision * recall / max(precision + recall, 1e-12))

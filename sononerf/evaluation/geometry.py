@@ -15,7 +15,7 @@ from sononerf.errors import NumericalError
 from sononerf.evaluation.baseline import backprojection, best_level_surface
 from sononerf.evaluation.metrics import geometry_metrics, target_metrics
 from sononerf.evaluation.registration import Kind, Registration, register
-from sononerf.evaluation.true_surface import TrueSurface
+from sononerf.evaluation.solid import Solid
 from sononerf.evaluation.voxels import voxel_fit
 from sononerf.scene.scene import Scene
 from sononerf.surface.start.volume import Volume
@@ -39,12 +39,12 @@ class Truth:
     """
 
     def __init__(self, true: trimesh.Trimesh, mesh: trimesh.Trimesh, kind: Kind) -> None:
-        self.surface = TrueSurface(true)
+        self.surface = Solid(true)
         self.kind: Kind = kind
         self.motion: Registration = register(mesh, true, kind)
         self.mesh = self.motion.of(mesh)
         # The truth in the frame of the reconstruction, in which levels of baselines are chosen.
-        self._near = self.surface if kind == "none" else TrueSurface(self.motion.inverse().of(true))
+        self._near = self.surface if kind == "none" else Solid(self.motion.inverse().of(true))
 
     def of_reconstruction(self, scene: Scene | None = None) -> dict[str, Any]:
         """Return the metrics of the reconstruction; of a scene with a target, also of that alone.

@@ -10,33 +10,22 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sononerf.evaluation.layered_depth import volumes
 from sononerf.evaluation.nearest import Nearest
 from sononerf.evaluation.prediction import prediction_metrics
-from sononerf.evaluation.solid import (
-    Solid,
-    count_parts,
-    outer_surface,
-    sample_outer_surface,
-    sample_surface,
-    solid_from_mesh,
-)
-from sononerf.evaluation.true_surface import TrueSurface
+from sononerf.evaluation.solid import Solid, sample_surface
 from sononerf.head.decibels import mae_db
 
 __all__ = [
     "geometry_metrics",
     "mae_db",
-    "outer_surface",
     "prediction_metrics",
-    "sample_outer_surface",
     "target_metrics",
 ]
 
 
 def geometry_metrics(
     reconstructed: trimesh.Trimesh,
-    truth: trimesh.Trimesh | TrueSurface,
+    truth: trimesh.Trimesh | Solid,
     *,
     samples: int = 100_000,
     seed: int = 0,
@@ -52,8 +41,8 @@ def geometry_metrics(
     ----------
     reconstructed : Trimesh
         Metres, world frame.
-    truth : Trimesh or TrueSurface
-        Likewise; where several are compared with it, the latter.
+    truth : Trimesh or Solid
+        Likewise; pass a Solid if several meshes are compared with it.
     samples : int
         Points drawn from each surface.
     seed : int
@@ -89,21 +78,20 @@ def geometry_metrics(
     """
     if samples < 1:
         raise ValueError(f"samples: {samples}, expected 1 or more")
-    true = truth if isinstance(truth, TrueSurface) else TrueSurface(truth)
-    found = solid_from_mesh(reconstructed, drop_cavities=False)
-    surface = trimesh.util.concatenate(found.parts)
+    true = truth if isinstance(truth, Solid) else Solid(truth)
+    found = Solid(reconstructed, fill_cavities=False)
     true_points, true_normals = true.samples(samples, seed)
-    points, face = sample_surface(surface, samples, np.random.default_rng([seed, 1]))
-    normals = np.asarray(surface.face_normals)[face]
+    points, face = sample_surface(reconstructed, samples, seed + 1)
+    normals = np.asarray(reconstructed.face_normals)[face]
     to_truth = true.nearest.distance(points)
-    to_found = Nearest(surface).distance(true_points)
+    to_found = Nearest(reconstructed).distance(true_points)
     return {
         "chamfer_m": float(to_truth.mean() + to_found.mean()) / 2,
         "fscore": {f"{limit:g}": _fscore(to_truth, to_found, limit) for limit in thresholds},
-        "thickness_bias_m": _thickness_bias(true.solid, points, to_truth),
-        **_volume_metrics(found, true.solid),
+        "thickness_bias_m": _thickness_bias(true, points, to_truth),
+        **_volume_metrics(found, true),
         "normal_consistency": _normal_consistency(points, normals, true_points, true_normals),
-        "components": count_parts(found),
+        "components": found.components,
         "components_true": true.components,
     }
 
@@ -150,9 +138,8 @@ def target_metrics(
     """
     if samples < 1:
         raise ValueError(f"samples: {samples}, expected 1 or more")
-    true = TrueSurface(target)
-    surface = trimesh.util.concatenate(solid_from_mesh(reconstructed, drop_cavities=False).parts)
-    points, face = sample_surface(surface, samples, np.random.default_rng([seed, 1]))
+    true = Solid(target)
+    points, face = sample_surface(reconstructed, samples, seed + 1)
     around = Nearest(background)
     to_truth = true.nearest.distance(points)
     counts = to_truth <= around.distance(points)
@@ -160,11 +147,11 @@ def target_metrics(
     if not counts.any():
         return {**found, "chamfer_m": None, "fscore": {f"{limit:g}": 0.0 for limit in thresholds}}
     to_truth = to_truth[counts]
-    # Whole triangles, by their middles and samples: the border is as coarse as the mesh.
-    middles = np.asarray(surface.triangles_center)
+    # The border between what counts and what does not is as coarse as the triangles.
+    middles = np.asarray(reconstructed.triangles_center)
     kept = true.nearest.distance(middles) <= around.distance(middles)
     kept[face[counts]] = True
-    part = trimesh.Trimesh(surface.vertices, surface.faces[kept], process=False)
+    part = trimesh.Trimesh(reconstructed.vertices, reconstructed.faces[kept], process=False)
     to_found = Nearest(part).distance(true.samples(samples, seed)[0])
     return {
         **found,
@@ -183,19 +170,16 @@ def _thickness_bias(
 ) -> float | None:
     if not true.closed:
         return None
-    # The sign comes from the closed bodies: the outer surface is open along its seams.
     return float(np.where(true.contains(points), -to_truth, to_truth).mean())
 
 
 def _volume_metrics(found: Solid, true: Solid) -> dict[str, float | None]:
     if not (found.closed and true.closed):
         return {"volume_ratio": None, "iou": None}
-    volume, true_volume, shared = volumes(found, true)
-    if not true_volume > 0:
-        return {"volume_ratio": None, "iou": None}
+    shared = found.shared_volume(true)
     return {
-        "volume_ratio": volume / true_volume,
-        "iou": shared / (volume + true_volume - shared),
+        "volume_ratio": found.volume / true.volume,
+        "iou": shared / (found.volume + true.volume - shared),
     }
 
 

@@ -18,15 +18,6 @@ TRIANGLES_PER_BOX = 8
 SLACK = 1e-9
 
 
-def polydata(mesh: trimesh.Trimesh) -> Any:
-    """Return a mesh as pyvista's PolyData."""
-    import pyvista
-
-    faces = np.asarray(mesh.faces)
-    threes = np.full((len(faces), 1), 3, dtype=faces.dtype)
-    return pyvista.PolyData(np.asarray(mesh.vertices), np.hstack([threes, faces]).ravel())
-
-
 class Nearest:
     """Distances to one mesh, whose search structures are built once and when first needed.
 
@@ -46,36 +37,18 @@ class Nearest:
 
     @cached_property
     def _locator(self) -> Any:
+        import pyvista
         from vtkmodules.vtkCommonDataModel import vtkCellLocator
 
+        vertices, faces = np.asarray(self.mesh.vertices), np.asarray(self.mesh.faces)
         locator = vtkCellLocator()
-        locator.SetDataSet(polydata(self.mesh))
+        locator.SetDataSet(pyvista.PolyData.from_regular_faces(vertices, faces))
         locator.SetNumberOfCellsPerNode(TRIANGLES_PER_BOX)
         locator.BuildLocator()
         return locator
 
-    @cached_property
-    def _signed(self) -> Any:
-        from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
-
-        function = vtkImplicitPolyDataDistance()
-        function.SetInput(polydata(self.mesh))
-        return function
-
-    def signed(self, points: Array) -> Array:
-        """Return the distance of points (N, 3), (N,) m, negative inside."""
-        if not len(points):
-            return np.zeros(0)
-        from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
-        from vtkmodules.vtkCommonCore import vtkDoubleArray
-
-        given = np.ascontiguousarray(points, dtype=np.float64)
-        found = vtkDoubleArray()
-        self._signed.FunctionValue(numpy_to_vtk(given), found)
-        return np.array(vtk_to_numpy(found), dtype=np.float64)
-
     def distance(self, points: Array) -> Array:
-        """Return the distance of points (N, 3), (N,) m, zero or more; quicker than with a sign."""
+        """Return the distance of points (N, 3), (N,) m, zero or more."""
         given = np.asarray(points, dtype=np.float64)
         if not len(given):
             return np.zeros(0)
@@ -84,8 +57,10 @@ class Nearest:
         rank = np.zeros(self.corners.n, np.intp)
         rank[self.corners.indices] = np.arange(self.corners.n)
         found = self._within(given, bound, np.argsort(rank[corner], kind="stable"))
-        lost = np.isinf(found)  # near corners of triangles without an area alone
-        found[lost] = np.abs(self.signed(given[lost]))
+        # The nearest corner may be of triangles without an area, which the locator leaves out.
+        lost = np.flatnonzero(np.isinf(found))
+        far = bound[lost] + np.linalg.norm(np.ptp(self.corners.data, axis=0))
+        found[lost] = self._within(given[lost], far, np.arange(len(lost)))
         return found
 
     def near(self, points: Array, limit: float) -> NDArray[np.bool_]:

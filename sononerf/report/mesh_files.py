@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Meshes read out of volumes, and written as files."""
+"""Meshes as files."""
 
 from __future__ import annotations
 
@@ -10,17 +10,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import NumericalError
-from sononerf.evaluation.parts import clean_mesh, split_parts
 from sononerf.report.confidence import confidence_colours, linear_light
-from sononerf.surface.start.isosurface import automatic_level, isosurface
-
-__all__ = [
-    "automatic_level",
-    "clean_mesh",
-    "isosurface",
-    "mesh_bytes",
-    "split_parts",
-]
 
 MeshFormat = Literal["ply", "stl", "glb"]
 

@@ -40,7 +40,7 @@ Stage = Literal["fit", "surface", "traced", "prediction", "evaluation"]
 STAGES: tuple[Stage, ...] = ("fit", "surface", "traced", "prediction", "evaluation")
 """Stages of a run, in order: the fit; the reconstruction; gain and weight of echoes traced off it;
 the prediction of held-out poses; the comparison with the true surface and the baselines."""
-RECORDED = ("torch", "lightning", "numpy", "scipy", "trimesh", "embreex", "zarr")
+RECORDED = ("torch", "lightning", "numpy", "scipy", "trimesh", "manifold3d", "embreex", "zarr")
 
 
 def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -11,7 +11,7 @@ import pytest
 from sononerf.errors import IncompatibleError
 from sononerf.settings.loading import dump_yaml, load_settings
 from tools.benchmarks import experiment
-from tools.benchmarks.experiment import CONFIG, row_of, run_experiment, run_series, summary, table
+from tools.benchmarks.experiment import CONFIG, row_of, run_experiment
 
 METRICS = {
     "schema": 1,
@@ -52,101 +52,6 @@ def test_a_row_is_taken_from_the_metrics():
 )
 def test_what_a_run_does_not_have_is_none(metrics):
     assert row_of(metrics) == dict.fromkeys(ROW)
-
-
-def shape(seed, kind, extent, **other):
-    return {"seed": seed, "kind": kind, "extent_m": extent, "over": False, **other}
-
-
-def rows():
-    bad = {"fit_s": 71.0, "fscore_1mm": 0.2, "chamfer_m": 0.005, "thickness_bias_m": -0.003}
-    bad |= {"volume_ratio": 0.5, "parts": 2, "backprojection_fscore_5mm": None, "over": True}
-    partial = {"fit_s": 50.0, "fscore_1mm": 0.4, "volume_ratio": None}
-    return [
-        shape(0, "cluster", 0.084, **ROW),
-        shape(1, "box", 0.1, **{**ROW, **bad}),
-        shape(2, "torus", 0.12, **{**ROW, **partial}),
-        shape(3, "capsules", 0.07, failed="no surface"),
-    ]
-
-
-def test_the_summary_is_median_and_worst_of_what_ended():
-    found = summary(rows())
-    assert found["median"]["fit_s"] == 50.0
-    assert found["median"]["fscore_1mm"] == 0.4
-    assert found["median"]["volume_ratio"] == pytest.approx((1.19 + 0.5) / 2)
-    # Worst is what lies furthest on the bad side: a bias or a volume may be off either way.
-    assert found["worst"]["fit_s"] == 71.0
-    assert found["worst"]["fscore_1mm"] == 0.2
-    assert found["worst"]["chamfer_m"] == 0.005
-    assert found["worst"]["thickness_bias_m"] == -0.003
-    assert found["worst"]["volume_ratio"] == 0.5
-    assert found["worst"]["backprojection_fscore_5mm"] == 0.73
-    assert "parts" not in found["median"]
-    assert (found["runs"], found["failed"], found["over"], found["parts_as_true"]) == (4, 1, 1, 2)
-
-
-def test_the_summary_of_nothing_is_empty():
-    counts = dict.fromkeys(("runs", "failed", "over", "parts_as_true"), 0)
-    assert summary([]) == {"median": {}, "worst": {}, **counts}
-
-
-def test_the_table_shows_every_run_in_its_units():
-    lines = table(rows()).splitlines()
-    assert lines[0].split()[:4] == ["seed", "kind", "extent/cm", "fit/s"]
-    assert "calls" not in lines[0]
-    expected = "0 cluster 8.4 41 0.62 0.99 1.00 0.91 +0.88 1.19 3 3 3.28 0.73"
-    assert lines[1].split() == expected.split()
-    assert lines[2].endswith("-  over")
-    assert lines[2].split()[8:11] == ["-3.00", "0.50", "2"]
-    assert lines[4].split()[:3] == ["3", "capsules", "7.0"]
-    assert lines[4].endswith("failed: no surface")
-    assert lines[5].split()[:3] == ["median", "50", "0.40"]
-    assert lines[6].split()[:3] == ["worst", "71", "0.20"]
-    assert lines[7] == ("2 of 4 with as many parts as in truth; 1 over the time, 1 failed")
-    # Numbers stand under their titles, at the right.
-    assert lines[1].index("8.4") + 3 == lines[0].index("extent/cm") + 9
-
-
-def series(monkeypatch, tmp_path, outcomes, after=lambda rows: None):
-    """Run a series whose runs end as told."""
-    asked = []
-
-    def run(folder, data, settings):
-        asked.append((folder, data, list(settings)))
-        outcome = outcomes[len(asked) - 1]
-        if isinstance(outcome, BaseException):
-            raise outcome
-        return outcome
-
-    monkeypatch.setattr(experiment, "run_experiment", run)
-    experiments = [(str(n), {"calls": n}, [f"poses.count={n}"]) for n in range(len(outcomes))]
-    text = run_series(tmp_path, "t.json", experiments, data=None, seconds=40.0, after=after)
-    return text, asked
-
-
-def test_a_series_runs_each_and_keeps_the_table(monkeypatch, tmp_path):
-    seen = []
-    outcomes = [METRICS, RuntimeError("exit code 5: error: no echo"), METRICS]
-    text, asked = series(monkeypatch, tmp_path, outcomes, lambda rows: seen.append(len(rows)))
-    assert asked[1] == (tmp_path / "1", tmp_path / "data", ["poses.count=1"])
-    assert text.endswith(f"wrote {tmp_path / 't.json'}")
-    assert seen == [1, 2, 3]
-    kept = json.loads((tmp_path / "t.json").read_text())
-    assert [row["calls"] for row in kept["rows"]] == [0, 1, 2]
-    assert kept["rows"][0] == {**ROW, "calls": 0, "over": True, "settings": ["poses.count=0"]}
-    assert kept["rows"][1]["failed"] == "exit code 5: error: no echo"
-    assert (kept["seconds"], kept["over"], kept["failed"]) == (40.0, 2, 1)
-    assert kept["median"]["fit_s"] == 41.0
-
-
-@pytest.mark.parametrize(
-    ("end", "said"), [(KeyboardInterrupt(), "goes on"), (IncompatibleError("other"), "other")]
-)
-def test_an_end_of_all_leaves_the_table_so_far(monkeypatch, tmp_path, end, said):
-    with pytest.raises(SystemExit, match=said):
-        series(monkeypatch, tmp_path, [METRICS, end, METRICS])
-    assert len(json.loads((tmp_path / "t.json").read_text())["rows"]) == 1
 
 
 SETTINGS = ["scene.name=sphere", "poses.count=5", "poses.heldout=0", "poses.validation=0"]

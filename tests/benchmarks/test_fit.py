@@ -9,7 +9,7 @@ from argparse import Namespace
 import pytest
 
 from tools.benchmarks import fit as module
-from tools.benchmarks.paper import EPOCHS
+from tools.benchmarks.fit import EPOCHS
 
 ERRORS = {1: 0.9, 2: 0.6, 3: 0.45}
 

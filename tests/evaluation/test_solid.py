@@ -4,13 +4,7 @@ import pytest
 import trimesh
 
 from sononerf.errors import NumericalError
-from sononerf.evaluation.solid import (
-    count_parts,
-    outer_surface,
-    sample_outer_surface,
-    signed_distance,
-    solid_from_mesh,
-)
+from sononerf.evaluation.solid import Solid, sample_surface, split_parts
 
 UA_RADIUS = 1 / 35
 # Centres of the scene's 19 spheres, in radii, all with x = 0.
@@ -39,15 +33,8 @@ def overlapping():
     return trimesh.util.concatenate([sphere(1), sphere(1, (1.2, 0, 0))])
 
 
-def test_signed_distance_is_exact_and_negative_inside():
-    box = trimesh.creation.box((2, 2, 2))
-    points = np.array([[0, 0, 0], [0.9, 0, 0], [3, 0, 0], [2, 2, 1]], dtype=float)
-    np.testing.assert_allclose(signed_distance(points, box), [-1, -0.1, 2, np.sqrt(2)], atol=1e-6)
-    assert signed_distance(np.zeros((0, 3)), box).shape == (0,)
-
-
 def test_samples_lie_on_the_outer_surface_evenly(overlapping):
-    points, normals = sample_outer_surface(overlapping, 20_000, seed=3)
+    points, normals = Solid(overlapping).samples(20_000, 3)
     centres = np.array([[0, 0, 0], [1.2, 0, 0]])
     distance = np.linalg.norm(points[:, None] - centres, axis=2)
     assert distance.min() > 0.99
@@ -60,34 +47,68 @@ def test_samples_lie_on_the_outer_surface_evenly(overlapping):
     left = points[points[:, 0] < 0.6]
     heights = np.histogram(left[:, 0], bins=8, range=(-1, 0.6))[0] / len(left)
     np.testing.assert_allclose(heights, 1 / 8, atol=0.012)
-    again, _ = sample_outer_surface(overlapping, 20_000, seed=3)
-    np.testing.assert_array_equal(points, again)
+
+
+def test_samples_are_drawn_once_per_count_and_seed(overlapping):
+    solid = Solid(overlapping)
+    assert solid.samples(50, 0)[0] is solid.samples(50, 0)[0]
+    assert len(solid.samples(60, 0)[0]) == 60
+    assert (solid.samples(50, 1)[0] != solid.samples(50, 0)[0]).any()
+    np.testing.assert_array_equal(solid.samples(50, 0)[0], Solid(overlapping).samples(50, 0)[0])
 
 
 def test_the_outer_surface_has_no_inner_walls(overlapping):
-    outer = outer_surface(overlapping)
-    expected = 2 * (4 * np.pi - lens(1.2)[1])
-    assert outer.area == pytest.approx(expected, rel=0.01)
-    inside = np.array([[0.6, 0.0, 0.0]])
-    # From the middle of the lens the seam is nearest, not the caps at 0.4.
-    assert abs(signed_distance(inside, outer)[0]) == pytest.approx(0.8, abs=0.03)
+    solid = Solid(overlapping)
+    assert solid.surface.area == pytest.approx(2 * (4 * np.pi - lens(1.2)[1]), rel=3e-3)
+    # The seam is nearest to the middle of the lens, not the caps at 0.4.
+    assert solid.nearest.distance(np.array([[0.6, 0.0, 0.0]]))[0] == pytest.approx(0.8, abs=0.003)
 
 
-def test_a_body_inside_another_and_a_hollow_do_not_show():
-    hollow = sphere(0.4)
-    hollow.invert()
-    nested = trimesh.util.concatenate([sphere(1), sphere(0.5, (0.1, 0, 0)), hollow])
-    assert outer_surface(nested).area == pytest.approx(sphere(1).area)
-    solid = solid_from_mesh(nested, drop_cavities=True)
-    assert count_parts(solid) == 1
+def test_a_body_inside_another_and_a_cavity_are_no_outer_surface():
+    cavity = sphere(0.4)
+    cavity.invert()
+    nested = trimesh.util.concatenate([sphere(1), sphere(0.5, (0.1, 0, 0)), cavity])
+    solid = Solid(nested)
+    assert solid.surface.area == pytest.approx(sphere(1).area)
+    assert solid.components == 1
 
 
-def test_a_body_turned_inside_out_is_turned_back():
+def test_a_cavity_between_bodies_is_no_outer_surface():
+    slabs = [(3, 3, 1, 0, 0, -1), (3, 3, 1, 0, 0, 1), (1, 3, 3, -1, 0, 0), (1, 3, 3, 1, 0, 0)]
+    slabs += [(3, 1, 3, 0, -1, 0), (3, 1, 3, 0, 1, 0)]
+    boxes = [trimesh.creation.box(slab[:3]) for slab in slabs]
+    for box, slab in zip(boxes, slabs, strict=True):
+        box.apply_translation(slab[3:])
+    mesh = trimesh.util.concatenate(boxes)
+    assert Solid(mesh).surface.area == pytest.approx(6 * 9)
+    assert Solid(mesh, fill_cavities=False).volume == pytest.approx(26)
+
+
+def test_a_cavity_belongs_to_the_body_around_it():
+    cavity, ball = sphere(0.6), sphere(0.2)
+    cavity.invert()
+    mesh = trimesh.util.concatenate([sphere(1), cavity, ball])
+    solid = Solid(mesh, fill_cavities=False)
+    places = np.array([[0.0, 0, 0], [0.4, 0, 0], [0.8, 0, 0], [1.2, 0, 0]])
+    np.testing.assert_array_equal(solid.contains(places), [True, False, True, False])
+    assert solid.volume == pytest.approx(sphere(1).volume * (1 - 0.6**3 + 0.2**3), rel=1e-6)
+    assert Solid(mesh).volume == pytest.approx(sphere(1).volume)
+
+
+def test_volume_of_the_union_and_of_what_is_shared(overlapping):
+    union, one, apart = Solid(overlapping), Solid(sphere(1)), Solid(sphere(1, (9, 0, 0)))
+    # The tessellated sphere itself has 0.2 % less volume.
+    assert union.volume == pytest.approx(8 / 3 * np.pi - lens(1.2)[0], rel=4e-3)
+    assert union.shared_volume(one) == pytest.approx(one.volume, rel=1e-6)
+    assert union.shared_volume(apart) == 0
+
+
+def test_a_body_inside_out_is_turned():
     mesh = sphere(1)
     mesh.invert()
-    solid = solid_from_mesh(mesh, drop_cavities=True)
+    solid = Solid(mesh)
     assert solid.closed
-    assert solid.bodies[0].volume > 0
+    assert solid.volume == pytest.approx(sphere(1).volume)
 
 
 def test_unmerged_corners_are_merged():
@@ -95,7 +116,15 @@ def test_unmerged_corners_are_merged():
     soup = trimesh.Trimesh(
         mesh.triangles.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3), process=False
     )
-    assert solid_from_mesh(soup, drop_cavities=True).closed
+    assert Solid(soup).closed
+
+
+def test_triangles_of_one_body_may_face_either_way():
+    mesh = sphere(1, subdivisions=2)
+    faces = np.array(mesh.faces)
+    faces[::3] = faces[::3, ::-1]
+    mixed = trimesh.Trimesh(mesh.vertices, faces, process=False, validate=False)
+    assert Solid(mixed).volume == pytest.approx(mesh.volume)
 
 
 @pytest.mark.parametrize(
@@ -108,51 +137,61 @@ def test_unmerged_corners_are_merged():
 )
 def test_overlapping_bodies_are_one_part(centres, parts):
     mesh = trimesh.util.concatenate([sphere(1, centre, 3) for centre in centres])
-    assert count_parts(solid_from_mesh(mesh, drop_cavities=True)) == parts
+    assert Solid(mesh).components == parts
 
 
 def test_bars_that_cross_without_a_corner_inside_are_one_part():
     cross = [trimesh.creation.box((4, 1, 1)), trimesh.creation.box((0.8, 4, 0.8))]
-    assert count_parts(solid_from_mesh(trimesh.util.concatenate(cross), drop_cavities=True)) == 1
+    assert Solid(trimesh.util.concatenate(cross)).components == 1
 
 
 def test_crumbs_are_not_counted():
     mesh = trimesh.util.concatenate([sphere(1, subdivisions=2), sphere(0.09, (5, 0, 0), 2)])
-    assert count_parts(solid_from_mesh(mesh, drop_cavities=True)) == 1
+    assert Solid(mesh).components == 1
 
 
 def test_ua_has_fifteen_parts():
     centres = UA_RADIUS * np.array([(0, y, z) for y, z in UA])
     mesh = trimesh.util.concatenate([sphere(UA_RADIUS, centre, 3) for centre in centres])
-    assert count_parts(solid_from_mesh(mesh, drop_cavities=True)) == 15
+    assert Solid(mesh).components == 15
 
 
-def test_a_sheet_is_open():
+def test_a_sheet_is_open_and_hidden_inside_a_body():
     sheet = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
-    solid = solid_from_mesh(sheet, drop_cavities=True)
+    solid = Solid(sheet)
     assert not solid.closed
-    assert len(solid.sheets) == 1
-    assert count_parts(solid) == 1
+    assert solid.components == 1
+    around = Solid(trimesh.util.concatenate([sheet, sphere(3)]))
+    assert around.surface.area == pytest.approx(sphere(3).area)
+
+
+def test_parts_come_largest_first_and_whole():
+    parts = split_parts(
+        trimesh.util.concatenate([sphere(1), sphere(2, (5, 0, 0)), sphere(1.5, (10, 0, 0))])
+    )
+    np.testing.assert_allclose([part.centroid[0] for part in parts], [5, 10, 0], atol=1e-9)
+    assert all(part.is_watertight for part in parts)
+    assert split_parts(trimesh.Trimesh()) == []
 
 
 def test_what_is_no_mesh_is_refused():
     with pytest.raises(NumericalError, match="empty"):
-        outer_surface(trimesh.Trimesh())
+        Solid(trimesh.Trimesh())
     broken = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], process=False)
     with pytest.raises(NumericalError, match="not finite"):
-        outer_surface(broken)
+        Solid(broken)
     point = trimesh.Trimesh([[0, 0, 0], [0, 0, 0], [0, 0, 0]], [[0, 1, 2]], process=False)
     with pytest.raises(NumericalError, match="no triangle with an area"):
-        outer_surface(point)
+        Solid(point)
     line = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1, 2]], process=False)
     with pytest.raises(NumericalError, match="no area"):
-        sample_outer_surface(line, 10)
+        sample_surface(line, 10, 0)
 
 
-def parts_by_all_pairs(solid):
+def parts_by_all_pairs(balls):
     """Parts of balls by what is known of them: they meet where their centres are near enough."""
-    centres = np.array([part.vertices.mean(axis=0) for part in solid.parts])
-    radii = np.sqrt([part.area / (4 * np.pi) for part in solid.parts])
+    centres = np.array([ball.vertices.mean(axis=0) for ball in balls])
+    radii = np.sqrt([ball.area / (4 * np.pi) for ball in balls])
     group = np.arange(len(centres))
     for i in range(len(centres)):
         for j in range(i):
@@ -164,10 +203,10 @@ def parts_by_all_pairs(solid):
 
 def test_many_balls_of_all_sizes_hang_together_as_they_should():
     generator = np.random.default_rng(0)
-    radii = 10 ** generator.uniform(-1, 0, 30)
+    radii = 10 ** generator.uniform(-0.7, 0, 30)
     balls = [sphere(r, generator.uniform(-2.5, 2.5, 3), 2) for r in radii]
-    solid = solid_from_mesh(trimesh.util.concatenate(balls), drop_cavities=True)
-    assert count_parts(solid) == parts_by_all_pairs(solid) > 1
+    solid = Solid(trimesh.util.concatenate(balls))
+    assert solid.components == parts_by_all_pairs(balls) > 1
 
 
 def test_groups_that_meet_late_become_one():
@@ -175,9 +214,9 @@ def test_groups_that_meet_late_become_one():
     row = [
         sphere(1 - 0.01 * size, (1.9 * place, 0, 0), 3) for place, size in enumerate((0, 3, 2, 1))
     ]
-    assert count_parts(solid_from_mesh(trimesh.util.concatenate(row), drop_cavities=True)) == 1
+    assert Solid(trimesh.util.concatenate(row)).components == 1
 
 
 def test_a_crumb_may_bridge_two_parts():
     bodies = [sphere(1, subdivisions=3), sphere(1, (2.1, 0, 0), 3), sphere(0.09, (1.05, 0, 0), 3)]
-    assert count_parts(solid_from_mesh(trimesh.util.concatenate(bodies), drop_cavities=True)) == 1
+    assert Solid(trimesh.util.concatenate(bodies)).components == 1

@@ -29,10 +29,10 @@ def test_a_beaker_is_open_on_top_and_hollow():
     mesh = load_scene("beaker").mesh
     places = np.zeros((4, 3))
     places[:, 2] = [0.06, 0.0, -0.0405, -0.043]
-    inside = Solid([mesh], []).contains(places)
+    inside = Solid(mesh).contains(places)
     np.testing.assert_array_equal(inside, [False, False, False, True])
     walls = np.array([[0.038, 0.0, 0.0], [0.035, 0.0, 0.0], [0.041, 0.0, 0.0]])
-    np.testing.assert_array_equal(Solid([mesh], []).contains(walls), [True, False, False])
+    np.testing.assert_array_equal(Solid(mesh).contains(walls), [True, False, False])
 
 
 def test_a_beaker_is_turned_and_of_its_material():

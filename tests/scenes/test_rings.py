@@ -5,7 +5,7 @@ from scipy.spatial import cKDTree
 from sononerf_scenes.bodies import EDGE, SIDE
 
 from sononerf.errors import SettingsError
-from sononerf.evaluation.solid import count_parts, solid_from_mesh
+from sononerf.evaluation.solid import Solid
 from sononerf.geometry.faults import surface_faults
 from sononerf.scene.scene import load_scene
 
@@ -15,7 +15,7 @@ def test_rings_are_two_tori_that_do_not_touch(major, minor):
     mesh = load_scene("rings", {"major_radius": major, "minor_radius": minor}).mesh
     assert surface_faults(mesh.vertices, mesh.faces) == []
     assert mesh.edges_unique_length.max() <= EDGE
-    assert count_parts(solid_from_mesh(mesh, drop_cavities=False)) == 2
+    assert Solid(mesh).components == 2
     first, second = mesh.split()
     gap = cKDTree(first.vertices).query(second.vertices)[0].min()
     assert gap == pytest.approx(major - 2.0 * minor, abs=0.2 * SIDE)

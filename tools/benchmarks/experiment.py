@@ -6,10 +6,9 @@ from __future__ import annotations
 import os
 import platform
 import signal
-import statistics
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,25 +43,6 @@ class Column:
     form: str = ""
     scale: float = 1.0
     badness: Callable[[float], float] | None = None  # none: no median, no worst
-
-
-COLUMNS = (
-    Column("seed", "seed"),
-    Column("kind", "kind"),
-    Column("extent_m", "extent/cm", ".1f", 1e2),
-    Column("calls", "calls"),
-    Column("fit_s", "fit/s", ".0f", badness=float),
-    Column("fscore_1mm", "F 1mm", ".2f", badness=lambda value: -value),
-    Column("fscore_2mm", "F 2mm", ".2f", badness=lambda value: -value),
-    Column("fscore_5mm", "F 5mm", ".2f", badness=lambda value: -value),
-    Column("chamfer_m", "Chamfer/mm", ".2f", 1e3, badness=float),
-    Column("thickness_bias_m", "bias/mm", "+.2f", 1e3, badness=abs),
-    Column("volume_ratio", "volume", ".2f", badness=lambda value: abs(value - 1.0)),
-    Column("parts", "parts"),
-    Column("parts_true", "true"),
-    Column("heldout_mae_db_active", "held-out/dB", ".2f", badness=float),
-    Column("backprojection_fscore_5mm", "backpr. F 5mm", ".2f", badness=lambda value: -value),
-)
 
 
 def run_experiment(
@@ -175,96 +155,6 @@ def row_of(metrics: Mapping[str, Any]) -> Row:
         "heldout_mae_db_active": prediction.get("mae_db_active"),
         "backprojection_fscore_5mm": other.get("0.005"),
     }
-
-
-def run_series(
-    output: Path,
-    file: str,
-    experiments: Iterable[tuple[str, Row, Sequence[str]]],
-    *,
-    data: Path | None,
-    seconds: float,
-    after: Callable[[list[Row]], None] = lambda _: None,
-) -> str:
-    """Run experiments in turn, and keep their table as JSON after each of them.
-
-    Parameters
-    ----------
-    output : Path
-        Holds a folder for each run, and the table.
-    file : str
-        Name of the table.
-    experiments : iterable of (str, dict, sequence of str)
-        Name of the run's folder, what its row begins with, and its settings.
-    data : Path or None
-        Of the ensembles; ``data`` in the output where None.
-    seconds : float
-        A fit that took longer is marked ``over``.
-    after : callable
-        Is given all rows so far after each run.
-
-    Returns
-    -------
-    text : str
-        The table for people.
-    """
-    rows: list[Row] = []
-    for name, head, settings in experiments:
-        with ending(output):  # wrong settings would be so for all, and cost a table that is there
-            try:
-                metrics = run_experiment(output / name, data or output / "data", settings)
-                row = {**head, **row_of(metrics)}
-                row["over"] = row["fit_s"] is not None and row["fit_s"] > seconds
-            except RuntimeError as error:
-                row = {**head, "failed": str(error), "over": False}
-        rows.append({**row, "settings": list(settings)})
-        print(f"{output / name}: {row.get('failed', 'done')}", file=sys.stderr, flush=True)
-        storage.commit_json(
-            output / file,
-            {**origin(), "seconds": seconds, **summary(rows), "rows": rows},
-        )
-        after(rows)
-    return f"{table(rows)}\nwrote {output / file}"
-
-
-def summary(rows: Sequence[Row]) -> dict[str, Any]:
-    """Return medians and worst values of the runs that came to an end, and counts."""
-    median, worst = {}, {}
-    for column in COLUMNS:
-        values = [row[column.key] for row in rows if row.get(column.key) is not None]
-        if column.badness is not None and values:
-            median[column.key] = statistics.median(values)
-            worst[column.key] = max(values, key=column.badness)
-    return {
-        "median": median,
-        "worst": worst,
-        "runs": len(rows),
-        "failed": sum("failed" in row for row in rows),
-        "over": sum(row["over"] for row in rows),
-        "parts_as_true": sum(
-            row.get("parts") is not None and row["parts"] == row["parts_true"] for row in rows
-        ),
-    }
-
-
-def table(rows: Sequence[Row]) -> str:
-    """Return the rows, their medians and their worst values as lines of text."""
-    columns = [column for column in COLUMNS if any(column.key in row for row in rows)]
-    found = summary(rows)
-    lines = [[column.title for column in columns]]
-    lines += [[shown(column, row) for column in columns] for row in rows]
-    for name in ("median", "worst"):
-        lines.append([shown(column, found[name], "") for column in columns])
-        lines[-1][0] = name
-    text = aligned(lines)
-    for number, row in enumerate(rows, start=1):
-        text[number] += f"  failed: {row['failed']}" if "failed" in row else ""
-        text[number] += "  over" if row["over"] else ""
-    text.append(
-        f"{found['parts_as_true']} of {found['runs']} with as many parts as in truth; "
-        f"{found['over']} over the time, {found['failed']} failed"
-    )
-    return "\n".join(text)
 
 
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:

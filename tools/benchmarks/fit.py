@@ -16,10 +16,11 @@ from typing import Any
 
 from sononerf import storage
 from tools.benchmarks.experiment import Row, aligned, ending, run_experiment
-from tools.benchmarks.paper import EPOCHS
 from tools.benchmarks.record import device_name, keep, ratios
 
 REPEATS = 5
+EPOCHS = (1, 2, 3, 5, 10, 20)
+"""Numbers of epochs that are tried in turn until a fit reaches the error."""
 
 
 def fit(arguments: argparse.Namespace) -> str:

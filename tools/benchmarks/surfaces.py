@@ -17,7 +17,7 @@ import trimesh
 
 from sononerf import storage
 from sononerf.evaluation.metrics import geometry_metrics
-from sononerf.evaluation.true_surface import TrueSurface
+from sononerf.evaluation.solid import Solid
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
 from tools.benchmarks.experiment import (
@@ -186,7 +186,7 @@ class _Experiment:
         found = trimesh.load_mesh(self.folder / "reconstruction" / "mesh.ply")
         for mesh in (true, found):
             mesh.apply_scale(1.0 / FACTOR)
-        geometry = geometry_metrics(found, TrueSurface(true))
+        geometry = geometry_metrics(found, Solid(true))
         row = measured({"geometry": geometry})
         return {key: value for key, value in row.items() if value is not None}
 

@@ -11,14 +11,12 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from sononerf.errors import NumericalError
-from sononerf.evaluation.layered_depth import crossings
+from sononerf.geometry.raycast import RayCaster
 
 # From the scene's front (+x), a little from the right and from above; z is up.
 DEFAULT_VIEW = (1.0, 0.42, 0.34)
 # Rays per pixel along each side.
 OVERSAMPLING = 2
-# Corners whose normal is further than this from the triangle's are edges, not roundings.
-SMOOTH_COSINE = 0.8
 # Lights in the camera's frame (towards the camera, right, up) and their strengths.
 LIGHTS = (((0.75, -0.35, 0.56), 0.55), ((0.45, 0.85, 0.05), 0.26), ((1.0, 0.0, 0.0), 0.10))
 AMBIENT = 0.27
@@ -100,15 +98,6 @@ def background(width: int, height: int) -> NDArray[np.float64]:
     return np.broadcast_to(top + (bottom - top) * fall**1.5, (height, width, 3)).copy()
 
 
-def _corner_normals(mesh: trimesh.Trimesh, faces: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return a normal per corner of some triangles, (T, 3, 3); sharp edges stay sharp."""
-    flat = np.asarray(mesh.face_normals)[faces]
-    smooth = np.asarray(mesh.vertex_normals)[np.asarray(mesh.faces)[faces]]
-    sharp = np.einsum("tci,ti->tc", smooth, flat) < SMOOTH_COSINE
-    normals: NDArray[np.float64] = np.where(sharp[..., None], flat[:, None], smooth)
-    return normals
-
-
 def _lit(normals: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the brightness of unit normals (N, 3) in the camera's frame."""
     brightness = AMBIENT + 0.10 * normals[:, 2]  # more light from the sky than from the ground
@@ -143,37 +132,32 @@ def draw_mesh(
         Of what was drawn; minus infinity where nothing was.
     """
     height, width = pixels.shape[:2]
-    vertices = (np.asarray(mesh.vertices) - camera.centre) @ camera.axes.T
-    # Pixel centres; lines ascend with the picture's up.
-    columns = (np.arange(width) + 0.5 - width / 2) / camera.scale
-    rows = (np.arange(height) + 0.5 - height / 2) / camera.scale
-    shown = np.arange(len(mesh.faces))
-    if mesh.is_watertight:
-        shown = np.flatnonzero(np.asarray(mesh.face_normals) @ camera.axes[0] > 0)
-    # Second coordinate is the row: with it first, a triangle facing the camera runs clockwise.
-    found = crossings(vertices[:, [0, 2, 1]], np.asarray(mesh.faces)[shown], rows, columns)
+    local = (np.asarray(mesh.vertices) - camera.centre) @ camera.axes.T
+    nearest = float(local[:, 0].max())
+    rows, columns = np.indices((height, width)).reshape(2, -1) + 0.5
+    origins = np.zeros((height * width, 3))
+    origins[:, 0] = nearest + float(np.ptp(local, axis=0).max())
+    origins[:, 1] = (columns - width / 2) / camera.scale
+    origins[:, 2] = (height / 2 - rows) / camera.scale
+    low, high = local[:, 1:].min(axis=0), local[:, 1:].max(axis=0)
+    cast = np.flatnonzero(((origins[:, 1:] >= low) & (origins[:, 1:] <= high)).all(axis=1))
+    caster = RayCaster(trimesh.Trimesh(local, mesh.faces, process=False, validate=False))
+    hits = caster.first_hit(origins[cast], np.tile([-1.0, 0.0, 0.0], (len(cast), 1)))
+    seen = cast[hits.ray]
     nearness = np.full(height * width, -np.inf)
-    winner = np.full(height * width, -1)
-    order = np.argsort(found.depth, kind="stable")
-    winner[found.line[order]] = order  # the nearest is written last
-    seen = np.flatnonzero(winner >= 0)
-    hit = winner[seen]
-    nearness[seen] = found.depth[hit]
-    face, second, third = shown[found.face[hit]], found.second[hit], found.third[hit]
-    weights = np.stack([1 - second - third, second, third], axis=1)
-    normals = np.einsum("nc,nci->ni", weights, _corner_normals(mesh, face)) @ camera.axes.T
-    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+    nearness[seen] = hits.points[:, 0]
     # The back of a sheet is lit like its front.
-    normals[np.asarray(mesh.face_normals)[face] @ camera.axes[0] < 0] *= -1
+    normals = np.where(hits.flat[:, :1] < 0, -hits.normals, hits.normals)
     base = np.asarray(colour, dtype=np.float64)
     if base.ndim == 2:
-        base = np.einsum("nc,nci->ni", weights, base[np.asarray(mesh.faces)[face]])
+        weights = trimesh.triangles.points_to_barycentric(
+            local[np.asarray(mesh.faces)[hits.triangle]], hits.points
+        )
+        base = np.einsum("nc,nci->ni", weights, base[np.asarray(mesh.faces)[hits.triangle]])
     image = nearness.reshape(height, width)
     shade = _lit(normals) * _crevices(image).reshape(-1)[seen]
-    flat = pixels[::-1].reshape(-1, 3)
-    flat[seen] = np.clip(base * shade[:, None], 0, 1)
-    pixels[:] = flat.reshape(height, width, 3)[::-1]
-    return image[::-1]
+    pixels.reshape(-1, 3)[seen] = np.clip(base * shade[:, None], 0, 1)
+    return image
 
 
 def _crevices(nearness: NDArray[np.float64]) -> NDArray[np.float64]:
