@@ -225,15 +225,7 @@ def _plain(value: Any) -> Any:
 
 
 def to_json(data: Any, *, indent: int | None = None, sort_keys: bool = False) -> str:
-    """Return plain data, NumPy's scalars and arrays as JSON text.
-
-    Raises
-    ------
-    ValueError
-        If a number is NaN or infinite; JSON knows neither.
-    TypeError
-        If something is no plain data.
-    """
+    """Return plain data, NumPy's scalars and arrays as JSON text."""
     return json.dumps(
         data,
         indent=indent,

@@ -37,13 +37,7 @@ def _checksum(plain: dict[str, Any]) -> str:
 
 
 def write_group(path: Path, plain: dict[str, Any]) -> None:
-    """Write the group's own file; zarr's update would keep the order of the calls in its bytes.
-
-    Raises
-    ------
-    StorageError
-        If it cannot be written.
-    """
+    """Write the group's own file; zarr's update would keep the order of the calls in its bytes."""
     own = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "checksum": _checksum(plain)}
     group = {"zarr_format": 3, "node_type": "group", "attributes": {**own, **plain}}
     storage.commit_json(path / "zarr.json", group)

@@ -92,13 +92,7 @@ class Echoes:
 
     @cached_property
     def region(self) -> EchoRegion:
-        """Places that the echoes leave possible.
-
-        Raises
-        ------
-        NumericalError
-            If no pose heard anything, or no more than noise gives.
-        """
+        """Places that the echoes leave possible."""
         turned = self.rotations[self.onsets.poses]
         return EchoRegion(self.onsets, self.hull, self.head.gains, turned, self.head.resolution)
 

@@ -124,11 +124,6 @@ def create_arrays(root: Path, axes: dict[str, NDArray[Any]], receivers: int) -> 
         By the names of :data:`AXES`.
     receivers : int
         Number E of receivers, from 1 on.
-
-    Raises
-    ------
-    StorageError
-        If a file cannot be written.
     """
     for name, values in axes.items():
         dtype, dimensions, _ = AXES[name]

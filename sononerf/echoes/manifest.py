@@ -47,27 +47,13 @@ class Manifest:
         self.journal = folder / "manifest.jsonl"
 
     def add(self, pose: int, record: PoseRecord) -> None:
-        """Append a finished pose to the journal, durably.
-
-        Raises
-        ------
-        StorageError
-            If the journal cannot be written.
-        """
+        """Append a finished pose to the journal, durably."""
         body = storage.to_json({"pose": pose, **record.plain()}, sort_keys=True)
         # The checksum covers the text before it, so that a torn or damaged line is no record.
         storage.append_line(self.journal, f"{body[:-1]},{_checksum_field(body)}}}")
 
     def read(self) -> dict[int, PoseRecord]:
-        """Return the finished poses in order.
-
-        Raises
-        ------
-        InputError
-            If ``manifest.json`` is damaged; damaged lines of the journal are left out.
-        IncompatibleError
-            If a newer sononerf wrote it.
-        """
+        """Return the finished poses in order."""
         records = self._read_sealed() if self.path.exists() else {}
         records.update(self._read_journal())
         return dict(sorted(records.items()))
@@ -108,13 +94,7 @@ class Manifest:
         return records
 
     def seal(self) -> None:
-        """Compact the journal into ``manifest.json``, whose bytes know no order of writing.
-
-        Raises
-        ------
-        StorageError
-            If it cannot be written.
-        """
+        """Compact the journal into ``manifest.json``, whose bytes know no order of writing."""
         records = self.read()
         poses = {str(pose): record.plain() for pose, record in records.items()}
         data = {"schema_version": SCHEMA_VERSION, "checksum": _digest(records), "poses": poses}

@@ -198,15 +198,7 @@ class EnsembleStore:
         return np.flatnonzero(self.split == SPLITS[split])
 
     def update_attributes(self, **values: Any) -> None:
-        """Set attributes, all at once or, if the process dies, none.
-
-        Raises
-        ------
-        NumericalError
-            If a value is NaN or infinite.
-        StorageError
-            If it cannot be written.
-        """
+        """Set attributes, all at once or, if the process dies, none."""
         self._refuse_reading()
         plain = plain_attributes(self.path, {**self._attributes, **values})
         write_group(self.path, plain)
@@ -292,13 +284,7 @@ class EnsembleStore:
         return faults
 
     def seal(self) -> None:
-        """Compact the journal of finished poses into ``manifest.json``.
-
-        Raises
-        ------
-        StorageError
-            If it cannot be written.
-        """
+        """Compact the journal of finished poses into ``manifest.json``."""
         self._refuse_reading()
         self._manifest.seal()
 

@@ -67,15 +67,6 @@ def backprojection(
     -------
     volume : Volume
         Mean energy per voxel; what lies outside the recorded ranges adds nothing.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit or the ranges are not evenly spaced.
-    NumericalError
-        If a spectrogram is not finite.
-    ResourceError
-        If the grid would not fit in memory.
     """
     emitters, receivers, axis = places_heard_from(
         positions, rotations, ranges, emitter_offset=emitter_offset, ear_offsets=ear_offsets

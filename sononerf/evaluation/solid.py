@@ -38,11 +38,6 @@ class Solid:
         The solid; empty if no part is closed.
     sheets : list of Trimesh
         The parts that are open or enclose no volume.
-
-    Raises
-    ------
-    NumericalError
-        If the mesh is empty or not finite.
     """
 
     def __init__(self, mesh: trimesh.Trimesh, *, fill_cavities: bool = True) -> None:

@@ -167,13 +167,7 @@ def poses_of(echoes: Echoes, split: Split, renderer: Renderer) -> WholePoses:
 def render_poses(
     fitted: FittedField, poses: WholePoses, *, accelerator: str = "auto", progress: Progress
 ) -> NDArray[np.float32]:
-    """Render poses one by one, (P, E, R, F) linear magnitude.
-
-    Raises
-    ------
-    ResourceError
-        If ``gpu`` was asked for and there is none.
-    """
+    """Render poses one by one, (P, E, R, F) linear magnitude."""
     quiet_lightning()
     require_accelerator(accelerator)
     rendered: list[NDArray[np.float32]] = []

@@ -29,13 +29,6 @@ def save_weights(folder: Path, state: dict[str, Tensor], description: dict[str, 
         Parameters and buffers by name, on any device.
     description : dict
         Plain data; ``schema_version`` and ``sha256`` are added.
-
-    Raises
-    ------
-    StorageError
-        If a file cannot be written.
-    NumericalError
-        If the description holds NaN.
     """
     # Views of one storage are refused by the format; each tensor goes with its own bytes.
     own = {name: tensor.detach().clone().contiguous() for name, tensor in state.items()}

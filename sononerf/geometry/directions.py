@@ -28,11 +28,6 @@ def fibonacci_sphere(count: int) -> NDArray[np.float64]:
     directions : (D, 3) float64
         Unit vectors.
 
-    Raises
-    ------
-    ValueError
-        If ``count`` is below one.
-
     Examples
     --------
     >>> abs(fibonacci_sphere(100).mean(axis=0)).max() < 0.01
@@ -62,11 +57,6 @@ def fibonacci_cap(
     -------
     directions : (D, 3) float64
         Unit vectors.
-
-    Raises
-    ------
-    ValueError
-        If ``count`` is below one, the axis has no length, or the angle is outside 0 to pi.
     """
     return CapSpiral(count, axis, half_angle, offset).directions()
 

@@ -239,11 +239,6 @@ def cap_poses(
     -------
     poses : Poses
         Level (roll 0), ``count`` of them.
-
-    Raises
-    ------
-    ValueError
-        If ``count`` is below one, the axis has no length, or the angle is outside 0 to pi.
     """
     spiral = fibonacci_cap(count, axis=axis, half_angle=half_angle, offset=(0.5, 0.0))
     return _aimed(radius * spiral, aim_jitter, generator)
@@ -280,11 +275,6 @@ def random_poses(
     -------
     poses : Poses
         Level (roll 0), ``count`` of them; they look at the origin, each a little off.
-
-    Raises
-    ------
-    ValueError
-        If the axis has no length.
     """
     height, turn, depth = generator.random((3, count))
     # Equal steps along the axis cut a sphere into equal areas; equal steps of r^3, equal volumes.

@@ -50,11 +50,6 @@ def call_waveform(settings: CallSettings, sampling_rate: float) -> NDArray[np.fl
         One sample of height 1 for an impulse; never higher than 1 for a sweep; of a file resampled
         where the rates differ, with a greatest of 1 before that.
 
-    Raises
-    ------
-    InputError
-        If the settings name a file that cannot be used.
-
     References
     ----------
     .. [1] J. J. Kroszczynski, "Pulse compression by means of linear-period modulation",
@@ -246,11 +241,6 @@ def call_content(settings: CallSettings) -> dict[str, Any]:
     """Return all that echoes depend on of a call, as plain data: for hashes.
 
     A preset counts as what it fills, a file as what it holds.
-
-    Raises
-    ------
-    InputError
-        If the settings name a file that cannot be used.
     """
     plain = settings.model_dump(mode="json", exclude={"preset", "file"})
     if settings.file is None:

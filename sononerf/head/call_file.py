@@ -235,12 +235,6 @@ def _bandwidth(waveform: NDArray[np.float64], rate: float) -> float:
 
 
 def contents(path: Path) -> bytes:
-    """Return all that a call depends on, for hashes: its samples and its sampling rate.
-
-    Raises
-    ------
-    InputError
-        As :func:`load_call`.
-    """
+    """Return all that a call depends on, for hashes: its samples and its sampling rate."""
     call = load_call(path)
     return np.float64(call.sampling_rate).tobytes() + call.waveform.astype("<f8").tobytes()

@@ -113,13 +113,6 @@ def mae_db(
     -------
     error : float or None, dB
         None where no cell is active.
-
-    Raises
-    ------
-    ValueError
-        If the shapes differ or nothing is there.
-    NumericalError
-        If a value is not finite.
     """
     first, second = same_shape(a, b)
     return mae_all_and_active(first, second, active_db)[1 if active else 0]

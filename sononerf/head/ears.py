@@ -112,13 +112,6 @@ def ear_tables(settings: EarSettings, frequency: ArrayLike) -> Ears:
     -------
     ears : Ears
         On a grid of 2 degrees.
-
-    Raises
-    ------
-    InputError
-        If the file of the directivity cannot be read.
-    SettingsError
-        If the receivers of settings and file do not fit.
     """
     f = np.asarray(frequency, dtype=np.float64)
     measured = _measured(settings)
@@ -147,13 +140,7 @@ def receiver_places(settings: EarSettings) -> NDArray[np.float64]:
 
 
 def directivity_content(settings: EarSettings) -> str | None:
-    """Return a hash of the directivity's file, None where there is none.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
+    """Return a hash of the directivity's file, None where there is none."""
     return None if settings.file is None else content_hash(settings.file)
 
 
@@ -247,11 +234,6 @@ def analysed_ears(
         At the analysis' frequencies.
     lag : (E, F, L, A) float32 or None, s
         How much too late each ear hears an echo, beam included; None for an impulse.
-
-    Raises
-    ------
-    InputError, SettingsError
-        As :func:`ear_tables`.
     """
     return _analysed(settings, call, analysis, directivity_content(settings))
 

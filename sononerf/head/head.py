@@ -137,13 +137,7 @@ class Head:
 
     @cached_property
     def range(self) -> Array:
-        """Ranges of the spectrogram's slices (R,), m.
-
-        Raises
-        ------
-        ValueError
-            If no analysis frame lies within the limits.
-        """
+        """Ranges of the spectrogram's slices (R,), m."""
         return range_axis(self.analysis, self.speed_of_sound)
 
     @property
@@ -242,11 +236,6 @@ class Head:
             From the start of the emission on.
         magnitude : (E, R, F) float64
             Linear.
-
-        Raises
-        ------
-        ValueError
-            If the impulse responses are too short.
         """
         waveform = emit(impulse_responses, self.waveform)[:, : self.samples]
         if self.noise.snr_db is not None:
@@ -259,13 +248,7 @@ class Head:
         return waveform, self.analyse(waveform)
 
     def analyse(self, waveform: Array) -> Array:
-        """Return the spectrogram (E, R, F) of a waveform (E, S) that starts at the emission.
-
-        Raises
-        ------
-        ValueError
-            If the waveform is shorter than ``samples``.
-        """
+        """Return the spectrogram (E, R, F) of a waveform (E, S) that starts at the emission."""
         return spectrogram(waveform, self.analysis, self.speed_of_sound, self.delay)
 
     @cached_property

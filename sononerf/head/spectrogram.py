@@ -54,11 +54,6 @@ def range_axis(settings: SpectrogramSettings, speed_of_sound: float) -> NDArray[
     range : (R,) float64, m
         Those within ``range_min`` to ``range_max``.
 
-    Raises
-    ------
-    ValueError
-        If no frame lies between the two.
-
     Examples
     --------
     >>> len(range_axis(SpectrogramSettings(), 343.0))
@@ -102,11 +97,6 @@ def echo_samples(
     -------
     samples : int
         At the sampling rate of the settings.
-
-    Raises
-    ------
-    ValueError
-        If no frame lies between the settings' ranges.
     """
     last = _frames(settings, speed_of_sound)[1]
     reach = row_filters(settings).reach

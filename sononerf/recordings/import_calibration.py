@@ -44,11 +44,6 @@ def calibrated(
         Cuts and calibrates pings.
     applied : dict
         Plain data.
-
-    Raises
-    ------
-    InputError
-        If background or reference do not fit the pings, or no target is heard.
     """
     speed, rate = head.speed_of_sound, recording.sampling_rate
     applied: dict[str, Any] = {

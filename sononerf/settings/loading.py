@@ -162,11 +162,6 @@ def load_settings(path: Path, overrides: Iterable[str] = ()) -> Settings:
 
     An assignment that names another scene, field or renderer than the file does takes the file's
     options for the old one away.
-
-    Raises
-    ------
-    SettingsError
-        If the file cannot be read or any key or value is not allowed.
     """
     data = read_yaml(path)
     overrides = list(overrides)

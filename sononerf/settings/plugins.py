@@ -137,11 +137,6 @@ def describe_options(factory: Callable[..., Any], *, given: int = 0) -> list[dic
     rows : list of dict
         ``name``; ``default``, plain data, or None where there is none; ``needed``, where it has
         to be set; ``allowed``, in words.
-
-    Raises
-    ------
-    InputError
-        If the factory's annotations cannot be read.
     """
     rows = []
     for name, field in _options_model(factory, "options", given).model_fields.items():

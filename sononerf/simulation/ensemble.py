@@ -61,11 +61,6 @@ def check_poses(scene: Scene, poses: Poses, *, offsets: NDArray[np.float64] | No
         To be checked.
     offsets : (K, 3) float64, m, optional
         Further points of the head that must be outside, such as emitter and ears; head frame.
-
-    Raises
-    ------
-    InputError
-        Naming the first ten.
     """
     finite = np.isfinite(poses.positions).all(axis=1) & np.isfinite(poses.rotations).all((1, 2))
     _refuse(~finite, "no finite numbers")
@@ -168,17 +163,6 @@ def simulate(
         Address of a Dask scheduler to use instead.
     progress : Progress
         Where to show it.
-
-    Raises
-    ------
-    SonoNerfError
-        If a pose fails, naming it.
-    NumericalError
-        If no pose hears anything.
-    StorageError
-        If the store cannot be written.
-    ResourceError
-        If the workers cannot be reached.
     """
     missing = store.missing()
     if workers is None:
@@ -249,13 +233,6 @@ def simulate_ensemble(
         Processes on this machine; one means this process.
     scheduler : str, optional
         Address of a Dask scheduler whose workers are used instead.
-
-    Raises
-    ------
-    SonoNerfError
-        If a pose fails, naming it.
-    ResourceError
-        If the workers cannot be reached.
     """
     wanted = [int(index) for index in indices]
     engine = simulator.engine

@@ -42,11 +42,6 @@ def ensemble_poses(wanted: PoseSettings) -> tuple[Poses, NDArray[np.int8]]:
         All of them.
     split : (P,) int8
         0 train, 1 validation, 2 test.
-
-    Raises
-    ------
-    InputError
-        If the table of a path cannot be read, or has too few rows.
     """
     if wanted.path is not None:
         return _path_poses(wanted, wanted.path)

@@ -60,13 +60,6 @@ class Simulator:
             What hears.
         options : SimulationSettings
             The engine and what bounds its work.
-
-        Raises
-        ------
-        ValueError
-            If the range limits hold no analysis frame.
-        InputError
-            If the engine cannot simulate the scene.
         """
         hearing, analysis = hearing_of(head), head.analysis
         if options.engine in ("spheres", "bem"):
@@ -105,11 +98,6 @@ class Simulator:
             Engine and number of rays are replaced.
         rays : int
             Per pose.
-
-        Raises
-        ------
-        InputError
-            If the surface cannot be simulated.
         """
         wanted = options.model_copy(update={"engine": "hybrid", "rays": rays})
         return cls.of(quiet_scene(mesh), head.without_noise(), wanted)

@@ -194,13 +194,6 @@ class Solved(Engine):
             Head to world.
         progress : callable, optional
             Takes how many frequencies are done and how many there are.
-
-        Raises
-        ------
-        ResourceError
-            If it would take too much memory or too long; nothing is solved then.
-        NumericalError
-            If a frequency cannot be solved.
         """
         finite = np.isfinite(positions).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
         pairs = zip(positions[finite], rotations[finite], strict=True)

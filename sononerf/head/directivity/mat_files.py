@@ -50,11 +50,6 @@ def read_mat(path: Path) -> Directivity:
     -------
     directivity : Directivity
         Receiver 0 is the left ear. Azimuth counts to the left, elevation upward.
-
-    Raises
-    ------
-    InputError
-        If it holds neither layout, or something else than numbers in it.
     """
     with path.open("rb") as file:
         is_new = b"MATLAB 7.3" in file.read(116)

@@ -15,13 +15,7 @@ HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
 def read_directivity(path: Path) -> Directivity:
-    """Read a SOFA file, a `.mat` file or a table of text; kept until the file changes.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or is none of these.
-    """
+    """Read a SOFA file, a `.mat` file or a table of text; kept until the file changes."""
     return _read(path, content_hash(path))
 
 

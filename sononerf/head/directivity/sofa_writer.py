@@ -56,11 +56,6 @@ def write_sofa(path: Path, directivity: Directivity, *, title: str = "directivit
         What is written.
     title : str
         Of the file.
-
-    Raises
-    ------
-    StorageError
-        If it cannot be written.
     """
     gains, places = directivity.gains, directivity.places
     names = [f"receiver {number}" for number in range(len(gains))]

@@ -47,13 +47,6 @@ def mesh_png(
     colours : (3,) or (V, 3) float, optional
         Colour in 0 to 1, one for all or one per vertex.
 
-
-    Raises
-    ------
-    ValueError
-        If size, view or colours have a wrong shape.
-    NumericalError
-        If the mesh is empty or not finite.
     """
     _require_drawable(mesh, "the mesh")
     camera = camera_for(mesh.vertices, size=size, view=view)
@@ -81,13 +74,6 @@ def side_by_side_png(
     view : (3,) float
         Direction to the camera, world frame.
 
-
-    Raises
-    ------
-    ValueError
-        If size or view are wrong.
-    NumericalError
-        If a mesh is empty or not finite.
     """
     for mesh, title in zip((left, right), titles, strict=True):
         _require_drawable(mesh, title or "a mesh")

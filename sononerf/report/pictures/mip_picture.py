@@ -67,13 +67,6 @@ def mip_png(
     scale : {"db", "linear"}
         Decibels below the greatest value (10 log10, 40 dB shown), or linear from zero.
 
-
-    Raises
-    ------
-    ValueError
-        If the projection has not two axes.
-    NumericalError
-        If a value is not finite.
     """
     values = _scaled(projection, scale)
     low, high = _limits(values, scale)
@@ -107,13 +100,6 @@ def mip_image(
     """Return one projection as pixels (H, W, 3), second axis upwards, without axes or labels.
 
     Voxels are repeated a whole number of times, so that the longer side comes near ``longest``.
-
-    Raises
-    ------
-    ValueError
-        If the projection has not two axes.
-    NumericalError
-        If a value is not finite.
     """
     from matplotlib import colormaps
 
@@ -126,13 +112,7 @@ def mip_image(
 
 
 def mip_pngs(volume: Volume, *, scale: Scale = "db") -> dict[str, bytes]:
-    """Draw a volume's three projections, named by the axis looked along: ``"x"``, ``"y"``, ``"z"``.
-
-    Raises
-    ------
-    NumericalError
-        If a value is not finite.
-    """
+    """Draw a volume's three projections, named by the axis looked along: ``"x"``, ``"y"``, ``"z"``."""
     edges = [
         (float(axis[0] - volume.spacing / 2), float(axis[-1] + volume.spacing / 2))
         for axis in volume.axes()
@@ -162,11 +142,6 @@ def maximum_intensity_projections(volume: Volume) -> dict[str, NDArray[np.floati
     -------
     projections : dict
         ``"x"`` (Y, Z), ``"y"`` (X, Z) and ``"z"`` (X, Y), named by the axis looked along.
-
-    Raises
-    ------
-    NumericalError
-        If a value is not finite.
     """
     require_finite(volume)
     return {name: volume.values.max(axis=axis) for axis, name in enumerate("xyz")}

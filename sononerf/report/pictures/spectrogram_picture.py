@@ -45,13 +45,6 @@ def spectrogram_png(
     title : str
         One line above.
 
-
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit.
-    NumericalError
-        If a value is not finite.
     """
     return png_from_pixels(_pixels(measured_db, predicted_db, range_m, frequency_hz, title, 130))
 

@@ -280,11 +280,6 @@ def find_balls(scene: Scene) -> list[Ball]:
     -------
     balls : list of Ball
         One for each connected part of the mesh.
-
-    Raises
-    ------
-    InputError
-        If a part is no sphere, is open, inside out or too coarse.
     """
     vertices = np.asarray(scene.mesh.vertices, dtype=np.float64)
     same = np.round(vertices / (TWICE * np.ptp(vertices, axis=0).max()))

@@ -77,15 +77,6 @@ def read_field(
         Size of the spherical lattice that is summed over where the field has no lobes.
     progress : callable, optional
         Called with the voxels done and the voxels in all.
-
-    Raises
-    ------
-    SettingsError
-        If the spacing is larger than the region.
-    NumericalError
-        If nothing was heard.
-    ResourceError
-        If the grid does not fit in memory.
     """
     lower, upper, step = _grid_of(field, spacing)
     energy = _energy(field, directions)

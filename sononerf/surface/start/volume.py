@@ -160,13 +160,6 @@ def grid_over(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Volume:
     -------
     volume : Volume
         float64 zeros; the outermost centres lie on the box or less than one spacing beyond.
-
-    Raises
-    ------
-    ValueError
-        If the box is empty or the spacing is not positive.
-    ResourceError
-        If the grid would not fit in memory.
     """
     shape = grid_shape(lower, upper, spacing)
     check_memory(lower, upper, spacing)
