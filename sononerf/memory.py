@@ -1,10 +1,17 @@
 # SPDX-License-Identifier: MIT
-"""How much memory there is."""
+"""How much memory, and how many cores, this process may use."""
 
 from __future__ import annotations
 
 import os
 from pathlib import Path
+
+
+def available_cores() -> int:
+    """Return on how many cores this process may run, as far as the system tells."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def available_memory() -> int | None:

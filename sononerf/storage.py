@@ -310,8 +310,10 @@ def remove_file(path: Path) -> None:
         If it cannot be removed.
     """
     try:
-        path.unlink(missing_ok=True)
+        path.unlink()
         sync_folder(path.parent)
+    except FileNotFoundError:
+        return  # its folder may be missing too
     except OSError as error:
         raise storage_error("cannot be removed", path, error) from error
 
@@ -397,6 +399,11 @@ def _take(path: Path) -> int | None:
             os.close(descriptor)
             raise
         os.close(descriptor)
+
+
+def is_held(folder: Path) -> bool:
+    """Tell whether a process holds a folder, or died without letting go of it; see :func:`lock`."""
+    return (folder / _LOCK_NAME).is_file()
 
 
 @contextmanager

@@ -19,7 +19,7 @@ PACKAGE = ROOT / "sononerf"
 
 FLOORS = (
     ("errors", "progress", "memory"),
-    ("storage", "settings", "geometry"),
+    ("storage", "tables", "settings", "geometry"),
     ("scene", "head"),
     ("echoes",),
     ("simulation", "recordings"),

@@ -26,11 +26,11 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sononerf import __version__, storage
-from sononerf.callbacks import preview, spectrogram_images
+from sononerf.callbacks import preview
 from sononerf.cli import entry
 from sononerf.evaluation import baseline
 from sononerf.evaluation import geometry as geometry_module
-from sononerf.field.weights import load_weights, save_weights
+from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.run import fit as fit_module
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
@@ -181,7 +181,7 @@ def test_the_numbers_are_those_of_schema_one(smoke):
     both = ("mae_db", "mean_predictor_mae_db", "noise_floor_mae_db")
     assert metrics["prediction"].keys() == {
         *("split", "poses", "log_spectral_distance_db", "psnr_db", "ssim", "pearson"),
-        *("rendered_mae_db", "rendered_mae_db_active", "traced_weight"),
+        *("rendered_mae_db", "rendered_mae_db_active", "traced_weight", "traced_fault"),
         *both,
         *(f"{name}_active" for name in both),
     }
@@ -333,7 +333,7 @@ def fit_alone(monkeypatch):
     monkeypatch.setattr(
         fit_module, "finish", lambda run, *, accelerator, progress: called.append(run) or {}
     )
-    monkeypatch.setattr(spectrogram_images.SpectrogramImages, "on_epoch", lambda *given: None)
+    monkeypatch.setattr(preview.SpectrogramImages, "on_epoch", lambda *given: None)
     return called
 
 

@@ -251,6 +251,7 @@ def test_remove_file_twice(tmp_path):
     storage.commit_bytes(tmp_path / "file", b"")
     storage.remove_file(tmp_path / "file")
     storage.remove_file(tmp_path / "file")
+    storage.remove_file(tmp_path / "missing" / "file")
     assert names(tmp_path) == []
 
 

@@ -9,7 +9,7 @@ from scipy import ndimage
 from scipy.spatial.distance import cdist
 
 from sononerf.echoes.consistency import ACCURACY
-from sononerf.echoes.detection import FALSE_ALARMS
+from sononerf.echoes.detection import FALSE_ALARMS, threshold_levels
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.onsets import Onsets
 from sononerf.errors import NumericalError
@@ -228,3 +228,37 @@ class EchoRegion:
         reach = int(np.ceil((tolerance + self.resolution) / self.step))
         covered = ndimage.maximum_filter1d(covered, 2 * reach + 1, axis=1, mode="constant")
         return np.asarray(covered)
+
+
+FEW = 0.02
+"""Fraction of the poses that must hear an echo at a range or beyond it for it to count, no unit."""
+
+
+def echo_extent(power: Array, axis: Array, looks: float, margin: float) -> tuple[float, float]:
+    """Return the least and the greatest range (m) that hold echoes, with a margin.
+
+    Parameters
+    ----------
+    power : (P, E, R) float
+        Power averaged over frequency.
+    axis : (R,) float, m
+        Ranges of the slices.
+    looks : float
+        How many independent values each power is the average of.
+    margin : float, m
+        Added on both sides.
+
+    Returns
+    -------
+    limits : (float, float), m
+        Within the axis; all of it where nothing is heard.
+    """
+    loud: NDArray[np.bool_] = power > threshold_levels(power, looks).total
+    heard = np.asarray(loud.any(axis=1))  # (P, R)
+    some = np.asarray(heard.any(axis=1))
+    if not some.any():
+        return float(axis[0]), float(axis[-1])
+    first = axis[heard[some].argmax(axis=1)]
+    last = axis[heard.shape[1] - 1 - heard[some, ::-1].argmax(axis=1)]
+    low, high = np.quantile(first, FEW), np.quantile(last, 1.0 - FEW)
+    return max(float(low - margin), float(axis[0])), min(float(high + margin), float(axis[-1]))

@@ -12,7 +12,6 @@ import zarr
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf import storage
-from sononerf.echoes.attributes import plain_attributes, read_attributes, write_group
 from sononerf.echoes.layout import (
     AXES,
     SPECTROGRAM,
@@ -21,7 +20,10 @@ from sononerf.echoes.layout import (
     checked_axes,
     chunk_path,
     create_arrays,
+    plain_attributes,
+    read_attributes,
     read_axes,
+    write_group,
 )
 from sononerf.echoes.manifest import Manifest, PoseRecord
 from sononerf.errors import IncompatibleError, InputError, NumericalError

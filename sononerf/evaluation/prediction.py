@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Predicted spectrograms, and how close they are to measured ones, in decibels."""
+"""Predicted spectrograms, their error in decibels, and what two runs differ in."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import trimesh
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.evaluation.mixture import mix
-from sononerf.evaluation.traced import Traced, trace_poses
+from sononerf.errors import NumericalError
+from sononerf.evaluation.traced import Traced, mix, trace_poses
 from sononerf.field.fitting import FittedField, render_poses
 from sononerf.field.range_slices import WholePoses
 from sononerf.head.decibels import (
@@ -25,6 +27,7 @@ from sononerf.head.decibels import (
 )
 from sononerf.progress import Progress
 from sononerf.settings.schema import SimulationSettings
+from sononerf.surface.start.volume import Volume
 
 SSIM_WINDOW = 11
 """Side of the window over which SSIM compares, cells; smaller spectrograms have no SSIM."""
@@ -42,6 +45,8 @@ class Prediction:
         The field's own rendering.
     traced_weight : float
         Mean weight of the traced echoes.
+    traced_fault : str or None
+        Why no echoes are traced off the surface.
     reference : float
         Magnitude m0 of the reported decibels.
     """
@@ -49,6 +54,7 @@ class Prediction:
     magnitude: NDArray[np.float32]
     rendered: NDArray[np.float32]
     traced_weight: float
+    traced_fault: str | None
     reference: float
 
     def numbers(self, echoes: Echoes, measured: NDArray[np.floating]) -> dict[str, Any]:
@@ -72,6 +78,7 @@ class Prediction:
             "rendered_mae_db": mae_db(level, alone),
             "rendered_mae_db_active": mae_db(level, alone, active=True),
             "traced_weight": self.traced_weight,
+            "traced_fault": self.traced_fault,
         }
 
 
@@ -111,7 +118,8 @@ def predict(
         level = mix(compress(rendered, reference), compress(found, reference), traced.weight)
         magnitude = (reference * (10 ** (level / 20) - 1)).astype(np.float32)
     weight = 0.0 if traced is None else float(traced.weight.mean())
-    return Prediction(magnitude, rendered, weight, reference)
+    fault = None if traced is None else traced.fault or None
+    return Prediction(magnitude, rendered, weight, fault, reference)
 
 
 def prediction_metrics(
@@ -205,3 +213,80 @@ def _image_metrics(
         "ssim": float(torch.as_tensor(ssim.compute())) if large else None,
         "pearson": float(torch.as_tensor(pearson.compute())) if varies else None,
     }
+
+
+Array = NDArray[np.float64]
+SAME = 1e-6
+"""Triangles are the same where their corners' mean lies no farther apart, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two volumes over their common maximum, and what remains of one without the other.
+
+    Attributes
+    ----------
+    first, second : Volume
+        0 to 1, on one grid.
+    difference : Volume
+        First without second.
+    strongest : (3,) float or None, m
+        Where the difference is greatest; None where it is nowhere above zero.
+    score : float
+        How great it is at most: part of the common maximum.
+    """
+
+    first: Volume
+    second: Volume
+    difference: Volume
+    strongest: Array | None
+    score: float
+
+
+def compare(first: Volume, second: Volume) -> Comparison:
+    """Compare two volumes, place by place.
+
+    Parameters
+    ----------
+    first, second : Volume
+        What is heard from each place, on one grid.
+
+    Returns
+    -------
+    comparison : Comparison
+
+    Raises
+    ------
+    ValueError
+        If the grids differ.
+    NumericalError
+        If both are silent.
+    """
+    alike = first.shape == second.shape and np.allclose(first.origin, second.origin)
+    if not alike or first.spacing != second.spacing:
+        raise ValueError("the two volumes have different grids")
+    most = max(float(first.values.max()), float(second.values.max()))
+    if not most > 0:
+        raise NumericalError("nothing to compare: both are silent")
+    one, other = (volume.with_values(volume.values / most) for volume in (first, second))
+    difference = first.with_values(one.values - other.values)
+    index = np.unravel_index(int(difference.values.argmax()), difference.shape)
+    score = float(difference.values[index])
+    # Where nothing is stronger the greatest value lies anywhere, often in a corner.
+    strongest = difference.origin + difference.spacing * np.array(index) if score > 0 else None
+    return Comparison(one, other, difference, strongest, score)
+
+
+def added_part(mesh: trimesh.Trimesh, without: trimesh.Trimesh) -> trimesh.Trimesh | None:
+    """Return what a true surface has and another one has not; None where that is nothing.
+
+    Parameters
+    ----------
+    mesh, without : Trimesh
+        Metres, one world frame; equal parts are equal triangle for triangle.
+    """
+    if not len(without.faces):
+        return mesh
+    distance, _ = cKDTree(without.triangles_center).query(mesh.triangles_center)
+    added = np.flatnonzero(distance > SAME)
+    return mesh.submesh([added], append=True) if len(added) else None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Echoes traced off a surface, which complete the prediction that the field renders."""
+"""Echoes traced off a surface, and their weight beside what the field renders."""
 
 from __future__ import annotations
 
@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.errors import SonoNerfError
-from sononerf.evaluation.mixture import gain_db, regress_weight
+from sononerf.errors import ResourceError, SonoNerfError
 from sononerf.field.fitting import FittedField, poses_of, render_poses
 from sononerf.field.range_slices import WholePoses
 from sononerf.head.decibels import compress
@@ -40,17 +39,20 @@ class Traced:
         Level that is added to the traced echoes.
     weight : (F,) float
         Weight of the traced echoes in the mean with the rendered ones, 0 to 1.
+    fault : str
+        Why no echoes can be traced off the surface; empty where they can.
     """
 
     mesh: trimesh.Trimesh
     gain_db: NDArray[np.float64]
     weight: NDArray[np.float64]
+    fault: str = ""
 
     @classmethod
-    def none(cls, mesh: trimesh.Trimesh, head: Head) -> Traced:
+    def none(cls, mesh: trimesh.Trimesh, head: Head, fault: str = "") -> Traced:
         """Return a surface whose traced echoes have no weight."""
         ears, rows = len(head.receivers), len(head.frequency)
-        return cls(mesh, np.zeros((ears, rows)), np.zeros(rows))
+        return cls(mesh, np.zeros((ears, rows)), np.zeros(rows), fault)
 
 
 def learn_traced(
@@ -89,14 +91,18 @@ def learn_traced(
     -------
     traced : Traced
         Of weight zero where there are no validation poses, or nothing can be traced off the
-        surface.
+        surface; ``fault`` then says why.
+
+    Raises
+    ------
+    ResourceError
+        If there is too little memory for it now.
     """
     renderer, reference = fitted.module.renderer, fitted.module.reference
     training = poses_of(echoes, "train", renderer)
     validation = poses_of(echoes, "val", renderer)
-    nothing = Traced.none(mesh, fitted.head)
     if not len(validation):
-        return nothing
+        return Traced.none(mesh, fitted.head, "no pose is for validation")
     numbers = np.linspace(0, len(training) - 1, min(GAIN_POSES, len(training))).astype(int)
     some = training.only(torch.as_tensor(numbers))
     try:
@@ -107,9 +113,11 @@ def learn_traced(
         traced = compress(_trace(simulator, some, seed, progress), reference)
         gain = gain_db(compress(_measured(some), reference), traced)
         traced = _trace(simulator, validation, seed, progress)
+    except ResourceError:
+        raise  # another time there may be more memory
     except SonoNerfError as error:  # some meshes can be drawn but not simulated
         progress.say(f"no echoes are traced off the surface: {error}")
-        return nothing
+        return Traced.none(mesh, fitted.head, str(error))
     traced = compress(traced * 10 ** (gain[:, None] / 20), reference)
     rendered = render_poses(fitted, validation, accelerator=accelerator, progress=progress)
     measured = compress(_measured(validation), reference)
@@ -154,3 +162,90 @@ def _trace(
             traced.append(simulator.spectrogram(place, turn, seed=seed))
             task.advance()
     return np.stack(traced).astype(np.float64)
+
+
+Array = NDArray[np.float64]
+LOUD_DB = 20.0
+"""Cells above this level, in reported decibels, give the gain: fainter ones hold the window's side
+lobes and interference."""
+
+
+def gain_db(measured_db: ArrayLike, traced_db: ArrayLike) -> Array:
+    """Return how much louder each ear measured each frequency than it was traced.
+
+    Parameters
+    ----------
+    measured_db, traced_db : (P, E, R, F) float, dB
+        Reported decibels; 0 dB is silence.
+
+    Returns
+    -------
+    gain : (E, F) float, dB
+        Median over the cells above ``LOUD_DB`` in both; zero where there is none.
+    """
+    measured, traced = (np.asarray(a, dtype=np.float64) for a in (measured_db, traced_db))
+    loud = (measured > LOUD_DB) & (traced > LOUD_DB)
+    apart = measured - traced
+    ears, rows = measured.shape[1], measured.shape[3]
+    gain = np.zeros((ears, rows))
+    for ear, row in np.ndindex(ears, rows):
+        some = loud[:, ear, :, row]
+        if some.any():
+            gain[ear, row] = np.median(apart[:, ear, :, row][some])
+    return gain
+
+
+def mix(rendered_db: ArrayLike, traced_db: ArrayLike, weight: ArrayLike) -> Array:
+    """Return the weighted mean of two predictions in decibels.
+
+    Parameters
+    ----------
+    rendered_db, traced_db : (..., F) float, dB
+        Predictions.
+    weight : (F,) float
+        Weight of the traced one, 0 to 1.
+
+    Returns
+    -------
+    mixed_db : (..., F) float64, dB
+    """
+    first = np.asarray(rendered_db, dtype=np.float64)
+    return first + np.asarray(weight) * (np.asarray(traced_db, dtype=np.float64) - first)
+
+
+def regress_weight(measured_db: ArrayLike, rendered_db: ArrayLike, traced_db: ArrayLike) -> Array:
+    r"""Return the weight of the traced prediction that minimises the error per frequency.
+
+    The weight minimises :math:`\sum |m - r - w (t - r)|` with :math:`0 \le w \le 1` over all
+    cells of a frequency: least absolute deviations, as the reported error is. With one unknown the
+    solution is the median of :math:`(m - r) / (t - r)`, weighted by :math:`|t - r|`.
+
+    Parameters
+    ----------
+    measured_db, rendered_db, traced_db : (..., F) float, dB
+        Of poses that neither prediction was fitted to.
+
+    Returns
+    -------
+    weight : (F,) float
+        0 to 1; zero where both predictions are equal.
+    """
+    measured, rendered, traced = (
+        np.asarray(a, dtype=np.float64) for a in (measured_db, rendered_db, traced_db)
+    )
+    count = measured.shape[-1]
+    wanted = (measured - rendered).reshape(-1, count)
+    apart = (traced - rendered).reshape(-1, count)
+    weights = np.zeros(count)
+    for row in range(count):
+        known = np.abs(apart[:, row]) > 0
+        if known.any():
+            slope = wanted[known, row] / apart[known, row]
+            weights[row] = _weighted_median(slope, np.abs(apart[known, row]))
+    return weights.clip(0.0, 1.0)
+
+
+def _weighted_median(values: Array, weights: Array) -> float:
+    order = values.argsort(kind="stable")
+    total = weights[order].cumsum()
+    return float(values[order][np.searchsorted(total, 0.5 * total[-1])])

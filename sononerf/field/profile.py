@@ -12,8 +12,7 @@ from pydantic import Field as Option
 from torch import Tensor, nn
 
 from sononerf.field.field import Field, lattice_over
-from sononerf.field.range_bins import Deposit, Window
-from sononerf.field.renderer import Possible, Renderer, look_up, tensor
+from sononerf.field.renderer import Deposit, Possible, Renderer, Window, look_up, tensor
 from sononerf.head.head import Head
 
 KERNEL_SKIRT = 31e-6

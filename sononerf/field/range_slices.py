@@ -49,7 +49,7 @@ class PoseReader:
 
     def __init__(self, store: EnsembleStore, memory_bytes: int) -> None:
         self.store = store
-        each = 2 * len(store.range) * len(store.frequency) * 4
+        each = store.receivers * len(store.range) * len(store.frequency) * 4
         self.most = max(1, memory_bytes // each)
         self._kept: OrderedDict[int, Tensor] = OrderedDict()
 

@@ -7,8 +7,6 @@ head to world, ``R = Rz(yaw) Ry(pitch) Rx(roll)``, so positive pitch looks *down
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_cap, fibonacci_sphere
+from sononerf.tables import number_in, read_rows
 
 CSV_COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
 
@@ -186,24 +185,7 @@ def sphere_poses(
 def random_sphere_poses(
     count: int, *, radius: float, aim_jitter: float, generator: np.random.Generator
 ) -> Poses:
-    """Poses as :func:`sphere_poses` makes them, but at uniformly random places.
-
-    Parameters
-    ----------
-    count : int
-        How many; none is allowed.
-    radius : float, m
-        Distance from the origin.
-    aim_jitter : float, rad
-        Standard deviation of the two turns about the head's own y and z axes.
-    generator : numpy.random.Generator
-        Draws places and turns.
-
-    Returns
-    -------
-    poses : Poses
-        Level (roll 0), ``count`` of them.
-    """
+    """Poses at random places of a sphere; parameters and result as :func:`sphere_poses`."""
     places = generator.standard_normal((count, 3))
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     return _aimed(radius * places, aim_jitter, generator)
@@ -220,25 +202,9 @@ def cap_poses(
 ) -> Poses:
     """Poses on a spiral over a cap of a sphere that look at the origin, each a little off.
 
-    Parameters
-    ----------
-    count : int
-        How many.
-    radius : float, m
-        Distance from the origin.
-    axis : (3,) float
-        From the origin to the cap's middle; any length but zero.
-    half_angle : float, rad
-        From the axis to the cap's rim, 0 to pi.
-    aim_jitter : float, rad
-        Standard deviation of the two turns about the head's own y and z axes.
-    generator : numpy.random.Generator
-        Draws the turns.
-
-    Returns
-    -------
-    poses : Poses
-        Level (roll 0), ``count`` of them.
+    ``axis`` (3,), of any length but zero, points from the origin to the middle of the cap, and
+    ``half_angle`` (rad, 0 to pi) is that from the axis to the rim; the others, and the result, as
+    :func:`sphere_poses`.
     """
     spiral = fibonacci_cap(count, axis=axis, half_angle=half_angle, offset=(0.5, 0.0))
     return _aimed(radius * spiral, aim_jitter, generator)
@@ -255,26 +221,9 @@ def random_poses(
 ) -> Poses:
     """Poses at random places between two spheres and within a cone, uniform in volume.
 
-    Parameters
-    ----------
-    count : int
-        How many; none is allowed.
-    radius : (2,) float, m
-        Least and greatest distance from the origin; where they are the same, the places are
-        uniform over a cap of that sphere.
-    axis : (3,) float
-        From the origin along the cone's middle; any length but zero.
-    half_angle : float, rad
-        From the axis to the cone, 0 to pi.
-    aim_jitter : float, rad
-        Standard deviation of the two turns about the head's own y and z axes.
-    generator : numpy.random.Generator
-        Draws places and turns.
-
-    Returns
-    -------
-    poses : Poses
-        Level (roll 0), ``count`` of them; they look at the origin, each a little off.
+    ``radius`` holds the least and the greatest distance from the origin, m; if they are the same,
+    the places are uniform over a cap of that sphere. The others, and the result, as
+    :func:`cap_poses`.
     """
     height, turn, depth = generator.random((3, count))
     # Equal steps along the axis cut a sphere into equal areas; equal steps of r^3, equal volumes.
@@ -307,49 +256,21 @@ def read_pose_csv(path: Path) -> Poses:
         If the file cannot be read, or anything in it is no finite number, naming file, line
         and column.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    try:
-        reader = csv.reader(io.StringIO(text), strict=True)
-        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except csv.Error as error:
-        raise InputError(f"{path}: no CSV table ({error})") from None
-    if not rows:
-        raise InputError(f"{path}: is empty; expected the header {','.join(CSV_COLUMNS)} and poses")
-    header = [cell.strip() for cell in rows[0][1]]
+    header, rows = read_rows(path)
     if sorted(header) != sorted(CSV_COLUMNS):
         raise InputError(
             f"{path}:1: the header is {','.join(header)!r}, expected {','.join(CSV_COLUMNS)}"
         )
-    if len(rows) < 2:
-        raise InputError(f"{path}: no poses below the header")
-    values = np.array([_csv_row(path, line, header, row) for line, row in rows[1:]])
+    values = np.array(
+        [
+            [number_in(path, line, name, cell) for name, cell in zip(header, row, strict=True)]
+            for line, row in rows
+        ]
+    )
     columns = dict(zip(header, values.T, strict=True))
     angles = (np.radians(columns[name]) for name in ("yaw", "pitch", "roll"))
     positions = np.stack([columns[name] for name in ("x", "y", "z")], axis=1)
     return Poses(positions, rotation_from_euler(*angles))
-
-
-def _csv_row(path: Path, line: int, header: list[str], row: list[str]) -> list[float]:
-    if len(row) != len(header):
-        raise InputError(f"{path}:{line}: {len(row)} columns, expected {len(header)}")
-    numbers = []
-    for name, cell in zip(header, row, strict=True):
-        try:
-            number = float(cell)
-        except ValueError:
-            number = math.nan
-        if not math.isfinite(number):
-            raise InputError(
-                f"{path}:{line}: column {name} is {cell!r}, expected a finite number; "
-                "metres and degrees with a decimal point"
-            )
-        numbers.append(number)
-    return numbers
 
 
 def write_pose_csv(poses: Poses) -> str:

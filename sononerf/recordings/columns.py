@@ -17,9 +17,7 @@ A unit is appended to a name with an underscore: ``x_mm``, ``yaw_deg``, ``time_m
 
 from __future__ import annotations
 
-import csv
 import difflib
-import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -30,6 +28,7 @@ from numpy.typing import ArrayLike, NDArray
 from sononerf.echoes.layout import SPLITS
 from sononerf.errors import InputError
 from sononerf.settings.import_schema import LENGTHS, ImportSettings
+from sononerf.tables import number_in, read_rows
 
 Array = NDArray[np.float64]
 
@@ -44,7 +43,6 @@ KINDS = {
 }
 TEXTS = ("file", "split")
 UNITS = {"length": LENGTHS, "angle": ANGLES, "time": TIMES}
-MOST_BYTES = 200_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,55 +201,15 @@ def read_table(path: Path, settings: ImportSettings) -> Columns:
     InputError
         If it cannot be read or anything in it is wrong, naming file, line and column.
     """
-    header, rows = _cells(path)
+    header, rows = read_rows(path)
     numbers: dict[str, list[float]] = {name: [] for name in header if name not in TEXTS}
     texts: dict[str, list[str]] = {name: [] for name in header if name in TEXTS}
     for name in numbers:
         _parted(f"{path}:1", name)
     for line, row in rows:
-        if len(row) != len(header):
-            raise InputError(f"{path}:{line}: {len(row)} columns, expected {len(header)}")
         for name, cell in zip(header, row, strict=True):
             if name in texts:
                 texts[name].append(cell.strip())
             else:
-                numbers[name].append(_number(path, line, name, cell))
+                numbers[name].append(number_in(path, line, name, cell))
     return columns_of(str(path), {**numbers}, settings, texts=texts)
-
-
-def _number(path: Path, line: int, name: str, cell: str) -> float:
-    try:
-        number = float(cell)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        raise InputError(
-            f"{path}:{line}: column {name} is {cell!r}, expected a finite number with a decimal "
-            "point"
-        )
-    return number
-
-
-def _cells(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path}: larger than {MOST_BYTES} bytes; no table of poses")
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from None
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    first = text.partition("\n")[0]
-    separator = max(",;\t", key=first.count)
-    try:
-        reader = csv.reader(io.StringIO(text), delimiter=separator, strict=True)
-        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
-    except csv.Error as error:
-        raise InputError(f"{path}: no CSV table ({error})") from None
-    if len(rows) < 2:
-        raise InputError(f"{path}: holds no poses; expected a header line and one line per ping")
-    header = [cell.strip() for cell in rows[0][1]]
-    double = {name for name in header if header.count(name) > 1}
-    if double:
-        raise InputError(f"{path}:1: column {sorted(double)[0]!r} stands twice")
-    return header, rows[1:]

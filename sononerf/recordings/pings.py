@@ -15,9 +15,9 @@ import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import InputError
-from sononerf.head.inverse_filter import inverse_filter
+from sononerf.head.matched_filter import inverse_filter
 from sononerf.recordings.audio import as_float
-from sononerf.recordings.recording import Recording
+from sononerf.recordings.writer import Recording
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from sononerf.head.decibels import ACTIVE_DB
 from sononerf.head.head import Head
 from sononerf.scene.scene import Scene
 from sononerf.settings import plugins
+from sononerf.settings.loading import faults_of
 from sononerf.settings.schema import Settings
-from sononerf.settings.setting_faults import faults_of
 from sononerf.simulation.simulator import Simulator
 
 
@@ -72,7 +72,7 @@ def region_of(settings: Settings, echoes: Echoes) -> tuple[Tensor, Possible]:
         box = found.box()
 
     def possible(places: Tensor, tolerance: float) -> Tensor:
-        left = found.possible(places.double().cpu().numpy(), tolerance)
+        left = found.possible(places.cpu().double().numpy(), tolerance)
         if not left.any():
             left[:] = True  # the user's own box is kept whole
         return torch.as_tensor(left, device=places.device)

@@ -22,9 +22,9 @@ from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
-from sononerf.run.attached import attach
 from sononerf.run.fitted import Fitted
 from sononerf.run.run_folder import RunFolder
+from sononerf.run.store_settings import attach
 from sononerf.settings.schema import HEAD_SECTIONS, SpectrogramSettings
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.self_calibration import KINDS, Calibration, Calibrator, Estimate, Kind

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from sononerf import storage
 from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.evaluation.baseline import backprojection
-from sononerf.evaluation.difference_of_runs import added_part, compare
+from sononerf.evaluation.prediction import added_part, compare
 from sononerf.field.fitting import render_poses
 from sononerf.field.range_slices import WholePoses
 from sononerf.geometry.poses import Poses
@@ -23,7 +23,7 @@ from sononerf.report.pictures.difference_picture import difference_pngs, overlay
 from sononerf.run.fitted import Fitted, all_poses
 from sononerf.run.run_folder import RunFolder, differing_keys, results_folder
 from sononerf.run.truth import true_mesh
-from sononerf.simulation.pose_sets import TRAIN
+from sononerf.simulation.simulator import TRAIN
 from sononerf.surface.start.volume import Volume, vti_bytes
 
 HEARING = ("air", "ears", "call", "spectrogram")
@@ -99,7 +99,7 @@ def compare_runs(
         )
     folder = output or first / f"compare-{second.resolve().name}"
     with run.locked(folder), results_folder(folder):
-        corners = np.array([one.module.field.region.double().cpu().numpy() for one in runs])
+        corners = np.array([one.module.field.region.cpu().double().numpy() for one in runs])
         box = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
         reference = max(one.module.reference for one in runs)
         poses = _common_poses(runs)
@@ -176,7 +176,7 @@ def _heard(
         roots,
         poses.positions,
         poses.rotations,
-        renderer.range.double().cpu().numpy(),
+        renderer.range.cpu().double().numpy(),
         lower,
         upper,
         float((upper - lower).max()) / VOXELS,

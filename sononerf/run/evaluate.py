@@ -12,7 +12,7 @@ from sononerf.evaluation.registration import Kind
 from sononerf.progress import Progress
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
-from sononerf.run.truth import read_truth, true_mesh, true_scene
+from sononerf.run.truth import read_truth, true_scene
 
 
 def evaluate(
@@ -55,8 +55,9 @@ def evaluate(
     with run.locked():
         if not (run.reconstruction / "mesh.ply").is_file():
             reconstruct(run, progress=progress)
-        true = true_mesh(settings) if truth is None else read_truth(truth)
-        own = truth is None and settings.evaluation.truth is None
+        file = truth or settings.evaluation.truth
+        scene = true_scene(settings) if file is None else None
+        true = read_truth(file) if file is not None else None if scene is None else scene.mesh
         geometry: dict[str, Any] | None = None
         baseline: dict[str, Any] = {"backprojection": None, "voxels": None}
         if true is not None:
@@ -64,7 +65,7 @@ def evaluate(
                 kind = registration or settings.evaluation.registration
                 level = storage.read_json(run.reconstruction / "read_out.json")["level"]
                 laid = Truth(true, run.mesh(), kind)
-                of_mesh = laid.of_reconstruction(true_scene(settings) if own else None)
+                of_mesh = laid.of_reconstruction(scene)
                 geometry = {**of_mesh, "level": level}
                 task.advance()
                 corners = (corner.double().numpy() for corner in fitted.module.field.region)

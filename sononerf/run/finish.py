@@ -6,7 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from sononerf.errors import NumericalError
+from sononerf.errors import NumericalError, ResourceError
 from sononerf.evaluation.traced import Traced, learn_traced
 from sononerf.progress import Progress
 from sononerf.run.evaluate import evaluate
@@ -68,13 +68,19 @@ def _learn_traced(run: RunFolder, accelerator: str, progress: Progress) -> None:
     if settings.prediction.traced == "off":
         traced = Traced.none(mesh, run.fitted.head)
     else:
-        traced = learn_traced(
-            run.fitted,
-            run.echoes,
-            mesh,
-            settings.simulation,
-            seed=settings.fit.seed,
-            accelerator=accelerator,
-            progress=progress,
-        )
+        try:
+            traced = learn_traced(
+                run.fitted,
+                run.echoes,
+                mesh,
+                settings.simulation,
+                seed=settings.fit.seed,
+                accelerator=accelerator,
+                progress=progress,
+            )
+        except ResourceError as error:
+            progress.say(
+                f"no echoes are traced off the surface; the same command tries again: {error}"
+            )
+            return
     run.keep_traced(traced)

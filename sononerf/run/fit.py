@@ -17,18 +17,15 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from sononerf import storage
 from sononerf.callbacks.checkpoint import CheckpointCallback
-from sononerf.callbacks.preview import PreviewCallback
-from sononerf.callbacks.progress_bar import ProgressCallback
-from sononerf.callbacks.spectrogram_images import SpectrogramImages
-from sononerf.callbacks.threads import ThreadsCallback
+from sononerf.callbacks.preview import PreviewCallback, SpectrogramImages
+from sononerf.callbacks.progress_bar import ProgressCallback, ThreadsCallback
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import StoppedError
-from sononerf.field.checkpoint_io import DurableCheckpointIO
+from sononerf.errors import ResourceError, StoppedError
+from sononerf.field.checkpoint_io import DurableCheckpointIO, save_weights
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import FittedField, require_accelerator
 from sononerf.field.fitting import fit as fit_field
-from sononerf.field.weights import save_weights
 from sononerf.progress import Progress
 from sononerf.run.build import (
     check_plugins,
@@ -50,6 +47,9 @@ from sononerf.run.store_settings import with_store
 from sononerf.settings.schema import Settings
 
 WAIT_SECONDS = 0.5
+PATIENCE_SECONDS = 120.0
+"""How long other processes wait for the first one to take the run's folder, s. Importing torch from
+a slow network disk takes a minute."""
 LEAST_STEPS = 60
 """Least steps of an epoch: few poses give a shorter pass, and an epoch is then several passes."""
 
@@ -64,11 +64,24 @@ def follows() -> bool:
     return int(getattr(rank_zero_only, "rank", 0)) > 0
 
 
-def _wait_for_store(settings: Settings) -> EnsembleStore:
-    """Open the ensemble once the first process has sealed it."""
+def _wait_for_store(settings: Settings, folder: Path) -> EnsembleStore:
+    """Open the ensemble once the first process has sealed it.
+
+    Raises
+    ------
+    ResourceError
+        If no process has held the run's folder for ``PATIENCE_SECONDS``.
+    """
     path = store_path(settings, None, None)
     background = background_path(settings)
+    last_held = time.monotonic()
     while not all(_is_sealed(part) for part in (path, background) if part is not None):
+        if storage.is_held(folder):
+            last_held = time.monotonic()
+        if time.monotonic() - last_held > PATIENCE_SECONDS:
+            raise ResourceError(
+                f"{folder}: the first process of this fit does not run; its own output says why"
+            )
         time.sleep(WAIT_SECONDS)
     return open_ensemble(settings, path)
 
@@ -136,7 +149,7 @@ def fit(
     hardware = {"accelerator": accelerator, "devices": devices, "num_nodes": num_nodes}
     if follows():
         # The first process holds the lock, simulates and writes; the others only compute.
-        echoes = Echoes(_wait_for_store(settings), head)
+        echoes = Echoes(_wait_for_store(settings, path), head)
         _fit(settings, run, echoes, hardware, Progress(quiet=True))
         return run
     if overwrite:

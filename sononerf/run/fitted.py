@@ -15,15 +15,15 @@ from numpy.typing import NDArray
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import IncompatibleError, InputError, SettingsError
+from sononerf.field.checkpoint_io import DESCRIPTION_NAME, load_weights
 from sononerf.field.fitting import FittedField
-from sononerf.field.weights import DESCRIPTION_NAME, load_weights
 from sononerf.geometry.poses import Poses
-from sononerf.run.attached import with_attached
 from sononerf.run.build import field_and_renderer, head_of, module_for
 from sononerf.run.simulate import default_store, open_ensemble
+from sononerf.run.store_settings import with_attached
 from sononerf.settings.loading import validate_settings
 from sononerf.settings.schema import Settings
-from sononerf.simulation.pose_sets import ensemble_poses
+from sononerf.simulation.simulator import ensemble_poses
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from sononerf.progress import Progress
 from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses
 from sononerf.recordings.splits import repeats
 from sononerf.report.pictures.ping_picture import pings_png
-from sononerf.run.attached import attach
+from sononerf.run.store_settings import attach
 from sononerf.run.understand import Understood, understand
 from sononerf.settings.schema import HEAD_SECTIONS, CallSettings
 

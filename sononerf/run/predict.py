@@ -132,8 +132,8 @@ def _traced(run: RunFolder, progress: Progress) -> Traced | None:
 
 def _check_poses(poses: Poses, csv: Path | None, fitted: Fitted, progress: Progress) -> None:
     """Refuse poses that can hear nothing of the region; say which lie within it."""
-    lower, upper = (c.double().cpu().numpy() for c in fitted.module.field.region)
-    ranges = fitted.module.renderer.range.double().cpu().numpy()
+    lower, upper = (c.cpu().double().numpy() for c in fitted.module.field.region)
+    ranges = fitted.module.renderer.range.cpu().double().numpy()
     below, above = lower - poses.positions, poses.positions - upper
     with np.errstate(over="ignore"):  # what is too far for a number is too far
         nearest = np.linalg.norm(np.maximum(np.maximum(below, above), 0), axis=1)

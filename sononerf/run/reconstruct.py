@@ -182,6 +182,7 @@ def _refined(
         support=refined.support.round().astype(np.int32),
         refined=refined.kept,
         error_db=refined.error_db if math.isfinite(refined.error_db) else None,
+        faults=refined.faults,
     )
 
 
@@ -206,5 +207,6 @@ def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None) -> Non
             "surface": None if surface.openness is None else surface.openness.kind,
             "refined": surface.refined,
             "validation_error_db": surface.error_db,
+            "faults": list(surface.faults),
         },
     )

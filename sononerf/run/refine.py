@@ -17,12 +17,12 @@ from torch import Tensor
 
 from sononerf import storage
 from sononerf.errors import IncompatibleError
+from sononerf.field.checkpoint_io import model_checksum
 from sononerf.field.fitting import require_accelerator
-from sononerf.field.weights import model_checksum
 from sononerf.progress import Progress
 from sononerf.run.run_folder import RunFolder
 from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine import stages
+from sononerf.surface.refine import descent as stages
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.refinement import (
     STATE_VERSION,

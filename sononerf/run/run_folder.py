@@ -20,9 +20,9 @@ from sononerf import __version__, storage
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import IncompatibleError, InputError
 from sononerf.evaluation.traced import Traced
-from sononerf.field.weights import DESCRIPTION_NAME
-from sononerf.run.attached import attach
+from sononerf.field.checkpoint_io import DESCRIPTION_NAME
 from sononerf.run.fitted import Fitted, echoes_of, load_fitted
+from sononerf.run.store_settings import attach
 from sononerf.run.traced_file import load_traced, save_traced
 from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
 from sononerf.settings.schema import Settings

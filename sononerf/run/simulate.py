@@ -11,22 +11,20 @@ from typing import Any
 import numpy as np
 
 from sononerf import __version__, storage
+from sononerf.echoes.echoes import SubtractedStore
 from sononerf.echoes.store import EnsembleStore
-from sononerf.echoes.subtracted import SubtractedStore
 from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.head.call import call_content
 from sononerf.head.ears import directivity_content
 from sononerf.head.reception import warn_of_call
 from sononerf.progress import Progress
-from sononerf.run.attached import attach
 from sononerf.run.build import head_of
-from sononerf.run.store_settings import complete_store
+from sononerf.run.store_settings import attach, complete_store
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import Settings
 from sononerf.simulation.ensemble import check_poses, check_reach
 from sononerf.simulation.ensemble import simulate as simulate_poses
-from sononerf.simulation.pose_sets import ensemble_poses
-from sononerf.simulation.simulator import VERSION, Simulator
+from sononerf.simulation.simulator import VERSION, Simulator, ensemble_poses
 
 HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")
 

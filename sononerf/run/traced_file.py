@@ -14,7 +14,7 @@ from safetensors import SafetensorError, safe_open
 from sononerf import storage
 from sononerf.errors import InputError
 from sononerf.evaluation.traced import Traced
-from sononerf.field.weights import model_checksum
+from sononerf.field.checkpoint_io import model_checksum
 
 NAME = "traced.safetensors"
 
@@ -26,6 +26,8 @@ def save_traced(path: Path, traced: Traced) -> None:
         "faces": torch.as_tensor(np.array(traced.mesh.faces, dtype=np.int64)),
         "gain_db": torch.as_tensor(traced.gain_db),
         "weight": torch.as_tensor(traced.weight),
+        # Not in the metadata: several entries are written in any order, and the file differs.
+        "fault": torch.tensor(list(traced.fault.encode()), dtype=torch.uint8),
     }
     data = safetensors.torch.save(tensors, metadata={"model": model_checksum(path)})
     storage.commit_bytes(path / NAME, data)
@@ -56,7 +58,9 @@ def load_traced(path: Path) -> Traced | None:
             raise ValueError("weights outside 0 to 1")
         if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
             raise ValueError("a triangle names a vertex that is not there")
-        return Traced(trimesh.Trimesh(vertices, faces, process=False), gain, weight)
+        fault = found["fault"].tobytes().decode() if "fault" in found else ""  # older files
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        return Traced(mesh, gain, weight, fault)
     except (SafetensorError, KeyError, ValueError, OSError) as error:
         raise InputError(
             f"{file}: damaged ({error}); remove it, and `sononerf fit` makes it again"

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import numpy as np
@@ -12,18 +13,23 @@ from sononerf.errors import InputError, SonoNerfError
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import Settings
 
+logger = logging.getLogger("sononerf")
+
 MOST_BYTES = 2_000_000_000
 """A larger file is refused before it is read."""
 KINDS = (".ply", ".stl", ".obj", ".off", ".glb")
 
 
 def true_scene(settings: Settings) -> Scene | None:
-    """Return the scene of a run; None without a scene, or where it is not installed here."""
+    """Return the scene of a run; None without one, and with a warning if it cannot be loaded."""
     if settings.scene is None:
         return None
     try:
         return load_scene(settings.scene.name, settings.scene.options)
-    except SonoNerfError:
+    except SonoNerfError as error:
+        logger.warning(
+            "the true surface is unknown: %s; evaluation.truth=FILE names another file of it", error
+        )
         return None
 
 

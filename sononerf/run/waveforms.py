@@ -16,7 +16,7 @@ from sononerf.run.understand import OWN_SETTINGS
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
 from sononerf.simulation.ensemble import pose_seed
-from sononerf.simulation.pose_sets import ensemble_poses
+from sononerf.simulation.simulator import ensemble_poses
 
 
 def write_waveforms(

@@ -16,7 +16,7 @@ from sononerf.errors import InputError, SettingsError, SonoNerfError
 from sononerf.geometry.faults import surface_faults
 from sononerf.scene.material import MATERIALS, RIGID, Material, MaterialName
 from sononerf.settings import plugins
-from sononerf.settings.setting_faults import faults_of
+from sononerf.settings.loading import faults_of
 
 __all__ = [
     "MATERIALS",

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from sononerf.errors import SettingsError
+from sononerf.settings.loading import describe_faults
 from sononerf.settings.schema import AirSettings, Positive, Seed, Vector
-from sononerf.settings.setting_faults import describe_faults
 
 Matrix = tuple[Vector, Vector, Vector]
 Channels = Annotated[

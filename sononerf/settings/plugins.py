@@ -19,7 +19,7 @@ from pydantic.errors import PydanticUserError
 from pydantic_core import to_jsonable_python
 
 from sononerf.errors import InputError, SettingsError
-from sononerf.settings.setting_faults import describe_faults, refuse_truths
+from sononerf.settings.loading import describe_faults, refuse_truths
 
 SCENES = "sononerf.scenes"
 FIELDS = "sononerf.fields"

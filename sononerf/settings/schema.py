@@ -15,8 +15,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from sononerf.settings.call_presets import CALL_PRESETS
-from sononerf.settings.window_defaults import fft_of, hop_of, window_of
+from sononerf.settings.call_presets import CALL_PRESETS, fft_of, hop_of, window_of
 
 HEAD_SECTIONS = ("air", "ears", "call", "spectrogram")
 """Sections that describe the head: a store and an import state them."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sononerf.geometry.raycast import RayCaster
 from sononerf.scene.scene import Scene
-from sononerf.simulation.arrival import Arrival
+from sononerf.simulation.audibility import Arrival
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.reflection import Reflection, reflection
 

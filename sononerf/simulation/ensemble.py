@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import warnings
 from collections import Counter, deque
@@ -22,6 +21,7 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
 from sononerf.geometry.inside import winding_numbers
 from sononerf.geometry.poses import Poses
+from sononerf.memory import available_cores
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SimulationSettings
@@ -166,7 +166,7 @@ def simulate(
     """
     missing = store.missing()
     if workers is None:
-        cores = min(len(os.sched_getaffinity(0)), MOST_WORKERS)
+        cores = min(available_cores(), MOST_WORKERS)
         alone = simulator.engine.prepares or len(missing) < WORTH_WORKERS
         workers = 1 if alone else cores
     test = store.indices("test")[: options.noise_floor_poses]

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sononerf.geometry.raycast import Hits, RayCaster
+from sononerf.simulation.audibility import RESOLVED_FREQUENCY
 from sononerf.simulation.impulse_response import NODE_SPACING
 from sononerf.simulation.outlines import Outlines
 
-RESOLVED_FREQUENCY = 80e3
-"""Frequency at which shadows are resolved, Hz; near the top of the default band."""
 CELL = 0.25
 """Size of a piece of surface with one obstacle factor, over the root of wavelength times the radius
 of the scene, which is the width of the first Fresnel zone. Finer cells changed little."""

@@ -1,21 +1,34 @@
 # SPDX-License-Identifier: MIT
-"""The echo simulator: a scene, a head, a pose in; what both ears hear out."""
+"""The echo simulator: a scene, a head and poses in, what the receivers hear out."""
 
 from __future__ import annotations
 
 import logging
+import math
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from sononerf.errors import InputError
+from sononerf.geometry.poses import (
+    Poses,
+    cap_poses,
+    random_poses,
+    random_sphere_poses,
+    read_pose_csv,
+    sphere_poses,
+)
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
-from sononerf.settings.schema import SimulationSettings, SpectrogramSettings
-from sononerf.simulation.arrival import silence_before
+from sononerf.settings.schema import PoseSettings, SimulationSettings, SpectrogramSettings
+from sononerf.simulation.audibility import RESOLVED_FREQUENCY, silence_before
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import hearing_of
 from sononerf.simulation.hybrid import hybrid
@@ -27,6 +40,8 @@ from sononerf.simulation.solved import TAPER, Solved
 
 logger = logging.getLogger("sononerf")
 
+COARSE = 1.25
+"""Times ``RESOLVED_FREQUENCY``: bands that end above are warned of. The default band ends there."""
 VERSION = 4  # to be raised when the same settings give other echoes: stores are told apart by it
 
 
@@ -72,6 +87,12 @@ class Simulator:
                     "are left out, simulation.engine=rays has them"
                 )
             return cls(Kirchhoff(scene, hearing, frequency_max=1.1 * analysis.frequency_max))
+        if analysis.frequency_max > COARSE * RESOLVED_FREQUENCY:
+            logger.warning(
+                "spectrogram.frequency_max=%g Hz: simulation.engine=%s resolves edges and shadows "
+                "up to %g Hz; echoes of edges above it are less exact",
+                *(analysis.frequency_max, options.engine, RESOLVED_FREQUENCY),
+            )
         rays: dict[str, Any] = {
             "rays": options.rays,
             "bounces": options.bounces,
@@ -208,3 +229,74 @@ def solved_frequency(wanted: SimulationSettings, analysis: SpectrogramSettings) 
             *(wanted.frequency_max, whole, analysis.frequency_max),
         )
     return wanted.frequency_max
+
+
+TRAIN, VALIDATION, TEST = 0, 1, 2
+
+
+def ensemble_poses(wanted: PoseSettings) -> tuple[Poses, NDArray[np.int8]]:
+    """Poses of an experiment: those to train on, then those for validation, then for the test.
+
+    Each set draws from a generator of its own, so that the number of one does not move another.
+    The poses of a path stay in the order of its table.
+
+    Parameters
+    ----------
+    wanted : PoseSettings
+        Arrangement, numbers and seed.
+
+    Returns
+    -------
+    poses : Poses
+        All of them.
+    split : (P,) int8
+        0 train, 1 validation, 2 test.
+    """
+    if wanted.path is not None:
+        return _path_poses(wanted, wanted.path)
+    train, test = _arrangement(wanted)
+    sets = (
+        (TRAIN, wanted.count, train),
+        (VALIDATION, wanted.validation, test),
+        (TEST, wanted.heldout, test),
+    )
+    made, split = [], []
+    for member, count, draw in sets:
+        jitter = math.radians(wanted.aim_jitter_deg)
+        made.append(draw(count, aim_jitter=jitter, generator=_generator(wanted, member)))
+        split.append(np.full(count, member, dtype=np.int8))
+    positions = np.concatenate([poses.positions for poses in made])
+    rotations = np.concatenate([poses.rotations for poses in made])
+    return Poses(positions, rotations), np.concatenate(split)
+
+
+def _generator(wanted: PoseSettings, member: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence([wanted.seed, member]))
+
+
+def _arrangement(wanted: PoseSettings) -> tuple[Callable[..., Poses], Callable[..., Poses]]:
+    """Return what makes the training poses, and what draws those for validation and test."""
+    radius, axis = wanted.radius, wanted.axis
+    if wanted.arrangement == "sphere":
+        return partial(sphere_poses, radius=radius), partial(random_sphere_poses, radius=radius)
+    angle = math.pi if wanted.half_angle_deg is None else math.radians(wanted.half_angle_deg)
+    distances = radius, wanted.radius_max or radius
+    draw = partial(random_poses, radius=distances, axis=axis, half_angle=angle)
+    if wanted.arrangement == "volume":
+        return draw, draw
+    return partial(cap_poses, radius=radius, axis=axis, half_angle=angle), draw
+
+
+def _path_poses(wanted: PoseSettings, path: Path) -> tuple[Poses, NDArray[np.int8]]:
+    """Read a flight path; its rows for validation and test are drawn at random."""
+    poses = read_pose_csv(path)
+    if len(poses) <= wanted.validation + wanted.heldout:
+        raise InputError(
+            f"{path}: {len(poses)} poses, of which poses.validation takes {wanted.validation} and "
+            f"poses.heldout {wanted.heldout}; none is left to train on"
+        )
+    split = np.full(len(poses), TRAIN, dtype=np.int8)
+    for member, count in ((TEST, wanted.heldout), (VALIDATION, wanted.validation)):
+        order = _generator(wanted, member).permutation(len(poses))
+        split[order[split[order] == TRAIN][:count]] = member
+    return poses, split

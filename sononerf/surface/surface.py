@@ -1,24 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""A reconstructed surface: its mesh, what is known about it, and where it ends."""
+"""A reconstructed surface: its mesh, what is known about it, and where it is open."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError
 
-from sononerf.surface.openness import (
-    Openness,
-    judge_openness,
-    known_part,
-    leaving_out,
-    without_unseen,
-)
+from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.region import ENOUGH
+from sononerf.geometry.raycast import RayCaster
 from sononerf.surface.start.occupancy import QUIET
 from sononerf.surface.start.read_out import FieldReading, Method
-from sononerf.surface.start.reliability import poses_that_heard
+from sononerf.surface.start.reliability import ALIGNED, poses_that_heard
+from sononerf.surface.start.sheet import THIN
 from sononerf.surface.start.volume import Volume
 
 
@@ -44,6 +44,8 @@ class Surface:
         True where the refined mesh explains the validation poses better than its start.
     error_db : float or None, dB
         Objective of the refinement on validation poses; None without a refinement.
+    faults : sequence of str
+        What went wrong in the refinement, one line each.
     """
 
     mesh: trimesh.Trimesh
@@ -54,6 +56,7 @@ class Surface:
     support: NDArray[np.int32] | None = None
     refined: bool = False
     error_db: float | None = None
+    faults: Sequence[str] = ()
 
 
 def finished_surface(
@@ -64,6 +67,7 @@ def finished_surface(
     support: NDArray[np.int32] | None = None,
     refined: bool = False,
     error_db: float | None = None,
+    faults: Sequence[str] = (),
 ) -> Surface:
     """Return the surface of a closed mesh, without the triangles that no pose can have heard.
 
@@ -79,7 +83,7 @@ def finished_surface(
         Evidence that the start was made of.
     support : (V,) int32, optional
         How many poses heard each vertex; counted in the evidence where None.
-    refined, error_db
+    refined, error_db, faults
         As of :class:`Surface`.
     """
     known = reading.gathered
@@ -103,4 +107,145 @@ def finished_surface(
         support=support,
         refined=refined,
         error_db=error_db,
+        faults=faults,
     )
+
+
+Array = NDArray[np.float64]
+FACING = 0.1
+"""Least cosine between a triangle's normal and the way to a pose that it faces."""
+UNSEEN_SHARE = 0.25
+"""Fraction of the area: if more than this cannot have been heard, the surface is one-sided."""
+THIN_SHARE = 0.75
+"""Fraction of the area: if more than this is thin, the surface is a sheet."""
+_LIFT = 1e-3  # of the root of a triangle's area: so far inside the search for the other side begins
+_POSES = 12  # tested at a time for whether they see a triangle, those that it faces best first
+_CHUNK = 4096  # triangles at a time, a bound of memory
+
+
+@dataclass(frozen=True)
+class Openness:
+    """What kind of surface it is.
+
+    Attributes
+    ----------
+    unseen : (T,) bool
+        The triangles that no pose can have heard, or that are unknown, see :func:`known_part`.
+    unseen_share, thin_share : float
+        Fractions of the area: of these triangles; that has the other side close behind it.
+    """
+
+    unseen: NDArray[np.bool_]
+    unseen_share: float
+    thin_share: float
+
+    @property
+    def kind(self) -> Literal["closed", "sheet", "one-sided"]:
+        """A body's skin, a sheet that was heard from both sides, or one side of something."""
+        if self.unseen_share > UNSEEN_SHARE:
+            return "one-sided"
+        return "sheet" if self.thin_share > THIN_SHARE else "closed"
+
+
+def judge_openness(mesh: trimesh.Trimesh, sources: Array, *, resolution: float) -> Openness:
+    """Tell a body's skin from an open surface.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        A closed reconstruction, normals outward, m.
+    sources : (P, 3) float, m
+        Where it was heard from.
+    resolution : float, m
+        Range resolution of the analysis.
+
+    Returns
+    -------
+    openness : Openness
+    """
+    middles = np.asarray(mesh.triangles_center, dtype=np.float64)
+    normals = np.asarray(mesh.face_normals, dtype=np.float64)
+    areas = np.asarray(mesh.area_faces, dtype=np.float64)
+    caster = RayCaster(mesh)
+    unseen = ~_seen(caster, middles, normals, sources)
+    lift = _LIFT * np.sqrt(areas)
+    inward = caster.first_hit(middles - lift[:, None] * normals, -normals)
+    thin = inward.ray[inward.distance + lift[inward.ray] < THIN * resolution]
+    total = areas.sum()
+    return Openness(unseen, float(areas[unseen].sum() / total), float(areas[thin].sum() / total))
+
+
+def _seen(caster: RayCaster, middles: Array, normals: Array, sources: Array) -> NDArray[np.bool_]:
+    seen = np.zeros(len(middles), dtype=bool)
+    for start in range(0, len(middles), _CHUNK):
+        some = slice(start, start + _CHUNK)
+        ways = sources[None] - middles[some, None]
+        ways /= np.linalg.norm(ways, axis=2, keepdims=True)
+        facing = np.einsum("tpi,ti->tp", ways, normals[some])
+        order = np.argsort(-facing, axis=1)
+        left = np.arange(len(facing))
+        for first in range(0, len(sources), _POSES):
+            best = order[left, first : first + _POSES]
+            row, column = np.nonzero(np.take_along_axis(facing[left], best, axis=1) > FACING)
+            if not len(row):
+                break
+            which = start + left[row]
+            tested = sources[best[row, column]]
+            seen[which[caster.visible(middles[which], tested, normals=normals[which])]] = True
+            left = left[~seen[start + left]]
+    return seen
+
+
+def known_part(
+    mesh: trimesh.Trimesh, heard: NDArray[np.int32], hull: EchoHull, *, resolution: float
+) -> NDArray[np.bool_]:
+    """Tell which part of a surface that was heard from one side is known.
+
+    That is what two poses heard. Between such places a triangle is also known if it lies where the
+    onsets end. Between them is in their convex hull, or as little out of it as one smooth surface
+    may be. Where the onsets end is no deeper than a range resolution behind one of them.
+
+    Parameters
+    ----------
+    mesh : Trimesh
+        m.
+    heard : (V,) int32
+        How many poses heard the surface around each vertex, see
+        :func:`~sononerf.surface.start.reliability.poses_that_heard`.
+    hull : EchoHull
+        The onsets.
+    resolution : float, m
+        Range resolution of the analysis.
+
+    Returns
+    -------
+    known : (T,) bool
+    """
+    middles = np.asarray(mesh.triangles_center, dtype=np.float64)
+    bounded = hull.clearance(middles)[0] < resolution
+    enough = heard >= min(ENOUGH, int(heard.max(initial=0)))
+    if not heard.any():
+        return np.asarray(bounded)
+    places = np.asarray(mesh.vertices)[enough]
+    try:
+        planes = ConvexHull(places).equations
+    except (QhullError, ValueError):  # too few, or all in one plane
+        return np.asarray(enough[mesh.faces].any(axis=1))
+    between = np.ones(len(middles), dtype=bool)
+    for plane in planes:
+        between &= middles @ plane[:3] + plane[3] <= ALIGNED * resolution
+    return np.asarray(enough[mesh.faces].any(axis=1) | (between & bounded))
+
+
+def leaving_out(openness: Openness, unknown: NDArray[np.bool_], areas: Array) -> Openness:
+    """Return the openness with triangles (T,) of these areas among the unseen ones."""
+    unseen = openness.unseen | unknown
+    share = float(areas[unseen].sum() / areas.sum())
+    return replace(openness, unseen=unseen, unseen_share=share)
+
+
+def without_unseen(mesh: trimesh.Trimesh, openness: Openness) -> trimesh.Trimesh:
+    """Return the mesh without the triangles that no pose can have heard."""
+    kept = trimesh.Trimesh(mesh.vertices.copy(), mesh.faces[~openness.unseen].copy(), process=False)
+    kept.remove_unreferenced_vertices()
+    return kept

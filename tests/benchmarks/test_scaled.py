@@ -14,7 +14,7 @@ from sononerf.run.build import simulator_of
 from sononerf.run.simulate import _attributes, echo_hash, simulate
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
-from sononerf.simulation.pose_sets import ensemble_poses
+from sononerf.simulation.simulator import ensemble_poses
 from tools.benchmarks.experiment import CONFIG
 from tools.benchmarks.scaled import UNSCALED, scaled_settings, scaled_store
 

@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sononerf.callbacks import spectrogram_images as images_module
-from sononerf.callbacks.spectrogram_images import SpectrogramImages
+from sononerf.callbacks import preview as images_module
+from sononerf.callbacks.preview import SpectrogramImages
 
 
 def callback(made, poses=None):

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sononerf.echoes.extent import echo_extent
+from sononerf.echoes.region import echo_extent
 
 AXIS = 0.2 + 0.001 * np.arange(600)
 LOOKS = 4.0

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sononerf.evaluation.mixture import gain_db, mix, regress_weight
+from sononerf.evaluation.traced import gain_db, mix, regress_weight
 
 SHAPE = (3, 2, 20, 5)  # poses, ears, ranges, frequencies
 OFFSETS = np.array([[-3.0, -0.25, 0.0, 1.5, 4.0], [1.0, 2.0, -1.0, 0.5, -4.0]])  # per ear

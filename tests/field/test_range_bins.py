@@ -4,7 +4,7 @@ import math
 import pytest
 import torch
 
-from sononerf.field.range_bins import Deposit, Window, _band
+from sononerf.field.renderer import Deposit, Window, _band
 
 
 def test_gradients_of_the_deposit_where_some_places_lie_outside_the_bins():

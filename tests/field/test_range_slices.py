@@ -190,6 +190,28 @@ def test_memory_is_bounded_and_the_longest_unused_goes_first(store, monkeypatch)
     assert small[4] is small[4]
 
 
+def test_memory_is_bounded_for_any_number_of_receivers(tmp_path):
+    ears = 16
+    store = EnsembleStore.create(
+        tmp_path / "store",
+        poses_positions=np.zeros((4, 3)),
+        poses_rotations=np.zeros((4, 3, 3)),
+        split=np.zeros(4, int),
+        range=0.2 + 0.01 * np.arange(RANGES),
+        frequency=1e4 * (1 + np.arange(FREQUENCIES)),
+        attributes={"echo_hash": "a"},
+        receivers=ears,
+    )
+    for pose in range(4):
+        store.write_pose(pose, np.ones((ears, RANGES, FREQUENCIES)))
+    store.seal()
+    reader = PoseReader(store, 2 * ears * RANGES * FREQUENCIES * 4)
+    first = reader[0]
+    assert reader[0] is first
+    assert [reader[pose] for pose in (1, 2)]
+    assert reader[0] is not first
+
+
 def test_whole_poses_with_and_without_measurements(store):
     positions, rotations = torch.rand(2, 3), torch.rand(2, 3, 3)
     given = WholePoses(positions, rotations, RANGES, FREQUENCIES)

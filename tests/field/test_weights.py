@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sononerf.errors import IncompatibleError, InputError
-from sononerf.field.weights import DESCRIPTION_NAME, WEIGHTS_NAME, load_weights, save_weights
+from sononerf.field.checkpoint_io import DESCRIPTION_NAME, WEIGHTS_NAME, load_weights, save_weights
 
 STATE = {"grid": torch.arange(6.0).reshape(2, 3).T, "bias": torch.ones(2, dtype=torch.complex64)}
 

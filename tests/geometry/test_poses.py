@@ -173,11 +173,11 @@ def test_table_is_in_degrees_in_any_order_of_columns(tmp_path):
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("", r"poses\.csv: is empty; expected the header x,y,z,yaw,pitch,roll and poses$"),
-        (" ,\n\n", r"poses\.csv: is empty"),
-        ("a,b\n", r"poses\.csv:1: the header is 'a,b', expected x,y,z,yaw,pitch,roll$"),
+        ("", r"poses\.csv: holds no poses; expected a header line and one line per pose$"),
+        (" ,\n\n", r"poses\.csv: holds no poses"),
+        ("a,b\n1,2\n", r"poses\.csv:1: the header is 'a,b', expected x,y,z,yaw,pitch,roll$"),
         ("x,y,z,yaw,pitch\n1,2,3,4,5\n", r"poses\.csv:1: the header"),
-        ("x,y,z,yaw,pitch,roll\n", "no poses"),
+        ("x,y,z,yaw,pitch,roll\n", "holds no poses"),
         ("x,y,z,yaw,pitch,roll\n0,0,0,0,0,0\n0,nan,0,0,0,0\n", r"poses\.csv:3: column y is 'nan'"),
         ("x,y,z,yaw,pitch,roll\n0,0,0,left,0,0\n", r"poses\.csv:2: column yaw is 'left'"),
         ("x,y,z,yaw,pitch,roll\n0,0,0,0,0\n", r"poses\.csv:2: 5 columns, expected 6"),

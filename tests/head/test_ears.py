@@ -6,7 +6,7 @@ from scipy.interpolate import RegularGridInterpolator
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.call import call_waveform, sweep_delay
-from sononerf.head.directivity.sofa_writer import write_sofa
+from sononerf.head.directivity.sofa import write_sofa
 from sononerf.head.ears import (
     Ears,
     analysed_ears,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sononerf.head.call import call_waveform
-from sononerf.head.inverse_filter import inverse_filter
+from sononerf.head.matched_filter import inverse_filter
 from sononerf.settings.schema import CallSettings
 
 RATE = 500e3

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.recordings.hdf5 import numbers, opened
+from sononerf.recordings.matlab import numbers, opened
 
 
 def read(path, name):

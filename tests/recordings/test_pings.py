@@ -11,7 +11,7 @@ import pytest
 from sononerf.errors import InputError
 from sononerf.recordings.columns import Columns
 from sononerf.recordings.pings import Clipping, Cutter, check_numbers, clipped_pings, cut, mix
-from sononerf.recordings.recording import Recording
+from sononerf.recordings.writer import Recording
 
 RATE = 1e5
 

@@ -6,8 +6,7 @@ import pytest
 import trimesh
 
 from sononerf.errors import NumericalError
-from sononerf.report.confidence import confidence_colours, linear_light
-from sononerf.report.mesh_files import mesh_bytes
+from sononerf.report.mesh_files import confidence_colours, linear_light, mesh_bytes
 
 
 @pytest.mark.parametrize("file_type", ["ply", "stl", "glb"])

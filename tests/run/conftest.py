@@ -8,7 +8,7 @@ import shutil
 
 import pytest
 
-from sononerf.callbacks import spectrogram_images
+from sononerf.callbacks import preview as spectrogram_images
 from sononerf.head import head as head_module
 from sononerf.run import reconstruct as reconstruct_module
 from sononerf.run.fit import fit

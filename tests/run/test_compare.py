@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from sononerf.errors import IncompatibleError, InputError, SettingsError
-from sononerf.field.weights import load_weights, save_weights
+from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.progress import Progress
 from sononerf.run.compare import compare_runs
 from sononerf.settings.loading import validate_settings

@@ -12,10 +12,10 @@ import safetensors.torch
 import trimesh
 
 from sononerf import storage
-from sononerf.errors import LockedError, NumericalError
+from sononerf.errors import LockedError, NumericalError, ResourceError
 from sononerf.evaluation import baseline
 from sononerf.evaluation import geometry as geometry_module
-from sononerf.field.weights import load_weights, save_weights
+from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.progress import Progress
 from sononerf.run import finish as finish_module
 from sononerf.run import fitted as fitted_module
@@ -167,6 +167,22 @@ def test_a_surface_that_cannot_be_traced_is_told_and_no_fault(run, steps, monkey
     finish_module._learn_traced(opened, "cpu", progress)
     assert any(text.startswith("no echoes are traced off the surface: ") for text in progress.said)
     assert not opened.traced().weight.any()
+
+
+def test_too_little_memory_to_trace_is_told_and_tried_again(run, steps, monkeypatch):
+    def lack(*given, **options):
+        raise ResourceError("too little memory")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(finish_module, "learn_traced", lack)
+        progress = Heard()
+        finish(run, progress=progress)
+    assert any("tries again: too little memory" in text for text in progress.said)
+    assert not RunFolder(run).is_finished
+    steps.clear()
+    finish(run)
+    assert steps[0] == "traced"
+    assert RunFolder(run).is_finished
 
 
 def test_one_call_loads_field_and_echoes_once(run, no_projections, monkeypatch):

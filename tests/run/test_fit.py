@@ -9,6 +9,7 @@ import json
 import os
 import signal
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ import pytest
 import safetensors.torch
 import torch
 import trimesh
+from lightning.fabric.utilities.rank_zero import rank_zero_only
 
 from sononerf import storage
 from sononerf.callbacks.checkpoint import SIGNALS, CheckpointCallback
@@ -35,7 +37,7 @@ from sononerf.errors import (
 from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.fitting import require_accelerator
 from sononerf.field.module import EchoModule
-from sononerf.head.directivity.sofa_writer import write_sofa
+from sononerf.head.directivity.sofa import write_sofa
 from sononerf.progress import Progress
 from sononerf.run import fit as fit_module
 from sononerf.run.build import head_of
@@ -451,6 +453,21 @@ def test_a_gpu_that_is_not_there(tiny, tmp_path, monkeypatch):
         fit(tiny(), tmp_path / "run", accelerator="gpu")
     assert not (tmp_path / "run").exists()
     require_accelerator("auto")
+
+
+def test_a_process_does_not_wait_for_a_first_one_that_does_not_run(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(rank_zero_only, "rank", 1)
+    monkeypatch.setattr(fit_module, "PATIENCE_SECONDS", 1.0)
+    settings = tiny(data={"store": str(tmp_path / "never")})
+    began = time.monotonic()
+    with storage.lock(tmp_path / "run"), ThreadPoolExecutor() as pool:
+        waiting = pool.submit(fit, settings, tmp_path / "run", accelerator="cpu")
+        time.sleep(2.0)
+        assert not waiting.done()
+        (tmp_path / "run" / ".lock").unlink()
+        with pytest.raises(ResourceError, match="first process of this fit does not run"):
+            waiting.result(timeout=30.0)
+    assert time.monotonic() - began > 2.5
 
 
 def test_memory_is_counted_in_bytes():

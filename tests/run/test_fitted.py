@@ -14,8 +14,8 @@ import torch
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
+from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.field.fitting import poses_of, render_poses
-from sononerf.field.weights import load_weights, save_weights
 from sononerf.progress import Progress
 from sononerf.run.build import head_of
 from sononerf.run.fit import fit

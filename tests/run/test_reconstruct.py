@@ -18,8 +18,8 @@ from sononerf.run import reconstruct as reconstruct_module
 from sononerf.run.fitted import load_fitted
 from sononerf.run.reconstruct import reconstruct
 from sononerf.surface import surface as surface_module
-from sononerf.surface.openness import Openness
 from sononerf.surface.start import read_out as read_out_module
+from sononerf.surface.surface import Openness
 
 
 def read_out(folder):

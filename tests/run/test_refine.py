@@ -21,10 +21,10 @@ from sononerf.run.refine import STATE, refine_surface
 from sononerf.run.run_folder import RunFolder
 from sononerf.storage import read_json
 from sononerf.surface.refine import comparison as core
+from sononerf.surface.refine import descent as stages
 from sononerf.surface.refine import refinement as refinement_module
-from sononerf.surface.refine import stages
+from sononerf.surface.refine.descent import Stage
 from sononerf.surface.refine.refinement import Refinement
-from sononerf.surface.refine.stages import Stage
 
 QUIET = Progress(quiet=True)
 BUMPY = trimesh.creation.icosphere(subdivisions=3, radius=0.0205)

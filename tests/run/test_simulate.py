@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from sononerf.echoes.echoes import SubtractedStore
 from sononerf.echoes.store import EnsembleStore
-from sononerf.echoes.subtracted import SubtractedStore
 from sononerf.errors import (
     IncompatibleError,
     InputError,
@@ -22,7 +22,7 @@ from sononerf.errors import (
     NumericalError,
     SettingsError,
 )
-from sononerf.head.directivity.sofa_writer import write_sofa
+from sononerf.head.directivity.sofa import write_sofa
 from sononerf.run import simulate as simulate_module
 from sononerf.run.simulate import (
     background_path,

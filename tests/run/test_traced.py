@@ -17,10 +17,9 @@ import trimesh
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError
 from sononerf.evaluation import traced as traced_module
-from sononerf.evaluation.mixture import mix
-from sononerf.evaluation.traced import Traced
+from sononerf.evaluation.traced import Traced, mix
+from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.field.fitting import poses_of, render_poses
-from sononerf.field.weights import load_weights, save_weights
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.run import finish as finish_module
@@ -274,8 +273,11 @@ def test_a_surface_that_the_simulator_refuses_is_told_and_not_traced(run, believ
     assert line.startswith("no echoes are traced off the surface: the mesh is ")
     assert words in line
     assert "\n" not in line
-    assert not load_traced(run).weight.any()
+    kept = load_traced(run)
+    assert not kept.weight.any()
+    assert words in kept.fault
     predict(run, accelerator="cpu")
+    assert RunFolder(run).read_metrics()["prediction"]["traced_fault"] == kept.fault
 
 
 def test_a_mesh_that_is_gone_or_damaged_is_an_error(run):

@@ -22,6 +22,18 @@ def test_without_scene_and_file_there_is_no_truth(tiny, echoes):
     assert true_mesh(tiny().model_copy(update={"scene": None})) is None
 
 
+def test_a_scene_whose_file_has_moved_is_told(tiny, tmp_path, caplog):
+    file = tmp_path / "mug.stl"
+    trimesh.creation.box((0.1, 0.2, 0.3)).export(file)
+    settings = tiny(scene={"name": "mesh", "options": {"path": str(file), "unit": "m"}})
+    assert true_mesh(settings) is not None
+    file.unlink()
+    assert true_mesh(settings) is None
+    assert "the true surface is unknown: " in caplog.text
+    assert str(file) in caplog.text
+    assert "evaluation.truth=FILE" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("name", "content", "says"),
     [

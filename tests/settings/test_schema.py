@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 
 from sononerf.errors import SettingsError
-from sononerf.settings import loading, setting_faults
+from sononerf.settings import loading
 from sononerf.settings.loading import apply_override, load_settings, read_yaml, validate_settings
 from sononerf.settings.schema import Settings
 
@@ -67,10 +67,10 @@ def test_settings_know_their_file_and_are_the_same_from_another(write):
 
 
 def test_later_faults_name_the_file():
-    with pytest.raises(SettingsError) as caught, setting_faults.faults_of("mine.yaml"):
+    with pytest.raises(SettingsError) as caught, loading.faults_of("mine.yaml"):
         raise SettingsError("one\ntwo")
     assert str(caught.value) == "mine.yaml: one\nmine.yaml: two"
-    with pytest.raises(SettingsError, match=r"^one$"), setting_faults.faults_of(None):
+    with pytest.raises(SettingsError, match=r"^one$"), loading.faults_of(None):
         raise SettingsError("one")
 
 

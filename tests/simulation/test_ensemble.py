@@ -16,7 +16,7 @@ from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
 from sononerf.simulation import ensemble
 from sononerf.simulation.ensemble import check_poses, check_reach, pose_seed, simulate_ensemble
-from sononerf.simulation.pose_sets import ensemble_poses
+from sononerf.simulation.simulator import ensemble_poses
 
 
 def settings(**sections):

@@ -12,7 +12,7 @@ from sononerf.errors import SettingsError
 from sononerf.geometry.poses import look_at, rotation_from_euler
 from sononerf.head.air import air_absorption
 from sononerf.head.decibels import compress
-from sononerf.head.directivity.sofa_writer import write_sofa
+from sononerf.head.directivity.sofa import write_sofa
 from sononerf.run.build import simulator_of
 from sononerf.scene.material import RIGID, Material
 from sononerf.scene.scene import Scene, load_scene
@@ -316,6 +316,13 @@ def test_settings_of_the_rays_go_through():
 def test_kirchhoff_says_that_it_leaves_lobes_out(material, lines, caplog):
     simulator(load_scene("sphere", {"material": material}), simulation={"engine": "kirchhoff"})
     assert len([r for r in caplog.records if "lobes are left out" in r.getMessage()]) == lines
+
+
+@pytest.mark.parametrize(("highest", "lines"), [(100e3, 0), (150e3, 1)])
+def test_a_band_above_the_resolved_frequency_is_told(highest, lines, caplog):
+    band = {"frequency_max": highest, "frequency_min": 10e3}
+    simulator(load_scene("sphere"), simulation={"engine": "rays"}, spectrogram=band)
+    assert len([r for r in caplog.records if "up to 80000 Hz" in r.getMessage()]) == lines
 
 
 def test_each_of_many_receivers_hears_as_it_does_alone():

@@ -13,8 +13,10 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.field.fourier import FourierField
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.lattice import Lattice
-from sononerf.surface import openness, surface
-from sononerf.surface.openness import (
+from sononerf.surface import surface
+from sononerf.surface.start import read_out
+from sononerf.surface.start.evidence import Evidence
+from sononerf.surface.surface import (
     FACING,
     THIN,
     Openness,
@@ -22,8 +24,6 @@ from sononerf.surface.openness import (
     leaving_out,
     without_unseen,
 )
-from sononerf.surface.start import read_out
-from sononerf.surface.start.evidence import Evidence
 
 RADIUS, DISTANCE, RESOLUTION = 0.02, 0.4, 0.006
 THINNEST = THIN * RESOLUTION
@@ -32,7 +32,7 @@ WALL = 0.05
 
 
 def judge_openness(mesh, sources, resolution=RESOLUTION):
-    return openness.judge_openness(mesh, sources, resolution=resolution)
+    return surface.judge_openness(mesh, sources, resolution=resolution)
 
 
 def sphere():
@@ -204,7 +204,7 @@ def test_a_pit_that_no_pose_looks_into_was_not():
 
 def test_pieces_of_the_work_change_nothing(monkeypatch):
     whole = judge_openness(sphere(), cap())
-    monkeypatch.setattr(openness, "_CHUNK", 777)
+    monkeypatch.setattr(surface, "_CHUNK", 777)
     pieces = judge_openness(sphere(), cap())
     np.testing.assert_array_equal(pieces.unseen, whole.unseen)
 

@@ -13,7 +13,7 @@ from sononerf.run.build import simulator_of
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
 from sononerf.simulation.ensemble import pose_seed
-from sononerf.simulation.pose_sets import ensemble_poses
+from sononerf.simulation.simulator import ensemble_poses
 
 
 def cost(arguments: argparse.Namespace) -> dict[str, Any]:

@@ -34,7 +34,7 @@ def _heard(scene: str, engine: str, poses: int) -> dict[str, Any]:
     from sononerf.scene.scene import load_scene
     from sononerf.settings.loading import validate_settings
     from sononerf.simulation.ensemble import pose_seed
-    from sononerf.simulation.pose_sets import ensemble_poses
+    from sononerf.simulation.simulator import ensemble_poses
 
     data = SETTINGS | {"scene": {"name": scene}, "simulation": {"engine": engine}}
     settings = validate_settings(data, "benchmark exact")

@@ -11,7 +11,7 @@ from sononerf.head.spectrogram import frequency_axis, range_axis
 from sononerf.run.simulate import HASHED_SECTIONS, echo_hash
 from sononerf.scene.scene import load_scene
 from sononerf.settings.schema import Settings
-from sononerf.simulation.pose_sets import ensemble_poses
+from sononerf.simulation.simulator import ensemble_poses
 
 UNSCALED = ("ears.notch_depth=0",)
 """The ears' notch is at frequencies that no setting changes, so neither world has it."""

@@ -19,7 +19,7 @@ from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import validate_settings
 from sononerf.settings.schema import Settings
 from sononerf.simulation.ensemble import pose_seed
-from sononerf.simulation.pose_sets import ensemble_poses
+from sononerf.simulation.simulator import ensemble_poses
 
 REFERENCE_RATIO = 1e-3  # the reported decibels start 60 dB below the greatest magnitude
 

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.evaluation.difference_of_runs import Comparison
+from sononerf.evaluation.prediction import Comparison
 from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
 from sononerf.report.pictures.mesh_picture import mesh_png
 from sononerf.report.pictures.mip_picture import maximum_intensity_projections

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sononerf.errors import NumericalError
-from sononerf.report.confidence import MANY_POSES, confidence_colours
+from sononerf.report.mesh_files import MANY_POSES, confidence_colours
 from sononerf.report.pictures.figure import png_from_pixels
 from sononerf.report.pictures.shading import (
     DEFAULT_VIEW,

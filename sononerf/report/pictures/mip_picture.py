@@ -112,7 +112,7 @@ def mip_image(
 
 
 def mip_pngs(volume: Volume, *, scale: Scale = "db") -> dict[str, bytes]:
-    """Draw a volume's three projections, named by the axis looked along: ``"x"``, ``"y"``, ``"z"``."""
+    """Draw a volume's three projections, named by the axis looked along: "x", "y" and "z"."""
     edges = [
         (float(axis[0] - volume.spacing / 2), float(axis[-1] + volume.spacing / 2))
         for axis in volume.axes()

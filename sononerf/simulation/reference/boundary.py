@@ -21,8 +21,8 @@ from sononerf.simulation.reference.boundary_mesh import (
     expected_vertices,
     suited,
 )
+from sononerf.simulation.reference.boundary_near import Panels
 from sononerf.simulation.reference.boundary_operators import Operators, coupling
-from sononerf.simulation.reference.boundary_panels import Panels
 from sononerf.simulation.solved import LONGEST, Heads, Solved
 
 logger = logging.getLogger("sononerf")

@@ -22,8 +22,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array, hstack
 
-from sononerf.simulation.reference.boundary_near import corrections
-from sononerf.simulation.reference.boundary_panels import Panels
+from sononerf.simulation.reference.boundary_near import Panels, corrections
 
 BLOCK = 1 << 21  # entries of the kernel at a time
 

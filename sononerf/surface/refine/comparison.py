@@ -11,7 +11,6 @@ import trimesh
 from numpy.typing import NDArray
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.errors import SonoNerfError
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.surface.refine.descent import ONSETS
 from sononerf.surface.refine.later_bounces import Tracer
@@ -53,7 +52,7 @@ class Comparison:
         self.poses = echoes.validation[chosen.astype(np.int64)]
 
     def objective(self, mesh: trimesh.Trimesh, level: Level, *, smooth: bool) -> float:
-        """Return how badly a surface explains what was heard, dB; infinite if it cannot be traced.
+        """Return how badly a surface explains what was heard, dB; infinite if all poses are silent.
 
         Parameters
         ----------
@@ -63,19 +62,21 @@ class Comparison:
             Its gains are applied.
         smooth : bool
             Whether the vertices lie on a smooth surface, and coarse triangles may be divided.
+
+        Raises
+        ------
+        SonoNerfError
+            If no echoes can be traced off the surface.
         """
         gain = level.gain.exp().cpu().numpy()[:, None]
         positions, rotations = self.echoes.positions, self.echoes.rotations
-        try:
-            if smooth:
-                mesh, _ = finer(mesh, np.zeros(len(mesh.vertices)), self.optics.wavelength)
-            tracer = Tracer(self.optics, mesh, rays=RAYS, seed=self.seed)
-            rendered = [
-                gain * tracer.spectrogram(positions[pose], rotations[pose])
-                for pose in self.poses.tolist()
-            ]
-        except SonoNerfError:
-            return math.inf
+        if smooth:
+            mesh, _ = finer(mesh, np.zeros(len(mesh.vertices)), self.optics.wavelength)
+        tracer = Tracer(self.optics, mesh, rays=RAYS, seed=self.seed)
+        rendered = [
+            gain * tracer.spectrogram(positions[pose], rotations[pose])
+            for pose in self.poses.tolist()
+        ]
         heard = [self.echoes.magnitude(pose).numpy() for pose in self.poses.tolist()]
         weights = [math.sqrt(float(one.max())) for one in heard]
         if not sum(weights) > 0:

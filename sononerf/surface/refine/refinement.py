@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -18,14 +20,15 @@ from sononerf.errors import SonoNerfError
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.comparison import Comparison
 from sononerf.surface.refine.correction import Correction
-from sononerf.surface.refine.descent import Descent, poses_that_hear
+from sononerf.surface.refine.descent import SHARP, STAGES, Descent, Stage, poses_that_hear
 from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.onset_ranges import OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.remesh import finer, remesh
-from sononerf.surface.refine.stages import SHARP, STAGES, Stage
 from sononerf.surface.start.read_out import StartMethod
+
+logger = logging.getLogger("sononerf")
 
 SIMULATED = 96
 """Training poses for which a surface is simulated; each is drawn about three times."""
@@ -33,7 +36,7 @@ Simulate = Callable[[trimesh.Trimesh], Simulator]
 TOLERATED = 1.15
 """Objectives of validation poses that differ by less than this factor differ by chance. A later
 stage, and a sheet, are preferred up to it."""
-STATE_VERSION = 1
+STATE_VERSION = 2
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
 Way = Literal["blurred", "sharp", "sheet"]
 """How a surface goes through the stages: with the blur and the edges of each stage; without blur on
@@ -62,6 +65,9 @@ class Refined:
     history : list of dict
         Per stage: its number, its way, the mismatch of its last step, and the objective on
         validation poses after it.
+    faults : list of str
+        What went wrong on the way, one line each: a surface that could not be traced and counted
+        as the worst, or a stage that went without the simulator's correction.
     """
 
     mesh: trimesh.Trimesh
@@ -71,6 +77,7 @@ class Refined:
     kept: bool
     error_db: float
     history: list[dict[str, Any]]
+    faults: list[str]
 
 
 def refine(
@@ -162,6 +169,7 @@ class Refinement:
         self.ways = _ways(meshes)
         self.way = self.ways[0]
         self.history: list[dict[str, Any]] = []
+        self.faults: list[str] = []
         self._rivals: list[trimesh.Trimesh] = []  # what the first stage made in each way
         self._descent: Descent | None = None
         self._later: LaterBounces | None = None
@@ -202,7 +210,7 @@ class Refinement:
         """End a stage; the first one is done in each way."""
         assert self._descent is not None
         mesh, self._descent, self.step = self._descent.mesh(), None, 0
-        objective = self.comparison.objective(mesh, self.level, smooth=True)
+        objective = self._objective(mesh, f"the surface of stage {self.stage}", smooth=True)
         self.history.append(
             {
                 "stage": self.stage,
@@ -239,9 +247,26 @@ class Refinement:
 
     def _begin(self, names: list[StartMethod]) -> None:
         meshes = [self.starts[name] for name in names]
-        found = [self.comparison.objective(mesh, self.level, smooth=False) for mesh in meshes]
+        found = [
+            self._objective(mesh, f"the start {name}", smooth=False)
+            for name, mesh in zip(names, meshes, strict=True)
+        ]
         best = int(np.argmin(found))
         self.start, self.candidates, self.objectives = names[best], [meshes[best]], [found[best]]
+
+    def _objective(self, mesh: trimesh.Trimesh, name: str, *, smooth: bool) -> float:
+        """Return the objective of a surface; infinite if it cannot be traced."""
+        try:
+            return self.comparison.objective(mesh, self.level, smooth=smooth)
+        except SonoNerfError as error:
+            self._note(f"{name} cannot be compared and counts as the worst: {error}")
+            return math.inf
+
+    def _note(self, fault: str) -> None:
+        """Record a fault, and warn of it once."""
+        if fault not in self.faults:
+            self.faults.append(fault)
+            logger.warning("%s", fault)
 
     def _descend(self, mesh: trimesh.Trimesh) -> Descent:
         stage = self.stages[self.stage]
@@ -279,7 +304,8 @@ class Refinement:
         try:
             simulator = self.simulate(fine)
             return Correction(self.optics, mesh, simulator, self.echoes, numbers, seed=self.seed)
-        except SonoNerfError:
+        except SonoNerfError as error:
+            self._note(f"stage {self.stage} goes without the simulator's correction: {error}")
             return None
 
     def state(self) -> dict[str, Tensor]:
@@ -296,6 +322,7 @@ class Refinement:
                 ],
                 dtype=torch.float64,
             ).reshape(-1, 4),
+            "faults": torch.tensor(list("\n".join(self.faults).encode()), dtype=torch.uint8),
             **{f"level.{name}": part for name, part in self.level.state().items()},
         }
         meshes = {f"candidate.{number}": mesh for number, mesh in enumerate(self.candidates)}
@@ -325,6 +352,7 @@ class Refinement:
             }
             for stage, way, mismatch, objective in state["history"].tolist()
         ]
+        self.faults = bytes(state["faults"].tolist()).decode().splitlines()
         self.level.load({name: state[f"level.{name}"] for name in self.level.state()})
         self.candidates, self._rivals = _meshes(state, "candidate"), _meshes(state, "rival")
         self._later, self._descent = None, None
@@ -342,13 +370,14 @@ class Refinement:
         better = [n for n, found in enumerate(self.objectives) if found < self.objectives[0]]
         best = max([n for n in better if self.objectives[n] <= good], default=0)
         mesh = self.candidates[best]
-        support = poses_that_hear(mesh, self.echoes, self.optics).double().cpu().numpy()
+        support = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
         if best:
             mesh, support = finer(mesh, support, self.optics.wavelength)
-        gain = self.level.gain.exp().double().cpu().numpy()
+        gain = self.level.gain.exp().cpu().double().numpy()
         assert self.start is not None
         error = self.objectives[best]
-        return Refined(mesh, gain, support, self.start, best > 0, error, self.history)
+        kept = best > 0
+        return Refined(mesh, gain, support, self.start, kept, error, self.history, self.faults)
 
 
 def _meshes(state: dict[str, Tensor], name: str) -> list[trimesh.Trimesh]:

@@ -15,11 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import sparse
+from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from sononerf.field.field import Field
+from sononerf.geometry.lattice import Grid
 
 Array = NDArray[np.float64]
 SHARED = 1.6
@@ -90,7 +91,7 @@ def locate_sound(
         Empty where nothing is heard.
     """
     bands = torch.arange(_BANDS, device=places.device) * (len(field.frequency) - 1) // (_BANDS - 1)
-    where = places.double().cpu().numpy()
+    where = places.cpu().double().numpy()
     kernel = _neighbours(where, SHARED * resolution)
     found: list[tuple[Array, Array, Array, NDArray[np.intp]]] = []
     for pose, source in enumerate(sources):
@@ -106,10 +107,10 @@ def locate_sound(
         loud = heard > _FAINTEST * heard.max() if len(heard) else heard > 0
         if bool(loud.any()):
             index = index[loud]
-            range_ = (distance[index] - lead[loud]).double().cpu().numpy()
+            range_ = (distance[index] - lead[loud]).cpu().double().numpy()
             which = index.cpu().numpy()
             near = kernel[which][:, which]
-            sound = power[loud].double().cpu().numpy()
+            sound = power[loud].cpu().double().numpy()
             located = _moved(where[which], range_, sound, near, source, resolution)
             found.append((*located, np.full(len(located[0]), pose, dtype=np.intp)))
         if progress is not None:
@@ -155,3 +156,100 @@ def _moved(
     towards = source - points
     normals: Array = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     return points, normals, np.asarray(total, dtype=np.float64)
+
+
+_ROBUST = 1.5  # voxels, scale of Cauchy's loss: evidence farther off the surface hardly counts
+_OUTER, _INNER = 4, 40  # rounds of reweighting, steps of conjugate gradients in each
+_COARSEST = 12  # least voxels along an axis of the coarsest grid
+_ACCURACY = 1e-3  # of the residual's norm, where conjugate gradients stop
+
+
+def signed_distance(
+    weight: Grid, target: Grid, bound: Grid, pull: float, empty: Grid, bending: float
+) -> Grid:
+    """Return the signed distance, positive outside.
+
+    Parameters
+    ----------
+    weight : (X, Y, Z) float
+        Of the targets, from 0 to 1.
+    target : (X, Y, Z) float, voxels
+        Signed distance by the evidence.
+    bound : (X, Y, Z) float, voxels
+        What the distance must not lie below.
+    pull : float
+        Weight of the distance to the bound.
+    empty : (X, Y, Z) float
+        Weight with which a place is outside.
+    bending : float
+        Weight of the squared Laplacian.
+
+    Returns
+    -------
+    distance : (X, Y, Z) float, voxels
+    """
+    if min(weight.shape) >= 2 * _COARSEST:
+        coarse = _halved(weight)
+        moment = _halved(np.asarray(weight * target, dtype=np.float32))
+        aim: Grid = (moment / np.maximum(coarse, 1e-9)).astype(np.float32)
+        # Values stay in fine voxels, so a Laplacian on twice the spacing is four times as small.
+        first = signed_distance(coarse, aim, _halved(bound), pull, _halved(empty), bending / 16)
+        distance = ndimage.zoom(first, 2, order=1, mode="nearest", grid_mode=True)
+        distance = distance[tuple(slice(n) for n in weight.shape)].astype(np.float32)
+    else:
+        distance = bound.copy()
+    for turn in range(_OUTER):
+        robust = 1 / (1 + ((distance - target) / _ROBUST) ** 2)
+        gap = distance - bound
+        held = pull / np.maximum(np.abs(gap), 1.0) + (gap < 0)
+        data, free = weight * robust, np.where(distance < 1.0, empty, 0.0)
+        distance = _conjugate_gradients(
+            distance,
+            (data + held + free).astype(np.float32),
+            (data * target + held * bound + free).astype(np.float32),
+            bending,
+            _INNER if turn else 2 * _INNER,
+        )
+    return distance
+
+
+def _halved(grid: Grid) -> Grid:
+    """Average blocks of eight; an odd last layer counts twice."""
+    padded = np.pad(grid, [(0, n % 2) for n in grid.shape], mode="edge")
+    x, y, z = (n // 2 for n in padded.shape)
+    return np.asarray(padded.reshape(x, 2, y, 2, z, 2).mean(axis=(1, 3, 5)), dtype=np.float32)
+
+
+def _laplacian(values: Grid) -> Grid:
+    result = np.zeros_like(values)
+    for axis in range(3):
+        step = np.diff(values, axis=axis)
+        before = tuple(slice(None, -1) if a == axis else slice(None) for a in range(3))
+        behind = tuple(slice(1, None) if a == axis else slice(None) for a in range(3))
+        result[before] += step
+        result[behind] -= step
+    return result
+
+
+def _conjugate_gradients(x: Grid, diagonal: Grid, right: Grid, bending: float, steps: int) -> Grid:
+    """Solve (diagonal + bending Laplacian²) x = right, from x on."""
+
+    def product(v: Grid) -> Grid:
+        return np.asarray(diagonal * v + bending * _laplacian(_laplacian(v)), dtype=np.float32)
+
+    scale = 1 / (diagonal + np.float32(42 * bending))  # 42: on the diagonal of Laplacian²
+    x = x.copy()
+    residual = right - product(x)
+    way = scale * residual
+    size = first = float((residual * way).sum())
+    for _ in range(steps):
+        if not size > _ACCURACY**2 * first:
+            break
+        turned = product(way)
+        length = np.float32(size / float((way * turned).sum()))
+        x += length * way
+        residual -= length * turned
+        scaled = scale * residual
+        before, size = size, float((residual * scaled).sum())
+        way = scaled + np.float32(size / before) * way
+    return x

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 r"""Estimate where the body is from the onsets and the fitted field, and extract its surface.
 
-Three kinds of evidence meet in one signed distance, see :mod:`sononerf.surface.start.distance`:
+Three kinds of evidence meet in one signed distance, see :mod:`sononerf.surface.start.evidence`:
 
 - *oriented points*: the field's sound, put at its range on the line of sight of each pose, weighted
   by how well other poses and the onsets agree with it;
@@ -31,8 +31,7 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError
 from sononerf.field.field import Field
 from sononerf.geometry.lattice import MARGIN, Grid, Lattice
-from sononerf.surface.start.distance import signed_distance
-from sononerf.surface.start.evidence import Evidence, locate_sound
+from sononerf.surface.start.evidence import Evidence, locate_sound, signed_distance
 from sononerf.surface.start.evidence_grids import planes, thinness, winding_of
 from sononerf.surface.start.reliability import reliability
 

@@ -164,7 +164,7 @@ def read_isosurface(
 
 def _grid_of(field: Field, spacing: float | None) -> tuple[Array, Array, float]:
     """Return lower and upper corner (3,) of a field's region, and the voxel size, m."""
-    lower, upper = (corner.double().cpu().numpy() for corner in field.region)
+    lower, upper = (corner.cpu().double().numpy() for corner in field.region)
     step = spacing or field.resolution / 2
     narrowest = float((upper - lower).min())
     if step > narrowest:
@@ -187,7 +187,7 @@ def energy_volume(field: Field, spacing: float, directions: int) -> Volume:
     directions : int
         Size of the spherical lattice that is summed over where the field has no lobes.
     """
-    lower, upper = (corner.double().cpu().numpy() for corner in field.region)
+    lower, upper = (corner.cpu().double().numpy() for corner in field.region)
     return volume_from_function(_energy(field, directions), lower, upper, spacing, chunk=_CHUNK)
 
 

@@ -270,24 +270,16 @@ def vti_bytes(volume: Volume, name: str = "reflectivity") -> bytes:
     """
     if not name.isidentifier():
         raise ValueError(f"name: {name!r}, expected letters, digits and underscores")
-    data = np.asarray(volume.values, dtype="<f4").tobytes(order="F")
-    extent = " ".join(f"0 {count - 1}" for count in volume.shape)
-    origin = " ".join(repr(float(x)) for x in volume.origin)
-    head = (
-        '<?xml version="1.0"?>\n'
-        '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" '
-        'header_type="UInt64">\n'
-        f'  <ImageData WholeExtent="{extent}" Origin="{origin}" '
-        f'Spacing="{" ".join([repr(volume.spacing)] * 3)}">\n'
-        f'    <Piece Extent="{extent}">\n'
-        f'      <PointData Scalars="{name}">\n'
-        f'        <DataArray type="Float32" Name="{name}" format="appended" offset="0"/>\n'
-        "      </PointData>\n"
-        "    </Piece>\n"
-        "  </ImageData>\n"
-        '  <AppendedData encoding="raw">\n'
-        "   _"
+    import pyvista
+    from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
+
+    image = pyvista.ImageData(
+        dimensions=volume.shape, spacing=(volume.spacing,) * 3, origin=volume.origin
     )
-    length = np.asarray([len(data)], dtype="<u8").tobytes()
-    tail = "\n  </AppendedData>\n</VTKFile>\n"
-    return head.encode("ascii") + length + data + tail.encode("ascii")
+    image.point_data[name] = np.asarray(volume.values, np.float32).ravel(order="F")
+    writer = vtkXMLImageDataWriter()
+    writer.SetInputData(image)
+    writer.SetDataModeToBinary()
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return str(writer.GetOutputString()).encode("ascii")

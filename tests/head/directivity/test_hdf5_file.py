@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.head.directivity.hdf5_file import numbers, opened, text
+from sononerf.head.directivity.mat_files import numbers, opened, text
 
 
 def fill(path, make):

@@ -4,7 +4,7 @@ import pytest
 
 from sononerf.errors import InputError
 from sononerf.head.directivity.read import content_hash, read_directivity
-from sononerf.head.directivity.sofa_writer import write_sofa
+from sononerf.head.directivity.sofa import write_sofa
 from tests.head.directivity.patterns import (
     batslam_fields,
     pair,

@@ -4,8 +4,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sononerf.head.directivity.sofa import read_sofa
-from sononerf.head.directivity.sofa_writer import directivity_of, write_sofa
+from sononerf.head.directivity.sofa import directivity_of, read_sofa, write_sofa
 from sononerf.head.ears import ear_tables
 from sononerf.settings.schema import EarSettings
 from tests.head.directivity.patterns import pair

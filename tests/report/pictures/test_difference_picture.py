@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from sononerf.evaluation.difference_of_runs import compare
+from sononerf.evaluation.prediction import compare
 from sononerf.report.pictures import difference_picture as difference_module
 from sononerf.report.pictures.difference_picture import SILENT, difference_pngs, overlay_png
 from sononerf.surface.start.volume import grid_over

@@ -18,8 +18,8 @@ from sononerf.settings.loading import validate_settings
 from sononerf.simulation.reference import boundary
 from sononerf.simulation.reference.boundary import Boundary, excitation, radiated
 from sononerf.simulation.reference.boundary_mesh import halved
+from sononerf.simulation.reference.boundary_near import Panels
 from sononerf.simulation.reference.boundary_operators import Operators
-from sononerf.simulation.reference.boundary_panels import Panels
 from sononerf.simulation.solved import Heads
 from tests.simulation.exact import SPEED, disc_on_axis, rigid_sphere
 from tests.simulation.listening import ball, box, echoes, hearing, level_db, spectrum, wall

@@ -3,8 +3,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.simulation.reference.boundary_near import POINTS, WEIGHTS, near_pairs, potentials
-from sononerf.simulation.reference.boundary_panels import Panels
+from sononerf.simulation.reference.boundary_near import (
+    POINTS,
+    WEIGHTS,
+    Panels,
+    near_pairs,
+    potentials,
+)
 
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [1.2, 0.1, 0.0], [0.3, 0.9, 0.0]])
 PLACES = {

@@ -5,8 +5,8 @@ import trimesh
 from scipy.special import eval_legendre, spherical_jn, spherical_yn
 
 from sononerf.simulation.reference.boundary_mesh import halved
+from sononerf.simulation.reference.boundary_near import Panels
 from sononerf.simulation.reference.boundary_operators import Operators, coupling
-from sononerf.simulation.reference.boundary_panels import Panels
 from tests.simulation.listening import ball
 
 SHAPES = {

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.simulation.reference.boundary_panels import Panels
+from sononerf.simulation.reference.boundary_near import Panels
 
 
 @pytest.fixture(scope="module")

@@ -15,11 +15,10 @@ from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.simulation.simulator import Simulator, quiet_scene
 from sononerf.surface.refine import comparison
 from sononerf.surface.refine import refinement as module
-from sononerf.surface.refine.descent import Descent
+from sononerf.surface.refine.descent import Descent, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.refinement import Refinement, number_of_steps
-from sononerf.surface.refine.stages import Stage
 from tests.memory import changed, deaf_hull
 from tests.surface.conftest import RADIUS
 
@@ -134,14 +133,41 @@ def simulated_stage(settings):
     return {"simulate": simulate, "stages": (SHORT[0], last)}
 
 
-def test_a_surface_that_cannot_be_simulated_is_refined_all_the_same(
-    bumpy, echoes, optics, simulated_stage
+def test_a_surface_that_cannot_be_simulated_is_refined_all_the_same_and_told(
+    bumpy, echoes, optics, simulated_stage, caplog
 ):
     def refuse(mesh):
         raise InputError("the mesh is 1e-06 m large")
 
     simulated_stage["simulate"] = refuse
-    assert refined(bumpy, echoes, optics, **simulated_stage).kept
+    work = started(bumpy, echoes, optics, **simulated_stage)
+    while work.step == 0 or work.stage == 0:
+        work.advance()
+    again = started(bumpy, echoes, optics, **simulated_stage)
+    again.load({name: part.clone() for name, part in work.state().items()})
+    while not again.done:
+        again.advance()
+    found = again.result()
+    assert found.kept
+    fault = "stage 1 goes without the simulator's correction: the mesh is 1e-06 m large"
+    assert found.faults == [fault]
+    assert fault in caplog.text
+
+
+def test_a_start_that_cannot_be_traced_is_told_and_counts_as_the_worst(
+    bumpy, echoes, optics, caplog
+):
+    flat = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False)
+    work = Refinement(
+        {"open": flat, "filled": bumpy}, echoes, optics, simulate=unasked, seed=1, stages=SHORT
+    )
+    while not work.done:
+        work.advance()
+    found = work.result()
+    assert found.start == "filled"
+    (fault,) = found.faults
+    assert fault.startswith("the start open cannot be compared and counts as the worst: ")
+    assert fault in caplog.text
 
 
 @pytest.mark.parametrize("corrected", [False, True])

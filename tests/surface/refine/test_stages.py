@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
-from sononerf.surface.refine.stages import SHARP, STAGES
+from sononerf.surface.refine.descent import SHARP, STAGES
 
 
 def test_stages_go_from_coarse_to_fine():

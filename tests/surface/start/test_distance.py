@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from sononerf.surface.start.distance import signed_distance
+from sononerf.surface.start.evidence import signed_distance
 
 SIZE, MIDDLE = 32, 15.5
 GRID = np.stack(np.meshgrid(*[np.arange(SIZE)] * 3, indexing="ij"), axis=-1) - MIDDLE

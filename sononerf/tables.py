@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: MIT
+"""Tables of poses as CSV: UTF-8, one header line, commas, semicolons or tabulators."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from pathlib import Path
+
+from sononerf.errors import InputError
+
+MOST_BYTES = 200_000_000
+"""A larger file is no table of poses; it is refused before it is read."""
+
+
+def read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Return the header of a table, and line number and cells of each row, as many as the header.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, holds no rows, a column stands twice, or a row has another length.
+    """
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path}: larger than {MOST_BYTES} bytes; no table of poses")
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(f"{path}: not UTF-8 text; save it as CSV in UTF-8") from None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    separator = max(",;\t", key=text.partition("\n")[0].count)
+    try:
+        reader = csv.reader(io.StringIO(text), delimiter=separator, strict=True)
+        rows = [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
+    except csv.Error as error:
+        raise InputError(f"{path}: no CSV table ({error})") from None
+    if len(rows) < 2:
+        raise InputError(f"{path}: holds no poses; expected a header line and one line per pose")
+    header = [cell.strip() for cell in rows[0][1]]
+    double = sorted({name for name in header if header.count(name) > 1})
+    if double:
+        raise InputError(f"{path}:1: column {double[0]!r} stands twice")
+    for line, row in rows[1:]:
+        if len(row) != len(header):
+            raise InputError(f"{path}:{line}: {len(row)} columns, expected {len(header)}")
+    return header, rows[1:]
+
+
+def number_in(path: Path, line: int, name: str, cell: str) -> float:
+    """Return the number in a cell.
+
+    Raises
+    ------
+    InputError
+        If it is no finite number, naming file, line and column.
+    """
+    try:
+        number = float(cell)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise InputError(
+            f"{path}:{line}: column {name} is {cell!r}, expected a finite number with a decimal "
+            "point"
+        )
+    return number
