@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sononerf.echoes.consistency import weighted
+from sononerf.echoes.detection import Onsets, find_onsets
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.layout import AXES
-from sononerf.echoes.onsets import Onsets, find_onsets
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, NumericalError

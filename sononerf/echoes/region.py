@@ -9,9 +9,8 @@ from scipy import ndimage
 from scipy.spatial.distance import cdist
 
 from sononerf.echoes.consistency import ACCURACY
-from sononerf.echoes.detection import FALSE_ALARMS, threshold_levels
+from sononerf.echoes.detection import FALSE_ALARMS, Onsets, threshold_levels
 from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.onsets import Onsets
 from sononerf.errors import NumericalError
 from sononerf.head.ears import Ears
 

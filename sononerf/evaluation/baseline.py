@@ -11,8 +11,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import NumericalError
-from sononerf.evaluation.nearest import Nearest
-from sononerf.evaluation.solid import Solid, sample_surface
+from sononerf.evaluation.solid import Nearest, Solid, sample_surface
 from sononerf.head.matched_filter import matched_filter
 from sononerf.surface.start.isosurface import isosurface
 from sononerf.surface.start.volume import Volume, grid_over

@@ -10,9 +10,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sononerf.evaluation.nearest import Nearest
 from sononerf.evaluation.prediction import prediction_metrics
-from sononerf.evaluation.solid import Solid, sample_surface
+from sononerf.evaluation.solid import Nearest, Solid, sample_surface
 from sononerf.head.decibels import mae_db
 
 __all__ = [

@@ -19,7 +19,7 @@ from sononerf.field.range_slices import WholePoses
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
-from sononerf.report.pictures.difference_picture import difference_pngs, overlay_png
+from sononerf.report.pictures.mip_picture import difference_pngs, overlay_png
 from sononerf.run.fitted import Fitted, all_poses
 from sononerf.run.run_folder import RunFolder, differing_keys, results_folder
 from sononerf.run.truth import true_mesh

@@ -17,8 +17,8 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from sononerf import storage
 from sononerf.callbacks.checkpoint import CheckpointCallback
+from sononerf.callbacks.epoch import ProgressCallback, ThreadsCallback
 from sononerf.callbacks.preview import PreviewCallback, SpectrogramImages
-from sononerf.callbacks.progress_bar import ProgressCallback, ThreadsCallback
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import ResourceError, StoppedError

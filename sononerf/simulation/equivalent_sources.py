@@ -12,7 +12,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from sononerf.errors import NumericalError
-from sononerf.geometry.spread import spread_points
+from sononerf.geometry.directions import spread_points
 from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.solved import Heads, Solved

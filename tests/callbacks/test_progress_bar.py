@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from sononerf.callbacks.epoch import EpochCallback
-from sononerf.callbacks.progress_bar import ProgressCallback
+from sononerf.callbacks.epoch import EpochCallback, ProgressCallback
 
 
 class Task:

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from sononerf.callbacks import progress_bar as threads
-from sononerf.callbacks.progress_bar import WORTH_THREADS, ThreadsCallback
+from sononerf.callbacks import epoch as threads
+from sononerf.callbacks.epoch import WORTH_THREADS, ThreadsCallback
 
 
 @pytest.fixture

@@ -5,9 +5,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sononerf.echoes import detection, onsets
-from sononerf.echoes.detection import FALSE_ALARMS, RANK, threshold_factor
-from sononerf.echoes.onsets import Onsets, asked_poses, find_onsets
+from sononerf.echoes import detection
+from sononerf.echoes.detection import (
+    FALSE_ALARMS,
+    RANK,
+    Onsets,
+    asked_poses,
+    find_onsets,
+    threshold_factor,
+)
 from sononerf.head.point_echo import PointEcho
 from sononerf.head.reception import effective_window
 from sononerf.head.spectrogram import frequency_axis, range_axis
@@ -65,7 +71,7 @@ def test_only_training_poses_are_asked():
 
 @pytest.mark.parametrize(("count", "asked"), [(7, 7), (25, 12)])
 def test_of_many_poses_some_are_asked_evenly(monkeypatch, count, asked):
-    monkeypatch.setattr(onsets, "MOST_POSES", 12)
+    monkeypatch.setattr(detection, "MOST_POSES", 12)
     train = 3 * np.arange(count)  # others lie between
     found = asked_poses(store_of(range(count), train=train))
     assert len(found) == asked

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.evaluation.nearest import Nearest
+from sononerf.evaluation.solid import Nearest
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from sononerf.geometry.spread import spread_points
+from sononerf.geometry.directions import spread_points
 
 
 def uneven():

@@ -12,11 +12,11 @@ import pytest
 import torch
 import trimesh
 
+from sononerf.echoes import detection as onsets
 from sononerf.echoes import echoes as echoes_module
-from sononerf.echoes import onsets
+from sononerf.echoes.detection import Onsets, asked_poses
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.onsets import Onsets, asked_poses
 from sononerf.echoes.region import WITNESS_GAIN
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError

@@ -21,8 +21,8 @@ from lightning.fabric.utilities.rank_zero import rank_zero_only
 
 from sononerf import storage
 from sononerf.callbacks.checkpoint import SIGNALS, CheckpointCallback
+from sononerf.callbacks.epoch import ProgressCallback
 from sononerf.callbacks.preview import PreviewCallback
-from sononerf.callbacks.progress_bar import ProgressCallback
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.store import EnsembleStore

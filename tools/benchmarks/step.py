@@ -30,7 +30,7 @@ from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
 from sononerf import storage
-from sononerf.callbacks.progress_bar import ThreadsCallback
+from sononerf.callbacks.epoch import ThreadsCallback
 from sononerf.echoes.echoes import Echoes
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.field import Field

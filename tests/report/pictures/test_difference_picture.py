@@ -8,8 +8,8 @@ import trimesh
 from PIL import Image
 
 from sononerf.evaluation.prediction import compare
-from sononerf.report.pictures import difference_picture as difference_module
-from sononerf.report.pictures.difference_picture import SILENT, difference_pngs, overlay_png
+from sononerf.report.pictures import mip_picture as difference_module
+from sononerf.report.pictures.mip_picture import SILENT, difference_pngs, overlay_png
 from sononerf.surface.start.volume import grid_over
 
 GRID = grid_over([-0.03, -0.02, -0.05], [0.03, 0.02, 0.05], 0.005)
