@@ -119,6 +119,7 @@ def test_slices_without_an_active_cell_are_silent(tiny):
         rotations=np.eye(3)[None],
         range=known.range,
         frequency=known.frequency,
+        receivers=2,
         attributes={"reference": 1.0},
         read_pose=lambda number: heard.numpy(),
     )
