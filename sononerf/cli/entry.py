@@ -76,7 +76,7 @@ def _run() -> int:
         fault = error
     except typer.TyperException as error:
         where = getattr(getattr(error, "ctx", None), "command_path", "sononerf")
-        text = error.format_message().rstrip(".")
+        text = error.format_message().rstrip(".").replace("Value error, ", "")
         fault = SettingsError(f"{text[:1].lower()}{text[1:]}; see `{where} --help`")
     except _SignalledError as error:
         fault = StoppedError(error.number)

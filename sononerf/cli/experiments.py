@@ -10,7 +10,6 @@ from typing import Annotated, Any
 import typer
 
 from sononerf.cli.options import (
-    Accelerator,
     Config,
     Json,
     OnWhat,
@@ -82,7 +81,7 @@ def fit(
     output: Annotated[
         Path | None, typer.Option(help="The run's folder; runs/<config's name> by default.")
     ] = None,
-    accelerator: OnWhat = Accelerator.auto,
+    accelerator: OnWhat = "auto",
     devices: Annotated[int | None, typer.Option(min=1, help="How many devices.")] = None,
     num_nodes: Annotated[int, typer.Option(min=1, help="How many machines.")] = 1,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the fit (fit.seed).")] = None,
@@ -107,7 +106,7 @@ def fit(
     done = run(
         settings,
         folder,
-        accelerator=accelerator.value,
+        accelerator=accelerator,
         devices=devices or "auto",
         num_nodes=num_nodes,
         overwrite=overwrite,
@@ -165,7 +164,7 @@ def predict(
         Path | None, typer.Option(help="CSV of your own poses: x,y,z,yaw,pitch,roll (m, degrees).")
     ] = None,
     output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
-    accelerator: OnWhat = Accelerator.auto,
+    accelerator: OnWhat = "auto",
 ) -> None:
     """Predict the spectrograms of poses that were never heard."""
     if split is not None and poses is not None:
@@ -175,10 +174,10 @@ def predict(
 
     folder = predict_run(
         run,
-        split="test" if split is None else split.value,
+        split=split or "test",
         poses_csv=poses,
         output=output,
-        accelerator=accelerator.value,
+        accelerator=accelerator,
         progress=Progress(),
     )
     say(f"wrote {folder}")
@@ -205,7 +204,7 @@ def reconstruct(
         ),
     ] = None,
     output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
-    accelerator: OnWhat = Accelerator.auto,
+    accelerator: OnWhat = "auto",
 ) -> None:
     """Read mesh, volume and projections out of a fitted field, and refine the mesh."""
     import math
@@ -228,9 +227,9 @@ def reconstruct(
         run,
         spacing=spacing,
         level=number,
-        method=None if method is None else method.value,
+        method=method,
         output=output,
-        accelerator=accelerator.value,
+        accelerator=accelerator,
         progress=Progress(),
     )
     say(f"wrote {folder}")
@@ -257,7 +256,7 @@ def evaluate(
     metrics = evaluate_run(
         run,
         truth=truth,
-        registration=None if registration is None else registration.value,
+        registration=registration,
         progress=Progress(quiet=as_json),
     )
     if as_json:
@@ -273,16 +272,14 @@ def compare(
     output: Annotated[
         Path | None, typer.Option(help="Folder of the results; RUN_A/compare-B where none.")
     ] = None,
-    accelerator: OnWhat = Accelerator.auto,
+    accelerator: OnWhat = "auto",
 ) -> None:
     """Show what is heard in RUN_A and not in RUN_B, and where: a prey on a leaf."""
     from sononerf import storage
     from sononerf.progress import Progress
     from sononerf.run.compare import compare_runs
 
-    folder = compare_runs(
-        run_a, run_b, output=output, accelerator=accelerator.value, progress=Progress()
-    )
+    folder = compare_runs(run_a, run_b, output=output, accelerator=accelerator, progress=Progress())
     found = storage.read_json(folder / "comparison.json")
     if found["strongest_m"] is None:
         say(f"nothing is stronger in {run_a} than in {run_b}")

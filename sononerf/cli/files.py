@@ -147,12 +147,12 @@ def export(
         typer.Option(
             help="auto: echoes of a store; of a run, points for .csv and else the prediction."
         ),
-    ] = Exported.auto,
+    ] = "auto",
 ) -> None:
     """Write echoes, predictions, volumes or surface points for other programs."""
     from sononerf.run.export import export as export_part
 
-    say(f"wrote {export_part(source, output, what=what.value)}")
+    say(f"wrote {export_part(source, output, what=what)}")
 
 
 @app.command()

@@ -4,9 +4,8 @@
 from __future__ import annotations
 
 import json
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -20,51 +19,11 @@ app = typer.Typer(
 )
 
 
-class Accelerator(StrEnum):
-    """What to compute on."""
-
-    auto = "auto"
-    cpu = "cpu"
-    gpu = "gpu"
-
-
-class SurfaceMethod(StrEnum):
-    """How a surface is read out."""
-
-    auto = "auto"
-    open = "open"
-    filled = "filled"
-    hull = "hull"
-    sheet = "sheet"
-    isosurface = "isosurface"
-
-
-class Registration(StrEnum):
-    """How a mesh is laid over the true surface."""
-
-    none = "none"
-    rigid = "rigid"
-    similarity = "similarity"
-
-
-class Exported(StrEnum):
-    """Part of a store or a run."""
-
-    auto = "auto"
-    echoes = "echoes"
-    prediction = "prediction"
-    volume = "volume"
-    points = "points"
-
-
-class Split(StrEnum):
-    """Poses of an ensemble."""
-
-    test = "test"
-    val = "val"
-    train = "train"
-
-
+Accelerator = Literal["auto", "cpu", "gpu"]
+SurfaceMethod = Literal["auto", "open", "filled", "hull", "sheet", "isosurface"]
+Registration = Literal["none", "rigid", "similarity"]
+Exported = Literal["auto", "echoes", "prediction", "volume", "points"]
+Split = Literal["test", "val", "train"]
 Config = Annotated[Path, typer.Argument(help="Settings file, such as configs/three_spheres.yaml.")]
 Overrides = Annotated[
     list[str] | None,

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import NumericalError
 from sononerf.evaluation.solid import Nearest, Solid, sample_surface
+from sononerf.geometry.poses import Poses
+from sononerf.head.head import Head
 from sononerf.head.matched_filter import matched_filter
 from sononerf.surface.start.isosurface import isosurface
 from sononerf.surface.start.volume import Volume, grid_over
@@ -28,15 +30,11 @@ ENERGY = 0.99
 
 def backprojection(
     spectrograms: Iterable[ArrayLike],
-    positions: ArrayLike,
-    rotations: ArrayLike,
-    ranges: ArrayLike,
+    poses: Poses,
+    head: Head,
     lower: ArrayLike,
     upper: ArrayLike,
     spacing: float,
-    *,
-    emitter_offset: ArrayLike,
-    ear_offsets: ArrayLike,
 ) -> Volume:
     r"""Incoherent delay-and-sum over poses and ears.
 
@@ -47,29 +45,31 @@ def backprojection(
     ----------
     spectrograms : iterable of (E, R, F) float
         Linear magnitude, one per pose in order; read one at a time.
-    positions : (P, 3) float, m
-        Heads, world frame.
-    rotations : (P, 3, 3) float
-        Head to world.
-    ranges : (R,) float, m
-        Evenly spaced; half the way from emitter over echo to ear.
+    poses : Poses
+        P of them.
+    head : Head
+        What heard the spectrograms.
     lower, upper : (3,) float, m
         The box.
     spacing : float, m
         Voxel size.
-    emitter_offset : (3,) float, m
-        Emitter in the head frame.
-    ear_offsets : (E, 3) float, m
-        Ears in the head frame.
 
     Returns
     -------
     volume : Volume
         Mean energy per voxel; what lies outside the recorded ranges adds nothing.
+
+    Raises
+    ------
+    ValueError
+        If there is not one spectrogram of the head's shape for each pose.
+    NumericalError
+        If a spectrogram is not finite.
+    ResourceError
+        If the grid does not fit in memory.
     """
-    emitters, receivers, axis = places_heard_from(
-        positions, rotations, ranges, emitter_offset=emitter_offset, ear_offsets=ear_offsets
-    )
+    emitters, receivers = head.places(poses.positions, poses.rotations)
+    axis = head.range
     volume = grid_over(lower, upper, spacing)
     points = volume.points().astype(np.float32)
     step = float(np.diff(axis).mean())
@@ -85,17 +85,11 @@ def backprojection(
 
 def coherent_backprojection(
     waveforms: Iterable[ArrayLike],
-    positions: ArrayLike,
-    rotations: ArrayLike,
+    poses: Poses,
+    head: Head,
     lower: ArrayLike,
     upper: ArrayLike,
     spacing: float,
-    *,
-    call: ArrayLike,
-    sampling_rate: float,
-    speed_of_sound: float,
-    emitter_offset: ArrayLike,
-    ear_offsets: ArrayLike,
 ) -> Volume:
     r"""Delay-and-sum with phase over poses and ears, for comparison.
 
@@ -110,16 +104,12 @@ def coherent_backprojection(
     ----------
     waveforms : iterable of (E, S) float
         Recordings from the start of the emission on, one per pose in order; read one at a time.
-    positions, rotations, lower, upper, emitter_offset, ear_offsets
+    poses, lower, upper
         As of :func:`backprojection`.
+    head : Head
+        Whose call was emitted.
     spacing : float, m
         Voxel size; a quarter of the shortest wavelength shows all there is.
-    call : (N,) float
-        Emitted waveform, at the same sampling rate.
-    sampling_rate : float, Hz
-        Of recordings and call.
-    speed_of_sound : float, m/s
-        Of the medium.
 
     Returns
     -------
@@ -135,12 +125,10 @@ def coherent_backprojection(
     ResourceError
         If the grid would not fit in memory.
     """
-    emitted = np.asarray(call, dtype=np.float64)
+    emitted = head.waveform
     finer = _oversampling(emitted)
-    step = speed_of_sound / (2.0 * sampling_rate * finer)
-    emitters, receivers, _ = places_heard_from(
-        positions, rotations, (0.0, step), emitter_offset=emitter_offset, ear_offsets=ear_offsets
-    )
+    step = head.speed_of_sound / (2.0 * head.sampling_rate * finer)
+    emitters, receivers = head.places(poses.positions, poses.rotations)
     volume = grid_over(lower, upper, spacing)
     points = volume.points().astype(np.float32)
     total = np.zeros(len(points), dtype=np.complex64)
@@ -171,36 +159,6 @@ def _oversampling(call: NDArray[np.float64]) -> int:
     below = np.cumsum(power) / max(power.sum(), 1e-300)
     highest = (int(np.searchsorted(below, ENERGY)) + 1) / (2 * len(power))  # per sample
     return max(1, int(np.ceil(SAMPLES_PER_PERIOD * highest)))
-
-
-def places_heard_from(
-    positions: ArrayLike,
-    rotations: ArrayLike,
-    ranges: ArrayLike,
-    *,
-    emitter_offset: ArrayLike,
-    ear_offsets: ArrayLike,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return where emitters (P, 3) and ears (P, E, 3) are in the world, and the ranges (R,), in m.
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit or the ranges are not evenly spaced.
-    """
-    heads = np.asarray(positions, dtype=np.float64)
-    turns = np.asarray(rotations, dtype=np.float64)
-    axis = np.asarray(ranges, dtype=np.float64)
-    ears = np.asarray(ear_offsets, dtype=np.float64).reshape(-1, 3)
-    if heads.ndim != 2 or heads.shape[1] != 3 or turns.shape != (len(heads), 3, 3):
-        raise ValueError(
-            f"positions {heads.shape} and rotations {turns.shape}: expected (P, 3) and (P, 3, 3)"
-        )
-    steps = np.diff(axis)
-    if len(axis) < 2 or not (steps > 0).all() or np.ptp(steps) > 1e-3 * steps.mean():
-        raise ValueError("ranges: expected two or more, ascending and evenly spaced")
-    emitters = heads + turns @ np.asarray(emitter_offset, dtype=np.float64)
-    return emitters, heads[:, None] + np.einsum("pij,ej->pei", turns, ears), axis
 
 
 def range_profiles(

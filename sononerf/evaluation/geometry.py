@@ -17,6 +17,7 @@ from sononerf.evaluation.metrics import geometry_metrics, target_metrics
 from sononerf.evaluation.registration import Kind, Registration, register
 from sononerf.evaluation.solid import Solid
 from sononerf.evaluation.voxels import voxel_fit
+from sononerf.geometry.poses import Poses
 from sononerf.scene.scene import Scene
 from sononerf.surface.start.volume import Volume
 
@@ -85,30 +86,10 @@ def baselines(
     lower, upper : (3,) float64, m
         Corners of the region.
     """
-    store, head = echoes.store, echoes.head
+    store = echoes.store
     train = store.indices("train")
-    given = (
-        echoes.positions[train],
-        echoes.rotations[train],
-        store.range,
-        lower,
-        upper,
-        float((upper - lower).max()) / BASELINE_VOXELS,
-    )
-
-    def heard() -> Iterator[NDArray[np.float32]]:
-        return (store.read_pose(int(index)) for index in train)
-
-    places = head.emitter, head.receivers
-    back = backprojection(heard(), *given, emitter_offset=places[0], ear_offsets=places[1])
-    yield "backprojection", back
-    voxels = voxel_fit(
-        heard(),
-        *given,
-        emitter_offset=places[0],
-        ear_offsets=places[1],
-        # Of a sweep each row has a window of its own; where rows are added up, their mean.
-        window=np.square(head.window).mean(axis=0),
-        window_step=head.speed_of_sound / head.sampling_rate / 2,
-    )
-    yield "voxels", voxels
+    poses = Poses(echoes.positions[train], echoes.rotations[train])
+    spacing = float((upper - lower).max()) / BASELINE_VOXELS
+    for name, baseline in (("backprojection", backprojection), ("voxels", voxel_fit)):
+        heard = (store.read_pose(int(index)) for index in train)
+        yield name, baseline(heard, poses, echoes.head, lower, upper, spacing)

@@ -8,7 +8,9 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.evaluation.baseline import places_heard_from, range_profiles
+from sononerf.evaluation.baseline import range_profiles
+from sononerf.geometry.poses import Poses
+from sononerf.head.head import Head
 from sononerf.surface.start.volume import Volume, grid_over
 
 # How often all poses are gone through, and in how many portions each time.
@@ -21,17 +23,12 @@ DEPTH_STEPS = 9
 
 def voxel_fit(
     spectrograms: Iterable[ArrayLike],
-    positions: ArrayLike,
-    rotations: ArrayLike,
-    ranges: ArrayLike,
+    poses: Poses,
+    head: Head,
     lower: ArrayLike,
     upper: ArrayLike,
     spacing: float,
     *,
-    emitter_offset: ArrayLike,
-    ear_offsets: ArrayLike,
-    window: ArrayLike,
-    window_step: float,
     passes: int = PASSES,
 ) -> Volume:
     r"""Fit a power to each voxel, the same towards all sides and for all frequencies.
@@ -52,13 +49,9 @@ def voxel_fit(
 
     Parameters
     ----------
-    spectrograms, positions, rotations, ranges, lower, upper, spacing, emitter_offset, ear_offsets
+    spectrograms, poses, head, lower, upper, spacing
         As of :func:`sononerf.evaluation.baseline.backprojection`; the emitter is near the ears
         against the ranges.
-    window : (W,) float
-        Energy that a point echo leaves around its range.
-    window_step : float, m
-        Range between two values of the window.
     passes : int
         How often all poses are gone through.
 
@@ -70,8 +63,7 @@ def voxel_fit(
     Raises
     ------
     ValueError
-        If shapes do not fit, the ranges are not evenly spaced, the window is empty, negative or
-        silent, or there is no pass.
+        If there is not one spectrogram of the head's shape for each pose, or there is no pass.
     NumericalError
         If a spectrogram is not finite.
     ResourceError
@@ -86,14 +78,15 @@ def voxel_fit(
     .. [3] H. M. Hudson and R. S. Larkin, "Accelerated image reconstruction using ordered subsets
        of projection data", 1994.
     """
-    emitters, receivers, axis = places_heard_from(
-        positions, rotations, ranges, emitter_offset=emitter_offset, ear_offsets=ear_offsets
-    )
+    emitters, receivers = head.places(poses.positions, poses.rotations)
+    axis = head.range
     if passes < 1:
         raise ValueError(f"passes: {passes}, expected 1 or more")
     volume = grid_over(lower, upper, spacing)
     step = float(np.diff(axis).mean())
-    kernel = _kernel(window, window_step, step, spacing)
+    # Of a sweep each row has a window of its own; where rows are added up, their mean.
+    window = np.square(head.window).mean(axis=0)
+    kernel = _kernel(window, head.speed_of_sound / head.sampling_rate / 2, step, spacing)
     energies = np.array(list(range_profiles(spectrograms, (*receivers.shape[:2], len(axis)))))
     reach = len(kernel) // 2
     bins = len(axis) + 2 * reach
@@ -126,16 +119,9 @@ def voxel_fit(
 
 
 def _kernel(
-    window: ArrayLike, window_step: float, step: float, depth: float
+    values: NDArray[np.float64], window_step: float, step: float, depth: float
 ) -> NDArray[np.float64]:
     """Return what a voxel leaves in the slices around it: the window, over the voxel's depth."""
-    values = np.asarray(window, dtype=np.float64)
-    usable = values.ndim == 1 and values.size and np.isfinite(values).all() and (values >= 0).all()
-    if not usable or not values.any() or not window_step > 0:
-        raise ValueError(
-            f"window: shape {values.shape} every {window_step} m; expected (W,) of zero or more, "
-            "not all zero"
-        )
     half = (len(values) - 1) / 2
     # So far that even the nearest part of a voxel's depth lies beyond the window: zero at the ends.
     reach = int(np.ceil((half * window_step + depth / 2) / step))

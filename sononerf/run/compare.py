@@ -173,15 +173,7 @@ def _heard(
     # Delay-and-sum adds squares; the square of this is the level.
     roots = (np.sqrt(compress(spectrogram, reference)) for spectrogram in rendered)
     return backprojection(
-        roots,
-        poses.positions,
-        poses.rotations,
-        renderer.range.cpu().double().numpy(),
-        lower,
-        upper,
-        float((upper - lower).max()) / VOXELS,
-        emitter_offset=run.head.emitter,
-        ear_offsets=run.head.receivers,
+        roots, poses, run.head, lower, upper, float((upper - lower).max()) / VOXELS
     )
 
 

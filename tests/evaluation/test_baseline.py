@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: MIT
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import trimesh
@@ -9,6 +11,7 @@ from sononerf.evaluation.baseline import (
     best_level_surface,
     coherent_backprojection,
 )
+from sononerf.geometry.poses import Poses
 from sononerf.head.call import call_waveform, emit
 from sononerf.settings.schema import CallSettings
 from sononerf.surface.start.volume import grid_over, volume_from_function
@@ -40,10 +43,23 @@ def echoes(positions, rotations):
         yield spectrogram
 
 
-def run(spectrograms, positions, rotations, ranges=RANGES):
-    return backprojection(
-        spectrograms, positions, rotations, ranges, *BOX, emitter_offset=EMITTER, ear_offsets=EARS
+def listener(ranges=RANGES, ears=EARS, call=None):
+    """What the baselines ask of a head."""
+
+    def places(positions, rotations):
+        return positions + rotations @ EMITTER, positions[:, None] + ears @ rotations.swapaxes(1, 2)
+
+    return SimpleNamespace(
+        range=np.asarray(ranges),
+        places=places,
+        waveform=call,
+        sampling_rate=1e6,
+        speed_of_sound=343.0,
     )
+
+
+def run(spectrograms, positions, rotations, ranges=RANGES, ears=EARS):
+    return backprojection(spectrograms, Poses(positions, rotations), listener(ranges, ears), *BOX)
 
 
 def test_a_point_is_found_where_it_is_with_its_energy():
@@ -57,15 +73,7 @@ def test_a_point_is_found_where_it_is_with_its_energy():
 
 def test_one_ear_and_silence():
     positions, rotations = poses(3)
-    volume = backprojection(
-        np.zeros((3, 1, 200, 4)),
-        positions,
-        rotations,
-        RANGES,
-        *BOX,
-        emitter_offset=EMITTER,
-        ear_offsets=EARS[:1],
-    )
+    volume = run(np.zeros((3, 1, 200, 4)), positions, rotations, ears=EARS[:1])
     assert (volume.values == 0).all()
 
 
@@ -78,14 +86,10 @@ def test_what_lies_beyond_the_recording_adds_nothing():
 
 def test_wrong_input_is_refused():
     positions, rotations = poses(3)
-    with pytest.raises(ValueError, match="evenly spaced"):
-        run(np.zeros((3, 2, 3, 1)), positions, rotations, [0.1, 0.2, 0.4])
     with pytest.raises(ValueError, match="one for each of 3 poses"):
         run(np.zeros((2, 2, 200, 1)), positions, rotations)
     with pytest.raises(ValueError, match="spectrogram 0"):
         run(np.zeros((3, 2, 199, 1)), positions, rotations)
-    with pytest.raises(ValueError, match=r"\(P, 3\)"):
-        run(np.zeros((3, 2, 200, 1)), positions[:2], rotations)
     with pytest.raises(NumericalError, match="pose 0"):
         run(np.full((3, 2, 200, 1), np.nan), positions, rotations)
 
@@ -105,13 +109,6 @@ def test_a_constant_volume_has_no_best_level():
 
 
 SWEEP = call_waveform(CallSettings(kind="linear", frequency_start=90e3, duration=1e-3), 1e6)
-PHASED = {
-    "call": SWEEP,
-    "sampling_rate": 1e6,
-    "speed_of_sound": 343.0,
-    "emitter_offset": EMITTER,
-    "ear_offsets": EARS,
-}
 
 
 def recordings(positions, rotations, gain=0.25):
@@ -128,7 +125,7 @@ def test_with_phase_a_point_is_found_to_a_fraction_of_a_wavelength():
     positions, rotations = poses()
     box = TARGET - 0.011, TARGET + 0.011, 0.001
     heard = recordings(positions, rotations)
-    volume = coherent_backprojection(heard, positions, rotations, *box, **PHASED)
+    volume = coherent_backprojection(heard, Poses(positions, rotations), listener(call=SWEEP), *box)
     peak = volume.points()[volume.values.argmax()]
     np.testing.assert_allclose(peak, TARGET, atol=1e-9)
     assert volume.values.max() == pytest.approx(0.25, rel=0.03)
@@ -140,9 +137,11 @@ def test_the_coherent_sum_refuses_wrong_input():
     positions, rotations = poses(2)
     heard = np.zeros((2, 2, 300))
 
-    def told(error, waveforms, **changes):
+    def told(error, waveforms, call=SWEEP):
         with pytest.raises(error) as caught:
-            coherent_backprojection(waveforms, positions, rotations, *BOX, **{**PHASED, **changes})
+            coherent_backprojection(
+                waveforms, Poses(positions, rotations), listener(call=call), *BOX
+            )
         return str(caught.value)
 
     assert "one for each of 2 poses" in told(ValueError, heard[:1])
