@@ -9,7 +9,6 @@
     python tools/benchmark.py exact [--scene three_spheres] [--engines hybrid rays] [--poses 8]
     python tools/benchmark.py wave [--bodies spheres leaf beaker] [--poses 8]
     python tools/benchmark.py dechirp
-    python tools/benchmark.py scale [--counts 100 400 1600] [--axes poses slices size places]
     python tools/benchmark.py surfaces [--only NAME ...] [--seeds 0 1 2] [--exact STORE]
     python tools/benchmark.py step [--accelerator cpu] [--compare OLD.json]
     python tools/benchmark.py fit [--scene three_spheres] [--error 0.45] [--compare OLD.json]
@@ -31,10 +30,9 @@ machine's matrix product and its copying. ``fit``: how long the default takes to
 ``reconstruct``: how long fitted runs take to be read out. The files of these three are named by
 version, machine and device, and ``--compare`` prints what has changed.
 
-``scale``: what simulation, a step, reading out and memory come to with ever more poses, range
-slices, room and places. ``surfaces``: how good the surfaces of all kinds of scenes are, some under
+``surfaces``: how good the surfaces of all kinds of scenes are, some under
 changed conditions; one line of JSON for each run. What is ``scaled`` is measured in the unscaled
-world's metres. ``fit``, ``scale`` and ``surfaces`` leave runs, a table as JSON and logs in a folder
+world's metres. ``fit`` and ``surfaces`` leave runs, a table as JSON and logs in a folder
 (``--output``), share ensembles (``--data``), go on where they were interrupted, and lay KEY=VALUE
 over the settings (``--set``).
 """
@@ -44,19 +42,18 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # the parts of this command, and the tests' exact solutions
 
-from tools.benchmarks.cost import cost  # noqa: E402
 from tools.benchmarks.exact import exact  # noqa: E402
 from tools.benchmarks.fit import fit  # noqa: E402
 from tools.benchmarks.physics import dechirp, physics  # noqa: E402
 from tools.benchmarks.reconstruct import reconstruct  # noqa: E402
-from tools.benchmarks.scale import COUNTS as SCALE_COUNTS  # noqa: E402
-from tools.benchmarks.scale import scale  # noqa: E402
-from tools.benchmarks.simulator import noise, simulate  # noqa: E402
+from tools.benchmarks.simulator import cost, noise, simulate  # noqa: E402
 from tools.benchmarks.step import step  # noqa: E402
 from tools.benchmarks.surfaces import CASES, surfaces  # noqa: E402
 from tools.benchmarks.wave import wave  # noqa: E402
@@ -73,32 +70,33 @@ def main() -> None:
     """Measure what the command line asks for."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     commands = parser.add_subparsers(dest="command", required=True)
-    for run, default in ((simulate, 400), (noise, 20), (physics, None), (dechirp, None)):
-        command = commands.add_parser(run.__name__, help=(run.__doc__ or "").strip())
+
+    def added(run: Callable[[argparse.Namespace], Any]) -> argparse.ArgumentParser:
+        command = commands.add_parser(run.__name__, help=(run.__doc__ or "").split("\n")[0])
         command.set_defaults(run=run)
-        if default is not None:
-            command.add_argument("--scene", default="ua")
-            command.add_argument("--poses", type=int, default=default)
-            command.add_argument("--bounces", type=int, default=3)
+        return command
+
+    for run, default in ((simulate, 400), (noise, 20)):
+        command = added(run)
+        command.add_argument("--scene", default="ua")
+        command.add_argument("--poses", type=int, default=default)
+        command.add_argument("--bounces", type=int, default=3)
         if run is simulate:
             command.add_argument("--rays", type=int, default=300_000)
-    command = commands.add_parser(cost.__name__, help=(cost.__doc__ or "").strip())
-    command.set_defaults(run=cost)
+    added(physics)
+    added(dechirp)
+    command = added(cost)
     command.add_argument("config", type=Path)
     command.add_argument("--poses", type=int, default=20, help="that are traced (20)")
-    command = commands.add_parser(exact.__name__, help=(exact.__doc__ or "").strip())
-    command.set_defaults(run=exact)
+    command = added(exact)
     command.add_argument("--scene", default="three_spheres")
     command.add_argument("--engines", nargs="+", default=["hybrid", "rays", "kirchhoff"])
     command.add_argument("--poses", type=int, default=8)
-    command = commands.add_parser(wave.__name__, help=(wave.__doc__ or "").strip())
-    command.set_defaults(run=wave)
-    names = ("spheres", "leaf", "beaker")
-    command.add_argument("--bodies", nargs="+", choices=names, help="those three")
+    command = added(wave)
+    command.add_argument("--bodies", nargs="+", choices=("spheres", "leaf", "beaker"), help="all")
     command.add_argument("--poses", type=int, default=8)
-    for series in (scale, surfaces, step, fit, reconstruct):
-        command = commands.add_parser(series.__name__, help=(series.__doc__ or "").split("\n")[0])
-        command.set_defaults(run=series)
+    for series in (surfaces, step, fit, reconstruct):
+        command = added(series)
         if series is surfaces:
             names = [case.name for case in CASES]
             command.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=ONLY_HELP)
@@ -115,10 +113,6 @@ def main() -> None:
             command.add_argument("--spacings", type=float, nargs="+", help=SPACINGS_HELP)
         if series in (step, fit):
             command.add_argument("--scene", default="three_spheres")
-        if series is scale:
-            command.add_argument("--counts", type=int, nargs="+", default=SCALE_COUNTS)
-            axes = ("poses", "slices", "size", "places")
-            command.add_argument("--axes", nargs="+", choices=axes, help="what grows; all")
         command.add_argument("--output", type=Path, help="folder of runs and table")
         if series is reconstruct:
             continue

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tools.benchmarks import cost as module
+from tools.benchmarks import simulator as module
 
 
 class Some(NamedTuple):

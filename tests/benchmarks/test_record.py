@@ -4,7 +4,7 @@ from __future__ import annotations
 import json
 
 from sononerf import __version__
-from tools.benchmarks.record import keep, ratios
+from tools.benchmarks.experiment import keep, ratios
 
 FOUND = {"copy": 2.0, "rows": [{"name": "a", "step_s": 0.5}, {"name": "b", "step_s": 3.0}]}
 

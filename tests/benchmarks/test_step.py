@@ -6,10 +6,9 @@ from argparse import Namespace
 from pathlib import Path
 
 import pytest
-import torch
 
 from tools.benchmarks import step as module
-from tools.benchmarks.step import CONFIG, PAIRS, PAPER, Pair, Traffic
+from tools.benchmarks.step import CONFIG, PAIRS, PAPER, Pair
 
 ECHOES = [
     "scene.options.radius=0.02",
@@ -44,7 +43,6 @@ def measured(tmp_path_factory):
         patch.setattr(
             module, "matrix_rate", lambda device, kind: {"float32": 1e9, "bfloat16": 2e9}[kind]
         )
-        patch.setattr(module, "copy_rate", lambda device: 1e10)
         text = module.step(given)
     (file,) = output.glob("step-*-cpu.json")
     return text, json.loads(file.read_text())
@@ -67,7 +65,6 @@ def test_rates_follow_from_what_was_counted_and_timed(measured):
     for row in (shell, default):
         assert row["points_per_s"] == pytest.approx(row["points"] / row["step_s"])
         assert row["over_matrix_rate"] == pytest.approx(row["flop"] / row["step_s"] / 1e9)
-        assert row["over_memory"] == pytest.approx(row["step_s"] / (row["bytes"] / 1e10))
     # Backward takes twice the products of forward, but for the embedding, which has no gradient.
     weights = 180 * 256 + 3 * 256**2 + (256 + 180) * 256 + 256**2 + (256 + 180) * 256 + 256 * 128
     forward = 2 * (weights + 128 * 94) * shell["points"]
@@ -98,25 +95,6 @@ def test_what_is_wrong_is_told_in_one_line_before_any_step_is_timed(tmp_path, wr
     with pytest.raises(SystemExit, match=f"^{said}"):
         module.step(Namespace(**{**plain, "accelerator": "cpu", **wrong}))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_traffic_counts_what_is_read_and_written_and_not_what_is_only_looked_at():
-    one, row = torch.zeros(100, 10), torch.zeros(10)
-    with Traffic() as seen:
-        one.view(1000)
-        row.expand(100, 10)
-    assert seen.bytes == 0
-    with Traffic() as seen:
-        one + row.expand(100, 10)  # what is expanded lies there once
-    assert seen.bytes == 4 * (1000 + 10 + 1000)
-    with Traffic() as seen:
-        one.add_(1.0)
-    assert seen.bytes == 4 * 2 * 1000
-    sparse = torch.eye(4).to_sparse_csr()
-    vector = torch.zeros(4, 1)
-    with Traffic() as seen:
-        sparse @ vector
-    assert seen.bytes >= 8 * (5 + 4) + 4 * (4 + 4 + 4)
 
 
 def test_each_field_goes_through_each_renderer_with_settings_that_are_known():

@@ -15,8 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from sononerf import storage
-from tools.benchmarks.experiment import Row, aligned, ending, run_experiment
-from tools.benchmarks.record import device_name, keep, ratios
+from tools.benchmarks.experiment import (
+    Row,
+    aligned,
+    device_name,
+    ending,
+    keep,
+    ratios,
+    run_experiment,
+)
 
 REPEATS = 5
 EPOCHS = (1, 2, 3, 5, 10, 20)

@@ -14,8 +14,7 @@ import torch
 from sononerf import storage
 from sononerf.run.fitted import load_fitted
 from sononerf.surface.start.read_out import StartMethod, read_field, start_surfaces
-from tools.benchmarks.experiment import Row, aligned, ending
-from tools.benchmarks.record import keep, ratios
+from tools.benchmarks.experiment import Row, aligned, ending, keep, ratios
 
 REPEATS = 5
 

@@ -7,9 +7,7 @@ ensemble to the optimiser's update; what is reported is the median over the time
 How far a loss lies from that of the exact renderer, or in float32, is told for the same batch and
 the same weights. *Floating-point operations* are those of the matrix products that were executed,
 forward and backward, as torch counts them, in one more step; the rate is given over that of a plain
-product of two matrices of the same type on the same machine. *Bytes* are what the operations of
-that step read and write, each tensor once for each operation that touches it; the time that they
-would take at the rate at which the machine copies is what its memory allows.
+product of two matrices of the same type on the same machine.
 """
 
 from __future__ import annotations
@@ -25,8 +23,6 @@ from typing import Any, NamedTuple
 import lightning
 import torch
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 from torch.utils.flop_counter import FlopCounterMode
 
 from sononerf import storage
@@ -50,8 +46,7 @@ from sononerf.run.simulate import default_store, echo_hash, ensemble
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
 from sononerf.settings.schema import Settings
-from tools.benchmarks.experiment import CONFIG, Row, aligned, ending
-from tools.benchmarks.record import device_name, keep, ratios
+from tools.benchmarks.experiment import CONFIG, Row, aligned, device_name, ending, keep, ratios
 
 PAPER = CONFIG.parent / "paper" / "three_spheres.yaml"
 NEURAL = CONFIG.parent / "neural.yaml"
@@ -76,7 +71,7 @@ PAIRS = (
     Pair("fourier in bfloat16, shell", PAPER, ("field.options.precision=bfloat16",), 5, 20),
     Pair("fourier in bfloat16, profile", NEURAL, ("field.options.precision=bfloat16",), 5, 20),
 )
-NAIVE, SHELL, DEFAULT = PAIRS[0].name, PAIRS[1].name, PAIRS[3].name
+NAIVE, SHELL = PAIRS[0].name, PAIRS[1].name
 
 
 class EquationSeventeen(ShellRenderer):
@@ -129,39 +124,6 @@ def _network(field: FourierField, places: Tensor, toward: Tensor) -> Tensor:
     return torch.complex(real, imaginary)
 
 
-class Traffic(TorchDispatchMode):  # type: ignore[no-untyped-call]
-    """Adds up the bytes that operations read and write."""
-
-    def __init__(self) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
-        self.bytes = 0
-
-    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = func(*args, **(kwargs or {}))
-        if not _only_looks(func):
-            touched = [*tree_leaves((args, kwargs)), *tree_leaves(result)]
-            self.bytes += sum(_bytes(t) for t in touched if isinstance(t, Tensor))
-        return result
-
-
-def _only_looks(func: Any) -> bool:
-    """Whether an operation hands out what it was given, under another shape."""
-    outputs = func._schema.returns
-    return bool(outputs) and all(
-        o.alias_info is not None and not o.alias_info.is_write for o in outputs
-    )
-
-
-def _bytes(tensor: Tensor) -> int:
-    if tensor.layout is torch.sparse_csr:
-        parts = (tensor.crow_indices(), tensor.col_indices(), tensor.values())
-        return sum(_bytes(part) for part in parts)
-    if tensor.layout is not torch.strided:
-        raise TypeError(f"bytes of a tensor of layout {tensor.layout} are not known")
-    whole = tensor.numel() * tensor.element_size()
-    return min(whole, tensor.untyped_storage().nbytes())  # what is expanded lies there once
-
-
 class Stopwatch(lightning.Callback):
     """Times the steps after the first ones, and counts in one more."""
 
@@ -169,8 +131,8 @@ class Stopwatch(lightning.Callback):
         self.warm, self.timed, self.counted = warm, timed, counted
         self.seconds: list[float] = []
         self.points: list[int] = []
-        self.flop = self.bytes = 0
-        self._modes: list[Any] = []
+        self.flop = 0
+        self._counter: FlopCounterMode | None = None
         self._began = 0.0
 
     def on_train_batch_start(
@@ -179,9 +141,8 @@ class Stopwatch(lightning.Callback):
         """Start the clock, or the counting."""
         del batch, batch_idx
         if trainer.global_step == self.warm + self.timed and self.counted:
-            self._modes = [FlopCounterMode(display=False), Traffic()]
-            for mode in self._modes:
-                mode.__enter__()
+            self._counter = FlopCounterMode(display=False)
+            self._counter.__enter__()
         self._points = int(pl_module.renderer.points_evaluated)
         self._settle()
         self._began = time.perf_counter()
@@ -192,12 +153,10 @@ class Stopwatch(lightning.Callback):
         """Stop it."""
         del outputs, batch, batch_idx
         self._settle()
-        if self._modes:
-            flop, traffic = self._modes
-            for mode in reversed(self._modes):
-                mode.__exit__(None, None, None)
-            self._modes = []
-            self.flop, self.bytes = flop.get_total_flops(), traffic.bytes
+        if self._counter is not None:
+            self._counter.__exit__(None, None, None)
+            self.flop = self._counter.get_total_flops()
+            self._counter = None
         elif trainer.global_step > self.warm:
             self.seconds.append(time.perf_counter() - self._began)
             self.points.append(int(pl_module.renderer.points_evaluated) - self._points)
@@ -222,20 +181,17 @@ def _step(arguments: argparse.Namespace, output: Path) -> str:
         storage.read_json(arguments.compare)  # that it cannot be read is told before minutes pass
     chosen = [_settings(pair, arguments, output) for pair in PAIRS]  # wrong ones cost no minutes
     device = device_name(arguments.accelerator)
-    copy = copy_rate(device)
     products = {kind: matrix_rate(device, kind) for kind in ("float32", "bfloat16")}
     rows: list[Row] = []
     for pair, settings in zip(PAIRS, chosen, strict=True):
-        rows.append(_measured(pair, settings, arguments.accelerator, products, copy))
+        rows.append(_measured(pair, settings, arguments.accelerator, products))
         print(f"{pair.name}: {1e3 * rows[-1]['step_s']:.1f} ms", file=sys.stderr, flush=True)
     by_name = {row["name"]: row for row in rows}
     found = {
         "scene": arguments.scene,
         "matrix_flop_per_s": products,
-        "copy_bytes_per_s": copy,
         "shell_over_equation_17": by_name[NAIVE]["step_s"] / by_name[SHELL]["step_s"],
         "loss_of_equation_17_differs_by": by_name[NAIVE]["loss_differs"],
-        "default_over_what_memory_allows": by_name[DEFAULT]["over_memory"],
         "rows": rows,
     }
     path = keep(output, "step", device, found)
@@ -252,9 +208,7 @@ def _settings(pair: Pair, arguments: argparse.Namespace, output: Path) -> Settin
     return load_settings(pair.config, [*chosen, f"data.store={folder / store}"])
 
 
-def _measured(
-    pair: Pair, settings: Settings, accelerator: str, products: dict[str, float], copy: float
-) -> Row:
+def _measured(pair: Pair, settings: Settings, accelerator: str, products: dict[str, float]) -> Row:
     store = ensemble(settings, progress=Progress())
     region, possible = region_of(settings, Echoes(store, head_of(settings)))
     field, renderer = field_and_renderer(settings, head_of(settings), region)
@@ -306,15 +260,11 @@ def _measured(
     if isinstance(field, FourierField) and field.precision != "float32":
         row["loss_differs"] = _loss_in_float32_differs(module, field, data)
     product = products[getattr(field, "precision", "float32")]
-    allowed = watch.bytes / copy
     return {
         **row,
         "flop": watch.flop,
         "flop_per_s": watch.flop / seconds,
         "over_matrix_rate": watch.flop / seconds / product,
-        "bytes": watch.bytes,
-        "memory_s": allowed,
-        "over_memory": seconds / allowed,
     }
 
 
@@ -354,14 +304,6 @@ def matrix_rate(device: str, kind: str = "float32", size: int | None = None) -> 
     return 2 * size**3 / _median_seconds(lambda: one @ one, device)
 
 
-def copy_rate(device: str, size: int | None = None) -> float:
-    """Return the bytes a second that a copy of a large tensor reads and writes."""
-    size = size or (1 << 30 if device == "cuda" else 1 << 26)
-    one = torch.rand(size, device=device)
-    other = torch.empty_like(one)
-    return 2 * 4 * size / _median_seconds(lambda: other.copy_(one), device)
-
-
 def _median_seconds(run: Callable[[], object], device: str) -> float:
     seconds = []
     for _ in range(8):
@@ -373,7 +315,7 @@ def _median_seconds(run: Callable[[], object], device: str) -> float:
     return statistics.median(seconds[1:])
 
 
-TITLES = ("pair", "steps", "ms", "points/s", "GFLOP", "of peak", "MB", "over memory", "loss apart")
+TITLES = ("pair", "steps", "ms", "points/s", "GFLOP", "of peak", "loss apart")
 
 
 def table(rows: list[Row]) -> str:
@@ -391,8 +333,6 @@ def table(rows: list[Row]) -> str:
             shown(row["points_per_s"], ",.0f"),
             shown(row.get("flop"), ".2f", 1e-9),
             shown(row.get("over_matrix_rate"), ".0%"),
-            shown(row.get("bytes"), ".0f", 1e-6),
-            shown(row.get("over_memory"), ".1f"),
             shown(row.get("loss_differs"), ".0e"),
         ]
         for row in rows
@@ -405,9 +345,7 @@ def sentences(found: dict[str, Any]) -> str:
     rates = found["matrix_flop_per_s"]
     return (
         f"matrix product {rates['float32'] / 1e9:.0f} GFLOP/s, "
-        f"in bfloat16 {rates['bfloat16'] / 1e9:.0f} GFLOP/s, "
-        f"copy {found['copy_bytes_per_s'] / 1e9:.1f} GB/s\n"
+        f"in bfloat16 {rates['bfloat16'] / 1e9:.0f} GFLOP/s\n"
         f"fourier, shell: {found['shell_over_equation_17']:.1f} times as fast as equation 17, "
-        f"loss {found['loss_of_equation_17_differs_by']:.0e} apart\n"
-        f"grid, profile: {found['default_over_what_memory_allows']:.1f} times what memory allows"
+        f"loss {found['loss_of_equation_17_differs_by']:.0e} apart"
     )
