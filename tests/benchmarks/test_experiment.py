@@ -11,7 +11,7 @@ import pytest
 from sononerf.errors import IncompatibleError
 from sononerf.settings.loading import dump_yaml, load_settings
 from tools.benchmarks import experiment
-from tools.benchmarks.experiment import CONFIG, row_of, run_experiment
+from tools.benchmarks.experiment import CONFIG, run_experiment
 
 METRICS = {
     "schema": 1,
@@ -27,33 +27,6 @@ METRICS = {
     },
     "baseline": {"backprojection": {"fscore": {"0.005": 0.73}}},
 }
-ROW = {
-    "fit_s": 41.0,
-    "fscore_1mm": 0.62,
-    "fscore_2mm": 0.99,
-    "fscore_5mm": 1.0,
-    "chamfer_m": 0.00091,
-    "thickness_bias_m": 0.00088,
-    "volume_ratio": 1.19,
-    "parts": 3,
-    "parts_true": 3,
-    "heldout_mae_db_active": 3.28,
-    "backprojection_fscore_5mm": 0.73,
-}
-
-
-def test_a_row_is_taken_from_the_metrics():
-    assert row_of(METRICS) == ROW
-
-
-@pytest.mark.parametrize(
-    "metrics",
-    [{}, {"prediction": None, "geometry": None, "baseline": {"backprojection": None}}],
-)
-def test_what_a_run_does_not_have_is_none(metrics):
-    assert row_of(metrics) == dict.fromkeys(ROW)
-
-
 SETTINGS = ["scene.name=sphere", "poses.count=5", "poses.heldout=0", "poses.validation=0"]
 
 

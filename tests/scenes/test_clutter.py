@@ -20,7 +20,10 @@ def halves(scene):
         yield part
 
 
-@pytest.mark.parametrize("seed", range(4))
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=SLOW), pytest.param(3, marks=SLOW)])
 def test_nothing_touches_the_target_nor_comes_near_the_poses(seed):
     scene = load_scene("clutter", {"seed": seed, "density": 1.0})
     target, background = halves(scene)

@@ -36,7 +36,12 @@ def bat(mesh, engine):
     return rear(simulator.echo(place[0], straight[0], seed=0)[0])
 
 
-@pytest.mark.parametrize("offset", [0.012, 0.015, 0.018, 0.021, 0.03])
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "offset", [0.012, pytest.param(0.015, marks=SLOW), 0.018, pytest.param(0.021, marks=SLOW), 0.03]
+)
 def test_a_ball_fades_behind_another_as_multiple_scattering_says(offset):
     front, behind = both(offset)
     mesh = trimesh.util.concatenate([front, behind])

@@ -143,24 +143,6 @@ def origin() -> dict[str, str]:
     return {"sononerf": __version__, "machine": machine}
 
 
-def row_of(metrics: Mapping[str, Any]) -> Row:
-    """Return what the table shows of one run; None for what it does not have."""
-    cost, prediction, geometry, baseline = (
-        metrics.get(name) or {} for name in ("cost", "prediction", "geometry", "baseline")
-    )
-    scores = geometry.get("fscore", {})
-    other = (baseline.get("backprojection") or {}).get("fscore", {})
-    return {
-        "fit_s": cost.get("fit_s"),
-        **{f"fscore_{mm}mm": scores.get(f"0.00{mm}") for mm in (1, 2, 5)},
-        **{key: geometry.get(key) for key in ("chamfer_m", "thickness_bias_m", "volume_ratio")},
-        "parts": geometry.get("components"),
-        "parts_true": geometry.get("components_true"),
-        "heldout_mae_db_active": prediction.get("mae_db_active"),
-        "backprojection_fscore_5mm": other.get("0.005"),
-    }
-
-
 def aligned(lines: Sequence[Sequence[str]]) -> list[str]:
     """Return rows of words as lines of text, each column at the right of its place."""
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]

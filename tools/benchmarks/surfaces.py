@@ -29,7 +29,6 @@ from tools.benchmarks.experiment import (
     ending,
     ensemble_name,
     origin,
-    row_of,
     run_experiment,
     shown,
 )
@@ -209,17 +208,21 @@ def measured(metrics: Mapping[str, Any]) -> Row:
     ``seconds`` are those of all but the simulation, ``rendered_mae_db_active`` is the error of the
     field's own rendering on active cells, ``heldout_mae_db_active`` that of all that predicts.
     """
-    cost, prediction = (metrics.get(name) or {} for name in ("cost", "prediction"))
+    cost, prediction, geometry = (
+        metrics.get(name) or {} for name in ("cost", "prediction", "geometry")
+    )
+    scores = geometry.get("fscore", {})
     spent = [
         value
         for key, value in cost.items()
         if key.endswith("_s") and key != "simulate_s" and value is not None
     ]
-    row = row_of(metrics)
     return {
-        **{key: row[key] for key in ("chamfer_m", "fscore_1mm", "fscore_2mm", "fscore_5mm")},
-        **{key: row[key] for key in ("thickness_bias_m", "parts", "parts_true")},
-        "heldout_mae_db_active": row["heldout_mae_db_active"],
+        **{key: geometry.get(key) for key in ("chamfer_m", "thickness_bias_m")},
+        **{f"fscore_{mm}mm": scores.get(f"0.00{mm}") for mm in (1, 2, 5)},
+        "parts": geometry.get("components"),
+        "parts_true": geometry.get("components_true"),
+        "heldout_mae_db_active": prediction.get("mae_db_active"),
         "heldout_mae_db": prediction.get("mae_db"),
         "rendered_mae_db_active": prediction.get("rendered_mae_db_active"),
         "seconds": sum(spent) if spent else None,
