@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: MIT
-"""A cubic lattice: values of points spread onto it, and read off it."""
+"""A cubic lattice: values of points spread onto it, and read off it; surfaces of one value."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+import trimesh
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
+from skimage.measure import marching_cubes
 
 Array = NDArray[np.float64]
 Grid = NDArray[np.float32]
@@ -76,3 +78,40 @@ class Lattice:
             grid, self.coordinates(points).T, order=1, mode="nearest", output=np.float64
         )
         return read
+
+
+def level_surface(
+    grid: NDArray[np.floating], level: float, origin: ArrayLike = 0.0, spacing: float = 1.0
+) -> trimesh.Trimesh:
+    """Return the surface on which a grid takes a level, by marching cubes.
+
+    Parameters
+    ----------
+    grid : (X, Y, Z) float
+        Values; none on the level itself, where triangles have no area.
+    level : float
+        Value on the surface.
+    origin : (3,) float, m
+        Centre of the first voxel.
+    spacing : float, m
+        Between centres.
+
+    Returns
+    -------
+    mesh : Trimesh
+        Of positive volume if it is closed.
+    """
+    vertices, faces, _, _ = marching_cubes(
+        grid.astype(np.float32), level, gradient_direction="ascent", allow_degenerate=False
+    )
+    places = np.asarray(origin) + spacing * np.asarray(vertices, dtype=np.float64)
+    mesh = trimesh.Trimesh(places, faces, process=False, validate=False)
+    if signed_volume(mesh) < 0:
+        mesh.invert()
+    return mesh
+
+
+def signed_volume(mesh: trimesh.Trimesh) -> float:
+    """Return the volume of a closed mesh, m³, negative if it is inside out; it may be zero."""
+    corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
+    return float(np.linalg.det(corners - corners.mean(axis=(0, 1))).sum() / 6.0)

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import zarr
 
+from sononerf import storage
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, NumericalError, StorageError
 
@@ -192,6 +193,11 @@ def significant(data):
         ignored = ("attributes", "storage_transformers", "codecs")
         return {key: value for key, value in data.items() if key not in ignored}
     return data
+
+
+def test_a_folder_that_is_locked_is_no_foreign_one(tmp_path):
+    with storage.lock(tmp_path / "s"):
+        assert len(filled(tmp_path / "s")) == POSES
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])

@@ -9,8 +9,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
-from skimage.measure import marching_cubes
 
+from sononerf.geometry.lattice import level_surface, signed_volume
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
 
 CELL = 1.1
@@ -62,15 +62,10 @@ def remesh(mesh: trimesh.Trimesh, edge: float, blur: float = 0.0) -> trimesh.Tri
         distance = ndimage.gaussian_filter(distance, blur / spacing)
     if not (distance < 0).any():
         return None
-    vertices, faces, _, _ = marching_cubes(
-        distance.astype(np.float32), 0.0, gradient_direction="ascent", allow_degenerate=False
-    )
-    found = trimesh.Trimesh(lower + spacing * vertices, faces, process=True)
+    found = level_surface(distance, 0.0, lower, spacing)
     found.merge_vertices()
-    if _volume(found) < 0.0:
-        found.invert()
     pieces = found.split(only_watertight=False)
-    pieces = [piece for piece in pieces if abs(_volume(piece)) >= (LEAST * edge) ** 3]
+    pieces = [piece for piece in pieces if abs(signed_volume(piece)) >= (LEAST * edge) ** 3]
     if not pieces:
         return None
     found = trimesh.util.concatenate(pieces) if len(pieces) > 1 else pieces[0]
@@ -169,7 +164,7 @@ def signed_distance(
     shape = np.ceil((bounds[1] - bounds[0]) / spacing).astype(int) + 2 * margin + 1
     distance = np.full(tuple(shape), (BAND + 0.5) * spacing, dtype=np.float32)
     for body in mesh.split(only_watertight=False):
-        if _volume(body) <= 0.0:
+        if signed_volume(body) <= 0.0:
             continue
         first = np.floor((body.bounds[0] - lower) / spacing).astype(int) - BAND - 1
         last = np.ceil((body.bounds[1] - lower) / spacing).astype(int) + BAND + 2
@@ -177,12 +172,6 @@ def signed_distance(
         found = _of_body(body, lower + first * spacing, tuple(last - first), spacing)
         distance[part] = np.minimum(distance[part], found)
     return lower, distance
-
-
-def _volume(mesh: trimesh.Trimesh) -> float:
-    """Signed volume, m³; unlike the mesh's own it may be zero."""
-    corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
-    return float(np.linalg.det(corners - corners.mean(axis=(0, 1))).sum() / 6.0)
 
 
 def _of_body(

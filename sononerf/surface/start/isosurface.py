@@ -7,9 +7,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from skimage.filters import threshold_otsu
-from skimage.measure import marching_cubes
 
 from sononerf.errors import NumericalError
+from sononerf.geometry.lattice import level_surface
 from sononerf.surface.start.volume import Volume, require_finite
 
 # How near to a voxel's centre the surface may pass, in voxels.
@@ -54,11 +54,8 @@ def isosurface(volume: Volume, level: float) -> trimesh.Trimesh:
     if (scaled == threshold).any():
         # A voxel exactly on the level gives triangles without area; one ulp is no difference.
         threshold = np.nextafter(threshold, np.float32(1 if threshold < 0.5 else 0))
-    vertices, faces, _, _ = marching_cubes(
-        scaled, float(threshold), gradient_direction="ascent", allow_degenerate=False
-    )
-    vertices = volume.origin + volume.spacing * (np.asarray(vertices, dtype=np.float64) - 1)
-    return trimesh.Trimesh(vertices, faces, process=False, validate=False)
+    origin = volume.origin - volume.spacing  # of the padded grid
+    return level_surface(scaled, float(threshold), origin, volume.spacing)
 
 
 def _kept_off(values: NDArray[np.float64], level: float) -> NDArray[np.float64]:

@@ -25,12 +25,11 @@ import torch
 import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage
-from skimage.measure import marching_cubes
 
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError
 from sononerf.field.field import Field
-from sononerf.geometry.lattice import MARGIN, Grid, Lattice
+from sononerf.geometry.lattice import MARGIN, Grid, Lattice, level_surface
 from sononerf.surface.start.evidence import Evidence, locate_sound, signed_distance
 from sononerf.surface.start.evidence_grids import planes, thinness, winding_of
 from sononerf.surface.start.reliability import reliability
@@ -265,14 +264,7 @@ def _surface(distance: Grid, lattice: Lattice) -> trimesh.Trimesh:
     # A voxel on the surface itself would be wrapped in triangles without area.
     near = np.abs(distance) < 1e-3
     off = np.where(near, np.where(distance < 0, -1e-3, 1e-3), distance)
-    vertices, faces, _, _ = marching_cubes(
-        off.astype(np.float32), 0.0, gradient_direction="ascent", allow_degenerate=False
-    )
-    vertices = lattice.origin + lattice.spacing * np.asarray(vertices, dtype=np.float64)
-    mesh = trimesh.Trimesh(vertices, faces, process=False)
-    if mesh.volume < 0:
-        mesh.invert()
-    return mesh
+    return level_surface(off, 0.0, lattice.origin, lattice.spacing)
 
 
 _COARSER = 4  # voxels between the places of the first look; only saves time

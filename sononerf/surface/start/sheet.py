@@ -28,9 +28,9 @@ import trimesh
 from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
-from skimage.measure import marching_cubes
 
 from sononerf.errors import NumericalError
+from sononerf.geometry.lattice import level_surface
 from sononerf.surface.start.occupancy import Gathered
 from sononerf.surface.start.reliability import ALIGNED
 
@@ -205,13 +205,11 @@ def _slab(frame: _Frame, z: Array, half: float) -> trimesh.Trimesh:
     outside = np.maximum(layers[None, None], -deepest[:, :, None])
     if not (outside < 0).any():
         raise NumericalError("no surface: the onsets leave no room for a sheet")
-    vertices, faces, _, _ = marching_cubes(
-        outside.astype(np.float32), 0.0, gradient_direction="ascent", allow_degenerate=False
-    )
-    where, layer = np.asarray(vertices[:, :2], dtype=np.float64), vertices[:, 2] - 3.0
+    slab = level_surface(outside, 0.0)
+    where, layer = slab.vertices[:, :2], slab.vertices[:, 2] - 3.0
     height = ndimage.map_coordinates(z, where.T, order=1) + layer * half
     place = np.column_stack((frame.lower + frame.step * where, height))
-    sheet = trimesh.Trimesh(place @ frame.axes.T + frame.centre, faces, process=False)
+    sheet = trimesh.Trimesh(place @ frame.axes.T + frame.centre, slab.faces, process=False)
     largest = max(sheet.split(only_watertight=False), key=lambda part: len(part.faces))
     if largest.volume < 0:
         largest.invert()
