@@ -320,8 +320,7 @@ def read(monkeypatch):
     field = FourierField(region, torch.tensor([40e3, 60e3]), octaves=2, width=8)
 
     def body(gathered, belief):
-        mesh = sphere()
-        return SimpleNamespace(mesh=mesh)
+        return sphere()
 
     def gathered(*given):
         nothing = np.zeros((0, 3))

@@ -63,31 +63,6 @@ _CONTRADICTED = 4.0  # range resolutions; if every place lies so far in front, t
 
 
 @dataclass(frozen=True, eq=False)
-class Occupancy:
-    """A body, its surface, and the evidence for it.
-
-    Attributes
-    ----------
-    mesh : Trimesh
-        Closed, m, normals outward.
-    distance : (X, Y, Z) float, m
-        Signed distance, positive outside.
-    lattice : Lattice
-        Its voxels.
-    evidence : Evidence
-        The oriented points.
-    hull : EchoHull
-        The free space.
-    """
-
-    mesh: trimesh.Trimesh
-    distance: Grid
-    lattice: Lattice
-    evidence: Evidence
-    hull: EchoHull
-
-
-@dataclass(frozen=True, eq=False)
 class Gathered:
     """All evidence, on one lattice; a surface of it is found by :func:`estimate_occupancy`.
 
@@ -167,8 +142,8 @@ def gather_evidence(
     return Gathered(evidence, weight, points, lattice, thin, bound, hull, resolution)
 
 
-def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> Occupancy:
-    """Return where the body is.
+def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> trimesh.Trimesh:
+    """Return the closed surface of the body, m, normals outward.
 
     Parameters
     ----------
@@ -205,7 +180,7 @@ def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> Occupancy:
     if belief != "hull":
         back = _THICKER * spacing * lattice.read(known.thin, np.asarray(mesh.vertices)).clip(0, 1)
         mesh.vertices = mesh.vertices - back[:, None] * mesh.vertex_normals
-    return Occupancy(mesh, spacing * distance, lattice, known.evidence, known.hull)
+    return mesh
 
 
 def _by_all_evidence(known: Gathered, belief: Literal["open", "filled"]) -> Grid:

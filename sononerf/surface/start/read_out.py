@@ -110,7 +110,7 @@ def start_surfaces(
     for method in methods:
         try:
             known = reading.gathered
-            mesh = fit_sheet(known) if method == "sheet" else estimate_occupancy(known, method).mesh
+            mesh = fit_sheet(known) if method == "sheet" else estimate_occupancy(known, method)
         except NumericalError as error:
             first = first or error
             continue
