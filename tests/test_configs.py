@@ -107,7 +107,7 @@ def test_the_papers_scenes_differ_in_scene_and_poses_alone():
 
 @pytest.mark.parametrize(
     "slices",
-    [64, pytest.param(512, marks=pytest.mark.slow)],  # its full batch: half a minute
+    [16, pytest.param(512, marks=pytest.mark.slow)],  # its full batch: half a minute
 )
 def test_the_papers_training_takes_steps(tmp_path, monkeypatch, slices):
     settings = load_settings(

@@ -125,12 +125,12 @@ def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, mo
     ("settings", "given", "expected"),
     [
         ({}, {}, "filled"),
-        ({"method": "open"}, {}, "open"),
+        pytest.param({"method": "open"}, {}, "open", marks=pytest.mark.slow),
         ({"method": "open"}, {"method": "hull"}, "hull"),
         ({"method": "open"}, {"level": "found"}, "isosurface"),
         ({"level": "found"}, {}, "isosurface"),
-        ({"level": "found"}, {"method": "hull"}, "hull"),
-        ({"level": "found"}, {"level": "auto"}, "filled"),
+        pytest.param({"level": "found"}, {"method": "hull"}, "hull", marks=pytest.mark.slow),
+        pytest.param({"level": "found"}, {"level": "auto"}, "filled", marks=pytest.mark.slow),
     ],
 )
 def test_what_the_caller_gives_replaces_the_settings(

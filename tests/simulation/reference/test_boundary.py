@@ -177,6 +177,7 @@ def test_the_engine_hears_a_sphere_as_the_series_does():
     np.testing.assert_array_equal(echoes(again, position, look_at(position, np.zeros(3))), found)
 
 
+@pytest.mark.slow  # nine seconds
 def test_meshes_are_coarser_at_lower_frequencies():
     one = engine(round_ball(4), frequency_max=40e3)
     counts = [

@@ -178,7 +178,7 @@ def test_going_on_from_any_step_ends_the_same(bumpy, echoes, optics, simulated_s
     while not whole.done:
         states[whole.drawn] = {k: v.clone() for k, v in whole.state().items()}
         whole.advance()
-    for step in (5, 8, 12, 16, 20):
+    for step in (5, 8, 20):  # within stages, and between two
         again = started(bumpy, echoes, optics, **given)
         again.load(states[step])
         while not again.done:
