@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Echoes: a store, its head, and what is found in them once; echoes less a background's."""
+"""Echoes: a store, its head, and what is found in them once; echoes minus those of a background."""
 
 from __future__ import annotations
 

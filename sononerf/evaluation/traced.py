@@ -102,7 +102,7 @@ def learn_traced(
     training = poses_of(echoes, "train", renderer)
     validation = poses_of(echoes, "val", renderer)
     if not len(validation):
-        return Traced.none(mesh, fitted.head, "no pose is for validation")
+        return Traced.none(mesh, fitted.head, "there are no validation poses")
     numbers = np.linspace(0, len(training) - 1, min(GAIN_POSES, len(training))).astype(int)
     some = training.only(torch.as_tensor(numbers))
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which hits of rays can be heard, and where and when: bundles of rays are too coarse or not."""
+"""Which hits of rays can be heard and when they arrive, and which bundles are too coarse."""
 
 from __future__ import annotations
 

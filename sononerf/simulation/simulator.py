@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The echo simulator: a scene, a head and poses in, what the receivers hear out."""
+"""The echo simulator: from a scene, a head and poses to what the receivers hear."""
 
 from __future__ import annotations
 

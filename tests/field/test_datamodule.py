@@ -52,7 +52,9 @@ def assert_same(one, two):
 
 
 # The stream is endless; a worker that is left in the middle of it sometimes aborts as it exits.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.filterwarnings(
+    "ignore:.*_MultiProcessingDataLoaderIter.__del__:pytest.PytestUnraisableExceptionWarning"
+)
 @pytest.mark.parametrize("whole", [True, False])
 def test_workers_change_nothing(store, whole):
     found = [

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Maximum-intensity projections as pictures."""
+"""Pictures of maximum-intensity projections, and of where two runs differ."""
 
 from __future__ import annotations
 
