@@ -40,20 +40,13 @@ STEP = 1e-6
 class Blade:
     """A blade, its stalk included.
 
-    Attributes
-    ----------
-    length, width, thickness : float, m
-        Without stalk and ribs.
-    curl : float, rad
-        By how much it is bent from edge to edge; above 0 towards its upper side.
-    bend : float, rad
-        By how much from base to tip; above 0 away from its upper side.
-    amplitude : float, m
-        Of each wave.
-    waves : (3, WAVES) float, rad/m, rad/m and rad
-        Wave numbers along and across, and phases.
-    veins : (2, VEINS) float
-        Where the side veins start, as shares of the length; of either side.
+    Attributes:
+        length, width, thickness (m): Without stalk and ribs.
+        curl (rad): By how much it is bent from edge to edge; above 0 towards its upper side.
+        bend (rad): By how much from base to tip; above 0 away from its upper side.
+        amplitude (m): Of each wave.
+        waves ((3, WAVES), rad/m, rad/m and rad): Wave numbers along and across, and phases.
+        veins (2, VEINS): Where the side veins start, as shares of the length; of either side.
     """
 
     length: float
@@ -186,19 +179,13 @@ class Blade:
     def frames(self, along: Values, across: Values) -> tuple[Values, Values, Values]:
         """Return where one stands on the upper side, passing over the ribs.
 
-        Parameters
-        ----------
-        along, across : (N,) float, m
-            Places.
+        Args:
+            along, across ((N,), m): Places.
 
-        Returns
-        -------
-        points : (N, 3) float, m
-            On the upper side.
-        normals : (N, 3) float
-            Unit vectors away from the leaf.
-        tangents : (N, 3) float
-            Unit vectors along the length, towards the tip.
+        Returns:
+            points ((N, 3), m): On the upper side.
+            normals (N, 3): Unit vectors away from the leaf.
+            tangents (N, 3): Unit vectors along the length, towards the tip.
         """
 
         def smooth(u: Values, v: Values) -> Values:

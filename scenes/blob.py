@@ -67,12 +67,9 @@ def _sphere(size: float) -> trimesh.Trimesh:
 class _Surface:
     """How far a surface is from the origin, over all directions; the mean is about 1.
 
-    Parameters
-    ----------
-    random : Generator
-        Draws the bumps.
-    roughness : float
-        Standard deviation of the logarithm of the distance.
+    Args:
+        random: Draws the bumps.
+        roughness: Standard deviation of the logarithm of the distance.
     """
 
     def __init__(self, random: np.random.Generator, roughness: float) -> None:

@@ -44,18 +44,13 @@ def sections(length: float) -> int:
 def tube(path: ArrayLike, radius: float) -> trimesh.Trimesh:
     """Build a tube with round ends, or a closed one where the path ends where it began.
 
-    Parameters
-    ----------
-    path : (N, 2) float, m
-        Points (y, z) of a line without corners; bends of a smaller radius than the tube's would
-        fold it.
-    radius : float, m
-        Of the tube.
+    Args:
+        path ((N, 2), m): Points (y, z) of a line without corners; bends of a smaller radius than
+            the tube's would fold it.
+        radius (m): Of the tube.
 
-    Returns
-    -------
-    body : Trimesh
-        Closed, facing outward, in the y-z plane.
+    Returns:
+        body: Closed, facing outward, in the y-z plane.
     """
     points = np.asarray(path, dtype=np.float64)
     closed = bool(np.allclose(points[0], points[-1]))
@@ -128,17 +123,12 @@ def placed(
 ) -> trimesh.Trimesh:
     """Turn a mesh, then move the middle of its bounding box to the origin.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Metres; stays as it is.
-    yaw, pitch, roll : float, degrees
-        Turns about z, y and x, roll first, as a head's.
+    Args:
+        mesh: Metres; stays as it is.
+        yaw, pitch, roll (degrees): Turns about z, y and x, roll first, as a head's.
 
-    Returns
-    -------
-    mesh : Trimesh
-        At the origin, at which poses look.
+    Returns:
+        mesh: At the origin, at which poses look.
     """
     vertices = np.asarray(mesh.vertices) @ _rotation(yaw, pitch, roll).T
     vertices -= (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0

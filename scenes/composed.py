@@ -84,24 +84,17 @@ def _part(options: PartOptions, where: str) -> Part:
 def load_within(name: str, options: dict[str, Any], of_name: str, of_options: str) -> Scene:
     """Build a scene that another one holds.
 
-    Parameters
-    ----------
-    name : str
-        Of the scene.
-    options : dict
-        Of the scene.
-    of_name, of_options : str
-        Dotted keys under which they are set, for messages.
+    Args:
+        name: Of the scene.
+        options: Of the scene.
+        of_name, of_options: Dotted keys under which they are set, for messages.
 
-    Returns
-    -------
-    scene : Scene
-        Checked.
+    Returns:
+        scene: Checked.
 
-    Raises
-    ------
-    SettingsError, InputError
-        As :func:`sononerf.scene.load_scene` does, with the keys that the user wrote.
+    Raises:
+        SettingsError, InputError: As :func:`sononerf.scene.load_scene` does, with the keys that the
+            user wrote.
     """
     try:
         return load_scene(name, options)

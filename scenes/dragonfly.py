@@ -59,16 +59,11 @@ MARGIN = 2e-3
 class Seat:
     """Where a dragonfly sits.
 
-    Attributes
-    ----------
-    blade : Blade
-        The leaf.
-    along, across : float, m
-        Place of the body's middle.
-    heading : float, rad
-        About the leaf's normal; 0 looks to the tip.
-    length : float, m
-        Of the body.
+    Attributes:
+        blade: The leaf.
+        along, across (m): Place of the body's middle.
+        heading (rad): About the leaf's normal; 0 looks to the tip.
+        length (m): Of the body.
     """
 
     blade: Blade
@@ -106,20 +101,14 @@ class Seat:
 def dragonfly_on(seat: Seat) -> trimesh.Trimesh:
     """Build a dragonfly.
 
-    Parameters
-    ----------
-    seat : Seat
-        Where it sits; body and feet must be over the leaf.
+    Args:
+        seat: Where it sits; body and feet must be over the leaf.
 
-    Returns
-    -------
-    mesh : Trimesh
-        Closed bodies that overlap, in the leaf's frame before that is turned.
+    Returns:
+        mesh: Closed bodies that overlap, in the leaf's frame before that is turned.
 
-    Raises
-    ------
-    SettingsError
-        If the leaf is curled so tightly that there is no room for the wings.
+    Raises:
+        SettingsError: If the leaf is curled so tightly that there is no room for the wings.
     """
     parts = [*_head(seat), _thorax(seat), _abdomen(seat)]
     for side in (1.0, -1.0):

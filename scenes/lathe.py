@@ -19,17 +19,13 @@ def lathe(profile: ArrayLike) -> trimesh.Trimesh:
     Circles of the profile are divided by their own length, so triangles are as large near the axis
     as far from it.
 
-    Parameters
-    ----------
-    profile : (N, 2) float, m
-        Radius and height of corners, with straight lines between them. The outside lies to the
-        right of the way from the first corner to the last, as on a way up an outer wall. An end
-        at radius zero is closed by a tip; any other end leaves a hole.
+    Args:
+        profile ((N, 2), m): Radius and height of corners, with straight lines between them. The
+            outside lies to the right of the way from the first corner to the last, as on a way up
+            an outer wall. An end at radius zero is closed by a tip; any other end leaves a hole.
 
-    Returns
-    -------
-    body : Trimesh
-        Facing outward; vertices circle by circle, in the order of the profile.
+    Returns:
+        body: Facing outward; vertices circle by circle, in the order of the profile.
     """
     corners = np.insert(np.asarray(profile, np.float64), 1, 0.0, axis=1)
     rows = evenly(corners, SIDE)[:, [0, 2]]

@@ -39,10 +39,8 @@ def blade_of(
 ) -> Blade:
     """Return the blade of a leaf's options (m, degrees).
 
-    Raises
-    ------
-    SettingsError
-        If it is wider than long: its curled edges could then meet where it is bent.
+    Raises:
+        SettingsError: If it is wider than long: its curled edges could then meet where it is bent.
     """
     if width > length:
         raise SettingsError(

@@ -16,18 +16,14 @@ from .bodies import SIDE, sections, walls
 def loft(path: ArrayLike, radius: ArrayLike) -> trimesh.Trimesh:
     """Build a body of circular section along a line.
 
-    Parameters
-    ----------
-    path : (N, 3) float, m
-        Points of the line, at least three, no two that follow one another the same. It must not
-        bend more sharply than the body is thick.
-    radius : (N,) float, m
-        Of the circles about them. Both ends are points, their radii are not asked for.
+    Args:
+        path ((N, 3), m): Points of the line, at least three, no two that follow one another the
+            same. It must not bend more sharply than the body is thick.
+        radius ((N,), m): Of the circles about them. Both ends are points, their radii are not asked
+            for.
 
-    Returns
-    -------
-    body : Trimesh
-        Closed, facing outward.
+    Returns:
+        body: Closed, facing outward.
     """
     points, radii = np.asarray(path, np.float64), np.asarray(radius, np.float64)
     along = np.gradient(points, axis=0)

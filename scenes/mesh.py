@@ -27,35 +27,23 @@ def mesh(
 ) -> Scene:
     """Load a surface from a file.
 
-    Parameters
-    ----------
-    path : str
-        STL, PLY, OBJ, OFF, GLB, or glTF that needs no other file; relative to the working
-        directory.
-    unit : {"m", "cm", "mm"}, optional
-        Of the file's numbers. GLB and glTF are in metres by their standard; the others say
-        nothing, so it must be given.
-    scale : float
-        How many times as large as in the file.
-    centre : bool
-        Move the middle of the bounding box to the origin, at which poses look.
-    material : {"rigid", "sonotracelab", "leaf", "insect"}
-        Of all that ``materials`` does not name.
-    materials : dict, optional
-        Materials by part: the geometries of GLB and glTF, the objects and groups of OBJ
-        (``object_group`` where it has both), the solids of a text STL.
+    Args:
+        path: STL, PLY, OBJ, OFF, GLB, or glTF that needs no other file; relative to the working
+            directory.
+        unit: Of the file's numbers. GLB and glTF are in metres by their standard; the others say
+            nothing, so it must be given.
+        scale: How many times as large as in the file.
+        centre: Move the middle of the bounding box to the origin, at which poses look.
+        material: Of all that ``materials`` does not name.
+        materials: Materials by part: the geometries of GLB and glTF, the objects and groups of OBJ
+            (``object_group`` where it has both), the solids of a text STL.
 
-    Returns
-    -------
-    scene : Scene
-        Metres.
+    Returns:
+        scene: Metres.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is damaged, or holds no surface; naming it.
-    SettingsError
-        If ``materials`` names a part that the file has not.
+    Raises:
+        InputError: If the file cannot be read, is damaged, or holds no surface; naming it.
+        SettingsError: If ``materials`` names a part that the file has not.
     """
     parts = read_parts(path)
     kind = kind_of(path)

@@ -24,10 +24,8 @@ STL_TRIANGLE = 50  # bytes
 def kind_of(path: str) -> str:
     """Return a file's format by the end of its name.
 
-    Raises
-    ------
-    InputError
-        If it is none that can be read, or no file at all.
+    Raises:
+        InputError: If it is none that can be read, or no file at all.
     """
     kind = Path(path).suffix.lower().lstrip(".")
     if "://" in path or kind not in FORMATS:
@@ -40,21 +38,16 @@ def kind_of(path: str) -> str:
 def read_parts(path: str) -> dict[str, trimesh.Trimesh]:
     """Read a mesh file and put its parts where its scene graph says.
 
-    Parameters
-    ----------
-    path : str
-        STL, PLY, OBJ, OFF, GLB, or glTF that needs no other file.
+    Args:
+        path: STL, PLY, OBJ, OFF, GLB, or glTF that needs no other file.
 
-    Returns
-    -------
-    parts : dict of Trimesh
-        By name, in the order of the file; vertices as they stand there, none merged. A part that
-        stands in several places is one.
+    Returns:
+        parts: By name, in the order of the file; vertices as they stand there, none merged. A part
+            that stands in several places is one.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, is damaged, too large, or holds no triangles; naming it.
+    Raises:
+        InputError: If the file cannot be read, is damaged, too large, or holds no triangles; naming
+            it.
     """
     kind = kind_of(path)
     data = _read(Path(path))

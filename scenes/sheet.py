@@ -22,12 +22,9 @@ FROM_RIM = 0.65
 class Outline:
     """What lies between two curves over x.
 
-    Attributes
-    ----------
-    x : (K,) float, m
-        Ascending.
-    low, high : (K,) float, m
-        The curves; they may meet at the ends, and nowhere else.
+    Attributes:
+        x ((K,), m): Ascending.
+        low, high ((K,), m): The curves; they may meet at the ends, and nowhere else.
     """
 
     x: NDArray[np.float64]
@@ -62,20 +59,14 @@ def _resampled(line: NDArray[np.float64], step: float) -> NDArray[np.float64]:
 def filled(outline: Outline, spacing: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Fill an outline with triangles that are nearly equilateral.
 
-    Parameters
-    ----------
-    outline : Outline
-        The shape.
-    spacing : float, m
-        Of a hexagonal lattice, one of whose rows is y = 0; edges near the rim are up to 1.7
-        times as long.
+    Args:
+        outline: The shape.
+        spacing (m): Of a hexagonal lattice, one of whose rows is y = 0; edges near the rim are up
+            to 1.7 times as long.
 
-    Returns
-    -------
-    points : (N, 2) float, m
-        On the rim and inside.
-    triangles : (T, 3) int
-        Counter-clockwise.
+    Returns:
+        points ((N, 2), m): On the rim and inside.
+        triangles (T, 3): Counter-clockwise.
     """
     rim = outline.rim(ALONG_RIM * spacing)
     low, high = rim.min(axis=0), rim.max(axis=0)
@@ -104,18 +95,13 @@ def two_sided(
 ) -> trimesh.Trimesh:
     """Build a closed sheet of two sides and the rim between them.
 
-    Parameters
-    ----------
-    top, bottom : (N, 3) float, m
-        Where the points of a filled outline come to lie on either side; the top is the side from
-        which its triangles run counter-clockwise.
-    triangles : (T, 3) int
-        Of the outline.
+    Args:
+        top, bottom ((N, 3), m): Where the points of a filled outline come to lie on either side;
+            the top is the side from which its triangles run counter-clockwise.
+        triangles (T, 3): Of the outline.
 
-    Returns
-    -------
-    sheet : Trimesh
-        Vertices of the top first, then the bottom's.
+    Returns:
+        sheet: Vertices of the top first, then the bottom's.
     """
     count = len(top)
     start = triangles.ravel()

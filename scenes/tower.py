@@ -45,14 +45,11 @@ def _blocks(
 ) -> trimesh.Trimesh:
     """Return the surface of blocks between planes at places along x and y, and along z (m).
 
-    Parameters
-    ----------
-    across : (N,) float, m
-        Planes along x, and along y.
-    up : (M,) float, m
-        Planes along z.
-    solid : (N - 1, N - 1, M - 1) bool
-        Which blocks are part of the body; no two of them may share an edge alone.
+    Args:
+        across ((N,), m): Planes along x, and along y.
+        up ((M,), m): Planes along z.
+        solid (N - 1, N - 1, M - 1): Which blocks are part of the body; no two of them may share an
+            edge alone.
     """
     places = []
     for axis, planes in enumerate((across, across, up)):

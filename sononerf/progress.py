@@ -58,10 +58,8 @@ class Task:
 class Progress:
     """Shows tasks one after the other.
 
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing, as inside libraries and tests.
+    Args:
+        quiet: Show nothing, as inside libraries and tests.
     """
 
     def __init__(self, *, quiet: bool = False) -> None:

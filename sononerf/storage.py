@@ -88,10 +88,8 @@ def _make_folder(folder: Path) -> None:
 def make_folder(folder: Path) -> None:
     """Create a folder and its parents, durably; nothing happens where it is there already.
 
-    Raises
-    ------
-    StorageError
-        If it cannot be created.
+    Raises:
+        StorageError: If it cannot be created.
     """
     try:
         _make_folder(folder)
@@ -127,19 +125,14 @@ def commit(
     The content goes to a temporary file beside the target, is flushed and fsynced, takes the
     target's name, and the folder is fsynced. Missing folders are created.
 
-    Parameters
-    ----------
-    path : Path
-        The target.
-    writer : callable
-        Writes the content to the binary file it is given.
-    previous : Path, optional
-        A name in the same folder under which the replaced content is kept.
+    Args:
+        path: The target.
+        writer: Writes the content to the binary file it is given.
+        previous: A name in the same folder under which the replaced content is kept.
 
-    Raises
-    ------
-    StorageError
-        If the file cannot be written; the old one is then untouched, the temporary one gone.
+    Raises:
+        StorageError: If the file cannot be written; the old one is then untouched, the temporary
+            one gone.
     """
     temporary = temporary_beside(path)
     try:
@@ -171,17 +164,12 @@ def commit_folder(folder: Path, files: Mapping[str, str]) -> None:
 
     They are written into a temporary folder beside the target, which then takes its name.
 
-    Parameters
-    ----------
-    folder : Path
-        The target; not there yet, or empty.
-    files : mapping
-        Content by name.
+    Args:
+        folder: The target; not there yet, or empty.
+        files: Content by name.
 
-    Raises
-    ------
-    StorageError
-        If the folder cannot be written, or is not empty; nothing is left behind then.
+    Raises:
+        StorageError: If the folder cannot be written, or is not empty; nothing is left behind then.
     """
     folder = folder.absolute()
     current = temporary_beside(folder)
@@ -240,12 +228,9 @@ def to_json(data: Any, *, indent: int | None = None, sort_keys: bool = False) ->
 def commit_json(path: Path, data: Any) -> None:
     """Commit plain data as JSON; see :func:`commit`.
 
-    Raises
-    ------
-    NumericalError
-        If a number is NaN or infinite; the old file is then untouched.
-    StorageError
-        If the file cannot be written.
+    Raises:
+        NumericalError: If a number is NaN or infinite; the old file is then untouched.
+        StorageError: If the file cannot be written.
     """
     try:
         text = to_json(data, indent=2)
@@ -257,10 +242,8 @@ def commit_json(path: Path, data: Any) -> None:
 def read_json(path: Path) -> Any:
     """Read a JSON file.
 
-    Raises
-    ------
-    InputError
-        If it is missing, unreadable, or no JSON.
+    Raises:
+        InputError: If it is missing, unreadable, or no JSON.
     """
     try:
         return json.loads(path.read_bytes().decode())
@@ -278,10 +261,8 @@ def append_line(path: Path, text: str) -> None:
     A line that a crash tore is closed first, so that it swallows none that follows. Readers
     tell torn lines by a checksum of their own.
 
-    Raises
-    ------
-    StorageError
-        If it cannot be written.
+    Raises:
+        StorageError: If it cannot be written.
     """
     try:
         is_new = not path.exists()
@@ -304,10 +285,8 @@ def append_line(path: Path, text: str) -> None:
 def remove_file(path: Path) -> None:
     """Remove a file, durably; nothing happens where there is none.
 
-    Raises
-    ------
-    StorageError
-        If it cannot be removed.
+    Raises:
+        StorageError: If it cannot be removed.
     """
     try:
         path.unlink()
@@ -349,15 +328,11 @@ def clean_leftovers(folder: Path) -> None:
 def probe_writable(folder: Path) -> list[Path]:
     """Create a folder and prove that files can be written there, before anything expensive.
 
-    Returns
-    -------
-    created : list of Path
-        The folders that were not there, innermost first; see :func:`remove_if_empty`.
+    Returns:
+        created: The folders that were not there, innermost first; see :func:`remove_if_empty`.
 
-    Raises
-    ------
-    StorageError
-        If it cannot be created or written; nothing is left behind then.
+    Raises:
+        StorageError: If it cannot be created or written; nothing is left behind then.
     """
     created = _missing_folders(folder)
     probe = folder / ".probe"
@@ -410,12 +385,9 @@ def is_held(folder: Path) -> bool:
 def lock(folder: Path) -> Iterator[None]:
     """Hold a folder against other processes; the kernel lets go when the process dies.
 
-    Raises
-    ------
-    LockedError
-        If another process holds it; the message names its process and start.
-    StorageError
-        If the lock file cannot be written.
+    Raises:
+        LockedError: If another process holds it; the message names its process and start.
+        StorageError: If the lock file cannot be written.
     """
     make_folder(folder)
     path = folder / _LOCK_NAME

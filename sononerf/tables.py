@@ -17,10 +17,9 @@ MOST_BYTES = 200_000_000
 def read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the header of a table, and line number and cells of each row, as many as the header.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read, holds no rows, a column stands twice, or a row has another length.
+    Raises:
+        InputError: If it cannot be read, holds no rows, a column stands twice, or a row has another
+            length.
     """
     try:
         if path.stat().st_size > MOST_BYTES:
@@ -51,10 +50,8 @@ def read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 def number_in(path: Path, line: int, name: str, cell: str) -> float:
     """Return the number in a cell.
 
-    Raises
-    ------
-    InputError
-        If it is no finite number, naming file, line and column.
+    Raises:
+        InputError: If it is no finite number, naming file, line and column.
     """
     try:
         number = float(cell)

@@ -24,12 +24,9 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 class CheckpointCallback(EpochCallback):
     """Keeps ``checkpoints/last.ckpt``; the step it holds is where the fit goes on.
 
-    Parameters
-    ----------
-    folder : Path
-        The run.
-    seconds : float
-        Longest time between two checkpoints.
+    Args:
+        folder: The run.
+        seconds: Longest time between two checkpoints.
     """
 
     def __init__(self, folder: Path, seconds: float) -> None:

@@ -15,10 +15,8 @@ from sononerf.progress import Task
 def echo_module(module: lightning.LightningModule) -> EchoModule:
     """Return the module that the callbacks here are made for.
 
-    Raises
-    ------
-    TypeError
-        If it is another one.
+    Raises:
+        TypeError: If it is another one.
     """
     if not isinstance(module, EchoModule):
         raise TypeError(f"{type(module).__name__} is no EchoModule")
@@ -66,10 +64,8 @@ class EpochCallback(lightning.Callback):
 class ProgressCallback(lightning.Callback):
     """Moves a bar with every step.
 
-    Parameters
-    ----------
-    task : Task
-        One count per step.
+    Args:
+        task: One count per step.
     """
 
     def __init__(self, task: Task) -> None:

@@ -26,16 +26,11 @@ from sononerf.surface.start.read_out import energy_volume
 class PreviewCallback(EpochCallback):
     """Writes ``epochs/0001/`` and shows the projections in TensorBoard.
 
-    Parameters
-    ----------
-    folder : Path
-        The run.
-    every_epochs : int
-        How often.
-    voxels : int
-        Along the region's longest side.
-    directions : int
-        Spherical lattice for fields without lobes.
+    Args:
+        folder: The run.
+        every_epochs: How often.
+        voxels: Along the region's longest side.
+        directions: Spherical lattice for fields without lobes.
     """
 
     def __init__(self, folder: Path, *, every_epochs: int, voxels: int, directions: int) -> None:
@@ -88,12 +83,9 @@ SHARE = 0.05
 class SpectrogramImages(EpochCallback):
     """Shows the first validation pose.
 
-    Parameters
-    ----------
-    poses : WholePoses
-        The validation poses.
-    range_m, frequency_hz : (R,), (F,) float
-        Axes.
+    Args:
+        poses: The validation poses.
+        range_m, frequency_hz ((R,), (F,) float): Axes.
     """
 
     def __init__(

@@ -42,12 +42,9 @@ OCTANTS = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), axis=-1).re
 def weighted(hull: EchoHull, resolution: float) -> EchoHull:
     """Return the hull with weight zero for onsets that the others contradict.
 
-    Parameters
-    ----------
-    hull : EchoHull
-        What the onsets leave.
-    resolution : float, m
-        Range resolution.
+    Args:
+        hull: What the onsets leave.
+        resolution (m): Range resolution.
     """
     box, ears = _heard_box(hull), hull.first.shape[1]
     if box is None:
@@ -117,12 +114,9 @@ def _cells(
 
     They are halved until half their diagonal is the least, m.
 
-    Returns
-    -------
-    against : (N, P E) bool
-        Which onsets rule a cell out.
-    meets : (N, W) bool
-        At which wanted onsets' range it lies.
+    Returns:
+        against (N, P E): Which onsets rule a cell out.
+        meets (N, W): At which wanted onsets' range it lies.
     """
     lower, upper = box
     side = float((upper - lower).max()) / COARSE

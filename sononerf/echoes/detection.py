@@ -28,10 +28,9 @@ gamma-distributed of shape :math:`K`, and with a false-alarm rate :math:`p` per 
 
 .. math:: T = G_K^{-1}(1 - p) \, / \, G_K^{-1}(q) .
 
-References
-----------
-.. [1] H. Rohling, "Radar CFAR thresholding in clutter and multiple target situations", IEEE
-   Transactions on Aerospace and Electronic Systems 19(4):608-621, 1983.
+References:
+    .. [1] H. Rohling, "Radar CFAR thresholding in clutter and multiple target situations", IEEE
+       Transactions on Aerospace and Electronic Systems 19(4):608-621, 1983.
 """
 
 from __future__ import annotations
@@ -70,15 +69,12 @@ noise even the rounding of a simulator would be detected."""
 def threshold_factor(looks: float) -> float:
     """Return the threshold over the quantile of noise power.
 
-    Parameters
-    ----------
-    looks : float
-        How many independent values each power is the average of.
+    Args:
+        looks: How many independent values each power is the average of.
 
-    Examples
-    --------
-    >>> round(threshold_factor(1.0))  # ln(1e-6) / ln(0.9)
-    131
+    Examples:
+        >>> round(threshold_factor(1.0))  # ln(1e-6) / ln(0.9)
+        131
     """
     low, high = gammaincinv(looks, [RANK, 1.0 - FALSE_ALARMS])
     return float(high / low)
@@ -94,12 +90,10 @@ class Levels(NamedTuple):
 def threshold_levels(power: Array, looks: float) -> Levels:
     """Return the thresholds of noise, and of noise and precursors.
 
-    Parameters
-    ----------
-    power : (..., R) float
-        Power averaged over frequency: of all poses and ears that are compared, over range.
-    looks : float
-        How many independent values each is the average of.
+    Args:
+        power (..., R): Power averaged over frequency: of all poses and ears that are compared, over
+            range.
+        looks: How many independent values each is the average of.
     """
     factor = threshold_factor(looks)
     noise = factor * np.quantile(power, RANK, axis=-1, keepdims=True)
@@ -150,23 +144,16 @@ def onsets(
     The range is read where the power has risen to a tenth of the echo's, or to the threshold of
     noise where that is more, and moved by what a point echo needs from there to its middle.
 
-    Parameters
-    ----------
-    power : (N, R) float
-        Power over range.
-    levels : Levels
-        What an echo exceeds.
-    window : (W,) float or callable
-        Power of a point echo over range, its own range in the middle; or what gives it for a row
-        and the slice of its echo's greatest power.
-    fineness : float
-        Spacing of its values in slices.
+    Args:
+        power (N, R): Power over range.
+        levels: What an echo exceeds.
+        window ((W,) float or callable): Power of a point echo over range, its own range in the
+            middle; or what gives it for a row and the slice of its echo's greatest power.
+        fineness: Spacing of its values in slices.
 
-    Returns
-    -------
-    onset : (N,) float
-        Minus infinity where nothing was heard, or where the first slice cuts an echo that the
-        first whole one does not exceed by the threshold factor.
+    Returns:
+        onset (N,): Minus infinity where nothing was heard, or where the first slice cuts an echo
+            that the first whole one does not exceed by the threshold factor.
     """
     found = np.full(len(power), -np.inf)
     inner = (_is_top(power) & (power > levels.total))[:, 1:-1]
@@ -209,18 +196,13 @@ less to the free space than an onset can be read to."""
 class Onsets:
     """What the asked poses heard.
 
-    Attributes
-    ----------
-    poses : (P,) int
-        Their numbers in the store, ascending.
-    range : (R,) float, m
-        Of the slices.
-    power : (P, E, R) float
-        Averaged over the band.
-    heard : (P, E, R) bool
-        Which slices hold an echo.
-    first : (P, E) float, m
-        Range of the first echo; minus infinity where there is none, or where it is cut.
+    Attributes:
+        poses (P,): Their numbers in the store, ascending.
+        range ((R,), m): Of the slices.
+        power (P, E, R): Averaged over the band.
+        heard (P, E, R): Which slices hold an echo.
+        first ((P, E), m): Range of the first echo; minus infinity where there is none, or where it
+            is cut.
     """
 
     poses: NDArray[np.int64]
@@ -232,10 +214,8 @@ class Onsets:
     def chance(self, resolution: float) -> float:
         """Return the probability that noise alone makes so many onsets.
 
-        Parameters
-        ----------
-        resolution : float, m
-            Range resolution: as many slices as it is long share their noise.
+        Args:
+            resolution (m): Range resolution: as many slices as it is long share their noise.
         """
         extent = len(self.range) * float(self.range[1] - self.range[0])
         tries = self.first.size * extent / resolution
@@ -252,12 +232,9 @@ def asked_poses(store: EnsembleStore) -> NDArray[np.int64]:
 def find_onsets(store: EnsembleStore, echo: PointEcho) -> Onsets:
     """Detect the echoes of a sealed ensemble's asked poses.
 
-    Parameters
-    ----------
-    store : EnsembleStore
-        The ensemble.
-    echo : PointEcho
-        What the analysis makes of one point.
+    Args:
+        store: The ensemble.
+        echo: What the analysis makes of one point.
     """
     poses = asked_poses(store)
     axis = np.asarray(store.range, dtype=np.float64)

@@ -30,24 +30,16 @@ HELD_BACK = 10
 class Echoes:
     """The spectrograms of one store, and the head that heard them.
 
-    Parameters
-    ----------
-    store : EnsembleStore
-        Poses, splits, axes and spectrograms.
-    head : Head
-        What heard them.
-    hull : EchoHull or None
-        The free space, where it is known already; found from the onsets where None.
+    Args:
+        store: Poses, splits, axes and spectrograms.
+        head: What heard them.
+        hull: The free space, where it is known already; found from the onsets where None.
 
-    Attributes
-    ----------
-    positions : (P, 3) float64, m
-        Of the head, world frame.
-    rotations : (P, 3, 3) float64
-        Head to world.
-    training, validation : (...,) int64
-        Poses that a surface is refined on and compared on. Where the store has no validation poses,
-        some of its training poses validate.
+    Attributes:
+        positions ((P, 3), m): Of the head, world frame.
+        rotations (P, 3, 3): Head to world.
+        training, validation (...,): Poses that a surface is refined on and compared on. Where the
+            store has no validation poses, some of its training poses validate.
     """
 
     def __init__(self, store: EnsembleStore, head: Head, hull: EchoHull | None = None) -> None:
@@ -128,19 +120,13 @@ class SubtractedStore(EnsembleStore):
     Phase is not heard, so what both have in one cell is taken off as power; what sounded there with
     more power alone than together leaves silence.
 
-    Parameters
-    ----------
-    path : Path
-        What was heard of target and surroundings.
-    background : Path
-        What was heard of the surroundings alone.
+    Args:
+        path: What was heard of target and surroundings.
+        background: What was heard of the surroundings alone.
 
-    Raises
-    ------
-    InputError
-        If there is no such store, one is damaged, or a pose is missing.
-    IncompatibleError
-        If poses, ranges or frequencies differ.
+    Raises:
+        InputError: If there is no such store, one is damaged, or a pose is missing.
+        IncompatibleError: If poses, ranges or frequencies differ.
     """
 
     def __init__(self, path: Path, background: Path) -> None:

@@ -7,9 +7,8 @@ the body's shape and however silent its faces are from elsewhere. What all poses
 what the visual hull [1]_ is to silhouettes: for a convex body, heard from all around, its surface.
 An onset that is known to be wrong has weight zero and rules nothing out.
 
-References
-----------
-.. [1] A. Laurentini, "The visual hull concept for silhouette-based image understanding", 1994.
+References:
+    .. [1] A. Laurentini, "The visual hull concept for silhouette-based image understanding", 1994.
 """
 
 from __future__ import annotations
@@ -33,22 +32,15 @@ AT_ONCE = 6_400_000
 class EchoHull:
     """Where something can be, for all that first echoes tell.
 
-    Attributes
-    ----------
-    emitters : (P, 3) float, m
-        Where each pose calls from, world frame.
-    receivers : (P, E, 3) float, m
-        Where its ears are.
-    first : (P, E) float, m
-        Range of the first echo that each ear heard: half of the way out and back; minus infinity
-        where it tells nothing.
-    axes : (P, 3) float
-        Which way each head looks, unit vectors.
-    within : float
-        A pose speaks for places towards which the cosine to its axis is at least this.
-    weight : (P, E) float or None
-        How far each first echo is trusted, from 0, an outlier that tells nothing, to 1; all of
-        them where None.
+    Attributes:
+        emitters ((P, 3), m): Where each pose calls from, world frame.
+        receivers ((P, E, 3), m): Where its ears are.
+        first ((P, E), m): Range of the first echo that each ear heard: half of the way out and
+            back; minus infinity where it tells nothing.
+        axes (P, 3): Which way each head looks, unit vectors.
+        within: A pose speaks for places towards which the cosine to its axis is at least this.
+        weight ((P, E) or None): How far each first echo is trusted, from 0, an outlier that tells
+            nothing, to 1; all of them where None.
     """
 
     emitters: Array
@@ -96,18 +88,14 @@ class EchoHull:
     def clearance(self, points: ArrayLike) -> tuple[Array, NDArray[np.intp]]:
         """Return how far points lie behind the first echoes, and which pose leaves them least.
 
-        Parameters
-        ----------
-        points : (N, 3) float, m
-            World frame.
+        Args:
+            points ((N, 3), m): World frame.
 
-        Returns
-        -------
-        clearance : (N,) float, m
-            Negative where a pose says that nothing is there; plus infinity where none speaks. Its
-            slope is at most one. So many poses as :attr:`undetected` may say so in vain.
-        pose : (N,) int
-            The pose that says so.
+        Returns:
+            clearance ((N,), m): Negative where a pose says that nothing is there; plus infinity
+                where none speaks. Its slope is at most one. So many poses as :attr:`undetected` may
+                say so in vain.
+            pose (N,): The pose that says so.
         """
         where = np.asarray(points, dtype=np.float64)
         chunk = self.chunk

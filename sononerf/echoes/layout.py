@@ -92,12 +92,9 @@ def _create(
 def checked_axes(**given: ArrayLike) -> dict[str, NDArray[Any]]:
     """Return axes in the types that are stored, by the names of :data:`AXES`.
 
-    Raises
-    ------
-    InputError
-        If shapes do not fit one another, or a split is unknown.
-    NumericalError
-        If a value is NaN or infinite.
+    Raises:
+        InputError: If shapes do not fit one another, or a split is unknown.
+        NumericalError: If a value is NaN or infinite.
     """
     axes: dict[str, NDArray[Any]] = {}
     for name, (dtype, dims, sizes) in AXES.items():
@@ -118,14 +115,10 @@ def checked_axes(**given: ArrayLike) -> dict[str, NDArray[Any]]:
 def create_arrays(root: Path, axes: dict[str, NDArray[Any]], receivers: int) -> None:
     """Write the axes whole and declare the spectrogram, all before the group that shows them.
 
-    Parameters
-    ----------
-    root : Path
-        The ensemble's folder.
-    axes : dict of array
-        By the names of :data:`AXES`.
-    receivers : int
-        Number E of receivers, from 1 on.
+    Args:
+        root: The ensemble's folder.
+        axes: By the names of :data:`AXES`.
+        receivers: Number E of receivers, from 1 on.
     """
     for name, values in axes.items():
         dtype, dimensions, _ = AXES[name]
@@ -185,24 +178,16 @@ def _open_array(
 def read_axes(root: Path, group: Any) -> tuple[dict[str, NDArray[Any]], Any]:
     """Check every array against what :func:`create_arrays` writes and read the axes.
 
-    Parameters
-    ----------
-    root : Path
-        The ensemble's folder.
-    group : zarr.Group
-        Its opened group.
+    Args:
+        root: The ensemble's folder.
+        group: Its opened group.
 
-    Returns
-    -------
-    axes : dict of array
-        By the names of :data:`AXES`.
-    spectrogram : zarr.Array
-        (P, E, R, F) float32, not read.
+    Returns:
+        axes: By the names of :data:`AXES`.
+        spectrogram: (P, E, R, F) float32, not read.
 
-    Raises
-    ------
-    InputError
-        If one is missing, damaged, or does not fit the others.
+    Raises:
+        InputError: If one is missing, damaged, or does not fit the others.
     """
     axes = {}
     for name, (dtype, dims, sizes) in AXES.items():
@@ -238,10 +223,8 @@ _RESERVED = ("checksum", "format", "schema_version")
 def plain_attributes(path: Path, attributes: dict[str, Any]) -> dict[str, Any]:
     """Return attributes as JSON would give them back, sorted, so that bytes know no order.
 
-    Raises
-    ------
-    NumericalError
-        If a value is NaN or infinite.
+    Raises:
+        NumericalError: If a value is NaN or infinite.
     """
     plain = {key: value for key, value in attributes.items() if key not in _RESERVED}
     try:
@@ -265,12 +248,9 @@ def write_group(path: Path, plain: dict[str, Any]) -> None:
 def read_attributes(path: Path) -> dict[str, Any]:
     """Return a store's attributes, checked, without the format's own names.
 
-    Raises
-    ------
-    InputError
-        If it is none of our ensembles, or its attributes are damaged.
-    IncompatibleError
-        If another version of the format wrote it.
+    Raises:
+        InputError: If it is none of our ensembles, or its attributes are damaged.
+        IncompatibleError: If another version of the format wrote it.
     """
     group = storage.read_json(path / "zarr.json")
     try:

@@ -36,10 +36,8 @@ def _record(data: dict[str, Any]) -> PoseRecord:
 class Manifest:
     """The record of finished poses, ``manifest.json`` overlaid by ``manifest.jsonl``.
 
-    Parameters
-    ----------
-    folder : Path
-        The ensemble's folder.
+    Args:
+        folder: The ensemble's folder.
     """
 
     def __init__(self, folder: Path) -> None:

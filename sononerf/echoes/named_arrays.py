@@ -27,16 +27,12 @@ HEAD = "MATLAB 5.0 MAT-file, written by sononerf"
 class Named:
     """An array that says what it is.
 
-    Attributes
-    ----------
-    values : ndarray
-        Any shape.
-    axes : tuple of str
-        Name of each dimension. A one-dimensional array of the same name holds its coordinates.
-    units : str
-        Such as ``m``; empty for a plain number.
-    meaning : str
-        A few words.
+    Attributes:
+        values: Any shape.
+        axes: Name of each dimension. A one-dimensional array of the same name holds its
+            coordinates.
+        units: Such as ``m``; empty for a plain number.
+        meaning: A few words.
     """
 
     values: NDArray[Any]
@@ -54,19 +50,13 @@ def file_bytes(
     ``attributes``. HDF5 has one dataset per array, with dimension scales. NetCDF (version 3, 64-bit
     offsets) has one variable per array; :func:`xarray.open_dataset` reads it.
 
-    Parameters
-    ----------
-    file_type : {"mat", "h5", "nc"}
-        Kind of file.
-    arrays : mapping of str to Named
-        By their names in the file.
-    attributes : mapping of str to str
-        Of the whole file.
+    Args:
+        file_type: Kind of file.
+        arrays: By their names in the file.
+        attributes: Of the whole file.
 
-    Raises
-    ------
-    ResourceError
-        If an array is too large for the kind of file.
+    Raises:
+        ResourceError: If an array is too large for the kind of file.
     """
     most = LARGEST.get(file_type)
     for name, array in arrays.items():

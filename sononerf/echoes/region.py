@@ -44,23 +44,15 @@ ENOUGH = 2  # poses: one alone does not tell where on its ellipsoid an echo come
 class EchoRegion:
     """What the asked poses say about places.
 
-    Parameters
-    ----------
-    heard : Onsets
-        Power, detected echoes and onsets.
-    hull : EchoHull
-        What the onsets leave; of the same poses.
-    ears : Ears
-        Gains of emitter and ears.
-    rotations : (P, 3, 3) float
-        Head to world.
-    resolution : float, m
-        Range resolution.
+    Args:
+        heard: Power, detected echoes and onsets.
+        hull: What the onsets leave; of the same poses.
+        ears: Gains of emitter and ears.
+        rotations (P, 3, 3): Head to world.
+        resolution (m): Range resolution.
 
-    Raises
-    ------
-    NumericalError
-        If no pose heard anything, or no more than noise gives.
+    Raises:
+        NumericalError: If no pose heard anything, or no more than noise gives.
     """
 
     def __init__(
@@ -86,12 +78,9 @@ class EchoRegion:
     def possible(self, points: Array, tolerance: float) -> Mask:
         """Return the places that no pose rules out and that some poses heard, (N,).
 
-        Parameters
-        ----------
-        points : (N, 3) float, m
-            Places, world frame.
-        tolerance : float, m
-            How far a place speaks for its surroundings.
+        Args:
+            points ((N, 3), m): Places, world frame.
+            tolerance (m): How far a place speaks for its surroundings.
         """
         return self._inside(points, tolerance / 4) & self._energy(points, tolerance)[1]
 
@@ -142,10 +131,8 @@ class EchoRegion:
 
         The margin is two range resolutions.
 
-        Raises
-        ------
-        NumericalError
-            If the echoes of no two poses meet anywhere.
+        Raises:
+            NumericalError: If the echoes of no two poses meet anywhere.
         """
         # A flight along a line or on one side still hears so far ahead, and to the sides.
         looks = np.array([[3, 0, 0], [3, 2, 0], [3, -2, 0], [3, 0, 2], [3, 0, -2]])  # 34 degrees
@@ -236,21 +223,14 @@ FEW = 0.02
 def echo_extent(power: Array, axis: Array, looks: float, margin: float) -> tuple[float, float]:
     """Return the least and the greatest range (m) that hold echoes, with a margin.
 
-    Parameters
-    ----------
-    power : (P, E, R) float
-        Power averaged over frequency.
-    axis : (R,) float, m
-        Ranges of the slices.
-    looks : float
-        How many independent values each power is the average of.
-    margin : float, m
-        Added on both sides.
+    Args:
+        power (P, E, R): Power averaged over frequency.
+        axis ((R,), m): Ranges of the slices.
+        looks: How many independent values each power is the average of.
+        margin (m): Added on both sides.
 
-    Returns
-    -------
-    limits : (float, float), m
-        Within the axis; all of it where nothing is heard.
+    Returns:
+        limits ((float, float), m): Within the axis; all of it where nothing is heard.
     """
     loud: NDArray[np.bool_] = power > threshold_levels(power, looks).total
     heard = np.asarray(loud.any(axis=1))  # (P, R)

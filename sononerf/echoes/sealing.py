@@ -14,19 +14,13 @@ from sononerf.head.decibels import RANGE_DB, compress, mae_db
 def seal(store: EnsembleStore, again: dict[int, NDArray[np.float32]], *, silent: str) -> None:
     """Fix the reported decibels and the noise floor of a complete ensemble, and seal it.
 
-    Parameters
-    ----------
-    store : EnsembleStore
-        No pose is missing.
-    again : dict
-        By number of a test pose, what the same pose heard another time, (E, R, F).
-    silent : str
-        What to say if no training pose heard anything.
+    Args:
+        store: No pose is missing.
+        again: By number of a test pose, what the same pose heard another time, (E, R, F).
+        silent: What to say if no training pose heard anything.
 
-    Raises
-    ------
-    NumericalError
-        If no training pose heard anything.
+    Raises:
+        NumericalError: If no training pose heard anything.
     """
     loudest = max(float(store.read_pose(int(i)).max()) for i in store.indices("train"))
     if loudest <= 0.0:

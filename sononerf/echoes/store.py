@@ -36,19 +36,13 @@ class EnsembleStore:
     process that is killed in between leaves a pose that counts as missing. The same input gives
     the same bytes, in whatever order the poses come.
 
-    Parameters
-    ----------
-    path : Path
-        The ensemble's folder.
-    mode : {"r", "r+"}
-        Reading, or adding poses too.
+    Args:
+        path: The ensemble's folder.
+        mode: Reading, or adding poses too.
 
-    Raises
-    ------
-    InputError
-        If there is no store, or it is damaged.
-    IncompatibleError
-        If another version of the format wrote it.
+    Raises:
+        InputError: If there is no store, or it is damaged.
+        IncompatibleError: If another version of the format wrote it.
     """
 
     def __init__(self, path: Path, *, mode: Literal["r", "r+"] = "r") -> None:
@@ -94,35 +88,21 @@ class EnsembleStore:
 
         The group's own file comes last, so that a half-made store is none.
 
-        Parameters
-        ----------
-        path : Path
-            A folder that is a store, is empty, or is not there.
-        poses_positions : (P, 3) float, m
-            Head positions, world frame.
-        poses_rotations : (P, 3, 3) float
-            Head to world.
-        split : (P,) int
-            0 train, 1 validation, 2 test.
-        range : (R,) float, m
-            One-way distances of the slices.
-        frequency : (F,) float, Hz
-            Frequencies of the bins.
-        attributes : dict
-            Plain data; ``echo_hash`` tells ensembles apart.
-        receivers : int
-            Number E of receivers.
+        Args:
+            path: A folder that is a store, is empty, or is not there.
+            poses_positions ((P, 3), m): Head positions, world frame.
+            poses_rotations (P, 3, 3): Head to world.
+            split (P,): 0 train, 1 validation, 2 test.
+            range ((R,), m): One-way distances of the slices.
+            frequency ((F,), Hz): Frequencies of the bins.
+            attributes: Plain data; ``echo_hash`` tells ensembles apart.
+            receivers: Number E of receivers.
 
-        Raises
-        ------
-        IncompatibleError
-            If the folder holds another ensemble.
-        InputError
-            If shapes do not fit one another, or the folder holds something else.
-        NumericalError
-            If an axis or an attribute is NaN or infinite.
-        StorageError
-            If it cannot be written.
+        Raises:
+            IncompatibleError: If the folder holds another ensemble.
+            InputError: If shapes do not fit one another, or the folder holds something else.
+            NumericalError: If an axis or an attribute is NaN or infinite.
+            StorageError: If it cannot be written.
         """
         axes = checked_axes(
             position=poses_positions,
@@ -209,21 +189,14 @@ class EnsembleStore:
     def write_pose(self, index: int, spectrogram: ArrayLike) -> None:
         """Commit one pose.
 
-        Parameters
-        ----------
-        index : int
-            Number of the pose.
-        spectrogram : (E, R, F) float32
-            Linear magnitude.
+        Args:
+            index: Number of the pose.
+            spectrogram ((E, R, F) float32): Linear magnitude.
 
-        Raises
-        ------
-        InputError
-            If there is no such pose, or the shape is another.
-        NumericalError
-            If a value is NaN or infinite.
-        StorageError
-            If it cannot be written; the pose then counts as missing.
+        Raises:
+            InputError: If there is no such pose, or the shape is another.
+            NumericalError: If a value is NaN or infinite.
+            StorageError: If it cannot be written; the pose then counts as missing.
         """
         self._refuse_reading()
         self._refuse_unknown(index)
@@ -244,10 +217,8 @@ class EnsembleStore:
     def read_pose(self, index: int) -> NDArray[np.float32]:
         """Return one pose's magnitude, (E, R, F), verified.
 
-        Raises
-        ------
-        InputError
-            If the pose is missing or damaged.
+        Raises:
+            InputError: If the pose is missing or damaged.
         """
         self._refuse_unknown(index)
         if index not in self._records:  # another process may have added it since

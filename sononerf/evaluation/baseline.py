@@ -41,32 +41,21 @@ def backprojection(
     .. math:: I(x) = \frac{1}{P} \sum_p \sum_e \sum_f
               \left|S_{p,e,f}\right|^2 \left(\frac{|x - x_p| + |x - x_{p,e}|}{2}\right)
 
-    Parameters
-    ----------
-    spectrograms : iterable of (E, R, F) float
-        Linear magnitude, one per pose in order; read one at a time.
-    poses : Poses
-        P of them.
-    head : Head
-        What heard the spectrograms.
-    lower, upper : (3,) float, m
-        The box.
-    spacing : float, m
-        Voxel size.
+    Args:
+        spectrograms (iterable of (E, R, F) float): Linear magnitude, one per pose in order; read
+            one at a time.
+        poses: P of them.
+        head: What heard the spectrograms.
+        lower, upper ((3,), m): The box.
+        spacing (m): Voxel size.
 
-    Returns
-    -------
-    volume : Volume
-        Mean energy per voxel; what lies outside the recorded ranges adds nothing.
+    Returns:
+        volume: Mean energy per voxel; what lies outside the recorded ranges adds nothing.
 
-    Raises
-    ------
-    ValueError
-        If there is not one spectrogram of the head's shape for each pose.
-    NumericalError
-        If a spectrogram is not finite.
-    ResourceError
-        If the grid does not fit in memory.
+    Raises:
+        ValueError: If there is not one spectrogram of the head's shape for each pose.
+        NumericalError: If a spectrogram is not finite.
+        ResourceError: If the grid does not fit in memory.
     """
     emitters, receivers = head.places(poses.positions, poses.rotations)
     axis = head.range
@@ -100,30 +89,20 @@ def coherent_backprojection(
     :func:`sononerf.head.matched_filter.matched_filter`. It asks for poses that are right to a
     fraction of a wavelength.
 
-    Parameters
-    ----------
-    waveforms : iterable of (E, S) float
-        Recordings from the start of the emission on, one per pose in order; read one at a time.
-    poses, lower, upper
-        As of :func:`backprojection`.
-    head : Head
-        Whose call was emitted.
-    spacing : float, m
-        Voxel size; a quarter of the shortest wavelength shows all there is.
+    Args:
+        waveforms (iterable of (E, S) float): Recordings from the start of the emission on, one per
+            pose in order; read one at a time.
+        poses, lower, upper: As of :func:`backprojection`.
+        head: Whose call was emitted.
+        spacing (m): Voxel size; a quarter of the shortest wavelength shows all there is.
 
-    Returns
-    -------
-    volume : Volume
-        Magnitude of the mean compressed pressure per voxel.
+    Returns:
+        volume: Magnitude of the mean compressed pressure per voxel.
 
-    Raises
-    ------
-    ValueError
-        If shapes do not fit.
-    NumericalError
-        If a recording is not finite.
-    ResourceError
-        If the grid would not fit in memory.
+    Raises:
+        ValueError: If shapes do not fit.
+        NumericalError: If a recording is not finite.
+        ResourceError: If the grid would not fit in memory.
     """
     emitted = head.waveform
     finer = _oversampling(emitted)
@@ -166,19 +145,14 @@ def range_profiles(
 ) -> Iterator[NDArray[np.float64]]:
     """Yield each pose's energy, summed over frequency, (E, R).
 
-    Parameters
-    ----------
-    spectrograms : iterable of (E, R, F) float
-        Linear magnitude, one per pose; read one at a time.
-    shape : (P, E, R)
-        What is expected.
+    Args:
+        spectrograms (iterable of (E, R, F) float): Linear magnitude, one per pose; read one at a
+            time.
+        shape (P, E, R): What is expected.
 
-    Raises
-    ------
-    ValueError
-        If there are more, fewer or other ones.
-    NumericalError
-        If one is not finite.
+    Raises:
+        ValueError: If there are more, fewer or other ones.
+        NumericalError: If one is not finite.
     """
     poses, ears, slices = shape
     count = 0
@@ -228,24 +202,16 @@ def best_level_surface(
     of twelve levels, judged by the F-score at 5 mm against the true surface. Never use this on what
     is being evaluated.
 
-    Parameters
-    ----------
-    volume : Volume
-        Greater values are inside.
-    truth : Trimesh or Solid
-        The true surface.
+    Args:
+        volume: Greater values are inside.
+        truth: The true surface.
 
-    Returns
-    -------
-    mesh : Trimesh
-        The best surface.
-    level : float
-        Its level.
+    Returns:
+        mesh: The best surface.
+        level: Its level.
 
-    Raises
-    ------
-    NumericalError
-        If no level gives a surface.
+    Raises:
+        NumericalError: If no level gives a surface.
     """
     true = truth if isinstance(truth, Solid) else Solid(truth)
     target, _ = true.samples(LEVEL_SAMPLES, 0)

@@ -29,14 +29,10 @@ ours."""
 class Truth:
     """A true surface, laid over a reconstruction.
 
-    Parameters
-    ----------
-    true : Trimesh
-        The true surface, m.
-    mesh : Trimesh
-        The reconstruction, m.
-    kind : {"none", "rigid", "similarity"}
-        What lays the reconstruction over the truth; baselines are moved alike.
+    Args:
+        true: The true surface, m.
+        mesh: The reconstruction, m.
+        kind: What lays the reconstruction over the truth; baselines are moved alike.
     """
 
     def __init__(self, true: trimesh.Trimesh, mesh: trimesh.Trimesh, kind: Kind) -> None:
@@ -79,12 +75,9 @@ def baselines(
 ) -> Iterator[tuple[str, Volume]]:
     """Yield names and volumes of what needs no learning: backprojection and voxel fit.
 
-    Parameters
-    ----------
-    echoes : Echoes
-        Whose training poses are used.
-    lower, upper : (3,) float64, m
-        Corners of the region.
+    Args:
+        echoes: Whose training poses are used.
+        lower, upper ((3,), m): Corners of the region.
     """
     store = echoes.store
     train = store.indices("train")

@@ -36,44 +36,35 @@ def geometry_metrics(
     reconstruction all surface counts, a wall inside it too. Distances are exact, from area-uniform
     samples of the one surface to the triangles of the other.
 
-    Parameters
-    ----------
-    reconstructed : Trimesh
-        Metres, world frame.
-    truth : Trimesh or Solid
-        Likewise; pass a Solid if several meshes are compared with it.
-    samples : int
-        Points drawn from each surface.
-    seed : int
-        The same seed gives the same numbers.
-    thresholds : tuple of float, m
-        Distances at which the F-score is taken.
+    Args:
+        reconstructed: Metres, world frame.
+        truth: Likewise; pass a Solid if several meshes are compared with it.
+        samples: Points drawn from each surface.
+        seed: The same seed gives the same numbers.
+        thresholds (tuple of float, m): Distances at which the F-score is taken.
 
-    Returns
-    -------
-    metrics : dict
-        ``chamfer_m``
-            Mean of the two mean distances.
-        ``fscore``
-            Per threshold, as ``"0.005"``: harmonic mean of the shares of the reconstruction near
-            the truth and of the truth near the reconstruction.
-        ``thickness_bias_m``
-            Mean signed distance of the reconstruction from the truth, positive outside; None where
-            the truth is open.
-        ``volume_ratio``, ``iou``
-            Volume over true volume, shared volume over united volume; None where either is open.
-        ``normal_consistency``
-            Mean cosine between the normals, without sign, of each sample and its nearest sample of
-            the other surface, both ways.
-        ``components``, ``components_true``
-            Connected parts with more than 1 % of the largest one's area.
+    Returns:
+        metrics:
+            ``chamfer_m``
+                Mean of the two mean distances.
+            ``fscore``
+                Per threshold, as ``"0.005"``: harmonic mean of the shares of the reconstruction
+                near the truth and of the truth near the reconstruction.
+            ``thickness_bias_m``
+                Mean signed distance of the reconstruction from the truth, positive outside; None
+                where the truth is open.
+            ``volume_ratio``, ``iou``
+                Volume over true volume, shared volume over united volume; None where either is
+                open.
+            ``normal_consistency``
+                Mean cosine between the normals, without sign, of each sample and its nearest sample
+                of the other surface, both ways.
+            ``components``, ``components_true``
+                Connected parts with more than 1 % of the largest one's area.
 
-    Raises
-    ------
-    ValueError
-        If ``samples`` is not positive.
-    NumericalError
-        If a mesh is empty or not finite.
+    Raises:
+        ValueError: If ``samples`` is not positive.
+        NumericalError: If a mesh is empty or not finite.
     """
     if samples < 1:
         raise ValueError(f"samples: {samples}, expected 1 or more")
@@ -109,31 +100,22 @@ def target_metrics(
     Of the reconstruction counts what lies nearer to the true target than to the true surroundings;
     else as :func:`geometry_metrics`.
 
-    Parameters
-    ----------
-    reconstructed, target, background : Trimesh
-        Metres, world frame.
-    samples : int
-        Points drawn from each surface.
-    seed : int
-        The same seed gives the same numbers.
-    thresholds : tuple of float, m
-        Distances at which the F-score is taken.
+    Args:
+        reconstructed, target, background: Metres, world frame.
+        samples: Points drawn from each surface.
+        seed: The same seed gives the same numbers.
+        thresholds (tuple of float, m): Distances at which the F-score is taken.
 
-    Returns
-    -------
-    metrics : dict
-        ``share``
-            The part of the reconstructed surface that counts.
-        ``chamfer_m``, ``fscore``
-            None and 0 where no part of it does.
+    Returns:
+        metrics:
+            ``share``
+                The part of the reconstructed surface that counts.
+            ``chamfer_m``, ``fscore``
+                None and 0 where no part of it does.
 
-    Raises
-    ------
-    ValueError
-        If ``samples`` is not positive.
-    NumericalError
-        If a mesh is empty or not finite.
+    Raises:
+        ValueError: If ``samples`` is not positive.
+        NumericalError: If a mesh is empty or not finite.
     """
     if samples < 1:
         raise ValueError(f"samples: {samples}, expected 1 or more")

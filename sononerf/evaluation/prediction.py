@@ -37,18 +37,12 @@ SSIM_WINDOW = 11
 class Prediction:
     """Spectrograms of poses, (P, E, R, F) linear magnitude.
 
-    Attributes
-    ----------
-    magnitude : (P, E, R, F) float32
-        The mean of rendered and traced levels.
-    rendered : (P, E, R, F) float32
-        The field's own rendering.
-    traced_weight : float
-        Mean weight of the traced echoes.
-    traced_fault : str or None
-        Why no echoes are traced off the surface.
-    reference : float
-        Magnitude m0 of the reported decibels.
+    Attributes:
+        magnitude ((P, E, R, F) float32): The mean of rendered and traced levels.
+        rendered ((P, E, R, F) float32): The field's own rendering.
+        traced_weight: Mean weight of the traced echoes.
+        traced_fault: Why no echoes are traced off the surface.
+        reference: Magnitude m0 of the reported decibels.
     """
 
     magnitude: NDArray[np.float32]
@@ -94,22 +88,14 @@ def predict(
 ) -> Prediction:
     """Predict the spectrograms of poses.
 
-    Parameters
-    ----------
-    fitted : FittedField
-        What is rendered.
-    traced : Traced or None
-        Surface that echoes are traced off as well.
-    poses : WholePoses
-        Where to hear.
-    simulation : SimulationSettings
-        Of the surface's echoes; engine and number of rays are replaced.
-    seed : int
-        Of the rays.
-    accelerator : {"auto", "cpu", "gpu"}
-        What to render on.
-    progress : Progress
-        Where to show it.
+    Args:
+        fitted: What is rendered.
+        traced: Surface that echoes are traced off as well.
+        poses: Where to hear.
+        simulation: Of the surface's echoes; engine and number of rays are replaced.
+        seed: Of the rays.
+        accelerator: What to render on.
+        progress: Where to show it.
     """
     rendered = render_poses(fitted, poses, accelerator=accelerator, progress=progress)
     reference, magnitude = fitted.module.reference, rendered
@@ -131,29 +117,23 @@ def prediction_metrics(
 ) -> dict[str, float | None]:
     """Compare predicted spectrograms with measured ones.
 
-    Parameters
-    ----------
-    measured_db, predicted_db : (P, E, R, F) float, dB
-        0 dB is silence; arrays mapped from a file are read a few poses at a time.
-    mean_db : (E, R, F) float, dB
-        Mean spectrogram of the training poses: what knowing nothing of the pose predicts.
-    active_db : float, dB
-        A cell is active where the measured or the judged spectrogram reaches this.
+    Args:
+        measured_db, predicted_db ((P, E, R, F), dB): 0 dB is silence; arrays mapped from a file are
+            read a few poses at a time.
+        mean_db ((E, R, F), dB): Mean spectrogram of the training poses: what knowing nothing of the
+            pose predicts.
+        active_db (dB): A cell is active where the measured or the judged spectrogram reaches this.
 
-    Returns
-    -------
-    metrics : dict
-        ``mae_db``, ``mae_db_active``, ``mean_predictor_mae_db``, ``mean_predictor_mae_db_active``,
-        ``log_spectral_distance_db`` (root mean square over frequency, mean over the rest),
-        ``psnr_db`` and ``ssim`` (range 60 dB), ``pearson``. None where a figure does not exist:
-        nothing active, a perfect match's PSNR, pictures too small for SSIM, no variation.
+    Returns:
+        metrics: ``mae_db``, ``mae_db_active``, ``mean_predictor_mae_db``,
+            ``mean_predictor_mae_db_active``, ``log_spectral_distance_db`` (root mean square over
+            frequency, mean over the rest), ``psnr_db`` and ``ssim`` (range 60 dB), ``pearson``.
+            None where a figure does not exist: nothing active, a perfect match's PSNR, pictures too
+            small for SSIM, no variation.
 
-    Raises
-    ------
-    ValueError
-        If the shapes do not fit.
-    NumericalError
-        If a value is not finite.
+    Raises:
+        ValueError: If the shapes do not fit.
+        NumericalError: If a value is not finite.
     """
     measured, predicted = same_shape(measured_db, predicted_db)
     mean = np.asarray(mean_db, dtype=np.float64)
@@ -224,16 +204,12 @@ SAME = 1e-6
 class Comparison:
     """Two volumes over their common maximum, and what remains of one without the other.
 
-    Attributes
-    ----------
-    first, second : Volume
-        0 to 1, on one grid.
-    difference : Volume
-        First without second.
-    strongest : (3,) float or None, m
-        Where the difference is greatest; None where it is nowhere above zero.
-    score : float
-        How great it is at most: part of the common maximum.
+    Attributes:
+        first, second: 0 to 1, on one grid.
+        difference: First without second.
+        strongest ((3,) or None, m): Where the difference is greatest; None where it is nowhere
+            above zero.
+        score: How great it is at most: part of the common maximum.
     """
 
     first: Volume
@@ -246,21 +222,12 @@ class Comparison:
 def compare(first: Volume, second: Volume) -> Comparison:
     """Compare two volumes, place by place.
 
-    Parameters
-    ----------
-    first, second : Volume
-        What is heard from each place, on one grid.
+    Args:
+        first, second: What is heard from each place, on one grid.
 
-    Returns
-    -------
-    comparison : Comparison
-
-    Raises
-    ------
-    ValueError
-        If the grids differ.
-    NumericalError
-        If both are silent.
+    Raises:
+        ValueError: If the grids differ.
+        NumericalError: If both are silent.
     """
     alike = first.shape == second.shape and np.allclose(first.origin, second.origin)
     if not alike or first.spacing != second.spacing:
@@ -280,10 +247,8 @@ def compare(first: Volume, second: Volume) -> Comparison:
 def added_part(mesh: trimesh.Trimesh, without: trimesh.Trimesh) -> trimesh.Trimesh | None:
     """Return what a true surface has and another one has not; None where that is nothing.
 
-    Parameters
-    ----------
-    mesh, without : Trimesh
-        Metres, one world frame; equal parts are equal triangle for triangle.
+    Args:
+        mesh, without: Metres, one world frame; equal parts are equal triangle for triangle.
     """
     if not len(without.faces):
         return mesh

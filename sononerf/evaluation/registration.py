@@ -31,12 +31,9 @@ SETTLED = 1e-5
 class Registration:
     """A rigid motion or similarity.
 
-    Attributes
-    ----------
-    matrix : (4, 4) float64
-        From the reconstruction's frame to the true one, lengths in m.
-    scale : float
-        Of lengths; 1 for a rigid motion.
+    Attributes:
+        matrix (4, 4): From the reconstruction's frame to the true one, lengths in m.
+        scale: Of lengths; 1 for a rigid motion.
     """
 
     matrix: NDArray[np.float64]
@@ -64,26 +61,18 @@ def register(
     surface is not laid over a whole. The iteration starts as the surfaces lie and from all proper
     alignments of their principal axes; the best result counts. A mirror image is never taken.
 
-    Parameters
-    ----------
-    found : Trimesh
-        Reconstruction, m.
-    truth : Trimesh
-        True surface, any unit if ``kind`` is ``similarity``.
-    kind : {"none", "rigid", "similarity"}
-        No motion; rotation and translation; and one scale.
-    seed : int
-        Of the samples. The same seed gives the same motion.
+    Args:
+        found: Reconstruction, m.
+        truth: True surface, any unit if ``kind`` is ``similarity``.
+        kind: No motion; rotation and translation; and one scale.
+        seed: Of the samples. The same seed gives the same motion.
 
-    Returns
-    -------
-    registration : Registration
-        Identity for ``none``.
+    Returns:
+        registration: Identity for ``none``.
 
-    References
-    ----------
-    .. [1] P. J. Besl and N. D. McKay, "A method for registration of 3-D shapes", IEEE PAMI 14(2),
-       1992.
+    References:
+        .. [1] P. J. Besl and N. D. McKay, "A method for registration of 3-D shapes", IEEE PAMI
+           14(2), 1992.
     """
     if kind == "none":
         return Registration(np.eye(4), 1.0)

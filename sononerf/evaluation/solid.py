@@ -26,19 +26,14 @@ ROUNDING = 1e-9
 class Solid:
     """The union of the closed bodies of a mesh, and its open sheets.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Metres. Closed bodies, which may overlap or be inside out, and open sheets.
-    fill_cavities : bool
-        Whether closed cavities count as filled, as for a true surface: no sound reaches them.
+    Args:
+        mesh: Metres. Closed bodies, which may overlap or be inside out, and open sheets.
+        fill_cavities: Whether closed cavities count as filled, as for a true surface: no sound
+            reaches them.
 
-    Attributes
-    ----------
-    union : Manifold
-        The solid; empty if no part is closed.
-    sheets : list of Trimesh
-        The parts that are open or enclose no volume.
+    Attributes:
+        union: The solid; empty if no part is closed.
+        sheets: The parts that are open or enclose no volume.
     """
 
     def __init__(self, mesh: trimesh.Trimesh, *, fill_cavities: bool = True) -> None:
@@ -137,26 +132,17 @@ def sample_surface(
 ) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
     """Draw points uniformly by area.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Metres.
-    count : int
-        Number of points.
-    seed : int
-        The same seed draws the same points.
+    Args:
+        mesh: Metres.
+        count: Number of points.
+        seed: The same seed draws the same points.
 
-    Returns
-    -------
-    points : (count, 3) float, m
-        On the surface.
-    face : (count,) int
-        The triangles that they lie on.
+    Returns:
+        points ((count, 3), m): On the surface.
+        face (count,): The triangles that they lie on.
 
-    Raises
-    ------
-    NumericalError
-        If the mesh has no area.
+    Raises:
+        NumericalError: If the mesh has no area.
     """
     if not mesh.area > 0:
         raise NumericalError("the mesh has no area to draw points from")
@@ -217,10 +203,8 @@ SLACK = 1e-9
 class Nearest:
     """Distances to one mesh, whose search structures are built once and when first needed.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Any mesh with a triangle; it is not to be changed afterwards.
+    Args:
+        mesh: Any mesh with a triangle; it is not to be changed afterwards.
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:

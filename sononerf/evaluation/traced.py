@@ -31,16 +31,11 @@ GAIN_POSES = 12
 class Traced:
     """A surface to trace echoes off, and the weight of these echoes in the prediction.
 
-    Attributes
-    ----------
-    mesh : Trimesh
-        The surface, m.
-    gain_db : (E, F) float, dB
-        Level that is added to the traced echoes.
-    weight : (F,) float
-        Weight of the traced echoes in the mean with the rendered ones, 0 to 1.
-    fault : str
-        Why no echoes can be traced off the surface; empty where they can.
+    Attributes:
+        mesh: The surface, m.
+        gain_db ((E, F), dB): Level that is added to the traced echoes.
+        weight (F,): Weight of the traced echoes in the mean with the rendered ones, 0 to 1.
+        fault: Why no echoes can be traced off the surface; empty where they can.
     """
 
     mesh: trimesh.Trimesh
@@ -70,33 +65,21 @@ def learn_traced(
     The gain per ear and frequency comes from training poses, the weight per frequency from one
     regression on the validation poses. Held-out poses take no part.
 
-    Parameters
-    ----------
-    fitted : FittedField
-        What is rendered.
-    echoes : Echoes
-        What was measured.
-    mesh : Trimesh
-        The surface, m.
-    simulation : SimulationSettings
-        Of the surface's echoes; engine and number of rays are replaced.
-    seed : int
-        Of the rays.
-    accelerator : {"auto", "cpu", "gpu"}
-        What the field is rendered on.
-    progress : Progress
-        Where to show it.
+    Args:
+        fitted: What is rendered.
+        echoes: What was measured.
+        mesh: The surface, m.
+        simulation: Of the surface's echoes; engine and number of rays are replaced.
+        seed: Of the rays.
+        accelerator: What the field is rendered on.
+        progress: Where to show it.
 
-    Returns
-    -------
-    traced : Traced
-        Of weight zero where there are no validation poses, or nothing can be traced off the
-        surface; ``fault`` then says why.
+    Returns:
+        traced: Of weight zero where there are no validation poses, or nothing can be traced off the
+            surface; ``fault`` then says why.
 
-    Raises
-    ------
-    ResourceError
-        If there is too little memory for it now.
+    Raises:
+        ResourceError: If there is too little memory for it now.
     """
     renderer, reference = fitted.module.renderer, fitted.module.reference
     training = poses_of(echoes, "train", renderer)
@@ -173,15 +156,12 @@ lobes and interference."""
 def gain_db(measured_db: ArrayLike, traced_db: ArrayLike) -> Array:
     """Return how much louder each ear measured each frequency than it was traced.
 
-    Parameters
-    ----------
-    measured_db, traced_db : (P, E, R, F) float, dB
-        Reported decibels; 0 dB is silence.
+    Args:
+        measured_db, traced_db ((P, E, R, F), dB): Reported decibels; 0 dB is silence.
 
-    Returns
-    -------
-    gain : (E, F) float, dB
-        Median over the cells above ``LOUD_DB`` in both; zero where there is none.
+    Returns:
+        gain ((E, F), dB): Median over the cells above ``LOUD_DB`` in both; zero where there is
+            none.
     """
     measured, traced = (np.asarray(a, dtype=np.float64) for a in (measured_db, traced_db))
     loud = (measured > LOUD_DB) & (traced > LOUD_DB)
@@ -198,16 +178,12 @@ def gain_db(measured_db: ArrayLike, traced_db: ArrayLike) -> Array:
 def mix(rendered_db: ArrayLike, traced_db: ArrayLike, weight: ArrayLike) -> Array:
     """Return the weighted mean of two predictions in decibels.
 
-    Parameters
-    ----------
-    rendered_db, traced_db : (..., F) float, dB
-        Predictions.
-    weight : (F,) float
-        Weight of the traced one, 0 to 1.
+    Args:
+        rendered_db, traced_db ((..., F), dB): Predictions.
+        weight (F,): Weight of the traced one, 0 to 1.
 
-    Returns
-    -------
-    mixed_db : (..., F) float64, dB
+    Returns:
+        mixed_db: (..., F), dB.
     """
     first = np.asarray(rendered_db, dtype=np.float64)
     return first + np.asarray(weight) * (np.asarray(traced_db, dtype=np.float64) - first)
@@ -220,15 +196,12 @@ def regress_weight(measured_db: ArrayLike, rendered_db: ArrayLike, traced_db: Ar
     cells of a frequency: least absolute deviations, as the reported error is. With one unknown the
     solution is the median of :math:`(m - r) / (t - r)`, weighted by :math:`|t - r|`.
 
-    Parameters
-    ----------
-    measured_db, rendered_db, traced_db : (..., F) float, dB
-        Of poses that neither prediction was fitted to.
+    Args:
+        measured_db, rendered_db, traced_db ((..., F), dB): Of poses that neither prediction was
+            fitted to.
 
-    Returns
-    -------
-    weight : (F,) float
-        0 to 1; zero where both predictions are equal.
+    Returns:
+        weight (F,): 0 to 1; zero where both predictions are equal.
     """
     measured, rendered, traced = (
         np.asarray(a, dtype=np.float64) for a in (measured_db, rendered_db, traced_db)

@@ -47,36 +47,28 @@ def voxel_fit(
     directions: a voxel just outside a mirror-like body lies in the shells of more poses than one
     on it does.
 
-    Parameters
-    ----------
-    spectrograms, poses, head, lower, upper, spacing
-        As of :func:`sononerf.evaluation.baseline.backprojection`; the emitter is near the ears
-        against the ranges.
-    passes : int
-        How often all poses are gone through.
+    Args:
+        spectrograms, poses, head, lower, upper, spacing: As of
+            :func:`sononerf.evaluation.baseline.backprojection`; the emitter is near the ears
+            against the ranges.
+        passes: How often all poses are gone through.
 
-    Returns
-    -------
-    volume : Volume
-        Power per voxel, as heard at one metre; zero where no recorded range reaches.
+    Returns:
+        volume: Power per voxel, as heard at one metre; zero where no recorded range reaches.
 
-    Raises
-    ------
-    ValueError
-        If there is not one spectrogram of the head's shape for each pose, or there is no pass.
-    NumericalError
-        If a spectrogram is not finite.
-    ResourceError
-        If the grid would not fit in memory.
+    Raises:
+        ValueError: If there is not one spectrogram of the head's shape for each pose, or there is
+            no pass.
+        NumericalError: If a spectrogram is not finite.
+        ResourceError: If the grid would not fit in memory.
 
-    References
-    ----------
-    .. [1] L. B. Lucy, "An iterative technique for the rectification of observed distributions",
-       1974, equation (15).
-    .. [2] L. A. Shepp and Y. Vardi, "Maximum likelihood reconstruction for emission tomography",
-       1982.
-    .. [3] H. M. Hudson and R. S. Larkin, "Accelerated image reconstruction using ordered subsets
-       of projection data", 1994.
+    References:
+        .. [1] L. B. Lucy, "An iterative technique for the rectification of observed distributions",
+           1974, equation (15).
+        .. [2] L. A. Shepp and Y. Vardi, "Maximum likelihood reconstruction for emission
+           tomography", 1982.
+        .. [3] H. M. Hudson and R. S. Larkin, "Accelerated image reconstruction using ordered
+           subsets of projection data", 1994.
     """
     emitters, receivers = head.places(poses.positions, poses.rotations)
     axis = head.range

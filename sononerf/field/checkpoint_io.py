@@ -59,12 +59,9 @@ class DurableCheckpointIO(CheckpointIO):
     ) -> None:
         """Write a checkpoint; the one it replaces is kept as ``<name>.previous``.
 
-        Raises
-        ------
-        StorageError
-            If it cannot be written; the old one is then untouched.
-        InputError
-            If the path is a URL.
+        Raises:
+            StorageError: If it cannot be written; the old one is then untouched.
+            InputError: If the path is a URL.
         """
         target = _local(path)
 
@@ -92,10 +89,8 @@ class DurableCheckpointIO(CheckpointIO):
         ``map_location`` and ``weights_only`` are Lightning's; a checkpoint is always loaded to
         the CPU and never runs code, whatever they say.
 
-        Raises
-        ------
-        InputError
-            If neither is there whole, or the content is more than plain data.
+        Raises:
+            InputError: If neither is there whole, or the content is more than plain data.
         """
         target = _local(path)
         chosen = target
@@ -132,14 +127,10 @@ DESCRIPTION_NAME = "model.json"
 def save_weights(folder: Path, state: dict[str, Tensor], description: dict[str, Any]) -> None:
     """Write ``model.safetensors`` and, last, the ``model.json`` that vouches for it.
 
-    Parameters
-    ----------
-    folder : Path
-        The run.
-    state : dict of Tensor
-        Parameters and buffers by name, on any device.
-    description : dict
-        Plain data; ``schema_version`` and ``sha256`` are added.
+    Args:
+        folder: The run.
+        state: Parameters and buffers by name, on any device.
+        description: Plain data; ``schema_version`` and ``sha256`` are added.
     """
     # Views of one storage are refused by the format; each tensor goes with its own bytes.
     own = {name: tensor.detach().clone().contiguous() for name, tensor in state.items()}
@@ -161,12 +152,9 @@ def model_checksum(folder: Path) -> str:
 def load_weights(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
     """Read a fitted field's weights, on the CPU, and their description; runs no code.
 
-    Raises
-    ------
-    InputError
-        If a file is missing or damaged.
-    IncompatibleError
-        If a newer sononerf wrote it.
+    Raises:
+        InputError: If a file is missing or damaged.
+        IncompatibleError: If a newer sononerf wrote it.
     """
     path = folder / DESCRIPTION_NAME
     description = storage.read_json(path)

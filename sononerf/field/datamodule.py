@@ -30,24 +30,16 @@ class StepSampler(Sampler[int]):
 class EchoDataModule(lightning.LightningDataModule):
     """Streams batches; the splits are the store's, by pose.
 
-    Parameters
-    ----------
-    store : EnsembleStore
-        A sealed ensemble.
-    whole_poses : bool
-        What the renderer wants: whole poses or single slices.
-    batch : int
-        Poses or slices per training batch, over all devices together.
-    batch_frequencies : int or None
-        Frequencies per training batch; all where None.
-    seed : int
-        Turns the order of the training batches.
-    workers : int
-        Processes that prepare batches; the batches do not depend on it.
-    memory_bytes : int
-        How much of the ensemble may be kept in memory.
-    silent_share, silent_below : float
-        Which part of the silent slices is met, and what magnitude no cell of these reaches.
+    Args:
+        store: A sealed ensemble.
+        whole_poses: What the renderer wants: whole poses or single slices.
+        batch: Poses or slices per training batch, over all devices together.
+        batch_frequencies: Frequencies per training batch; all where None.
+        seed: Turns the order of the training batches.
+        workers: Processes that prepare batches; the batches do not depend on it.
+        memory_bytes: How much of the ensemble may be kept in memory.
+        silent_share, silent_below: Which part of the silent slices is met, and what magnitude no
+            cell of these reaches.
     """
 
     def __init__(

@@ -23,12 +23,9 @@ def sphere_directions(count: int, like: Tensor) -> Tensor:
 class Field(nn.Module):
     """Pressure reflectivity per frequency of a place, towards a direction; zero outside a box.
 
-    Parameters
-    ----------
-    region : (2, 3) float, m
-        Lower and upper corner of the box, world frame.
-    frequency : (F,) float, Hz
-        Frequencies of the answer.
+    Args:
+        region ((2, 3), m): Lower and upper corner of the box, world frame.
+        frequency ((F,), Hz): Frequencies of the answer.
     """
 
     region: Tensor
@@ -58,12 +55,9 @@ class Field(nn.Module):
     def keep(self, places: Tensor, spacing: float) -> None:
         """Be zero from now on wherever none of the places is near.
 
-        Parameters
-        ----------
-        places : (N, 3) float, m
-            Vertices of a lattice that may hold something.
-        spacing : float, m
-            Of that lattice.
+        Args:
+            places ((N, 3), m): Vertices of a lattice that may hold something.
+            spacing (m): Of that lattice.
         """
         cell = self.resolution
         size = ((self.region[1] - self.region[0]) / cell).ceil().long() + 1
@@ -85,12 +79,9 @@ class Field(nn.Module):
 
         What changes has to lie in a buffer, so that a loaded field is the fitted one.
 
-        Parameters
-        ----------
-        step : int
-            Number of the training step, from 0.
-        total : int
-            How many steps the fit has.
+        Args:
+            step: Number of the training step, from 0.
+            total: How many steps the fit has.
         """
         del step, total
 
@@ -104,35 +95,26 @@ class Field(nn.Module):
 
         Differentiable in the parameters.
 
-        Parameters
-        ----------
-        positions : (..., 3) float, m
-            Places, world frame.
-        directions : (..., 3) float
-            Unit vectors from each place to the emitter, world frame.
+        Args:
+            positions ((..., 3), m): Places, world frame.
+            directions (..., 3): Unit vectors from each place to the emitter, world frame.
 
-        Returns
-        -------
-        reflectivity : (..., F) float or complex
-            Pressure reflectivity; zero outside the region.
+        Returns:
+            reflectivity ((..., F) float or complex): Pressure reflectivity; zero outside the
+                region.
         """
         raise NotImplementedError
 
     def select(self, positions: Tensor, directions: Tensor, bins: Tensor | None) -> Tensor:
         """Return the reflectivity at some of the frequencies.
 
-        Parameters
-        ----------
-        positions : (N, 3) float, m
-            Places, world frame.
-        directions : (..., N, 3) float
-            Unit vectors to the emitter, for any number of poses at once.
-        bins : (B,) int or None
-            Which frequencies; all where None.
+        Args:
+            positions ((N, 3), m): Places, world frame.
+            directions (..., N, 3): Unit vectors to the emitter, for any number of poses at once.
+            bins ((B,) int or None): Which frequencies; all where None.
 
-        Returns
-        -------
-        reflectivity : (..., N, B) float or complex
+        Returns:
+            reflectivity: (..., N, B) float or complex.
         """
         response: Tensor = self(positions.expand(directions.shape), directions)
         return response if bins is None else response[..., bins]
@@ -142,14 +124,11 @@ class Field(nn.Module):
 
         :meth:`audible` and :meth:`echo` take it, so that it need be found out once for both.
 
-        Parameters
-        ----------
-        positions : (N, 3) float, m
-            Places, world frame.
+        Args:
+            positions ((N, 3), m): Places, world frame.
 
-        Returns
-        -------
-        code : (N, C) float or None
+        Returns:
+            code: (N, C) or None.
         """
         del positions
         return None
@@ -157,16 +136,13 @@ class Field(nn.Module):
     def code_of_lattice(self, lattice: Tensor, which: Tensor | None) -> Tensor | None:
         """Return what :meth:`code` does, for places that will be asked for again and again.
 
-        Parameters
-        ----------
-        lattice : (L, 3) float, m
-            The same tensor as long as the places are the same: how it is read may be kept.
-        which : (N,) int or None
-            Which of the places; all where None.
+        Args:
+            lattice ((L, 3), m): The same tensor as long as the places are the same: how it is read
+                may be kept.
+            which ((N,) int or None): Which of the places; all where None.
 
-        Returns
-        -------
-        code : (N, C) float or None
+        Returns:
+            code: (N, C) or None.
         """
         return self.code(lattice if which is None else lattice[which])
 
@@ -174,19 +150,13 @@ class Field(nn.Module):
     def audible(self, positions: Tensor, sources: Tensor, code: Tensor | None = None) -> Tensor:
         """Return which places answer which emitters at all.
 
-        Parameters
-        ----------
-        positions : (N, 3) float, m
-            Places, world frame.
-        sources : (P, 3) float, m
-            Emitters of several poses.
-        code : (N, C) float or None
-            Of :meth:`code`; found out where None.
+        Args:
+            positions ((N, 3), m): Places, world frame.
+            sources ((P, 3), m): Emitters of several poses.
+            code ((N, C) or None): Of :meth:`code`; found out where None.
 
-        Returns
-        -------
-        audible : (P, N) bool
-            False only where the answer may be left out.
+        Returns:
+            audible (P, N): False only where the answer may be left out.
         """
         del code
         return positions.new_ones(len(sources), len(positions), dtype=torch.bool)
@@ -201,27 +171,18 @@ class Field(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Return what places answer, and from how much nearer than they lie.
 
-        Parameters
-        ----------
-        positions : (N, 3) float, m
-            Places, world frame.
-        directions : (M, 3) float
-            Unit vectors to the emitter.
-        bins : (B,) int or None
-            Which frequencies; all where None.
-        place : (M,) int or None
-            Which place each direction is for, so that what a place is need be found out once
-            for all directions; each its own where None.
-        code : (N, C) float or None
-            Of :meth:`code`; found out where None.
+        Args:
+            positions ((N, 3), m): Places, world frame.
+            directions (M, 3): Unit vectors to the emitter.
+            bins ((B,) int or None): Which frequencies; all where None.
+            place ((M,) int or None): Which place each direction is for, so that what a place is
+                need be found out once for all directions; each its own where None.
+            code ((N, C) or None): Of :meth:`code`; found out where None.
 
-        Returns
-        -------
-        reflectivity : (M, B) float or complex
-            As of :meth:`select`.
-        lead : (M,) float, m
-            A place that stands for a piece of curved surface answers off its axis from another
-            point of it, which lies this much nearer.
+        Returns:
+            reflectivity ((M, B) float or complex): As of :meth:`select`.
+            lead ((M,), m): A place that stands for a piece of curved surface answers off its axis
+                from another point of it, which lies this much nearer.
         """
         del code
         there = positions if place is None else positions[place]
@@ -241,15 +202,13 @@ class Field(nn.Module):
     def outside(self, lattice: Tensor) -> Tensor | None:
         """Return where places do not lie in the region, for places asked for again and again.
 
-        Parameters
-        ----------
-        lattice : (L, 3) float, m
-            The same tensor as long as the places are the same: the answer is kept.
+        Args:
+            lattice ((L, 3), m): The same tensor as long as the places are the same: the answer is
+                kept.
 
-        Returns
-        -------
-        outside : (L,) bool or None
-            None where all lie inside, so that nothing need be made zero.
+        Returns:
+            outside ((L,) bool or None): None where all lie inside, so that nothing need be made
+                zero.
         """
         asked = self._asked
         if asked is None or asked[0] is not lattice or asked[1] is not self.occupancy:
@@ -262,19 +221,13 @@ class Field(nn.Module):
     def oriented(self, positions: Tensor, directions: int) -> tuple[Tensor, Tensor]:
         """Return each place's energy over all directions and the axis it reflects along.
 
-        Parameters
-        ----------
-        positions : (N, 3) float, m
-            Places, world frame.
-        directions : int
-            Size of the spherical lattice that is summed over.
+        Args:
+            positions ((N, 3), m): Places, world frame.
+            directions: Size of the spherical lattice that is summed over.
 
-        Returns
-        -------
-        energy : (N,) float
-            Mean over directions of the power summed over frequencies.
-        axis : (N, 3) float
-            Unit vector, the energy-weighted mean direction; zero where there is none.
+        Returns:
+            energy (N,): Mean over directions of the power summed over frequencies.
+            axis (N, 3): Unit vector, the energy-weighted mean direction; zero where there is none.
         """
         lattice = sphere_directions(directions, positions)
         energy = positions.new_zeros(positions.shape[0])
@@ -291,9 +244,8 @@ class Field(nn.Module):
     def loudness(self, positions: Tensor, directions: int) -> Tensor:
         """Return the paper's volume: magnitudes summed over directions and frequencies, (N,).
 
-        References
-        ----------
-        .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, equations 18 and 19.
+        References:
+            .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, equations 18 and 19.
         """
         total = positions.new_zeros(positions.shape[0])
         for direction in sphere_directions(directions, positions):

@@ -34,14 +34,10 @@ Split = Literal["train", "val", "test"]
 class FittedField:
     """A fitted field with the head that it was heard with.
 
-    Attributes
-    ----------
-    module : EchoModule
-        Field and renderer.
-    head : Head
-        What heard the echoes.
-    hull : EchoHull
-        Free space in front of the onsets of the training poses.
+    Attributes:
+        module: Field and renderer.
+        head: What heard the echoes.
+        hull: Free space in front of the onsets of the training poses.
     """
 
     module: EchoModule
@@ -69,10 +65,8 @@ def quiet_lightning() -> None:
 def require_accelerator(accelerator: str) -> None:
     """Refuse a GPU that is not there.
 
-    Raises
-    ------
-    ResourceError
-        If ``gpu`` was asked for and there is none.
+    Raises:
+        ResourceError: If ``gpu`` was asked for and there is none.
     """
     if accelerator == "gpu" and not (
         torch.cuda.is_available() or torch.backends.mps.is_available()
@@ -96,31 +90,19 @@ def fit(
 ) -> FittedField:
     """Fit a module to echoes for its number of steps; validate after each of its epochs.
 
-    Parameters
-    ----------
-    echoes : Echoes
-        What is fitted to.
-    module : EchoModule
-        Field and renderer.
-    data : EchoDataModule
-        Streams the echoes.
-    callbacks : list of Callback
-        What happens around the fit.
-    gradient_clip : float or None
-        Largest norm of a gradient; not limited where None.
-    logger : Logger or None
-        Where scalars and pictures go.
-    folder : Path or None
-        Where Lightning and its callbacks write by default.
-    checkpoint : Path or None
-        Where the fit goes on; from the beginning where None.
-    accelerator, devices, num_nodes
-        As of Lightning's Trainer.
+    Args:
+        echoes: What is fitted to.
+        module: Field and renderer.
+        data: Streams the echoes.
+        callbacks: What happens around the fit.
+        gradient_clip: Largest norm of a gradient; not limited where None.
+        logger: Where scalars and pictures go.
+        folder: Where Lightning and its callbacks write by default.
+        checkpoint: Where the fit goes on; from the beginning where None.
+        accelerator, devices, num_nodes: As of Lightning's Trainer.
 
-    Raises
-    ------
-    NumericalError
-        If a parameter is not finite at the end.
+    Raises:
+        NumericalError: If a parameter is not finite at the end.
     """
     quiet_lightning()
     trainer = lightning.Trainer(

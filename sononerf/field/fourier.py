@@ -44,35 +44,24 @@ class FourierField(Field):
     in place of batch normalisation: 546,324 parameters at 47 frequencies. In the code the
     angles are the *sensor's*; renderer ``shell`` passes them with ``direction="sensor"``.
 
-    Parameters
-    ----------
-    region : (2, 3) float, m
-        Lower and upper corner of the box, world frame.
-    frequency : (F,) float, Hz
-        Frequencies of the answer.
-    inputs : {"direction", "angles"}
-        Which of the two networks.
-    octaves : int
-        Number of sines per input, half an octave apart.
-    direction_octaves : int or None
-        Number of sines per component of the direction, of ``inputs="direction"``; as many as
-        for the position where None. Many of them let directions that were never heard from be
-        anything.
-    width : int
-        Width of the hidden layers.
-    scale : float, 1/m
-        What positions in metres are multiplied by before the embedding.
-    spacing : float or None, m
-        Spacing of places that resolves the field; a hundredth of the region's longest side where
-        None, for the network itself has none.
-    precision : {"float32", "bfloat16"}
-        What the layers multiply in; parameters, sums and the answer are float32 in any case.
-    rate : float
-        What Adam starts with where the settings name no rate.
+    Args:
+        region ((2, 3), m): Lower and upper corner of the box, world frame.
+        frequency ((F,), Hz): Frequencies of the answer.
+        inputs: Which of the two networks.
+        octaves: Number of sines per input, half an octave apart.
+        direction_octaves: Number of sines per component of the direction, of
+            ``inputs="direction"``; as many as for the position where None. Many of them let
+            directions that were never heard from be anything.
+        width: Width of the hidden layers.
+        scale (1/m): What positions in metres are multiplied by before the embedding.
+        spacing (m): Spacing of places that resolves the field; a hundredth of the region's longest
+            side where None, for the network itself has none.
+        precision: What the layers multiply in; parameters, sums and the answer are float32 in any
+            case.
+        rate: What Adam starts with where the settings name no rate.
 
-    References
-    ----------
-    .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, section 2.
+    References:
+        .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, section 2.
     """
 
     costly = True

@@ -39,16 +39,11 @@ class _Reading:
     Most places of a lattice lie on vertices of the finest grid and between few of the coarser
     ones, so that ten products do what takes eight of each grid, found anew every time.
 
-    Parameters
-    ----------
-    places : (N, 3) float, m
-        Kept, to be known again.
-    origin : (3,) float, m
-        The grids' first vertex.
-    steps : list of float, m
-        Vertex spacing of each grid.
-    grids : list of (1, C, Z, Y, X) float
-        As they will be read.
+    Args:
+        places ((N, 3), m): Kept, to be known again.
+        origin ((3,), m): The grids' first vertex.
+        steps (list of float, m): Vertex spacing of each grid.
+        grids (list of (1, C, Z, Y, X) float): As they will be read.
     """
 
     def __init__(
@@ -112,32 +107,21 @@ class _Reading:
 class GridField(LobeField):
     """Lobes on dense grids, read by trilinear interpolation and summed over the levels.
 
-    Parameters
-    ----------
-    region : (2, 3) float, m
-        Lower and upper corner of the box, world frame.
-    frequency : (F,) float, Hz
-        Frequencies of the answer.
-    spacing : float or None, m
-        Vertex spacing of the finest level; found from ``vertices`` where None.
-    vertices : int
-        How many vertices the finest level may have where ``spacing`` is None.
-    finest, coarsest : float, m
-        Bounds of the spacing that is found.
-    levels : int
-        Number of grids, each twice as coarse as the one before.
-    rank : int
-        Number of spectra that places add by coefficients of their own; at most one less than
-        there are frequencies.
-    correction : int
-        Width of the hidden layers of a network that corrects what places answer; 0 for none.
-        Only :meth:`select` and :meth:`echo` hear it: which places are audible, and their energy
-        and axis, go by the lobe alone.
+    Args:
+        region ((2, 3), m): Lower and upper corner of the box, world frame.
+        frequency ((F,), Hz): Frequencies of the answer.
+        spacing (m): Vertex spacing of the finest level; found from ``vertices`` where None.
+        vertices: How many vertices the finest level may have where ``spacing`` is None.
+        finest, coarsest (m): Bounds of the spacing that is found.
+        levels: Number of grids, each twice as coarse as the one before.
+        rank: Number of spectra that places add by coefficients of their own; at most one less than
+            there are frequencies.
+        correction: Width of the hidden layers of a network that corrects what places answer; 0 for
+            none. Only :meth:`select` and :meth:`echo` hear it: which places are audible, and their
+            energy and axis, go by the lobe alone.
 
-    Raises
-    ------
-    SettingsError
-        If ``finest`` lies above ``coarsest`` where they are needed.
+    Raises:
+        SettingsError: If ``finest`` lies above ``coarsest`` where they are needed.
     """
 
     origin: Tensor

@@ -47,34 +47,22 @@ class HashField(LobeField):
     hidden layers, and past them, into what the places are. A fit begins with the coarsest level;
     the finer ones follow one after the other.
 
-    Parameters
-    ----------
-    region : (2, 3) float, m
-        Lower and upper corner of the box, world frame.
-    frequency : (F,) float, Hz
-        Frequencies of the answer.
-    finest : float, m
-        Vertex spacing of the finest level.
-    growth : float
-        How much coarser each level is than the next.
-    levels : int
-        Number of levels.
-    features : int
-        Numbers per vertex and level.
-    log2_entries : int
-        A level has at most two to the power of this many entries.
-    width : int
-        Width of the hidden layers.
-    rank : int
-        Number of spectra that places add by coefficients of their own; at most one less than
-        there are frequencies.
-    released : float
-        The part of the fit after which all levels take part.
+    Args:
+        region ((2, 3), m): Lower and upper corner of the box, world frame.
+        frequency ((F,), Hz): Frequencies of the answer.
+        finest (m): Vertex spacing of the finest level.
+        growth: How much coarser each level is than the next.
+        levels: Number of levels.
+        features: Numbers per vertex and level.
+        log2_entries: A level has at most two to the power of this many entries.
+        width: Width of the hidden layers.
+        rank: Number of spectra that places add by coefficients of their own; at most one less than
+            there are frequencies.
+        released: The part of the fit after which all levels take part.
 
-    References
-    ----------
-    .. [1] T. Müller, A. Evans, C. Schied, A. Keller, "Instant neural graphics primitives with a
-       multiresolution hash encoding", ACM Transactions on Graphics 41(4):102, 2022.
+    References:
+        .. [1] T. Müller, A. Evans, C. Schied, A. Keller, "Instant neural graphics primitives with a
+           multiresolution hash encoding", ACM Transactions on Graphics 41(4):102, 2022.
     """
 
     progress: Tensor
@@ -142,19 +130,14 @@ class HashField(LobeField):
     def corners(self, positions: Tensor, level: int) -> tuple[Tensor, Tensor]:
         """Return the eight vertices around each place as entries of the table, and their weights.
 
-        Parameters
-        ----------
-        positions : (N, 3) float, m
-            Places, world frame; those outside the lattice are moved to its faces.
-        level : int
-            Counted from the coarsest.
+        Args:
+            positions ((N, 3), m): Places, world frame; those outside the lattice are moved to its
+                faces.
+            level: Counted from the coarsest.
 
-        Returns
-        -------
-        entries : (8, N) int
-            Rows of the table.
-        weights : (8, N) float
-            Trilinear; they sum to one.
+        Returns:
+            entries (8, N): Rows of the table.
+            weights (8, N): Trilinear; they sum to one.
         """
         last = self._last[level]
         unit = ((positions - self.region[0]) / self.spacings[level]).clamp_min(0).minimum(last)

@@ -28,10 +28,8 @@ CALM = 0.1
 class CalmLayer(nn.Linear):
     """A layer that moves calmly: with steps as large as a vertex takes, a whole field may die.
 
-    Parameters
-    ----------
-    start, end : int
-        Numbers in and out.
+    Args:
+        start, end: Numbers in and out.
     """
 
     def __init__(self, start: int, end: int) -> None:
@@ -103,15 +101,11 @@ class LobeField(Field):
     the places would move outward to make up for it. A place without a lobe has no axis to be off,
     so the lead fades with the lobe, by :math:`1 - e^{-|m|^2}`, which is seen below :math:`|m| = 2`.
 
-    Parameters
-    ----------
-    region : (2, 3) float, m
-        Lower and upper corner of the box, world frame.
-    frequency : (F,) float, Hz
-        Frequencies of the answer.
-    rank : int
-        Number of spectra that places add by coefficients of their own; at most one less than
-        there are frequencies.
+    Args:
+        region ((2, 3), m): Lower and upper corner of the box, world frame.
+        frequency ((F,), Hz): Frequencies of the answer.
+        rank: Number of spectra that places add by coefficients of their own; at most one less than
+            there are frequencies.
     """
 
     learning_rate = 0.05

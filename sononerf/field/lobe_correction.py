@@ -17,20 +17,17 @@ LARGEST = 3.0
 def harmonics(directions: Tensor) -> Tensor:
     """Return the real spherical harmonics up to degree 3.
 
-    Parameters
-    ----------
-    directions : (..., 3) float
-        Unit vectors.
+    Args:
+        directions (..., 3): Unit vectors.
 
-    Returns
-    -------
-    harmonics : (..., 16) float
-        By degree; the mean of their squares over the sphere is one, of products zero.
+    Returns:
+        harmonics (..., 16): By degree; the mean of their squares over the sphere is one, of
+            products zero.
 
-    References
-    ----------
-    .. [1] M. A. Blanco, M. Flórez, M. Bermejo, "Evaluation of the rotation matrices in the basis
-       of real spherical harmonics", Journal of Molecular Structure: THEOCHEM 419:19-27, 1997.
+    References:
+        .. [1] M. A. Blanco, M. Flórez, M. Bermejo, "Evaluation of the rotation matrices in the
+           basis of real spherical harmonics", Journal of Molecular Structure: THEOCHEM 419:19-27,
+           1997.
     """
     x, y, z = directions.unbind(-1)
     polynomials = (
@@ -55,16 +52,11 @@ class Correction(nn.Module):
     longest side down by halves to no less than four times the spacing, and the spherical
     harmonics of the direction; of its output :math:`y` it returns :math:`L \tanh(y / L)`.
 
-    Parameters
-    ----------
-    region : (2, 3) float, m
-        Lower and upper corner of the box, world frame.
-    spacing : float, m
-        Of the field that is corrected.
-    width : int
-        Width of the two hidden layers.
-    count : int
-        Number of frequencies.
+    Args:
+        region ((2, 3), m): Lower and upper corner of the box, world frame.
+        spacing (m): Of the field that is corrected.
+        width: Width of the two hidden layers.
+        count: Number of frequencies.
     """
 
     origin: Tensor
@@ -94,20 +86,15 @@ class Correction(nn.Module):
 
         Differentiable in the parameters.
 
-        Parameters
-        ----------
-        positions : (N, 3) float, m
-            Places, world frame.
-        directions : (..., N, 3) or (M, 3) float
-            Unit vectors to the emitter; the latter with ``place``.
-        bins : (B,) int or None
-            Which frequencies; all where None.
-        place : (M,) int or None
-            Which place each direction is for.
+        Args:
+            positions ((N, 3), m): Places, world frame.
+            directions ((..., N, 3) or (M, 3)): Unit vectors to the emitter; the latter with
+                ``place``.
+            bins ((B,) int or None): Which frequencies; all where None.
+            place ((M,) int or None): Which place each direction is for.
 
-        Returns
-        -------
-        correction : (..., N, B) or (M, B) float
+        Returns:
+            correction: (..., N, B) or (M, B).
         """
         # What the first layer makes of a place is found out once for all its directions. Weights
         # are calmed, not what they make of many pairs: it is the same, and they are few.

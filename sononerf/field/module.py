@@ -26,37 +26,24 @@ def decibels(magnitude: Tensor, reference: float | Tensor) -> Tensor:
 class EchoModule(lightning.LightningModule):
     """Fits a field through a renderer.
 
-    Parameters
-    ----------
-    field : Field
-        What is learned.
-    renderer : Renderer
-        How it is heard.
-    reference : float
-        Magnitude m0 of the reported decibels.
-    dynamic_range_db : float
-        How far below the loudest cell the fit's own compression starts.
-    early_range_db : float
-        How far below each pose's own loudest cell it starts at first, so that the loud echoes,
-        which come straight from a surface, settle before the faint ones, many of which are second
-        bounces, can draw places to where nothing is. No more than ``dynamic_range_db`` is used.
-    early_share : float
-        The share of the fit that this is for.
-    possible : callable or None
-        Which places the echoes leave possible.
-    learning_rate : float
-        What Adam starts with.
-    total_steps, steps_per_epoch : int
-        Length of the fit.
-    schedule : {"cool", "staircase"}
-        Constant for one half, then falling to ``final_rate_factor``; or times
-        ``staircase_factor`` every ``staircase_epochs``.
-    loss : {"l1", "l2", "l1_4l2"}
-        On compressed spectra, 1 being the full dynamic range.
-    silent_weight : float
-        Weight of cells that are silent in the measurement, beside 1.
-    seed : int
-        All random numbers of a step come from the seed and the step.
+    Args:
+        field: What is learned.
+        renderer: How it is heard.
+        reference: Magnitude m0 of the reported decibels.
+        dynamic_range_db: How far below the loudest cell the fit's own compression starts.
+        early_range_db: How far below each pose's own loudest cell it starts at first, so that the
+            loud echoes, which come straight from a surface, settle before the faint ones, many of
+            which are second bounces, can draw places to where nothing is. No more than
+            ``dynamic_range_db`` is used.
+        early_share: The share of the fit that this is for.
+        possible: Which places the echoes leave possible.
+        learning_rate: What Adam starts with.
+        total_steps, steps_per_epoch: Length of the fit.
+        schedule: Constant for one half, then falling to ``final_rate_factor``; or times
+            ``staircase_factor`` every ``staircase_epochs``.
+        loss: On compressed spectra, 1 being the full dynamic range.
+        silent_weight: Weight of cells that are silent in the measurement, beside 1.
+        seed: All random numbers of a step come from the seed and the step.
     """
 
     def __init__(

@@ -38,29 +38,21 @@ class ProfileRenderer(Renderer):
     :math:`W_f` starts as the square of a point echo in its row, the analysis window or what that
     makes of a sweep, and is learned on; it has two equal sides where the point echoes have.
 
-    Parameters
-    ----------
-    region : (2, 3) float, m
-        Lower and upper corner of the box that holds the field.
-    head : Head
-        What heard the spectra.
-    oversampling : int
-        Bins of the profile per range slice.
-    points : int
-        How many places a step evaluates at most; more are drawn by their running energy.
-    uniform : float
-        Share of the drawn places that are drawn uniformly.
-    start : int
-        How many places the first lattice may have. It is as often twice as coarse as the field
-        as that takes, and is refined around what is alive.
-    prune_every : int
-        Steps between two looks at which places are alive, and whether the lattice is refined;
-        0 never does.
-    prune_below : float
-        Places weaker than this part of the strongest in their surroundings are dropped.
-    surroundings : float
-        How far "surroundings" reaches, range resolutions: some of them, so that a part has its own
-        strongest place, and not a fraction of one, where all of a blur would stay.
+    Args:
+        region ((2, 3), m): Lower and upper corner of the box that holds the field.
+        head: What heard the spectra.
+        oversampling: Bins of the profile per range slice.
+        points: How many places a step evaluates at most; more are drawn by their running energy.
+        uniform: Share of the drawn places that are drawn uniformly.
+        start: How many places the first lattice may have. It is as often twice as coarse as the
+            field as that takes, and is refined around what is alive.
+        prune_every: Steps between two looks at which places are alive, and whether the lattice is
+            refined; 0 never does.
+        prune_below: Places weaker than this part of the strongest in their surroundings are
+            dropped.
+        surroundings: How far "surroundings" reaches, range resolutions: some of them, so that a
+            part has its own strongest place, and not a fraction of one, where all of a blur would
+            stay.
     """
 
     lattice: Tensor
@@ -314,21 +306,14 @@ class ProfileRenderer(Renderer):
     def _paths(self, in_head: Tensor, out: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
         """Return what the way to places and back does to pressure.
 
-        Parameters
-        ----------
-        in_head : (3, M) float, m
-            Places, each in the head of its pose.
-        out : (M,) float, m
-            How far they lie from the emitter.
-        bins : (B,) int
-            Which frequencies.
+        Args:
+            in_head ((3, M), m): Places, each in the head of its pose.
+            out ((M,), m): How far they lie from the emitter.
+            bins (B,): Which frequencies.
 
-        Returns
-        -------
-        known : (E, B, M) float
-            By beam, ears, air and spreading.
-        middle : (E, 1, M) or (E, B, M) float
-            The bin of the profile that the echo is heard in.
+        Returns:
+            known (E, B, M): By beam, ears, air and spreading.
+            middle ((E, 1, M) or (E, B, M)): The bin of the profile that the echo is heard in.
         """
         ray = in_head - self.ear_positions[..., None]  # (E, 3, M)
         back = _length(ray)

@@ -39,12 +39,9 @@ def seed_of(*parts: int) -> int:
 class PoseReader:
     """Spectrograms of a store, kept in memory up to a bound, the oldest given up first.
 
-    Parameters
-    ----------
-    store : EnsembleStore
-        Where they lie.
-    memory_bytes : int
-        How much may be kept.
+    Args:
+        store: Where they lie.
+        memory_bytes: How much may be kept.
     """
 
     def __init__(self, store: EnsembleStore, memory_bytes: int) -> None:
@@ -69,35 +66,22 @@ class PoseReader:
 class SliceStream(Dataset[RangeSlices]):
     """The training batches; item k is batch k, whoever asks and in whatever order.
 
-    Parameters
-    ----------
-    store : EnsembleStore
-        A sealed ensemble.
-    split : {"train", "val", "test"}
-        Which poses.
-    whole_poses : bool
-        Batches of whole poses, or of single slices of any poses.
-    batch : int
-        Poses or slices per batch, over all devices together.
-    batch_frequencies : int or None
-        How many frequencies a batch holds; all where None.
-    seed : int
-        Turns the order.
-    memory_bytes : int
-        How much of the ensemble may be kept in memory.
-    share : (int, int)
-        Which part of each batch this device gets, and of how many parts.
-    silent_share : float
-        Which part of the silent slices is met at all, drawn once by the seed; single slices alone.
-    silent_below : float
-        Magnitude that no cell of a silent slice reaches.
+    Args:
+        store: A sealed ensemble.
+        split: Which poses.
+        whole_poses: Batches of whole poses, or of single slices of any poses.
+        batch: Poses or slices per batch, over all devices together.
+        batch_frequencies: How many frequencies a batch holds; all where None.
+        seed: Turns the order.
+        memory_bytes: How much of the ensemble may be kept in memory.
+        share (int, int): Which part of each batch this device gets, and of how many parts.
+        silent_share: Which part of the silent slices is met at all, drawn once by the seed; single
+            slices alone.
+        silent_below: Magnitude that no cell of a silent slice reaches.
 
-    Raises
-    ------
-    SettingsError
-        If a batch is smaller than the number of devices.
-    ValueError
-        If whole poses are to go without their silence.
+    Raises:
+        SettingsError: If a batch is smaller than the number of devices.
+        ValueError: If whole poses are to go without their silence.
     """
 
     def __init__(
@@ -193,18 +177,12 @@ class SliceStream(Dataset[RangeSlices]):
 class WholePoses(Dataset[RangeSlices]):
     """Poses one by one with all ranges and frequencies, for validation, tests and prediction.
 
-    Parameters
-    ----------
-    positions : (P, 3) float, m
-        Where the head is.
-    rotations : (P, 3, 3) float
-        Head to world.
-    ranges, frequencies : int
-        Lengths of the axes.
-    reader : PoseReader or None
-        Where measured spectra come from; none are returned without it.
-    numbers : (P,) int or None
-        Which poses of the store they are; counted from 0 where None.
+    Args:
+        positions ((P, 3), m): Where the head is.
+        rotations (P, 3, 3): Head to world.
+        ranges, frequencies: Lengths of the axes.
+        reader: Where measured spectra come from; none are returned without it.
+        numbers ((P,) int or None): Which poses of the store they are; counted from 0 where None.
     """
 
     def __init__(

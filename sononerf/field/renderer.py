@@ -29,17 +29,14 @@ def look_up(table: Tensor, directions: Tensor) -> Tensor:
 
     Not differentiable in ``directions`` where they are fixed places and poses.
 
-    Parameters
-    ----------
-    table : (C, L, A) or (E, C, L, A) float
-        Gains over elevation (-90 to 90 degrees) and azimuth (-180 to 180), both ends included.
-    directions : (..., 3) or (E, ..., 3) float
-        Unit vectors in the head frame (x forward, y left, z up); for each of E tables its own.
+    Args:
+        table ((C, L, A) or (E, C, L, A)): Gains over elevation (-90 to 90 degrees) and azimuth
+            (-180 to 180), both ends included.
+        directions ((..., 3) or (E, ..., 3)): Unit vectors in the head frame (x forward, y left, z
+            up); for each of E tables its own.
 
-    Returns
-    -------
-    gains : (..., C) or (E, ..., C) float
-        In memory one channel after the other.
+    Returns:
+        gains ((..., C) or (E, ..., C)): In memory one channel after the other.
     """
     x, y, z = directions.movedim(-1, 0).contiguous()  # side by side, for the sake of speed
     azimuth = torch.atan2(y, x) / math.pi
@@ -57,12 +54,9 @@ def look_up(table: Tensor, directions: Tensor) -> Tensor:
 class Renderer(nn.Module):
     """A field, poses and ranges in; the magnitude that both ears hear out.
 
-    Parameters
-    ----------
-    region : (2, 3) float, m
-        Lower and upper corner of the box that holds the field.
-    head : Head
-        What heard the spectra.
+    Args:
+        region ((2, 3), m): Lower and upper corner of the box that holds the field.
+        head: What heard the spectra.
     """
 
     whole_poses: bool = True
@@ -104,28 +98,21 @@ class Renderer(nn.Module):
     def advance(self, step: int, total: int) -> None:
         """Learn how far a fit has come; called before each training step.
 
-        Parameters
-        ----------
-        step, total : int
-            Number of the step, and of all.
+        Args:
+            step, total: Number of the step, and of all.
         """
 
     def prepare(self, field: Field, possible: Possible | None, step: int) -> bool:
         """Choose where the field is evaluated next; called before each training step.
 
-        Parameters
-        ----------
-        field : Field
-            What is rendered.
-        possible : callable or None
-            Which places the echoes leave possible; asked at the first step and at refinements.
-        step : int
-            Number of the training step.
+        Args:
+            field: What is rendered.
+            possible: Which places the echoes leave possible; asked at the first step and at
+                refinements.
+            step: Number of the training step.
 
-        Returns
-        -------
-        changed : bool
-            Whether the gain no longer fits, so that :meth:`calibrate` has to follow.
+        Returns:
+            changed: Whether the gain no longer fits, so that :meth:`calibrate` has to follow.
         """
         del field, possible
         return step == 0
@@ -151,23 +138,15 @@ class Renderer(nn.Module):
     ) -> Tensor:
         """Render.
 
-        Parameters
-        ----------
-        field : Field
-            What is rendered.
-        position : (P, 3) float, m
-            Where the head is.
-        rotation : (P, 3, 3) float
-            Head to world.
-        rows : (P, R) int
-            Which range slices of each pose.
-        bins : (B,) int or None
-            Which frequencies; all where None.
+        Args:
+            field: What is rendered.
+            position ((P, 3), m): Where the head is.
+            rotation (P, 3, 3): Head to world.
+            rows (P, R): Which range slices of each pose.
+            bins ((B,) int or None): Which frequencies; all where None.
 
-        Returns
-        -------
-        magnitude : (P, E, R, B) float
-            Linear.
+        Returns:
+            magnitude (P, E, R, B): Linear.
         """
         raise NotImplementedError
 

@@ -25,23 +25,17 @@ class ShellRenderer(Renderer):
     the published code does. Places outside the field's region are zero
     and are not computed.
 
-    Parameters
-    ----------
-    region : (2, 3) float, m
-        Lower and upper corner of the box that holds the field.
-    head : Head
-        What heard the spectra.
-    directions : int
-        Number of directions over the forward hemisphere.
-    direction : {"incidence", "sensor"}
-        What the field is told: the direction from each place to the head, or, as the published
-        code does, the sensor's own look direction (reversed) for all places of a call.
-    call_spectrum : {"flat", "learned"}
-        Whether each frequency has a gain of its own.
+    Args:
+        region ((2, 3), m): Lower and upper corner of the box that holds the field.
+        head: What heard the spectra.
+        directions: Number of directions over the forward hemisphere.
+        direction: What the field is told: the direction from each place to the head, or, as the
+            published code does, the sensor's own look direction (reversed) for all places of a
+            call.
+        call_spectrum: Whether each frequency has a gain of its own.
 
-    References
-    ----------
-    .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, equation 17.
+    References:
+        .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, equation 17.
     """
 
     whole_poses = False

@@ -21,20 +21,15 @@ PATCHES = (64, 128)  # of a cap, over its area and around its axis
 def fibonacci_sphere(count: int) -> NDArray[np.float64]:
     """Return unit vectors on a spiral from +z to -z, each standing for the same solid angle.
 
-    Parameters
-    ----------
-    count : int
-        How many, one or more.
+    Args:
+        count: How many, one or more.
 
-    Returns
-    -------
-    directions : (D, 3) float64
-        Unit vectors.
+    Returns:
+        directions (D, 3): Unit vectors.
 
-    Examples
-    --------
-    >>> abs(fibonacci_sphere(100).mean(axis=0)).max() < 0.01
-    np.True_
+    Examples:
+        >>> abs(fibonacci_sphere(100).mean(axis=0)).max() < 0.01
+        np.True_
     """
     return fibonacci_cap(count, axis=(0.0, 0.0, 1.0), half_angle=math.pi, offset=(0.5, 0.0))
 
@@ -44,22 +39,16 @@ def fibonacci_cap(
 ) -> NDArray[np.float64]:
     """Return unit vectors on a spiral that fills the cap around an axis; equal areas, stratified.
 
-    Parameters
-    ----------
-    count : int
-        How many, one or more.
-    axis : (3,) float
-        The cap's middle; any length but zero.
-    half_angle : float, rad
-        From the axis to the cap's rim, 0 to pi.
-    offset : (2,) float, 1
-        Two numbers in [0, 1): the first shifts every direction within its ring's area, the
-        second turns the whole pattern about the axis. (0.5, 0) is the centred pattern.
+    Args:
+        count: How many, one or more.
+        axis (3,): The cap's middle; any length but zero.
+        half_angle (rad): From the axis to the cap's rim, 0 to pi.
+        offset ((2,), 1): Two numbers in [0, 1): the first shifts every direction within its ring's
+            area, the second turns the whole pattern about the axis. (0.5, 0) is the centred
+            pattern.
 
-    Returns
-    -------
-    directions : (D, 3) float64
-        Unit vectors.
+    Returns:
+        directions (D, 3): Unit vectors.
     """
     return CapSpiral(count, axis, half_angle, offset).directions()
 
@@ -68,14 +57,10 @@ def fibonacci_cap(
 class Cells:
     """Parallelograms on the plane of (share of a cap's area, turn about its axis).
 
-    Attributes
-    ----------
-    middles : (2, N) float64
-        Share and turn.
-    sides : (2, 2, N) float64
-        Two sides, each in share and turn.
-    parts : int
-        How many of them make up one cell of the spiral.
+    Attributes:
+        middles (2, N): Share and turn.
+        sides (2, 2, N): Two sides, each in share and turn.
+        parts: How many of them make up one cell of the spiral.
     """
 
     middles: NDArray[np.float64]
@@ -104,18 +89,12 @@ class CapSpiral:
     In the coordinates (share of the cap's area, turn about the axis) the spiral is a lattice, so
     the parallelogram between neighbours is a cell of it, and cells can be divided evenly.
 
-    Attributes
-    ----------
-    count : int
-        How many directions.
-    axis : (3,) float
-        The cap's middle; any length but zero.
-    half_angle : float, rad
-        From the axis to the cap's rim, 0 to pi.
-    offset : (2,) float, 1
-        Shift within the ring's area, and turn of the whole pattern.
-    rotation : (3, 3) float, optional
-        Turns the finished pattern, the axis with it.
+    Attributes:
+        count: How many directions.
+        axis (3,): The cap's middle; any length but zero.
+        half_angle (rad): From the axis to the cap's rim, 0 to pi.
+        offset ((2,), 1): Shift within the ring's area, and turn of the whole pattern.
+        rotation (3, 3): Turns the finished pattern, the axis with it.
     """
 
     count: int
@@ -152,12 +131,9 @@ class CapSpiral:
 
         Others that lie near a cone are among them: whole patches of the cap are left out or not.
 
-        Parameters
-        ----------
-        towards : (B, 3) float64
-            Axes of the cones, unit vectors.
-        half_angle : (B,) float64, rad
-            Of the cones.
+        Args:
+            towards (B, 3): Axes of the cones, unit vectors.
+            half_angle ((B,), rad): Of the cones.
         """
         rows, columns = PATCHES
         edge, turn = np.arange(rows + 1) / rows, (np.arange(columns) + 0.5) / columns
@@ -268,24 +244,17 @@ def spread_points(
 
     So any first ones of them are spread evenly over the surface, whatever its triangles.
 
-    Parameters
-    ----------
-    mesh : trimesh.Trimesh
-        The surface.
-    count : int
-        How many points, N.
+    Args:
+        mesh: The surface.
+        count: How many points, N.
 
-    Returns
-    -------
-    points : (N, 3) float64, m
-        On the triangles.
-    normals : (N, 3) float64
-        Of the smooth surface, outward unit vectors.
+    Returns:
+        points ((N, 3), m): On the triangles.
+        normals (N, 3): Of the smooth surface, outward unit vectors.
 
-    References
-    ----------
-    .. [1] T. F. Gonzalez, "Clustering to minimize the maximum intercluster distance",
-       Theoretical Computer Science 38, 1985.
+    References:
+        .. [1] T. F. Gonzalez, "Clustering to minimize the maximum intercluster distance",
+           Theoretical Computer Science 38, 1985.
     """
     # A pool of points, as many on each part of the area, uniform over their triangles: Osada et
     # al., "Shape distributions", ACM TOG 21(4), 2002.

@@ -27,18 +27,14 @@ THIN = 1e-9
 def surface_faults(vertices: ArrayLike, faces: ArrayLike) -> list[str]:
     """Describe what is odd about a surface.
 
-    Parameters
-    ----------
-    vertices : (V, 3) float, m
-        Finite.
-    faces : (T, 3) int
-        Triangles, at least one.
+    Args:
+        vertices ((V, 3), m): Finite.
+        faces (T, 3): Triangles, at least one.
 
-    Returns
-    -------
-    lines : list of str
-        Triangles without area, open and oddly shared edges, triangles that disagree on which side
-        is outside, bodies that are inside out or wholly inside another; none where all is well.
+    Returns:
+        lines: Triangles without area, open and oddly shared edges, triangles that disagree on which
+            side is outside, bodies that are inside out or wholly inside another; none where all is
+            well.
     """
     corners, triangles = np.asarray(vertices, dtype=np.float64), np.asarray(faces)
     lines = []

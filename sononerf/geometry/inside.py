@@ -25,19 +25,13 @@ def winding_numbers(
     taken. Of closed bodies it is exact: one inside, two where two overlap, negative where they
     are inside out. Of an open surface it is the share of the directions that it fills, in sixths.
 
-    Parameters
-    ----------
-    vertices : (V, 3) float, m
-        Of the surface.
-    faces : (T, 3) int
-        Its triangles, counter-clockwise from outside.
-    points : (N, 3) float, m
-        The places.
+    Args:
+        vertices ((V, 3), m): Of the surface.
+        faces (T, 3): Its triangles, counter-clockwise from outside.
+        points ((N, 3), m): The places.
 
-    Returns
-    -------
-    windings : (N,) float64
-        Above one half is inside.
+    Returns:
+        windings (N,): Above one half is inside.
     """
     corners = np.asarray(vertices, dtype=np.float64)
     triangles, places = np.asarray(faces), np.asarray(points, dtype=np.float64)

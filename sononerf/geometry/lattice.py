@@ -21,14 +21,10 @@ MARGIN = 3
 class Lattice:
     """Places of voxels.
 
-    Attributes
-    ----------
-    origin : (3,) float, m
-        Centre of the first voxel.
-    spacing : float, m
-        Between centres.
-    shape : tuple of int
-        Voxels along x, y and z.
+    Attributes:
+        origin ((3,), m): Centre of the first voxel.
+        spacing (m): Between centres.
+        shape: Voxels along x, y and z.
     """
 
     origin: Array
@@ -85,21 +81,14 @@ def level_surface(
 ) -> trimesh.Trimesh:
     """Return the surface on which a grid takes a level, by marching cubes.
 
-    Parameters
-    ----------
-    grid : (X, Y, Z) float
-        Values; none on the level itself, where triangles have no area.
-    level : float
-        Value on the surface.
-    origin : (3,) float, m
-        Centre of the first voxel.
-    spacing : float, m
-        Between centres.
+    Args:
+        grid (X, Y, Z): Values; none on the level itself, where triangles have no area.
+        level: Value on the surface.
+        origin ((3,), m): Centre of the first voxel.
+        spacing (m): Between centres.
 
-    Returns
-    -------
-    mesh : Trimesh
-        Of positive volume if it is closed.
+    Returns:
+        mesh: Of positive volume if it is closed.
     """
     vertices, faces, _, _ = marching_cubes(
         grid.astype(np.float32), level, gradient_direction="ascent", allow_degenerate=False

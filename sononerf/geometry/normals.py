@@ -22,22 +22,17 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease: float = CREASE) -> NDArray[
     the crease angle, so a sphere is smooth and a box keeps its edges. The weights are those of
     Max [1]_: exact wherever a vertex and its neighbours lie on one sphere.
 
-    Parameters
-    ----------
-    mesh : trimesh.Trimesh
-        With shared vertices.
-    crease : float, rad
-        Triangles that meet at a greater angle do not share a normal.
+    Args:
+        mesh: With shared vertices.
+        crease (rad): Triangles that meet at a greater angle do not share a normal.
 
-    Returns
-    -------
-    normals : (T, 3, 3) float64
-        Unit vectors, outward where the mesh is; of a triangle without area, zero.
+    Returns:
+        normals (T, 3, 3): Unit vectors, outward where the mesh is; of a triangle without area,
+            zero.
 
-    References
-    ----------
-    .. [1] N. Max, "Weights for computing vertex normals from facet normals", Journal of
-       Graphics Tools 4(2), 1999.
+    References:
+        .. [1] N. Max, "Weights for computing vertex normals from facet normals", Journal of
+           Graphics Tools 4(2), 1999.
     """
     faces = np.asarray(mesh.faces)
     corners = mesh.vertices.view(np.ndarray)[faces]  # (T, 3, 3)
@@ -59,22 +54,17 @@ def total_curvature(mesh: trimesh.Trimesh, normals: NDArray[np.float64]) -> NDAr
     of the map from a step along the surface to the normal's change; the normals at the corners
     give that map, as in Rusinkiewicz [1]_. Edges are no part of it.
 
-    Parameters
-    ----------
-    mesh : trimesh.Trimesh
-        With shared vertices.
-    normals : (T, 3, 3) float64
-        From :func:`corner_normals`.
+    Args:
+        mesh: With shared vertices.
+        normals (T, 3, 3): From :func:`corner_normals`.
 
-    Returns
-    -------
-    curvature : (T,) float64, 1/m
-        Of a sphere, the square root of 2 over its radius; of a triangle without area, 0.
+    Returns:
+        curvature ((T,), 1/m): Of a sphere, the square root of 2 over its radius; of a triangle
+            without area, 0.
 
-    References
-    ----------
-    .. [1] S. Rusinkiewicz, "Estimating curvatures and their derivatives on triangle meshes",
-       3DPVT 2004.
+    References:
+        .. [1] S. Rusinkiewicz, "Estimating curvatures and their derivatives on triangle meshes",
+           3DPVT 2004.
     """
     corners = mesh.vertices.view(np.ndarray)[np.asarray(mesh.faces)]
     second, third = weight_gradients(corners)
@@ -90,15 +80,12 @@ def weight_gradients(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """How the weights of a triangle's second and third corner grow along it.
 
-    Parameters
-    ----------
-    corners : (T, 3, 3) float64, m
-        Of the triangles.
+    Args:
+        corners ((T, 3, 3), m): Of the triangles.
 
-    Returns
-    -------
-    second, third : (T, 3) float64, 1/m
-        Gradients in the triangle's plane; of a triangle without area, zero.
+    Returns:
+        second, third ((T, 3), 1/m): Gradients in the triangle's plane; of a triangle without area,
+            zero.
     """
     ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     sides = np.cross(ab, ac)
@@ -140,21 +127,14 @@ def enclosing_balls(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return balls that hold all triangles: one for each body, and more where that is tighter.
 
-    Parameters
-    ----------
-    corners : (T, 3, 3) float64, m
-        Of the triangles.
-    label : (T,) int64
-        Which body they belong to.
-    count : int
-        At most so many balls, one or more.
+    Args:
+        corners ((T, 3, 3), m): Of the triangles.
+        label (T,): Which body they belong to.
+        count: At most so many balls, one or more.
 
-    Returns
-    -------
-    centres : (B, 3) float64, m
-        Of the balls.
-    radii : (B,) float64, m
-        Of the balls.
+    Returns:
+        centres ((B, 3), m): Of the balls.
+        radii ((B,), m): Of the balls.
     """
     middles = corners.mean(axis=1)
 

@@ -25,12 +25,9 @@ CSV_COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
 class Poses:
     """Positions and orientations of the head.
 
-    Attributes
-    ----------
-    positions : (P, 3) float64, m
-        World frame.
-    rotations : (P, 3, 3) float64
-        Head to world.
+    Attributes:
+        positions ((P, 3), m): World frame.
+        rotations (P, 3, 3): Head to world.
     """
 
     positions: NDArray[np.float64]
@@ -63,21 +60,16 @@ class Poses:
 def rotation_from_euler(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> NDArray[np.float64]:
     """Rotation matrices from yaw, pitch and roll.
 
-    Parameters
-    ----------
-    yaw, pitch, roll : (...,) float, rad
-        Turns about z, y and x; positive pitch looks down.
+    Args:
+        yaw, pitch, roll ((...,), rad): Turns about z, y and x; positive pitch looks down.
 
-    Returns
-    -------
-    rotations : (..., 3, 3) float64
-        Head to world, ``Rz(yaw) Ry(pitch) Rx(roll)``.
+    Returns:
+        rotations (..., 3, 3): Head to world, ``Rz(yaw) Ry(pitch) Rx(roll)``.
 
-    Examples
-    --------
-    >>> down = rotation_from_euler(0.0, math.pi / 6, 0.0)
-    >>> [round(float(part), 3) for part in down @ [1.0, 0.0, 0.0]]
-    [0.866, 0.0, -0.5]
+    Examples:
+        >>> down = rotation_from_euler(0.0, math.pi / 6, 0.0)
+        >>> [round(float(part), 3) for part in down @ [1.0, 0.0, 0.0]]
+        [0.866, 0.0, -0.5]
     """
     yaw, pitch, roll = np.broadcast_arrays(*(np.asarray(a, np.float64) for a in (yaw, pitch, roll)))
     sy, cy = np.sin(yaw), np.cos(yaw)
@@ -96,15 +88,11 @@ def euler_from_rotation(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """Yaw, pitch and roll of rotation matrices; looking straight up or down, yaw is 0.
 
-    Parameters
-    ----------
-    rotations : (..., 3, 3) float
-        Head to world.
+    Args:
+        rotations (..., 3, 3): Head to world.
 
-    Returns
-    -------
-    yaw, pitch, roll : (...,) float64, rad
-        Pitch from -pi/2 to pi/2.
+    Returns:
+        yaw, pitch, roll ((...,), rad): Pitch from -pi/2 to pi/2.
     """
     r = np.asarray(rotations, dtype=np.float64)
     level = np.hypot(r[..., 0, 0], r[..., 1, 0])
@@ -123,22 +111,15 @@ def euler_from_rotation(
 def look_at(positions: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
     """Level rotations that look from positions at a target.
 
-    Parameters
-    ----------
-    positions : (..., 3) float, m
-        World frame.
-    target : (3,) or (..., 3) float, m
-        What is looked at.
+    Args:
+        positions ((..., 3), m): World frame.
+        target ((3,) or (..., 3), m): What is looked at.
 
-    Returns
-    -------
-    rotations : (..., 3, 3) float64
-        Head to world, roll 0; straight up or down, yaw is 0.
+    Returns:
+        rotations (..., 3, 3): Head to world, roll 0; straight up or down, yaw is 0.
 
-    Raises
-    ------
-    ValueError
-        If a position is the target.
+    Raises:
+        ValueError: If a position is the target.
     """
     forward = np.asarray(target, np.float64) - np.asarray(positions, np.float64)
     length = np.linalg.norm(forward, axis=-1)
@@ -163,21 +144,14 @@ def sphere_poses(
 ) -> Poses:
     """Poses on a spiral around the origin that look at it, each a little off.
 
-    Parameters
-    ----------
-    count : int
-        How many.
-    radius : float, m
-        Distance from the origin.
-    aim_jitter : float, rad
-        Standard deviation of the two turns about the head's own y and z axes.
-    generator : numpy.random.Generator
-        Draws the turns.
+    Args:
+        count: How many.
+        radius (m): Distance from the origin.
+        aim_jitter (rad): Standard deviation of the two turns about the head's own y and z axes.
+        generator: Draws the turns.
 
-    Returns
-    -------
-    poses : Poses
-        Level (roll 0), ``count`` of them.
+    Returns:
+        poses: Level (roll 0), ``count`` of them.
     """
     return _aimed(radius * fibonacci_sphere(count), aim_jitter, generator)
 
@@ -240,21 +214,15 @@ def random_poses(
 def read_pose_csv(path: Path) -> Poses:
     """Read poses from a table with the header ``x,y,z,yaw,pitch,roll`` (m, degrees).
 
-    Parameters
-    ----------
-    path : Path
-        The columns may stand in any order; others are not allowed.
+    Args:
+        path: The columns may stand in any order; others are not allowed.
 
-    Returns
-    -------
-    poses : Poses
-        One per row.
+    Returns:
+        poses: One per row.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or anything in it is no finite number, naming file, line
-        and column.
+    Raises:
+        InputError: If the file cannot be read, or anything in it is no finite number, naming file,
+            line and column.
     """
     header, rows = read_rows(path)
     if sorted(header) != sorted(CSV_COLUMNS):

@@ -27,23 +27,16 @@ LIFT = 4e-6
 class Hits:
     """What rays hit first; one row per ray that hits anything.
 
-    Attributes
-    ----------
-    ray : (H,) int64
-        Index of the ray, ascending.
-    points : (H, 3) float64, m
-        On the triangle.
-    normals : (H, 3) float64
-        Smooth unit normals, as the mesh is oriented.
-    triangle : (H,) int64
-        Index of the triangle.
-    distance : (H,) float64, m
-        Along the ray.
-    flat : (H, 3) float64
-        Unit normals of the flat triangles.
-    gradients : (4, 3, H) float32
-        How the smooth normal changes along the triangle: gradients of the second and third
-        corner's weight (1/m), and by how much the normals there differ from that at the first.
+    Attributes:
+        ray (H,): Index of the ray, ascending.
+        points ((H, 3), m): On the triangle.
+        normals (H, 3): Smooth unit normals, as the mesh is oriented.
+        triangle (H,): Index of the triangle.
+        distance ((H,), m): Along the ray.
+        flat (H, 3): Unit normals of the flat triangles.
+        gradients ((4, 3, H) float32): How the smooth normal changes along the triangle: gradients
+            of the second and third corner's weight (1/m), and by how much the normals there differ
+            from that at the first.
     """
 
     ray: NDArray[np.int64]
@@ -144,19 +137,13 @@ def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
 class RayCaster:
     """Rays against one mesh. Cannot be pickled; send the mesh and build it anew.
 
-    Parameters
-    ----------
-    mesh : trimesh.Trimesh
-        At least one triangle.
+    Args:
+        mesh: At least one triangle.
 
-    Attributes
-    ----------
-    face_normals : (T, 3) float64
-        Unit normals of the flat triangles; of one without area, zero.
-    curvature : (T,) float64, 1/m
-        Total curvature of the smooth surface.
-    lift : float, m
-        How far above its triangle a ray starts from a hit.
+    Attributes:
+        face_normals (T, 3): Unit normals of the flat triangles; of one without area, zero.
+        curvature ((T,), 1/m): Total curvature of the smooth surface.
+        lift (m): How far above its triangle a ray starts from a hit.
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
@@ -191,17 +178,12 @@ class RayCaster:
     def first_hit(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
         """Return what each ray hits first; rays that hit nothing are left out.
 
-        Parameters
-        ----------
-        origins : (N, 3) float64, m
-            Where the rays start.
-        directions : (N, 3) float64
-            Unit vectors.
+        Args:
+            origins ((N, 3), m): Where the rays start.
+            directions (N, 3): Unit vectors.
 
-        Returns
-        -------
-        hits : Hits
-            Points and distances in double precision, from the triangles' planes.
+        Returns:
+            hits: Points and distances in double precision, from the triangles' planes.
         """
         found = self._engine.first(self._scaled(origins), directions)
         ray = np.flatnonzero(found >= 0)
@@ -239,20 +221,15 @@ class RayCaster:
     ) -> NDArray[np.bool_]:
         """Whether nothing stands between points and targets.
 
-        Parameters
-        ----------
-        points : (N, 3) float64, m
-            On the surface or off it.
-        targets : (N, 3) or (3,) float64, m
-            What is looked for.
-        normals : (N, 3) float64, optional
-            Where points lie on the surface: unit normals of their triangles, on the side from
-            which they are seen. The points are lifted along them, or else towards the targets.
+        Args:
+            points ((N, 3), m): On the surface or off it.
+            targets ((N, 3) or (3,), m): What is looked for.
+            normals (N, 3): Where points lie on the surface: unit normals of their triangles, on the
+                side from which they are seen. The points are lifted along them, or else towards the
+                targets.
 
-        Returns
-        -------
-        visible : (N,) bool
-            True where the line is free.
+        Returns:
+            visible (N,): True where the line is free.
         """
         spans = np.broadcast_to(targets, points.shape) - points
         if normals is None:
@@ -274,12 +251,9 @@ class RayCaster:
 class Occlusion:
     """Whether anything of a mesh stands between points; quicker to build than a ray caster.
 
-    Parameters
-    ----------
-    vertices : (V, 3) float64, m
-        At least one triangle's.
-    faces : (T, 3) int64
-        Triangles.
+    Args:
+        vertices ((V, 3), m): At least one triangle's.
+        faces (T, 3): Triangles.
     """
 
     def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:

@@ -19,20 +19,15 @@ TRIPLE_POINT = 273.16  # K
 def speed_of_sound(temperature_c: float) -> float:
     """Speed of sound in air.
 
-    Parameters
-    ----------
-    temperature_c : float, °C
-        Air temperature.
+    Args:
+        temperature_c (°C): Air temperature.
 
-    Returns
-    -------
-    speed : float, m/s
-        ISO 9613-1:1993, equation (A.5); humidity changes it by less than 0.4 %.
+    Returns:
+        speed (m/s): ISO 9613-1:1993, equation (A.5); humidity changes it by less than 0.4 %.
 
-    Examples
-    --------
-    >>> round(speed_of_sound(20.0), 1)
-    343.2
+    Examples:
+        >>> round(speed_of_sound(20.0), 1)
+        343.2
     """
     return float(343.2 * np.sqrt((temperature_c + 273.15) / REFERENCE_TEMPERATURE))
 
@@ -70,38 +65,28 @@ def air_absorption(
 
     A bat hears the echo after a *two-way* path: multiply by ``2 * range``.
 
-    Parameters
-    ----------
-    frequency : (...,) float, Hz
-        Tone frequencies.
-    temperature_c : float, °C
-        Air temperature, -20 to 50 for the stated 10 % accuracy.
-    relative_humidity : float, 1
-        Relative humidity as a fraction, 0 to 1 (not per cent).
-    pressure : float, Pa
-        Ambient pressure.
+    Args:
+        frequency ((...,), Hz): Tone frequencies.
+        temperature_c (°C): Air temperature, -20 to 50 for the stated 10 % accuracy.
+        relative_humidity (1): Relative humidity as a fraction, 0 to 1 (not per cent).
+        pressure (Pa): Ambient pressure.
 
-    Returns
-    -------
-    absorption : (...,) float64, dB/m
-        Same shape as ``frequency``; zero or more.
+    Returns:
+        absorption ((...,), dB/m): Same shape as ``frequency``; zero or more.
 
-    Raises
-    ------
-    ValueError
-        If temperature or humidity lies outside the stated range, or ``frequency / pressure``
-        outside 4e-4 to 10 Hz/Pa (about 40 Hz to 1 MHz at sea level), where the standard states
-        no accuracy.
+    Raises:
+        ValueError: If temperature or humidity lies outside the stated range, or ``frequency /
+            pressure`` outside 4e-4 to 10 Hz/Pa (about 40 Hz to 1 MHz at sea level), where the
+            standard states no accuracy.
 
-    References
-    ----------
-    .. [1] ISO 9613-1:1993, equations (3) to (5), (B.1) to (B.3).
+    References:
+        .. [1] ISO 9613-1:1993, equations (3) to (5), (B.1) to (B.3).
 
-    Examples
-    --------
-    >>> absorption = air_absorption([20e3, 50e3, 100e3], temperature_c=20.0, relative_humidity=0.5)
-    >>> [round(float(value), 3) for value in absorption]
-    [0.524, 1.661, 3.28]
+    Examples:
+        >>> frequency = [20e3, 50e3, 100e3]
+        >>> absorption = air_absorption(frequency, temperature_c=20.0, relative_humidity=0.5)
+        >>> [round(float(value), 3) for value in absorption]
+        [0.524, 1.661, 3.28]
     """
     f = np.asarray(frequency, dtype=np.float64)
     if not -20.0 <= temperature_c <= 50.0:

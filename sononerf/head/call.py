@@ -37,23 +37,17 @@ def call_waveform(settings: CallSettings, sampling_rate: float) -> NDArray[np.fl
 
     so that a hyperbolic sweep's period runs straight, and it bears Doppler shifts [1]_.
 
-    Parameters
-    ----------
-    settings : CallSettings
-        The call.
-    sampling_rate : float, Hz
-        Of the waveform.
+    Args:
+        settings: The call.
+        sampling_rate (Hz): Of the waveform.
 
-    Returns
-    -------
-    waveform : (N,) float64
-        One sample of height 1 for an impulse; never higher than 1 for a sweep; of a file resampled
-        where the rates differ, with a greatest of 1 before that.
+    Returns:
+        waveform (N,): One sample of height 1 for an impulse; never higher than 1 for a sweep; of a
+            file resampled where the rates differ, with a greatest of 1 before that.
 
-    References
-    ----------
-    .. [1] J. J. Kroszczynski, "Pulse compression by means of linear-period modulation",
-       Proceedings of the IEEE 57(7), 1969.
+    References:
+        .. [1] J. J. Kroszczynski, "Pulse compression by means of linear-period modulation",
+           Proceedings of the IEEE 57(7), 1969.
     """
     if settings.kind == "impulse":
         return np.ones(1)
@@ -93,18 +87,13 @@ def _envelope(settings: CallSettings, time: NDArray[np.float64]) -> NDArray[np.f
 def covered(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.bool_]:
     """Tell which frequencies the call emits.
 
-    Parameters
-    ----------
-    settings : CallSettings
-        The call.
-    frequency : (F,) float, Hz
-        Frequencies asked about.
+    Args:
+        settings: The call.
+        frequency ((F,), Hz): Frequencies asked about.
 
-    Returns
-    -------
-    covered : (F,) bool
-        Whether a harmonic sweeps over it; an impulse covers all, a file what lies within 20 dB of
-        its loudest frequency.
+    Returns:
+        covered (F,): Whether a harmonic sweeps over it; an impulse covers all, a file what lies
+            within 20 dB of its loudest frequency.
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "impulse":
@@ -120,12 +109,9 @@ def has_ghosts(settings: CallSettings, frequency: ArrayLike) -> bool:
     That is so where several harmonics sweep over one of the frequencies, each at a time of its own,
     and has to be expected of a file.
 
-    Parameters
-    ----------
-    settings : CallSettings
-        The call.
-    frequency : (F,) float, Hz
-        Of the rows.
+    Args:
+        settings: The call.
+        frequency ((F,), Hz): Of the rows.
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "file":
@@ -176,26 +162,21 @@ def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.floa
     The fundamental is at :math:`f` at :math:`T (f - f_0) / (f_1 - f_0)` in a linear sweep and at
     :math:`T (1/f - 1/f_0) / (1/f_1 - 1/f_0)` in a hyperbolic one.
 
-    Parameters
-    ----------
-    settings : CallSettings
-        The call.
-    frequency : (F,) float, Hz
-        Above zero.
+    Args:
+        settings: The call.
+        frequency ((F,), Hz): Above zero.
 
-    Returns
-    -------
-    delay : (F,) float64, s
-        Of the first harmonic that sweeps over the frequency, or else of the nearest end of a
-        sweep; zero for an impulse. Other harmonics that sweep over it too are heard farther off, as
-        :func:`sononerf.head.reception.effective_window` has it, so that no echo is heard in
-        front of the first one.
+    Returns:
+        delay ((F,), s): Of the first harmonic that sweeps over the frequency, or else of the
+            nearest end of a sweep; zero for an impulse. Other harmonics that sweep over it too are
+            heard farther off, as :func:`sononerf.head.reception.effective_window` has it, so that
+            no echo is heard in front of the first one.
 
-    Examples
-    --------
-    >>> call = CallSettings(kind="linear", duration=1e-3, frequency_start=90e3, frequency_end=40e3)
-    >>> [round(1e6 * float(delay)) for delay in sweep_delay(call, [90e3, 60e3, 20e3])]
-    [0, 600, 1000]
+    Examples:
+        >>> sweep = dict(kind="linear", duration=1e-3, frequency_start=90e3, frequency_end=40e3)
+        >>> call = CallSettings(**sweep)
+        >>> [round(1e6 * float(delay)) for delay in sweep_delay(call, [90e3, 60e3, 20e3])]
+        [0, 600, 1000]
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "impulse":
@@ -212,17 +193,13 @@ def sweep_rate(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.float
     :math:`h |f_1 - f_0| / T` for harmonic :math:`h` of a linear sweep, :math:`|k| f^2 / h` of a
     hyperbolic one.
 
-    Parameters
-    ----------
-    settings : CallSettings
-        The call.
-    frequency : (F,) float, Hz
-        Above zero.
+    Args:
+        settings: The call.
+        frequency ((F,), Hz): Above zero.
 
-    Returns
-    -------
-    rate : (F,) float64, Hz/s
-        Above zero, of the same harmonic as in :func:`sweep_delay`; infinite for an impulse.
+    Returns:
+        rate ((F,), Hz/s): Above zero, of the same harmonic as in :func:`sweep_delay`; infinite for
+            an impulse.
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "impulse":
@@ -251,17 +228,12 @@ def call_content(settings: CallSettings) -> dict[str, Any]:
 def emit(impulse_responses: ArrayLike, waveform: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pressure at the ears when the call is emitted in place of an impulse.
 
-    Parameters
-    ----------
-    impulse_responses : (E, S) float
-        Pressure for a call that is one sample of height 1.
-    waveform : (N,) float64
-        The call, at the same sampling rate.
+    Args:
+        impulse_responses (E, S): Pressure for a call that is one sample of height 1.
+        waveform (N,): The call, at the same sampling rate.
 
-    Returns
-    -------
-    echo : (E, S + N - 1) float64
-        The two convolved, from the start of the emission on.
+    Returns:
+        echo (E, S + N - 1): The two convolved, from the start of the emission on.
     """
     responses = np.asarray(impulse_responses, dtype=np.float64)
     if len(waveform) == 1:

@@ -45,20 +45,14 @@ ROWS = 200  # frequencies that the delay is read at
 class CallFile:
     """A recorded or computed call.
 
-    Attributes
-    ----------
-    waveform : (N,) float64
-        From the file's first sample on, which is the start of the emission; its greatest is 1.
-    sampling_rate : float, Hz
-        Of the file.
-    frequency : (K,) float64, Hz
-        Ascending.
-    delay : (K,) float64, s
-        When each is emitted.
-    is_covered : (K,) bool
-        Whether it is emitted.
-    bandwidth : float, Hz
-        Of the window that it was looked at through.
+    Attributes:
+        waveform (N,): From the file's first sample on, which is the start of the emission; its
+            greatest is 1.
+        sampling_rate (Hz): Of the file.
+        frequency ((K,), Hz): Ascending.
+        delay ((K,), s): When each is emitted.
+        is_covered (K,): Whether it is emitted.
+        bandwidth (Hz): Of the window that it was looked at through.
     """
 
     waveform: NDArray[np.float64]
@@ -105,21 +99,15 @@ class CallFile:
 def load_call(path: Path) -> CallFile:
     """Read a call.
 
-    Parameters
-    ----------
-    path : Path
-        WAV of one channel.
+    Args:
+        path: WAV of one channel.
 
-    Returns
-    -------
-    call : CallFile
-        The same object for as long as the file does not change.
+    Returns:
+        call: The same object for as long as the file does not change.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, no WAV, truncated, of several channels, silent, not finite, or too
-        long.
+    Raises:
+        InputError: If the file is missing, no WAV, truncated, of several channels, silent, not
+            finite, or too long.
     """
     try:
         status = path.stat()

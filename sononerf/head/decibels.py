@@ -23,22 +23,15 @@ CHUNK_POSES = 8
 def compress(magnitude: ArrayLike, reference: float) -> NDArray[np.float64]:
     """Decibels above a soft floor, ``20 log10(1 + magnitude / reference)``.
 
-    Parameters
-    ----------
-    magnitude : (...,) float
-        Linear, zero or more.
-    reference : float
-        Same unit; silence is 0 dB, a magnitude of the reference 6 dB.
+    Args:
+        magnitude (...,): Linear, zero or more.
+        reference: Same unit; silence is 0 dB, a magnitude of the reference 6 dB.
 
-    Returns
-    -------
-    level_db : (...,) float64, dB
-        Zero or more.
+    Returns:
+        level_db ((...,), dB): Zero or more.
 
-    Raises
-    ------
-    ValueError
-        If the reference is not above zero.
+    Raises:
+        ValueError: If the reference is not above zero.
     """
     if not reference > 0.0:
         raise ValueError(f"reference is {reference}, expected above 0")
@@ -100,19 +93,13 @@ def mae_db(
 ) -> float | None:
     """Mean absolute difference of two sets of spectrograms.
 
-    Parameters
-    ----------
-    a, b : (P, ...) float, dB
-        Spectrograms.
-    active : bool
-        Whether only those cells count that reach ``active_db`` in either.
-    active_db : float, dB
-        What makes a cell active.
+    Args:
+        a, b ((P, ...), dB): Spectrograms.
+        active: Whether only those cells count that reach ``active_db`` in either.
+        active_db (dB): What makes a cell active.
 
-    Returns
-    -------
-    error : float or None, dB
-        None where no cell is active.
+    Returns:
+        error (dB): None where no cell is active.
     """
     first, second = same_shape(a, b)
     return mae_all_and_active(first, second, active_db)[1 if active else 0]

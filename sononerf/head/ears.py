@@ -31,22 +31,15 @@ GRID_DEG = 2.0
 class Ears:
     """Real, non-negative gains of the beam and of each receiver, and where they are.
 
-    Attributes
-    ----------
-    azimuth : (A,) float64, rad
-        Uniform from -pi to pi, both included.
-    elevation : (L,) float64, rad
-        Uniform from -pi/2 to pi/2, both included.
-    frequency : (F,) float64, Hz
-        Ascending.
-    beam : (F, L, A) float32
-        Gain of the emission.
-    ears : (E, F, L, A) float32
-        Gain of each receiver; all of them may share one table in memory.
-    emitter : (3,) float64, m
-        Head frame.
-    positions : (E, 3) float64, m
-        Of the receivers, head frame.
+    Attributes:
+        azimuth ((A,), rad): Uniform from -pi to pi, both included.
+        elevation ((L,), rad): Uniform from -pi/2 to pi/2, both included.
+        frequency ((F,), Hz): Ascending.
+        beam ((F, L, A) float32): Gain of the emission.
+        ears ((E, F, L, A) float32): Gain of each receiver; all of them may share one table in
+            memory.
+        emitter ((3,), m): Head frame.
+        positions ((E, 3), m): Of the receivers, head frame.
     """
 
     azimuth: NDArray[np.float64]
@@ -78,10 +71,8 @@ class Ears:
     def cone(self, least: float) -> float:
         """Return the cosine to the head's axis down to which every direction has a gain.
 
-        Parameters
-        ----------
-        least : float
-            Gain of beam and receivers that suffices, as a fraction of the greatest.
+        Args:
+            least: Gain of beam and receivers that suffices, as a fraction of the greatest.
         """
         gain = (self.beam * self.ears.max(axis=0)).max(axis=0).astype(np.float64)
         deaf = self.directions[..., 0][gain < least * gain.max()]
@@ -98,20 +89,15 @@ class Ears:
 def ear_tables(settings: EarSettings, frequency: ArrayLike) -> Ears:
     """Tables of the emitter and of the receivers that settings describe.
 
-    Parameters
-    ----------
-    settings : EarSettings
-        Places and directivities; models are those of :mod:`sononerf.head.gains`. Between
-        measured directions and frequencies gains are linear. Below the lowest and above the
-        highest measured frequency they are those at it; outside the measured directions they fade
-        to zero over 10 degrees.
-    frequency : (F,) float, Hz
-        Ascending.
+    Args:
+        settings: Places and directivities; models are those of :mod:`sononerf.head.gains`. Between
+            measured directions and frequencies gains are linear. Below the lowest and above the
+            highest measured frequency they are those at it; outside the measured directions they
+            fade to zero over 10 degrees.
+        frequency ((F,), Hz): Ascending.
 
-    Returns
-    -------
-    ears : Ears
-        On a grid of 2 degrees.
+    Returns:
+        ears: On a grid of 2 degrees.
     """
     f = np.asarray(frequency, dtype=np.float64)
     measured = _measured(settings)
@@ -219,21 +205,15 @@ def analysed_ears(
 
     so that beside a notch an echo seems to come from millimetres nearer or farther.
 
-    Parameters
-    ----------
-    settings : EarSettings
-        Places, axes, widths.
-    call : CallSettings
-        An impulse or a sweep.
-    analysis : SpectrogramSettings
-        Window, transform and frequencies.
+    Args:
+        settings: Places, axes, widths.
+        call: An impulse or a sweep.
+        analysis: Window, transform and frequencies.
 
-    Returns
-    -------
-    ears : Ears
-        At the analysis' frequencies.
-    lag : (E, F, L, A) float32 or None, s
-        How much too late each ear hears an echo, beam included; None for an impulse.
+    Returns:
+        ears: At the analysis' frequencies.
+        lag ((E, F, L, A) float32 or None, s): How much too late each ear hears an echo, beam
+            included; None for an impulse.
     """
     return _analysed(settings, call, analysis, directivity_content(settings))
 
@@ -285,17 +265,12 @@ def _analysed(
 def beam_gain(ears: Ears, directions_head: NDArray[np.float64]) -> NDArray[np.float32]:
     """Gain of the emission towards directions, bilinear between the table's nodes.
 
-    Parameters
-    ----------
-    ears : Ears
-        Tables.
-    directions_head : (N, 3) float64
-        Unit vectors away from the emitter, head frame.
+    Args:
+        ears: Tables.
+        directions_head (N, 3): Unit vectors away from the emitter, head frame.
 
-    Returns
-    -------
-    gain : (N, F) float32
-        Linear, zero or more.
+    Returns:
+        gain ((N, F) float32): Linear, zero or more.
     """
     return _look_up(ears, 0, directions_head)
 
@@ -303,19 +278,13 @@ def beam_gain(ears: Ears, directions_head: NDArray[np.float64]) -> NDArray[np.fl
 def ear_gain(ears: Ears, ear: int, directions_head: NDArray[np.float64]) -> NDArray[np.float32]:
     """Gain of one ear for sound from directions, bilinear between the table's nodes.
 
-    Parameters
-    ----------
-    ears : Ears
-        Tables.
-    ear : int
-        Its number.
-    directions_head : (N, 3) float64
-        Unit vectors from the ear to where the sound comes from, head frame.
+    Args:
+        ears: Tables.
+        ear: Its number.
+        directions_head (N, 3): Unit vectors from the ear to where the sound comes from, head frame.
 
-    Returns
-    -------
-    gain : (N, F) float32
-        Linear, zero or more.
+    Returns:
+        gain ((N, F) float32): Linear, zero or more.
     """
     return _look_up(ears, 1 + ear, directions_head)
 

@@ -29,23 +29,16 @@ def piston(directions: Array, radius: float, frequency: Array) -> Array:
     with the radius a. The first factor is a circular piston in an infinite baffle [1]_; the second
     makes it fade towards its back, as a source without a baffle does.
 
-    Parameters
-    ----------
-    directions : (L, A, 3) float64
-        Unit vectors, head frame.
-    radius : float, m
-        Of the piston; 0 is the same in all directions.
-    frequency : (F,) float64, Hz
-        Any.
+    Args:
+        directions (L, A, 3): Unit vectors, head frame.
+        radius (m): Of the piston; 0 is the same in all directions.
+        frequency ((F,), Hz): Any.
 
-    Returns
-    -------
-    gain : (F, L, A) float64
-        1 straight ahead.
+    Returns:
+        gain (F, L, A): 1 straight ahead.
 
-    References
-    ----------
-    .. [1] L. L. Beranek, T. J. Mellow, Acoustics: Sound Fields and Transducers, 2012, 13.7.
+    References:
+        .. [1] L. L. Beranek, T. J. Mellow, Acoustics: Sound Fields and Transducers, 2012, 13.7.
     """
     if radius == 0.0:
         return np.ones((len(frequency), *directions.shape[:2]))
@@ -63,21 +56,14 @@ def ear(directions: Array, side: float, settings: EarSettings, frequency: Array)
     square root of frequency (``width_deg`` at 50 kHz). A spectral notch rises from 30 kHz (straight
     down) over 60 kHz to 90 kHz (straight up), so that elevation can be told from the spectrum.
 
-    Parameters
-    ----------
-    directions : (L, A, 3) float64
-        Unit vectors, head frame; elevation is that of the row.
-    side : float
-        1 for an ear that looks to the left, -1 to the right, 0 straight ahead.
-    settings : EarSettings
-        Axis, width and depth of the notch.
-    frequency : (F,) float64, Hz
-        Above zero.
+    Args:
+        directions (L, A, 3): Unit vectors, head frame; elevation is that of the row.
+        side: 1 for an ear that looks to the left, -1 to the right, 0 straight ahead.
+        settings: Axis, width and depth of the notch.
+        frequency ((F,), Hz): Above zero.
 
-    Returns
-    -------
-    gain : (F, L, A) float64
-        At most 1.
+    Returns:
+        gain (F, L, A): At most 1.
     """
     azimuth, elevation = np.radians(side * settings.azimuth_deg), np.radians(settings.elevation_deg)
     axis = (

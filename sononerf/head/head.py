@@ -42,25 +42,17 @@ class Head:
 
     What costs time is computed when it is first asked for, and kept.
 
-    Attributes
-    ----------
-    ears : EarSettings
-        Places and directivities of emitter and receivers.
-    call : CallSettings
-        What is emitted.
-    air : AirSettings
-        Speed of sound and absorption.
-    analysis : SpectrogramSettings
-        Front end: filters, hop, range limits.
-    noise : NoiseSettings
-        Noise of the receivers.
+    Attributes:
+        ears: Places and directivities of emitter and receivers.
+        call: What is emitted.
+        air: Speed of sound and absorption.
+        analysis: Front end: filters, hop, range limits.
+        noise: Noise of the receivers.
 
-    Raises
-    ------
-    InputError
-        If a file of the call or of the directivity cannot be used.
-    SettingsError
-        If receivers of settings and file do not fit, or noise is set for two of others.
+    Raises:
+        InputError: If a file of the call or of the directivity cannot be used.
+        SettingsError: If receivers of settings and file do not fit, or noise is set for two of
+            others.
     """
 
     ears: EarSettings = dataclasses.field(default_factory=EarSettings)
@@ -101,12 +93,9 @@ class Head:
     def places(self, positions: ArrayLike, rotations: ArrayLike) -> tuple[Array, Array]:
         """Return emitters (..., 3) and receivers (..., E, 3), m, world frame.
 
-        Parameters
-        ----------
-        positions : (..., 3) float64, m
-            Of the head, world frame.
-        rotations : (..., 3, 3) float64
-            Head to world.
+        Args:
+            positions ((..., 3), m): Of the head, world frame.
+            rotations (..., 3, 3): Head to world.
         """
         at, turn = np.asarray(positions, np.float64), np.asarray(rotations, np.float64)
         return at + turn @ self.emitter, at[..., None, :] + self.receivers @ turn.swapaxes(-1, -2)
@@ -221,21 +210,15 @@ class Head:
     def receive(self, impulse_responses: ArrayLike, *, seed: int) -> tuple[Array, Array]:
         """Return the pressure at the receivers, noise included, and its spectrogram.
 
-        Parameters
-        ----------
-        impulse_responses : (E, S) float
-            Pressure for a call that is one sample of height 1. They should have ``samples``
-            samples; of shorter ones, down to the last frame of an impulse, the last rows lack
-            what the window lets in from behind.
-        seed : int
-            Of the pose; the noise is drawn from it.
+        Args:
+            impulse_responses (E, S): Pressure for a call that is one sample of height 1. They
+                should have ``samples`` samples; of shorter ones, down to the last frame of an
+                impulse, the last rows lack what the window lets in from behind.
+            seed: Of the pose; the noise is drawn from it.
 
-        Returns
-        -------
-        waveform : (E, S) float64
-            From the start of the emission on.
-        magnitude : (E, R, F) float64
-            Linear.
+        Returns:
+            waveform (E, S): From the start of the emission on.
+            magnitude (E, R, F): Linear.
         """
         waveform = emit(impulse_responses, self.waveform)[:, : self.samples]
         if self.noise.snr_db is not None:

@@ -8,10 +8,9 @@ The recording is correlated with the call that was emitted,
 which of all linear filters makes an echo in white noise stand out best [1]_. Its analytic signal
 has the echo's envelope as magnitude and its phase as phase.
 
-References
-----------
-.. [1] G. L. Turin, "An introduction to matched filters", IRE Transactions on Information Theory
-   6(3), 1960.
+References:
+    .. [1] G. L. Turin, "An introduction to matched filters", IRE Transactions on Information Theory
+       6(3), 1960.
 """
 
 from __future__ import annotations
@@ -26,34 +25,26 @@ def matched_filter(
 ) -> NDArray[np.complex128]:
     """Compress the echoes of a call.
 
-    Parameters
-    ----------
-    recordings : (..., S) float
-        Pressure from the start of the emission on.
-    call : (N,) float
-        Waveform, at the same sampling rate.
-    oversampling : int
-        Samples of the result per sample of the recordings.
+    Args:
+        recordings (..., S): Pressure from the start of the emission on.
+        call (N,): Waveform, at the same sampling rate.
+        oversampling: Samples of the result per sample of the recordings.
 
-    Returns
-    -------
-    compressed : (..., S * oversampling) complex128
-        Analytic signal. An echo that is ``g`` times the call has the magnitude ``g`` at its delay;
-        the magnitude is the envelope, the real part the filter's output.
+    Returns:
+        compressed ((..., S * oversampling) complex128): Analytic signal. An echo that is ``g``
+            times the call has the magnitude ``g`` at its delay; the magnitude is the envelope, the
+            real part the filter's output.
 
-    Raises
-    ------
-    ValueError
-        If the call is silent or has several dimensions, or the oversampling is below 1.
+    Raises:
+        ValueError: If the call is silent or has several dimensions, or the oversampling is below 1.
 
-    Examples
-    --------
-    >>> call = np.sin(np.arange(60.0) ** 2 / 60.0)
-    >>> echo = np.zeros(300)
-    >>> echo[100:160] = 0.5 * call
-    >>> compressed = matched_filter(echo, call)
-    >>> int(abs(compressed).argmax()), round(float(compressed[100].real), 6)
-    (100, 0.5)
+    Examples:
+        >>> call = np.sin(np.arange(60.0) ** 2 / 60.0)
+        >>> echo = np.zeros(300)
+        >>> echo[100:160] = 0.5 * call
+        >>> compressed = matched_filter(echo, call)
+        >>> int(abs(compressed).argmax()), round(float(compressed[100].real), 6)
+        (100, 0.5)
     """
     heard, waveform = (np.asarray(each, dtype=np.float64) for each in (recordings, call))
     if waveform.ndim != 1 or not np.any(waveform):
@@ -82,23 +73,16 @@ far as a call counts as covering a frequency."""
 def inverse_filter(recordings: ArrayLike, call: ArrayLike) -> NDArray[np.float64]:
     """Replace each echo of a call by that of an impulse.
 
-    Parameters
-    ----------
-    recordings : (..., S) float
-        From the start of the emission on.
-    call : (N,) float
-        Waveform, at the same sampling rate.
+    Args:
+        recordings (..., S): From the start of the emission on.
+        call (N,): Waveform, at the same sampling rate.
 
-    Returns
-    -------
-    compressed : (..., S) float64
-        An echo that is ``g`` times the call has the spectrum ``g`` within the call's band. The last
-        N - 1 samples lack what came after the recording.
+    Returns:
+        compressed (..., S): An echo that is ``g`` times the call has the spectrum ``g`` within the
+            call's band. The last N - 1 samples lack what came after the recording.
 
-    Raises
-    ------
-    ValueError
-        If the call is silent or has several dimensions.
+    Raises:
+        ValueError: If the call is silent or has several dimensions.
     """
     heard, waveform = (np.asarray(each, dtype=np.float64) for each in (recordings, call))
     if waveform.ndim != 1 or not np.any(waveform):

@@ -29,27 +29,20 @@ NOISE_STREAM = 1  # keeps a pose's noise apart from what else is drawn from its 
 def target_gain(target_strength_db: float, distance: float) -> float:
     """Echo of a small target, as a part of the call's pressure at 1 m.
 
-    Parameters
-    ----------
-    target_strength_db : float, dB
-        Of the echo at 1 m from the target, over the pressure that falls on it;
-        20 log10(radius / 2 m) of a rigid sphere that is large against the wavelength [1]_.
-    distance : float, m
-        From emitter and ear to the target.
+    Args:
+        target_strength_db (dB): Of the echo at 1 m from the target, over the pressure that falls on
+            it; 20 log10(radius / 2 m) of a rigid sphere that is large against the wavelength [1]_.
+        distance (m): From emitter and ear to the target.
 
-    Returns
-    -------
-    gain : float
-        Spherical spreading both ways.
+    Returns:
+        gain: Spherical spreading both ways.
 
-    References
-    ----------
-    .. [1] R. J. Urick, Principles of Underwater Sound, 3rd edition, 1983, table 9.1.
+    References:
+        .. [1] R. J. Urick, Principles of Underwater Sound, 3rd edition, 1983, table 9.1.
 
-    Examples
-    --------
-    >>> round(target_gain(-46.02, 0.4), 4)
-    0.0313
+    Examples:
+        >>> round(target_gain(-46.02, 0.4), 4)
+        0.0313
     """
     return float(10.0 ** (target_strength_db / 20.0)) / distance**2
 
@@ -59,19 +52,13 @@ def loudest_power(
 ) -> NDArray[np.float64]:
     """Mean power within the analysis band over an echo's loudest stretch.
 
-    Parameters
-    ----------
-    echo : (E, S) float64
-        Waveforms.
-    analysis : SpectrogramSettings
-        Sampling rate and band.
-    samples : int
-        Length of a stretch.
+    Args:
+        echo (E, S): Waveforms.
+        analysis: Sampling rate and band.
+        samples: Length of a stretch.
 
-    Returns
-    -------
-    power : (E,) float64
-        Square of the echo's unit.
+    Returns:
+        power (E,): Square of the echo's unit.
     """
     padded = np.pad(echo, ((0, 0), (samples, samples)))
     length = int(scipy.fft.next_fast_len(padded.shape[-1], real=True))
@@ -88,20 +75,14 @@ def noise_level(
 ) -> NDArray[np.float64]:
     """Set each ear's noise: the standard deviation of its samples.
 
-    Parameters
-    ----------
-    settings : NoiseSettings
-        The ratio, which must be set.
-    power : (E,) float64
-        Of the echo that it is relative to, from :func:`loudest_power`.
-    analysis : SpectrogramSettings
-        Sampling rate and band: of white noise's power, the band holds its share of all
-        frequencies up to half the sampling rate.
+    Args:
+        settings: The ratio, which must be set.
+        power (E,): Of the echo that it is relative to, from :func:`loudest_power`.
+        analysis: Sampling rate and band: of white noise's power, the band holds its share of all
+            frequencies up to half the sampling rate.
 
-    Returns
-    -------
-    level : (E,) float64
-        Unit of the echo.
+    Returns:
+        level (E,): Unit of the echo.
     """
     share = 2.0 * (analysis.frequency_max - analysis.frequency_min) / analysis.sampling_rate
     ratio = 10.0 ** (np.asarray(settings.snr_db, dtype=np.float64) / 10.0)
@@ -112,19 +93,13 @@ def noise_level(
 def draw_noise(level: NDArray[np.float64], samples: int, *, seed: int) -> NDArray[np.float64]:
     """White Gaussian noise, each ear's its own.
 
-    Parameters
-    ----------
-    level : (E,) float64
-        Standard deviations.
-    samples : int
-        Per ear.
-    seed : int
-        Of the pose; what else is drawn from it is independent of the noise.
+    Args:
+        level (E,): Standard deviations.
+        samples: Per ear.
+        seed: Of the pose; what else is drawn from it is independent of the noise.
 
-    Returns
-    -------
-    noise : (E, samples) float64
-        Unit of ``level``.
+    Returns:
+        noise (E, samples): Unit of ``level``.
     """
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(NOISE_STREAM,)))
     return level[:, None] * generator.standard_normal((len(level), samples))

@@ -20,17 +20,13 @@ Array = NDArray[np.float64]
 class PointEcho:
     """What the analysis makes of the echo of one point.
 
-    Attributes
-    ----------
-    window : (W,) float
-        Its power over range, averaged over the part of the band that the call has.
-    spacing : float, m
-        Between these values.
-    looks : float
-        How many independent values there are among the frequencies.
-    rows : (F, W) float or None
-        The same of each row, which the window is the sum of; None where all rows are about alike.
-        If low rows swell more slowly, an echo without high frequencies does so too.
+    Attributes:
+        window (W,): Its power over range, averaged over the part of the band that the call has.
+        spacing (m): Between these values.
+        looks: How many independent values there are among the frequencies.
+        rows ((F, W) or None): The same of each row, which the window is the sum of; None where all
+            rows are about alike. If low rows swell more slowly, an echo without high frequencies
+            does so too.
     """
 
     window: Array

@@ -46,19 +46,13 @@ def row_duration(
     row is the filter's transform, turned by the sweep's quadratic phase and transformed back; for
     a Gaussian filter and a linear sweep that gives exactly this.
 
-    Parameters
-    ----------
-    call : CallSettings
-        What is emitted.
-    analysis : SpectrogramSettings
-        Window and sampling rate.
-    frequency : (F,) float, Hz
-        Of the rows.
+    Args:
+        call: What is emitted.
+        analysis: Window and sampling rate.
+        frequency ((F,), Hz): Of the rows.
 
-    Returns
-    -------
-    duration : (F,) float64, s
-        Two-way: times ``c / 2`` it is a width in range.
+    Returns:
+        duration ((F,), s): Two-way: times ``c / 2`` it is a width in range.
     """
     lasts, wide = row_widths(analysis, frequency)
     duration: NDArray[np.float64] = np.hypot(lasts, wide / sweep_rate(call, frequency))
@@ -72,24 +66,18 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
     long itself. What is made smallest is the root mean square of :func:`row_duration` over the
     analysed frequencies that the call covers.
 
-    Parameters
-    ----------
-    call : CallSettings
-        What is emitted.
-    analysis : SpectrogramSettings
-        Sampling rate and frequencies.
+    Args:
+        call: What is emitted.
+        analysis: Sampling rate and frequencies.
 
-    Returns
-    -------
-    window : int
-        Samples. For an impulse shorter is always better, so it is the window that is set; a
-        gammatone's is not asked for.
+    Returns:
+        window: Samples. For an impulse shorter is always better, so it is the window that is set; a
+            gammatone's is not asked for.
 
-    Examples
-    --------
-    >>> call = CallSettings(kind="linear", duration=3e-3)
-    >>> best_window(call, SpectrogramSettings(frequency_min=40e3))
-    306
+    Examples:
+        >>> call = CallSettings(kind="linear", duration=3e-3)
+        >>> best_window(call, SpectrogramSettings(frequency_min=40e3))
+        306
     """
     if call.kind == "impulse" or analysis.kind == "gammatone":
         return analysis.window
@@ -112,21 +100,16 @@ def _heard(call: CallSettings, analysis: SpectrogramSettings) -> NDArray[np.floa
 def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> NDArray[np.float64]:
     """Point echo in each row of the dechirped spectrogram, as a window over the received time.
 
-    Parameters
-    ----------
-    call : CallSettings
-        What is emitted.
-    analysis : SpectrogramSettings
-        Filters and frequencies.
+    Args:
+        call: What is emitted.
+        analysis: Filters and frequencies.
 
-    Returns
-    -------
-    window : (F, W) float64
-        One value per sample; the point's own range is in the middle, where it is 1. For an impulse
-        the rows' envelopes, of a height of almost 1; for a sweep as much longer as the sweep stays
-        in the window's main lobe. Of Hamming windows and a sweep it is made symmetric (the mean
-        power of both sides). Of gammatones it is not, nor where harmonics overlap: what one more
-        harmonic adds at other times is part of it.
+    Returns:
+        window (F, W): One value per sample; the point's own range is in the middle, where it is 1.
+            For an impulse the rows' envelopes, of a height of almost 1; for a sweep as much longer
+            as the sweep stays in the window's main lobe. Of Hamming windows and a sweep it is made
+            symmetric (the mean power of both sides). Of gammatones it is not, nor where harmonics
+            overlap: what one more harmonic adds at other times is part of it.
     """
     frequency, filters = frequency_axis(analysis), row_filters(analysis)
     if call.kind == "impulse":
@@ -183,12 +166,9 @@ def _cropped(
 def warn_of_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
     """Log one line for each way in which call and analysis do not suit one another.
 
-    Parameters
-    ----------
-    call : CallSettings
-        What is emitted.
-    analysis : SpectrogramSettings
-        Window and band.
+    Args:
+        call: What is emitted.
+        analysis: Window and band.
     """
     warn_of_band(call, analysis)
     best = best_window(call, analysis)

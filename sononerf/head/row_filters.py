@@ -21,13 +21,12 @@ bins do: an echo then lasts as its upper channels have it, which tell its range 
 length is needed for all rows, it is that of the Hamming window that is as wide (-6 dB) as the root
 mean square of the rows' envelopes, averaged so.
 
-References
-----------
-.. [1] R. D. Patterson et al., "Complex sounds and auditory images", Auditory Physiology and
-   Perception, 1992.
-.. [2] B. R. Glasberg and B. C. J. Moore, "Derivation of auditory filter shapes from notched-noise
-   data", Hearing Research 47, 1990; here without the constant part of the bandwidth, which is
-   25 Hz in man.
+References:
+    .. [1] R. D. Patterson et al., "Complex sounds and auditory images", Auditory Physiology and
+       Perception, 1992.
+    .. [2] B. R. Glasberg and B. C. J. Moore, "Derivation of auditory filter shapes from
+       notched-noise data", Hearing Research 47, 1990; here without the constant part of the
+       bandwidth, which is 25 Hz in man.
 """
 
 from __future__ import annotations
@@ -61,22 +60,15 @@ FLOOR = 1e-3
 class RowFilters:
     """The filters of an analysis.
 
-    Attributes
-    ----------
-    frequency : (F,) float64, Hz
-        Of the rows, ascending.
-    envelope : (F, W) float64
-        Over the samples that a frame reads, 1 at its greatest or almost.
-    origin : int
-        First of these samples, from the frame's start; the ones before the emission are silent.
-    centre : float
-        Of the envelopes, samples from the frame's start: the frame's time.
-    length : int
-        Of the Hamming window that is as wide as the mean over the band, samples.
-    band : (float, float), Hz
-        What the rows let through.
-    looks : float
-        How many independent values of noise there are in a mean over the band.
+    Attributes:
+        frequency ((F,), Hz): Of the rows, ascending.
+        envelope (F, W): Over the samples that a frame reads, 1 at its greatest or almost.
+        origin: First of these samples, from the frame's start; the ones before the emission are
+            silent.
+        centre: Of the envelopes, samples from the frame's start: the frame's time.
+        length: Of the Hamming window that is as wide as the mean over the band, samples.
+        band ((float, float), Hz): What the rows let through.
+        looks: How many independent values of noise there are in a mean over the band.
     """
 
     frequency: NDArray[np.float64]
@@ -124,12 +116,9 @@ def fft_bins(settings: SpectrogramSettings) -> tuple[int, int]:
 def band_mean(values: NDArray[Any], frequency: ArrayLike) -> NDArray[Any]:
     """Return the mean over frequency, each row with its part of the band.
 
-    Parameters
-    ----------
-    values : (..., F) float
-        Of the rows.
-    frequency : (F,) float, Hz
-        Ascending; where its steps are equal this is the mean.
+    Args:
+        values (..., F): Of the rows.
+        frequency ((F,), Hz): Ascending; where its steps are equal this is the mean.
     """
     part = band_parts(frequency)
     return np.asarray(values.mean(axis=-1) if part is None else values @ part)
@@ -150,17 +139,13 @@ def row_widths(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """How long a row's envelope lasts and how wide its transform is, each above half its height.
 
-    Parameters
-    ----------
-    settings : SpectrogramSettings
-        The analysis.
-    frequency : (F,) float, Hz
-        Of the rows.
+    Args:
+        settings: The analysis.
+        frequency ((F,), Hz): Of the rows.
 
-    Returns
-    -------
-    duration : (F,) float64, s
-    bandwidth : (F,) float64, Hz
+    Returns:
+        duration: (F,), s.
+        bandwidth: (F,), Hz.
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "gammatone":
@@ -174,10 +159,8 @@ def row_widths(
 def row_filters(settings: SpectrogramSettings) -> RowFilters:
     """Return the filters of an analysis.
 
-    Parameters
-    ----------
-    settings : SpectrogramSettings
-        The analysis.
+    Args:
+        settings: The analysis.
     """
     return _gammatone(settings) if settings.kind == "gammatone" else _hamming(settings)
 

@@ -28,18 +28,13 @@ WIDEST = 8.0
 class Smearing(NamedTuple):
     """What the rows hear of fine frequencies.
 
-    Attributes
-    ----------
-    frequency : (N,) float64, Hz
-        The fine ones, ascending.
-    rows : (F, K) int64
-        Which of them each row hears.
-    weight : (F, K) float64 or complex128
-        How much: of a sound's pressure for an impulse, of its power for a sweep. The sum is 1, for
-        complex weights its magnitude.
-    later : (F, K) float64 or None, s
-        The weight times how much later than the row's own frequency each one is emitted; None for
-        an impulse.
+    Attributes:
+        frequency ((N,), Hz): The fine ones, ascending.
+        rows (F, K): Which of them each row hears.
+        weight ((F, K) float64 or complex128): How much: of a sound's pressure for an impulse, of
+            its power for a sweep. The sum is 1, for complex weights its magnitude.
+        later ((F, K) or None, s): The weight times how much later than the row's own frequency each
+            one is emitted; None for an impulse.
     """
 
     frequency: NDArray[np.float64]
@@ -51,12 +46,9 @@ class Smearing(NamedTuple):
 def smearing(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
     """Return what the rows of an analysis hear of a call.
 
-    Parameters
-    ----------
-    call : CallSettings
-        What is emitted.
-    analysis : SpectrogramSettings
-        Filters and frequencies.
+    Args:
+        call: What is emitted.
+        analysis: Filters and frequencies.
     """
     return (_of_gammatones if analysis.kind == "gammatone" else _of_a_window)(call, analysis)
 

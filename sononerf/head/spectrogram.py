@@ -20,21 +20,16 @@ def frequency_axis(settings: SpectrogramSettings) -> NDArray[np.float64]:
     Of the kind ``stft`` the FFT's bins nearest to the two ends, and all between,
     ``sampling_rate / fft`` apart; of ``gammatone`` equal ratios from one end to the other.
 
-    Parameters
-    ----------
-    settings : SpectrogramSettings
-        The analysis.
+    Args:
+        settings: The analysis.
 
-    Returns
-    -------
-    frequency : (F,) float64, Hz
-        Ascending.
+    Returns:
+        frequency ((F,), Hz): Ascending.
 
-    Examples
-    --------
-    >>> axis = frequency_axis(SpectrogramSettings())
-    >>> len(axis), float(axis[0]), float(axis[-1])
-    (47, 9765.625, 99609.375)
+    Examples:
+        >>> axis = frequency_axis(SpectrogramSettings())
+        >>> len(axis), float(axis[0]), float(axis[-1])
+        (47, 9765.625, 99609.375)
     """
     return row_frequencies(settings)
 
@@ -42,22 +37,16 @@ def frequency_axis(settings: SpectrogramSettings) -> NDArray[np.float64]:
 def range_axis(settings: SpectrogramSettings, speed_of_sound: float) -> NDArray[np.float64]:
     """Ranges of the analysis frames, ``c t / 2`` with t at the centre of the frame's envelopes.
 
-    Parameters
-    ----------
-    settings : SpectrogramSettings
-        The analysis; frames start every ``hop`` samples from the emission on.
-    speed_of_sound : float, m/s
-        Of the medium.
+    Args:
+        settings: The analysis; frames start every ``hop`` samples from the emission on.
+        speed_of_sound (m/s): Of the medium.
 
-    Returns
-    -------
-    range : (R,) float64, m
-        Those within ``range_min`` to ``range_max``.
+    Returns:
+        range ((R,), m): Those within ``range_min`` to ``range_max``.
 
-    Examples
-    --------
-    >>> len(range_axis(SpectrogramSettings(), 343.0))
-    875
+    Examples:
+        >>> len(range_axis(SpectrogramSettings(), 343.0))
+        875
     """
     first, last = _frames(settings, speed_of_sound)
     frames = np.arange(first, last + 1, dtype=np.float64)
@@ -84,19 +73,13 @@ def echo_samples(
 ) -> int:
     """How many samples from the emission on the last analysis frame needs.
 
-    Parameters
-    ----------
-    settings : SpectrogramSettings
-        The analysis.
-    speed_of_sound : float, m/s
-        Of the medium.
-    longest_delay : float, s
-        The greatest by which a frequency's row is advanced; 0 for an impulse.
+    Args:
+        settings: The analysis.
+        speed_of_sound (m/s): Of the medium.
+        longest_delay (s): The greatest by which a frequency's row is advanced; 0 for an impulse.
 
-    Returns
-    -------
-    samples : int
-        At the sampling rate of the settings.
+    Returns:
+        samples: At the sampling rate of the settings.
     """
     last = _frames(settings, speed_of_sound)[1]
     reach = row_filters(settings).reach
@@ -120,30 +103,21 @@ def spectrogram(
     with :math:`X(t, f)` the output of the filter whose envelope is centred at :math:`t`, between
     two samples too.
 
-    Parameters
-    ----------
-    echo : (E, S) float
-        Pressure from the emission on, at the sampling rate of the settings.
-    settings : SpectrogramSettings
-        The analysis.
-    speed_of_sound : float, m/s
-        Of the medium.
-    delay : (F,) float, s, optional
-        Emission time of each frequency, zero or more; all at once where it is left out.
+    Args:
+        echo (E, S): Pressure from the emission on, at the sampling rate of the settings.
+        settings: The analysis.
+        speed_of_sound (m/s): Of the medium.
+        delay ((F,), s): Emission time of each frequency, zero or more; all at once where it is left
+            out.
 
-    Returns
-    -------
-    magnitude : (E, R, F) float64
-        Linear.
+    Returns:
+        magnitude (E, R, F): Linear.
 
-    Raises
-    ------
-    ValueError
-        If the echo ends before the last frame, or a delay is negative.
+    Raises:
+        ValueError: If the echo ends before the last frame, or a delay is negative.
 
-    References
-    ----------
-    .. [1] W. Jansen and J. Steckel, SonoNERFs, Biomimetics 9(6):321, 2024, equation (16).
+    References:
+        .. [1] W. Jansen and J. Steckel, SonoNERFs, Biomimetics 9(6):321, 2024, equation (16).
     """
     signal = np.asarray(echo, dtype=np.float64)
     advance = np.zeros(1) if delay is None else np.asarray(delay, dtype=np.float64)

@@ -13,10 +13,9 @@ The array moves along x and looks across it, to positive y. Sampling rate, call,
 and microphones and the delay of the electronics stand in files beside it and are given as
 settings: ``import.sampling_rate``, ``call``, ``ears``, ``import.time_offset``.
 
-References
-----------
-.. [1] T. E. Blanford et al., "An in-air synthetic aperture sonar dataset of target scattering in
-   environments of varying complexity", Scientific Data 11, 2024.
+References:
+    .. [1] T. E. Blanford et al., "An in-air synthetic aperture sonar dataset of target scattering
+       in environments of varying complexity", Scientific Data 11, 2024.
 """
 
 from __future__ import annotations
@@ -40,10 +39,8 @@ ACROSS = np.pi / 2  # yaw of a head that looks to positive y, rad
 def read_airsas(path: Path, settings: ImportSettings) -> Recording:
     """Read the format ``airsas``; see the module.
 
-    Raises
-    ------
-    InputError
-        If it is damaged, or has another layout.
+    Raises:
+        InputError: If it is damaged, or has another layout.
     """
     if settings.sampling_rate is None:
         raise InputError(

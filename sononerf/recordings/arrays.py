@@ -43,10 +43,8 @@ WHOLE = {"position": PLACE, "euler": EULER}
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Read all arrays of an ``.npz``, or of the root of an HDF5 file.
 
-    Raises
-    ------
-    InputError
-        If it is missing, damaged, of another kind than its name says, or holds objects.
+    Raises:
+        InputError: If it is missing, damaged, of another kind than its name says, or holds objects.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -82,10 +80,8 @@ def waveform_of(
 ) -> tuple[float, NDArray[Any]]:
     """Return the sampling rate (Hz) and the array ``waveform`` as it is.
 
-    Raises
-    ------
-    InputError
-        If either is missing.
+    Raises:
+        InputError: If either is missing.
     """
     if "waveform" not in arrays:
         listed = ", ".join(sorted(arrays)) or "nothing"
@@ -103,10 +99,8 @@ def waveform_of(
 def read_numpy(path: Path, settings: ImportSettings) -> Recording:
     """Read the format ``numpy``; see the module.
 
-    Raises
-    ------
-    InputError
-        If arrays are missing, unknown, or do not fit one another.
+    Raises:
+        InputError: If arrays are missing, unknown, or do not fit one another.
     """
     arrays = read_arrays(path)
     rate, waveform = waveform_of(path, arrays, settings)

@@ -22,22 +22,15 @@ SUFFIXES = (*WAV, *OTHERS)
 def read_audio(path: Path) -> tuple[float, NDArray[Any]]:
     """Read a sound file.
 
-    Parameters
-    ----------
-    path : Path
-        Of a kind in :data:`SUFFIXES`; a WAV is mapped, not loaded, where it can be.
+    Args:
+        path: Of a kind in :data:`SUFFIXES`; a WAV is mapped, not loaded, where it can be.
 
-    Returns
-    -------
-    sampling_rate : float, Hz
-        As the file says.
-    samples : (E, S)
-        Integers reach from one end of their type to the other.
+    Returns:
+        sampling_rate (Hz): As the file says.
+        samples (E, S): Integers reach from one end of their type to the other.
 
-    Raises
-    ------
-    InputError
-        If it is missing, truncated, empty, or of another kind than its name says.
+    Raises:
+        InputError: If it is missing, truncated, empty, or of another kind than its name says.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")

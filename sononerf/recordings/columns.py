@@ -49,18 +49,12 @@ UNITS = {"length": LENGTHS, "angle": ANGLES, "time": TIMES}
 class Columns:
     """One table, in SI units and radians, in its own frame.
 
-    Attributes
-    ----------
-    where : str
-        The table, for messages.
-    values : dict of array
-        Numbers by name, each (P,).
-    texts : dict of list of str
-        Text by name, each of P.
-    rotation : (P, 3, 3) float or None
-        Head to world as matrices, where the source has them.
-    units : dict of str
-        The unit that each length and angle was given in.
+    Attributes:
+        where: The table, for messages.
+        values: Numbers by name, each (P,).
+        texts: Text by name, each of P.
+        rotation ((P, 3, 3) or None): Head to world as matrices, where the source has them.
+        units: The unit that each length and angle was given in.
     """
 
     where: str
@@ -94,10 +88,8 @@ class Columns:
     def split(self) -> NDArray[np.int8] | None:
         """Return what each pose is for, (P,): 0 train, 1 validation, 2 test; None if not said.
 
-        Raises
-        ------
-        InputError
-            If a word is none of these three.
+        Raises:
+            InputError: If a word is none of these three.
         """
         words = self.texts.get("split")
         if words is None:
@@ -121,23 +113,16 @@ def columns_of(
 ) -> Columns:
     """Bring named columns into SI units.
 
-    Parameters
-    ----------
-    where : str
-        The table, for messages.
-    given : dict of (P,) float
-        Columns by name, with or without a unit in it.
-    settings : ImportSettings
-        Units of those without.
-    texts : dict of list of str
-        Columns of words.
-    rotation : (P, 3, 3) float
-        Rotation matrices, if there are any.
+    Args:
+        where: The table, for messages.
+        given (dict of (P,) float): Columns by name, with or without a unit in it.
+        settings: Units of those without.
+        texts: Columns of words.
+        rotation (P, 3, 3): Rotation matrices, if there are any.
 
-    Raises
-    ------
-    InputError
-        If a name is unknown or stands twice, a unit is missing, or a value is not finite.
+    Raises:
+        InputError: If a name is unknown or stands twice, a unit is missing, or a value is not
+            finite.
     """
     values: dict[str, Array] = {}
     units: dict[str, str] = {}
@@ -189,17 +174,12 @@ def _parted(where: str, full: str) -> tuple[str, str | None]:
 def read_table(path: Path, settings: ImportSettings) -> Columns:
     """Read a CSV table of poses with one header line.
 
-    Parameters
-    ----------
-    path : Path
-        UTF-8; separated by commas, semicolons or tabulators.
-    settings : ImportSettings
-        Units of columns that do not say theirs.
+    Args:
+        path: UTF-8; separated by commas, semicolons or tabulators.
+        settings: Units of columns that do not say theirs.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read or anything in it is wrong, naming file, line and column.
+    Raises:
+        InputError: If it cannot be read or anything in it is wrong, naming file, line and column.
     """
     header, rows = read_rows(path)
     numbers: dict[str, list[float]] = {name: [] for name in header if name not in TEXTS}

@@ -38,10 +38,9 @@ SLACK = 1e-3
 def frame_matrices(settings: ImportSettings) -> tuple[Array, Array]:
     """Return the matrices (3, 3) that take the world's and the head's axes to ours.
 
-    Raises
-    ------
-    SettingsError
-        If an own frame's matrix is not orthogonal, or one is left-handed and the other not.
+    Raises:
+        SettingsError: If an own frame's matrix is not orthogonal, or one is left-handed and the
+            other not.
     """
     if settings.frame == "own":
         world = np.asarray(settings.axes, dtype=np.float64)
@@ -68,19 +67,13 @@ def frame_matrices(settings: ImportSettings) -> tuple[Array, Array]:
 def to_poses(columns: Columns, settings: ImportSettings) -> Poses:
     """Return the poses of a table in our frame.
 
-    Parameters
-    ----------
-    columns : Columns
-        Places and orientations, or a turntable's angles and heights.
-    settings : ImportSettings
-        Frame, turntable, and what is looked at where there are no orientations.
+    Args:
+        columns: Places and orientations, or a turntable's angles and heights.
+        settings: Frame, turntable, and what is looked at where there are no orientations.
 
-    Raises
-    ------
-    InputError
-        If columns are missing or contradict one another.
-    SettingsError
-        If the frame's matrices are none.
+    Raises:
+        InputError: If columns are missing or contradict one another.
+        SettingsError: If the frame's matrices are none.
     """
     if settings.turntable is not None:
         return _turntable_of(columns, settings.turntable)
@@ -188,22 +181,15 @@ def _turntable_of(columns: Columns, settings: TurntableSettings) -> Poses:
 def turntable_poses(angle: Array, height: Array, *, radius: float, clockwise: bool) -> Poses:
     """Poses of a fixed sensor beside a turning object, seen from the object.
 
-    Parameters
-    ----------
-    angle : (P,) float, rad
-        Of the turntable.
-    height : (P,) float, m
-        Of the sensor; z of the world.
-    radius : float, m
-        From the axis to the sensor.
-    clockwise : bool
-        Whether growing angles turn the object clockwise, seen from above. The sensor then goes
-        about the object counter-clockwise.
+    Args:
+        angle ((P,), rad): Of the turntable.
+        height ((P,), m): Of the sensor; z of the world.
+        radius (m): From the axis to the sensor.
+        clockwise: Whether growing angles turn the object clockwise, seen from above. The sensor
+            then goes about the object counter-clockwise.
 
-    Returns
-    -------
-    poses : Poses
-        At angle 0 on the x axis; they look at the axis, level.
+    Returns:
+        poses: At angle 0 on the x axis; they look at the axis, level.
     """
     turn = np.asarray(angle) * (1.0 if clockwise else -1.0)
     level = np.asarray(height, dtype=np.float64)

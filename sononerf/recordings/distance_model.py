@@ -38,15 +38,11 @@ RIDGE = 1e-3
 class Prediction:
     """What the pings say of one another.
 
-    Attributes
-    ----------
-    residual : (P, E) float, m
-        Measured less predicted; NaN where nothing was measured.
-    centre : (3,) float, m
-        From where distances are counted.
-    size : float, m
-        Mean distance from there to the body's surface; negative if the echoes contradict one
-        another by so much.
+    Attributes:
+        residual ((P, E), m): Measured less predicted; NaN where nothing was measured.
+        centre ((3,), m): From where distances are counted.
+        size (m): Mean distance from there to the body's surface; negative if the echoes contradict
+            one another by so much.
     """
 
     residual: Array
@@ -57,14 +53,10 @@ class Prediction:
 def predict(middle: Array, separation: Array, first: Array) -> Prediction:
     """Predict each ping's first echoes from the other pings'.
 
-    Parameters
-    ----------
-    middle : (P, E, 3) float, m
-        Points half way between emitter and receivers.
-    separation : (P, E, 3) float, m
-        From the emitter to each receiver.
-    first : (P, E) float, m
-        Ranges of first echoes; not finite where there is none.
+    Args:
+        middle ((P, E, 3), m): Points half way between emitter and receivers.
+        separation ((P, E, 3), m): From the emitter to each receiver.
+        first ((P, E), m): Ranges of first echoes; not finite where there is none.
     """
     known = np.isfinite(first).any(axis=1)
     pings = np.flatnonzero(known)

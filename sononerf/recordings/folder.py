@@ -26,10 +26,8 @@ SUFFIXES = (*audio.SUFFIXES, *arrays.SUFFIXES)
 def read_sound(path: Path, settings: ImportSettings) -> tuple[float, NDArray[Any]]:
     """Read one file of any kind: its sampling rate (Hz) and samples (E, S).
 
-    Raises
-    ------
-    InputError
-        If it is missing, damaged, or of a kind that is not known.
+    Raises:
+        InputError: If it is missing, damaged, or of a kind that is not known.
     """
     suffix = path.suffix.lower()
     if suffix in audio.SUFFIXES:
@@ -51,17 +49,12 @@ def read_sound(path: Path, settings: ImportSettings) -> tuple[float, NDArray[Any
 def read_folder(source: Path, settings: ImportSettings) -> Recording:
     """Read the format ``recordings``.
 
-    Parameters
-    ----------
-    source : Path
-        The folder, or the table of poses in it.
-    settings : ImportSettings
-        Where the table is, and its units.
+    Args:
+        source: The folder, or the table of poses in it.
+        settings: Where the table is, and its units.
 
-    Raises
-    ------
-    InputError
-        If files or poses are missing, or files differ in rate or channels.
+    Raises:
+        InputError: If files or poses are missing, or files differ in rate or channels.
     """
     table = source if source.is_file() else source / settings.poses
     if not table.is_file():

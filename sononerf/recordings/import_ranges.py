@@ -32,28 +32,19 @@ def found_ranges(
 ) -> tuple[dict[str, float], Array]:
     """Find range limits that are left out from the echoes.
 
-    Parameters
-    ----------
-    head : Head
-        Air, receivers, call and analysis.
-    cutter : Cutter
-        Cuts the pings.
-    recording : Recording
-        All pings.
-    given : collection of str
-        Keys of the analysis that are set; limits that are not among them follow from the echoes.
+    Args:
+        head: Air, receivers, call and analysis.
+        cutter: Cuts the pings.
+        recording: All pings.
+        given: Keys of the analysis that are set; limits that are not among them follow from the
+            echoes.
 
-    Returns
-    -------
-    limits : dict
-        ``range_min`` and ``range_max``, m.
-    power : (P, E, R) float
-        Of some pings over all ranges, averaged over frequency.
+    Returns:
+        limits: ``range_min`` and ``range_max``, m.
+        power (P, E, R): Of some pings over all ranges, averaged over frequency.
 
-    Raises
-    ------
-    InputError
-        If the recordings are too short, or begin too late, for limits that are set.
+    Raises:
+        InputError: If the recordings are too short, or begin too late, for limits that are set.
     """
     analysis, speed = head.analysis, head.speed_of_sound
     rate = analysis.sampling_rate
@@ -113,23 +104,15 @@ def calibrated(
 ) -> tuple[Cutter, dict[str, Any]]:
     """Return what cuts pings, with background, reference and offsets, and what was applied.
 
-    Parameters
-    ----------
-    recording : Recording
-        All pings.
-    wanted : ImportSettings
-        What to apply.
-    head : Head
-        Gains, places, air, call and analysis.
-    folder : Path
-        Of background and reference.
+    Args:
+        recording: All pings.
+        wanted: What to apply.
+        head: Gains, places, air, call and analysis.
+        folder: Of background and reference.
 
-    Returns
-    -------
-    cutter : Cutter
-        Cuts and calibrates pings.
-    applied : dict
-        Plain data.
+    Returns:
+        cutter: Cuts and calibrates pings.
+        applied: Plain data.
     """
     speed, rate = head.speed_of_sound, recording.sampling_rate
     applied: dict[str, Any] = {

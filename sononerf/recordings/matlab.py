@@ -27,24 +27,17 @@ PLAIN = "save it again with numbers, structs and cells alone"
 def read_mat(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
     """Read variables of a MATLAB file.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    wanted : tuple of str
-        Names of variables; those that are not there are left out.
+    Args:
+        path: The file.
+        wanted: Names of variables; those that are not there are left out.
 
-    Returns
-    -------
-    variables : dict
-        Structs as dicts, cells and arrays of structs as lists, numbers as arrays in MATLAB's
-        shape, text as str.
+    Returns:
+        variables: Structs as dicts, cells and arrays of structs as lists, numbers as arrays in
+            MATLAB's shape, text as str.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged or no MATLAB file, or a variable holds objects, functions
-        or tables.
+    Raises:
+        InputError: If the file is missing, damaged or no MATLAB file, or a variable holds objects,
+            functions or tables.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -153,10 +146,8 @@ def as_list(value: Any) -> list[Any]:
 def vector(path: Path, where: dict[str, Any], name: str, size: int) -> NDArray[np.float64]:
     """Return a field of some numbers, (size,).
 
-    Raises
-    ------
-    InputError
-        If it is missing, of another size, or not finite.
+    Raises:
+        InputError: If it is missing, of another size, or not finite.
     """
     found = where.get(name) if isinstance(where, dict) else None
     values = np.asarray(found if isinstance(found, np.ndarray) else [], dtype=np.float64)
@@ -174,10 +165,9 @@ MOST_TIMES = 2000
 def opened(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading.
 
-    Raises
-    ------
-    InputError
-        If it is missing, truncated, or no HDF5 file; also for what is found on reading it.
+    Raises:
+        InputError: If it is missing, truncated, or no HDF5 file; also for what is found on reading
+            it.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -192,10 +182,8 @@ def opened(path: Path) -> Iterator[h5py.File]:
 def child(group: Any, name: str) -> Any:
     """Return a group's member; None where there is none.
 
-    Raises
-    ------
-    InputError
-        If it is a link.
+    Raises:
+        InputError: If it is a link.
     """
     link = group.get(name, getlink=True)
     if link is None:
@@ -208,10 +196,9 @@ def child(group: Any, name: str) -> Any:
 def dataset(group: Any, name: str) -> Any:
     """Return a dataset of numbers of its own file, not read; None where there is none.
 
-    Raises
-    ------
-    InputError
-        If it is no dataset of numbers, lies in another file, or is larger than it can be.
+    Raises:
+        InputError: If it is no dataset of numbers, lies in another file, or is larger than it can
+            be.
     """
     node = group
     for part in name.strip("/").split("/"):

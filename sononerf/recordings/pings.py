@@ -33,20 +33,14 @@ stays at the same number for long anyway."""
 def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -> Array:
     """Return samples from the emission on; zeros where the recording had not begun or has ended.
 
-    Parameters
-    ----------
-    samples : (E, S)
-        As they are on disk.
-    emission : float
-        When the call left, in samples from the first one on; between two of them too.
-    count : int
-        How many samples, N.
-    first : int
-        The first of them, counted from the emission.
+    Args:
+        samples (E, S): As they are on disk.
+        emission: When the call left, in samples from the first one on; between two of them too.
+        count: How many samples, N.
+        first: The first of them, counted from the emission.
 
-    Returns
-    -------
-    echo : (E, N) float64
+    Returns:
+        echo: (E, N).
     """
     whole = int(np.floor(emission))
     part = emission - whole
@@ -69,10 +63,8 @@ def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -
 def mix(samples: Array, channels: tuple[int | tuple[int, ...], ...] | None) -> Array:
     """Return the chosen channels (E, S); those that stand together are averaged.
 
-    Raises
-    ------
-    InputError
-        If there is no such channel.
+    Raises:
+        InputError: If there is no such channel.
     """
     if channels is None:
         return samples
@@ -89,20 +81,15 @@ def mix(samples: Array, channels: tuple[int | tuple[int, ...], ...] | None) -> A
 class Cutter:
     """Cuts pings out of a recording.
 
-    Attributes
-    ----------
-    recording : Recording
-        All pings.
-    channels : tuple or None
-        Which channels become receivers; see :func:`mix`.
-    delay : float, s
-        Added to the time of every emission.
-    gain : (E,) float
-        Factor of each receiver.
-    background : (E, S) float or None
-        Echoes of the surroundings alone, from the emission on, before the factors.
-    call : (N,) float or None
-        Waveform whose echoes become those of an impulse; None leaves them as they are.
+    Attributes:
+        recording: All pings.
+        channels: Which channels become receivers; see :func:`mix`.
+        delay (s): Added to the time of every emission.
+        gain (E,): Factor of each receiver.
+        background ((E, S) or None): Echoes of the surroundings alone, from the emission on, before
+            the factors.
+        call ((N,) or None): Waveform whose echoes become those of an impulse; None leaves them as
+            they are.
     """
 
     recording: Recording
@@ -128,14 +115,10 @@ class Cutter:
     def echo(self, index: int, count: int, *, first: int = 0) -> Array:
         """Return what the receivers of a ping heard, (E, N), calibrated.
 
-        Parameters
-        ----------
-        index : int
-            Number of the ping.
-        count : int
-            How many samples N.
-        first : int
-            The first of them, counted from the emission.
+        Args:
+            index: Number of the ping.
+            count: How many samples N.
+            first: The first of them, counted from the emission.
         """
         whole = count + self._tail
         raw = cut(self.recording.read(index), self._emission(index), whole, first=first)
@@ -153,12 +136,9 @@ class Cutter:
     def clipped(self, index: int, first: int, last: int) -> Clipping:
         """Return how a ping's loudest samples look, from one sample after the emission to another.
 
-        Parameters
-        ----------
-        index : int
-            Number of the ping.
-        first, last : int
-            Counted from the emission.
+        Args:
+            index: Number of the ping.
+            first, last: Counted from the emission.
         """
         samples = self.recording.read(index)
         begin = round(self._emission(index))
@@ -182,14 +162,10 @@ class Cutter:
 class Clipping:
     """The greatest value of each channel of a ping, and of its negative, and how often it stays.
 
-    Attributes
-    ----------
-    peak : (2 E,) float
-        As a fraction of full scale, or in the unit of the recording.
-    stays : (2 E,) int
-        How many samples of that value stand beside another one.
-    step : float
-        Between two numbers of the recording; 0 of floats.
+    Attributes:
+        peak (2 E,): As a fraction of full scale, or in the unit of the recording.
+        stays (2 E,): How many samples of that value stand beside another one.
+        step: Between two numbers of the recording; 0 of floats.
     """
 
     peak: Array
@@ -228,19 +204,13 @@ def clipped_pings(found: list[Clipping]) -> NDArray[np.bool_]:
 def check_numbers(recording: Recording, cutter: Cutter, last: int) -> None:
     """Refuse pings that hold NaN, or whose times lie outside the recording.
 
-    Parameters
-    ----------
-    recording : Recording
-        All pings.
-    cutter : Cutter
-        Cuts them.
-    last : int
-        Samples after the emission that are needed; 0 where that is not known yet.
+    Args:
+        recording: All pings.
+        cutter: Cuts them.
+        last: Samples after the emission that are needed; 0 where that is not known yet.
 
-    Raises
-    ------
-    InputError
-        Naming the first one and how many there are.
+    Raises:
+        InputError: Naming the first one and how many there are.
     """
 
     def refuse(bad: list[int], what: str) -> None:

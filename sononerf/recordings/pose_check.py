@@ -56,14 +56,10 @@ AROUND = 0.15
 class Verdict:
     """What is wrong with poses, if anything.
 
-    Attributes
-    ----------
-    name : str
-        Of the convention that explains the echoes best; empty if it is the stated one.
-    message : str
-        One line for the user; empty if nothing is wrong.
-    gain : float
-        How much better, in log-likelihood.
+    Attributes:
+        name: Of the convention that explains the echoes best; empty if it is the stated one.
+        message: One line for the user; empty if nothing is wrong.
+        gain: How much better, in log-likelihood.
     """
 
     name: str = ""
@@ -74,17 +70,12 @@ class Verdict:
 def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]:
     """Return the poses of a table under conventions that are easily mixed up with the stated one.
 
-    Parameters
-    ----------
-    columns : Columns
-        The table as read.
-    settings : ImportSettings
-        As stated.
+    Args:
+        columns: The table as read.
+        settings: As stated.
 
-    Returns
-    -------
-    poses : dict
-        By name; those that do not differ from the stated ones are left out.
+    Returns:
+        poses: By name; those that do not differ from the stated ones are left out.
     """
     stated = to_poses(columns, settings)
     found: dict[str, Poses] = {}
@@ -158,20 +149,13 @@ def check_poses(
 ) -> Verdict:
     """Name the convention that explains the first echoes, if it is not the stated one.
 
-    Parameters
-    ----------
-    first : (P, E) float, m
-        Ranges of the first echoes; not finite where there is none.
-    stated : Poses
-        The poses as they were read.
-    others : mapping
-        The same poses under other conventions, by name.
-    emitter : (3,) float, m
-        Head frame.
-    receivers : (E, 3) float, m
-        Head frame.
-    resolution : float, m
-        Range resolution; onsets are known to a tenth of it.
+    Args:
+        first ((P, E), m): Ranges of the first echoes; not finite where there is none.
+        stated: The poses as they were read.
+        others: The same poses under other conventions, by name.
+        emitter ((3,), m): Head frame.
+        receivers ((E, 3), m): Head frame.
+        resolution (m): Range resolution; onsets are known to a tenth of it.
     """
     heard = np.flatnonzero(np.isfinite(first).any(axis=1))
     if len(heard) < FEWEST:

@@ -8,9 +8,8 @@ on it, at 1 m [1]_. Heard at distance r of its surface that is, of the call's pr
 
 with :math:`d_e, d_r` from emitter and receiver to the surface and G the gains straight ahead.
 
-References
-----------
-.. [1] R. J. Urick, Principles of Underwater Sound, 3rd edition, 1983, table 9.1.
+References:
+    .. [1] R. J. Urick, Principles of Underwater Sound, 3rd edition, 1983, table 9.1.
 """
 
 from __future__ import annotations
@@ -38,12 +37,9 @@ SEARCH = 0.25
 class Calibration:
     """What the reference target says.
 
-    Attributes
-    ----------
-    gain : (E,) float
-        Factor that brings each receiver to the call's pressure at 1 m.
-    range_offset : float, m
-        To be added to every range.
+    Attributes:
+        gain (E,): Factor that brings each receiver to the call's pressure at 1 m.
+        range_offset (m): To be added to every range.
     """
 
     gain: Array
@@ -57,19 +53,13 @@ def calibrate(
 ) -> Calibration:
     """Compare the echo of a reference target with what it should be.
 
-    Parameters
-    ----------
-    echo : (E, S) float
-        What the receivers heard of it, from the emission on.
-    reference : ReferenceSettings
-        The target.
-    head : Head
-        Gains, places, air, call and analysis; its range limits do not matter.
+    Args:
+        echo (E, S): What the receivers heard of it, from the emission on.
+        reference: The target.
+        head: Gains, places, air, call and analysis; its range limits do not matter.
 
-    Raises
-    ------
-    InputError
-        If the recording ends before the target, or nothing is heard of it.
+    Raises:
+        InputError: If the recording ends before the target, or nothing is heard of it.
     """
     ears, call, speed_of_sound = head.gains, head.call, head.speed_of_sound
     absorption = head.absorption(head.frequency)

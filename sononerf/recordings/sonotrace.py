@@ -35,10 +35,8 @@ SONONERF_RATE, SONONERF_SPEED = 1e6, 343.0  # Hz, m/s: of its first script
 def read_sononerf_matlab(path: Path, settings: ImportSettings) -> Recording:
     """Read the format ``sononerf-matlab``; see the module.
 
-    Raises
-    ------
-    InputError
-        If it is damaged, or has another layout.
+    Raises:
+        InputError: If it is damaged, or has another layout.
     """
     stored = read_mat(path, ("dataStorageMatrix",)).get("dataStorageMatrix")
     if stored is None:
@@ -58,10 +56,8 @@ def read_sononerf_matlab(path: Path, settings: ImportSettings) -> Recording:
 def read_sonotracelab(path: Path, settings: ImportSettings) -> Recording:
     """Read the format ``sonotracelab``; see the module.
 
-    Raises
-    ------
-    InputError
-        If it is damaged, or has another layout.
+    Raises:
+        InputError: If it is damaged, or has another layout.
     """
     names = ("structSensor", "structSimulationResult", "structSimulationParameters")
     found = read_mat(path, names)

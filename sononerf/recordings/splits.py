@@ -36,28 +36,18 @@ def assign_split(
 ) -> NDArray[np.int8]:
     """Return what each ping is for.
 
-    Parameters
-    ----------
-    poses : Poses
-        P of them.
-    stated : (P,) int8 or None
-        As the table says; drawn at random where None.
-    validation, heldout : int or None
-        How many poses; a twentieth and a tenth where None, at most 10 and 20.
-    seed : int
-        Of the draw.
-    where : str
-        The table, for messages.
+    Args:
+        poses: P of them.
+        stated ((P,) int8 or None): As the table says; drawn at random where None.
+        validation, heldout: How many poses; a twentieth and a tenth where None, at most 10 and 20.
+        seed: Of the draw.
+        where: The table, for messages.
 
-    Returns
-    -------
-    split : (P,) int8
-        0 train, 1 validation, 2 test.
+    Returns:
+        split ((P,) int8): 0 train, 1 validation, 2 test.
 
-    Raises
-    ------
-    InputError
-        If none is left to train on.
+    Raises:
+        InputError: If none is left to train on.
     """
     groups = pose_groups(poses)
     count = int(groups.max(initial=-1)) + 1

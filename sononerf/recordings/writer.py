@@ -23,17 +23,12 @@ HEADER = "file,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg,split"
 def wav_bytes(waveform: ArrayLike, sampling_rate: float) -> bytes:
     """Return a WAV file of 32-bit floats, so that levels stay as they are.
 
-    Parameters
-    ----------
-    waveform : (E, S) float
-        One channel per receiver.
-    sampling_rate : float, Hz
-        A whole number.
+    Args:
+        waveform (E, S): One channel per receiver.
+        sampling_rate (Hz): A whole number.
 
-    Raises
-    ------
-    ValueError
-        If the sampling rate is no whole number; a WAV file cannot hold it.
+    Raises:
+        ValueError: If the sampling rate is no whole number; a WAV file cannot hold it.
     """
     if sampling_rate != round(sampling_rate):
         raise ValueError(f"a WAV file cannot hold a sampling rate of {sampling_rate} Hz")
@@ -45,14 +40,10 @@ def wav_bytes(waveform: ArrayLike, sampling_rate: float) -> bytes:
 def pose_table(poses: Poses, files: Sequence[str], split: NDArray[np.int8]) -> str:
     """Return the table that the format ``recordings`` reads.
 
-    Parameters
-    ----------
-    poses : Poses
-        P of them.
-    files : sequence of str
-        The recording of each.
-    split : (P,) int8
-        0 train, 1 validation, 2 test.
+    Args:
+        poses: P of them.
+        files: The recording of each.
+        split ((P,) int8): 0 train, 1 validation, 2 test.
     """
     words = {number: word for word, number in SPLITS.items()}
     angles = (np.degrees(angle) for angle in euler_from_rotation(poses.rotations))
@@ -68,26 +59,18 @@ def pose_table(poses: Poses, files: Sequence[str], split: NDArray[np.int8]) -> s
 class Recording:
     """Pings as they were recorded, and the table that says where each of them was.
 
-    Attributes
-    ----------
-    path : Path
-        Where it was read from, for messages.
-    sampling_rate : float
-        Hz.
-    labels : tuple of str
-        What each of the P pings is called in messages.
-    emission : (P,) float, s
-        When the call of each ping left, counted from the first sample that :attr:`read` gives.
-        Negative where the recording began later.
-    read : callable
-        Takes the number of a ping and returns its samples (E, S) as they are on disk: integers
-        reach from one end of their type to the other, floats have the user's unit.
-    columns : Columns
-        Poses as in the table, in its own frame.
-    settings : dict
-        What the source itself says of ``air``, ``ears`` and ``call``: plain data by section.
-    notes : tuple of str
-        What was understood and may surprise, one line each.
+    Attributes:
+        path: Where it was read from, for messages.
+        sampling_rate: Hz.
+        labels: What each of the P pings is called in messages.
+        emission ((P,), s): When the call of each ping left, counted from the first sample that
+            :attr:`read` gives. Negative where the recording began later.
+        read: Takes the number of a ping and returns its samples (E, S) as they are on disk:
+            integers reach from one end of their type to the other, floats have the user's unit.
+        columns: Poses as in the table, in its own frame.
+        settings: What the source itself says of ``air``, ``ears`` and ``call``: plain data by
+            section.
+        notes: What was understood and may surprise, one line each.
     """
 
     path: Path

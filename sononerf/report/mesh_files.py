@@ -24,26 +24,18 @@ def mesh_bytes(
     :func:`~sononerf.report.mesh_files.confidence_colours`). PLY also holds the numbers
     themselves, as the vertices' property ``poses``, and always their normals. STL knows neither.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Metres.
-    file_type : {"ply", "stl", "glb"}
-        Binary PLY, binary STL, or binary glTF.
-    confidence : (V,) int, optional
-        How many poses heard the surface around each vertex.
+    Args:
+        mesh: Metres.
+        file_type: Binary PLY, binary STL, or binary glTF.
+        confidence (V,): How many poses heard the surface around each vertex.
 
-    Returns
-    -------
-    data : bytes
-        The file.
+    Returns:
+        data: The file.
 
-    Raises
-    ------
-    ValueError
-        If the format is another one, or there is not one number per vertex, zero or more.
-    NumericalError
-        If the mesh is empty or a vertex is not finite.
+    Raises:
+        ValueError: If the format is another one, or there is not one number per vertex, zero or
+            more.
+        NumericalError: If the mesh is empty or a vertex is not finite.
     """
     if file_type not in ("ply", "stl", "glb"):
         raise ValueError(f"file_type: {file_type!r}, expected 'ply', 'stl' or 'glb'")
@@ -89,19 +81,14 @@ def confidence_colours(poses: ArrayLike) -> NDArray[np.float64]:
     Steps are even to the eye (a straight line in OKLab [1]_) over the logarithm of one plus the
     number, and the ends are the same for every mesh, so that pictures can be compared.
 
-    Parameters
-    ----------
-    poses : (N,) int
-        Zero or more.
+    Args:
+        poses (N,): Zero or more.
 
-    Returns
-    -------
-    colours : (N, 3) float
-        sRGB, 0 to 1.
+    Returns:
+        colours (N, 3): sRGB, 0 to 1.
 
-    References
-    ----------
-    .. [1] B. Ottosson, "A perceptual color space for image processing", 2020.
+    References:
+        .. [1] B. Ottosson, "A perceptual color space for image processing", 2020.
     """
     counts = np.asarray(poses, dtype=np.float64)
     share = np.clip(np.log1p(counts) / np.log1p(MANY_POSES), 0, 1)[..., None]

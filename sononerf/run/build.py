@@ -31,10 +31,8 @@ def _tensor(values: NDArray[np.floating]) -> Tensor:
 def head_of(settings: Settings) -> Head:
     """Return the head that settings describe.
 
-    Raises
-    ------
-    InputError, SettingsError
-        As :class:`sononerf.head.head.Head`.
+    Raises:
+        InputError, SettingsError: As :class:`sononerf.head.head.Head`.
     """
     return Head(
         ears=settings.ears,
@@ -53,17 +51,13 @@ def simulator_of(scene: Scene, settings: Settings) -> Simulator:
 def region_of(settings: Settings, echoes: Echoes) -> tuple[Tensor, Possible]:
     """Return the box that is fitted, from the settings or the echoes, and what is possible in it.
 
-    Returns
-    -------
-    region : (2, 3) float, m
-        Lower and upper corner.
-    possible : callable
-        Which places the echoes leave possible, given how far a place speaks for its surroundings.
+    Returns:
+        region ((2, 3), m): Lower and upper corner.
+        possible: Which places the echoes leave possible, given how far a place speaks for its
+            surroundings.
 
-    Raises
-    ------
-    NumericalError
-        If no pose heard anything, or no more than noise gives.
+    Raises:
+        NumericalError: If no pose heard anything, or no more than noise gives.
     """
     found, wanted = echoes.region, settings.region
     if wanted.lower is not None and wanted.upper is not None:
@@ -83,12 +77,9 @@ def region_of(settings: Settings, echoes: Echoes) -> tuple[Tensor, Possible]:
 def field_and_renderer(settings: Settings, head: Head, region: Tensor) -> tuple[Field, Renderer]:
     """Return an unfitted field and its renderer.
 
-    Raises
-    ------
-    SettingsError
-        If a kind or an option is not known, or options do not go together.
-    InputError
-        If a plugin returns something else.
+    Raises:
+        SettingsError: If a kind or an option is not known, or options do not go together.
+        InputError: If a plugin returns something else.
     """
     with faults_of(settings.source):
         make_field = plugins.load(plugins.FIELDS, settings.field.kind)

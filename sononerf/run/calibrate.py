@@ -47,16 +47,11 @@ _DB = 20.0 / math.log(10.0)
 class Calibrated:
     """A corrected store.
 
-    Attributes
-    ----------
-    store : EnsembleStore
-        Complete; opened for reading.
-    estimate : Estimate
-        What was taken off.
-    lines : list of str
-        What was found, one line each.
-    warnings : list of str
-        What the echoes do not determine.
+    Attributes:
+        store: Complete; opened for reading.
+        estimate: What was taken off.
+        lines: What was found, one line each.
+        warnings: What the echoes do not determine.
     """
 
     store: EnsembleStore
@@ -68,10 +63,8 @@ class Calibrated:
 def kinds_of(names: Sequence[str]) -> tuple[Kind, ...]:
     """Return the kinds of errors by name.
 
-    Raises
-    ------
-    SettingsError
-        If a name is unknown, or there is none.
+    Raises:
+        SettingsError: If a name is unknown, or there is none.
     """
     unknown = [name for name in names if name not in KINDS]
     if unknown or not names:
@@ -85,25 +78,16 @@ def calibrate(
 ) -> Calibrated:
     """Find errors of the recording that a run was fitted to, and write a corrected store.
 
-    Parameters
-    ----------
-    run : Path
-        Folder of a run with a surface.
-    output : Path
-        The corrected store; the run's own store is left as it is.
-    kinds : sequence of str
-        Which errors: ``gain``, ``range_offset``, ``speed_of_sound``, ``position``, ``aim``.
-    progress : Progress or None
-        Where to show it.
+    Args:
+        run: Folder of a run with a surface.
+        output: The corrected store; the run's own store is left as it is.
+        kinds: Which errors: ``gain``, ``range_offset``, ``speed_of_sound``, ``position``, ``aim``.
+        progress: Where to show it.
 
-    Raises
-    ------
-    SettingsError
-        If a kind is unknown.
-    InputError
-        If the run has no surface, or its echoes are not there.
-    IncompatibleError
-        If there is a store at ``output`` already.
+    Raises:
+        SettingsError: If a kind is unknown.
+        InputError: If the run has no surface, or its echoes are not there.
+        IncompatibleError: If there is a store at ``output`` already.
     """
     progress = progress or Progress(quiet=True)
     wanted = kinds_of(kinds)
@@ -245,14 +229,10 @@ def describe(
 ) -> tuple[list[str], list[str]]:
     """Return what was found and what is not determined, one line each.
 
-    Parameters
-    ----------
-    head, store, mesh
-        Of the run.
-    estimate : Estimate
-        What was found.
-    kinds : sequence of str
-        What was looked for.
+    Args:
+        head, store, mesh: Of the run.
+        estimate: What was found.
+        kinds: What was looked for.
     """
     found, deviation = estimate.calibration, estimate.deviation
     train = store.indices("train")

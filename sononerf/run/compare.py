@@ -51,34 +51,22 @@ def compare_runs(
     of the two fields themselves are not compared: two fits of one scene place the same sound some
     millimetres apart.
 
-    Parameters
-    ----------
-    first, second : Path
-        Fitted runs; the difference is the first without the second.
-    output : Path or None
-        Folder of the results; ``FIRST/compare-<name of SECOND>`` where None.
-    accelerator : {"auto", "cpu", "gpu"}
-        What to render on.
-    progress : Progress or None
-        Where to show it.
+    Args:
+        first, second: Fitted runs; the difference is the first without the second.
+        output: Folder of the results; ``FIRST/compare-<name of SECOND>`` where None.
+        accelerator: What to render on.
+        progress: Where to show it.
 
-    Returns
-    -------
-    folder : Path
-        With ``comparison.json``; both volumes over their common maximum and their difference as
-        VTI; projections of all three; and the difference on the first's true surface, where that
-        is known.
+    Returns:
+        folder: With ``comparison.json``; both volumes over their common maximum and their
+            difference as VTI; projections of all three; and the difference on the first's true
+            surface, where that is known.
 
-    Raises
-    ------
-    InputError
-        If one is no fitted run.
-    SettingsError
-        If both are the same folder.
-    IncompatibleError
-        If the two hear differently.
-    NumericalError
-        If both are silent.
+    Raises:
+        InputError: If one is no fitted run.
+        SettingsError: If both are the same folder.
+        IncompatibleError: If the two hear differently.
+        NumericalError: If both are silent.
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder(first)

@@ -26,27 +26,19 @@ def evaluate(
 
     The baselines are moved by the registration of the reconstruction.
 
-    Parameters
-    ----------
-    run : Path or RunFolder
-        A run that was reconstructed.
-    truth : Path or None
-        File of the true surface; ``evaluation.truth`` of the run's settings where None, or else
-        the surface of its scene.
-    registration : {"none", "rigid", "similarity"} or None
-        What lays the reconstruction over the truth; ``evaluation.registration`` where None.
-    progress : Progress or None
-        Where to show it.
+    Args:
+        run: A run that was reconstructed.
+        truth: File of the true surface; ``evaluation.truth`` of the run's settings where None, or
+            else the surface of its scene.
+        registration: What lays the reconstruction over the truth; ``evaluation.registration`` where
+            None.
+        progress: Where to show it.
 
-    Returns
-    -------
-    metrics : dict
-        All of ``metrics.json``.
+    Returns:
+        metrics: All of ``metrics.json``.
 
-    Raises
-    ------
-    InputError
-        If the run is none, or the true surface cannot be read.
+    Raises:
+        InputError: If the run is none, or the true surface cannot be read.
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder.of(run)

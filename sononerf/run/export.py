@@ -36,31 +36,20 @@ def export(source: Path, output: Path, *, what: What = "auto") -> Path:
     points      ``.csv``, ``.mat .h5 .nc``          vertices, normals, poses that heard them
     =========== =================================== ==========================================
 
-    Parameters
-    ----------
-    source : Path
-        A store, or the folder of a run.
-    output : Path
-        The file.
-    what : {"auto", "echoes", "prediction", "volume", "points"}
-        Which part. ``auto``: echoes of a store; of a run the points for ``.csv``, else the
-        prediction.
+    Args:
+        source: A store, or the folder of a run.
+        output: The file.
+        what: Which part. ``auto``: echoes of a store; of a run the points for ``.csv``, else the
+            prediction.
 
-    Returns
-    -------
-    output : Path
-        The file that was written.
+    Returns:
+        output: The file that was written.
 
-    Raises
-    ------
-    SettingsError
-        If the suffix is unknown or does not suit the part.
-    InputError
-        If the source is neither a store nor a run, or lacks the part.
-    ResourceError
-        If an array is too large for the format.
-    StorageError
-        If the file cannot be written.
+    Raises:
+        SettingsError: If the suffix is unknown or does not suit the part.
+        InputError: If the source is neither a store nor a run, or lacks the part.
+        ResourceError: If an array is too large for the format.
+        StorageError: If the file cannot be written.
     """
     suffix = output.suffix.lower()
     if suffix not in (*ARRAYS, ".csv"):

@@ -22,24 +22,16 @@ def finish(
 
     Stages that are done are left out, so that an interrupted call goes on with its own stage.
 
-    Parameters
-    ----------
-    run : Path or RunFolder
-        A fitted run.
-    accelerator : {"auto", "cpu", "gpu"}
-        What to render on.
-    progress : Progress or None
-        Where to show it.
+    Args:
+        run: A fitted run.
+        accelerator: What to render on.
+        progress: Where to show it.
 
-    Returns
-    -------
-    metrics : dict
-        ``RUN/metrics.json``.
+    Returns:
+        metrics: ``RUN/metrics.json``.
 
-    Raises
-    ------
-    NumericalError
-        If the field has no surface; its predictions are written all the same.
+    Raises:
+        NumericalError: If the field has no surface; its predictions are written all the same.
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder.of(run)

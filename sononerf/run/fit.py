@@ -67,10 +67,8 @@ def follows() -> bool:
 def _wait_for_store(settings: Settings, folder: Path) -> EnsembleStore:
     """Open the ensemble once the first process has sealed it.
 
-    Raises
-    ------
-    ResourceError
-        If no process has held the run's folder for ``PATIENCE_SECONDS``.
+    Raises:
+        ResourceError: If no process has held the run's folder for ``PATIENCE_SECONDS``.
     """
     path = store_path(settings, None, None)
     background = background_path(settings)
@@ -109,36 +107,23 @@ def fit(
 
     The same call goes on where an interrupted one stopped; a finished run is left as it is.
 
-    Parameters
-    ----------
-    settings : Settings
-        The experiment.
-    path : Path
-        The run's folder.
-    accelerator : {"auto", "cpu", "gpu"}
-        What to fit on.
-    devices : int or "auto"
-        How many.
-    num_nodes : int
-        How many machines.
-    overwrite : bool
-        Move a folder that is there aside.
-    workers : int or None
-        Processes that simulate.
-    finishes : bool
-        True also runs the stages after the fit, see :func:`sononerf.run.finish.finish`.
-    progress : Progress or None
-        Where to show it.
+    Args:
+        settings: The experiment.
+        path: The run's folder.
+        accelerator: What to fit on.
+        devices: How many.
+        num_nodes: How many machines.
+        overwrite: Move a folder that is there aside.
+        workers: Processes that simulate.
+        finishes: True also runs the stages after the fit, see :func:`sononerf.run.finish.finish`.
+        progress: Where to show it.
 
-    Returns
-    -------
-    run : RunFolder
-        With ``model.safetensors`` and ``model.json``.
+    Returns:
+        run: With ``model.safetensors`` and ``model.json``.
 
-    Raises
-    ------
-    SonoNerfError
-        Each kind as its name says; :class:`StoppedError` after a signal, with all saved.
+    Raises:
+        SonoNerfError: Each kind as its name says; :class:`StoppedError` after a signal, with all
+            saved.
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder(path)

@@ -30,12 +30,9 @@ from sononerf.simulation.simulator import ensemble_poses
 class Fitted(FittedField):
     """A fitted field as its run's two files describe it.
 
-    Attributes
-    ----------
-    settings : Settings
-        Of the experiment.
-    echo_hash : str
-        Of the echoes that were fitted to.
+    Attributes:
+        settings: Of the experiment.
+        echo_hash: Of the echoes that were fitted to.
     """
 
     settings: Settings
@@ -45,12 +42,9 @@ class Fitted(FittedField):
 def load_fitted(path: Path) -> Fitted:
     """Read a fitted field from ``model.safetensors`` and ``model.json`` alone; runs no code.
 
-    Raises
-    ------
-    InputError
-        If they are missing or damaged.
-    IncompatibleError
-        If they do not fit together or need a newer version.
+    Raises:
+        InputError: If they are missing or damaged.
+        IncompatibleError: If they do not fit together or need a newer version.
     """
     if not (path / DESCRIPTION_NAME).is_file():
         raise InputError(
@@ -99,12 +93,9 @@ def _hull(state: dict[str, torch.Tensor]) -> EchoHull:
 def echoes_of(fitted: Fitted) -> Echoes:
     """Open the echoes that a field was fitted to.
 
-    Raises
-    ------
-    InputError
-        If they are not where the settings say.
-    IncompatibleError
-        If others lie there.
+    Raises:
+        InputError: If they are not where the settings say.
+        IncompatibleError: If others lie there.
     """
     settings = fitted.settings
     path = settings.data.store or default_store(settings, fitted.echo_hash)

@@ -75,38 +75,24 @@ def import_recordings(
 ) -> tuple[EnsembleStore, Verdict]:
     """Make an ensemble of recordings, or open it if it is there already.
 
-    Parameters
-    ----------
-    form : str
-        ``recordings``, ``numpy``, ``sonotracelab``, ``sononerf-matlab`` or ``airsas``.
-    source : Path
-        File or folder.
-    output : Path
-        The store.
-    settings_file : Path or None
-        Settings of the import; ``import.yaml`` beside the recordings where None.
-    overrides : iterable of str
-        ``KEY=VALUE``.
-    progress : Progress or None
-        Where to show it.
+    Args:
+        form: ``recordings``, ``numpy``, ``sonotracelab``, ``sononerf-matlab`` or ``airsas``.
+        source: File or folder.
+        output: The store.
+        settings_file: Settings of the import; ``import.yaml`` beside the recordings where None.
+        overrides: ``KEY=VALUE``.
+        progress: Where to show it.
 
-    Returns
-    -------
-    store : EnsembleStore
-        Complete; opened for reading.
-    verdict : Verdict
-        What the first echoes say of the poses.
+    Returns:
+        store: Complete; opened for reading.
+        verdict: What the first echoes say of the poses.
 
-    Raises
-    ------
-    SettingsError, InputError
-        If settings, recordings or poses are no good; nothing is written then.
-    NumericalError
-        If no pose hears anything.
-    StorageError
-        If the store cannot be written.
-    IncompatibleError
-        If the folder holds another ensemble.
+    Raises:
+        SettingsError, InputError: If settings, recordings or poses are no good; nothing is written
+            then.
+        NumericalError: If no pose hears anything.
+        StorageError: If the store cannot be written.
+        IncompatibleError: If the folder holds another ensemble.
     """
     known = understand(form, source, output, settings_file=settings_file, overrides=overrides)
     return import_understood(known, output, progress=progress)
@@ -193,12 +179,9 @@ def verdict(known: Understood, store: EnsembleStore) -> Verdict:
 def check_before(known: Understood, *, progress: Progress | None = None) -> Verdict:
     """Return the verdict on the poses without making a store.
 
-    Raises
-    ------
-    NumericalError
-        If no pose hears anything.
-    StorageError
-        If the folder of temporary files cannot be written.
+    Raises:
+        NumericalError: If no pose hears anything.
+        StorageError: If the folder of temporary files cannot be written.
     """
     train = np.flatnonzero(known.split == 0)
     chosen = train[np.linspace(0, len(train) - 1, min(MOST, len(train))).round().astype(int)]
@@ -257,10 +240,8 @@ def _kinds(units: dict[str, str]) -> dict[str, str]:
 def draw(known: Understood, folder: Path) -> Path:
     """Draw poses, and waveforms and spectrograms of the first pings, into a folder.
 
-    Raises
-    ------
-    StorageError
-        If it cannot be written.
+    Raises:
+        StorageError: If it cannot be written.
     """
     head = known.head
     pings = [int(ping) for ping in known.pings[:SHOWN]]

@@ -70,24 +70,16 @@ def test_a_wrong_option_is_refused(options):
 def new_scene(name: str, folder: Path | None = None) -> list[Path]:
     """Write a plugin with one scene: two files that install, and their test.
 
-    Parameters
-    ----------
-    name : str
-        Of distribution, module and scene; in the last two, ``-`` becomes ``_``.
-    folder : Path, optional
-        Where to; ``name`` in the working directory by default.
+    Args:
+        name: Of distribution, module and scene; in the last two, ``-`` becomes ``_``.
+        folder: Where to; ``name`` in the working directory by default.
 
-    Returns
-    -------
-    written : list of Path
-        All at once, or none.
+    Returns:
+        written: All at once, or none.
 
-    Raises
-    ------
-    SettingsError
-        If the name is no name, or taken, or the folder is not free.
-    StorageError
-        If the files cannot be written.
+    Raises:
+        SettingsError: If the name is no name, or taken, or the folder is not free.
+        StorageError: If the files cannot be written.
     """
     module = name.replace("-", "_")
     _check_name(name, module)

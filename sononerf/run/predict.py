@@ -37,31 +37,20 @@ def predict(
 ) -> Path:
     """Predict spectrograms; where they were measured, compare.
 
-    Parameters
-    ----------
-    run : Path or RunFolder
-        A fitted run.
-    split : {"test", "val", "train"}
-        Which poses of the ensemble.
-    poses_csv : Path or None
-        Poses of the user's instead: header ``x,y,z,yaw,pitch,roll``, metres and degrees.
-    output : Path or None
-        Folder of the results; ``RUN/prediction`` where None.
-    accelerator : {"auto", "cpu", "gpu"}
-        What to render on.
-    progress : Progress or None
-        Where to show it.
+    Args:
+        run: A fitted run.
+        split: Which poses of the ensemble.
+        poses_csv: Poses of the user's instead: header ``x,y,z,yaw,pitch,roll``, metres and degrees.
+        output: Folder of the results; ``RUN/prediction`` where None.
+        accelerator: What to render on.
+        progress: Where to show it.
 
-    Returns
-    -------
-    folder : Path
-        With ``spectrograms.npz`` and a picture per pose.
+    Returns:
+        folder: With ``spectrograms.npz`` and a picture per pose.
 
-    Raises
-    ------
-    InputError
-        If the run or the poses are none, a pose can hear nothing of what was fitted, or the folder
-        is a run's.
+    Raises:
+        InputError: If the run or the poses are none, a pose can hear nothing of what was fitted, or
+            the folder is a run's.
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder.of(run)

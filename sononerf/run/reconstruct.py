@@ -63,33 +63,19 @@ def reconstruct(
     The surface is read out of the field and refined against the echoes that the field was fitted
     to. It is not refined if a level or a method is given, or if the settings say so.
 
-    Parameters
-    ----------
-    run : Path or RunFolder
-        A fitted run.
-    spacing : float or None, m
-        Voxel size; the settings' where None.
-    level : float, "auto" or None
-        A number asks for an iso-surface of this level; the settings' where None.
-    method : {"auto", "open", "filled", "hull", "sheet", "isosurface"} or None
-        How the surface is read out; the settings' where None.
-    output : Path or None
-        Folder of the results; ``RUN/reconstruction`` where None.
-    accelerator : {"auto", "cpu", "gpu"}
-        What the surface is refined on.
-    progress : Progress or None
-        Where to show it.
+    Args:
+        run: A fitted run.
+        spacing (m): Voxel size; the settings' where None.
+        level ("auto" or None): A number asks for an iso-surface of this level; the settings' where
+            None.
+        method: How the surface is read out; the settings' where None.
+        output: Folder of the results; ``RUN/reconstruction`` where None.
+        accelerator: What the surface is refined on.
+        progress: Where to show it.
 
-    Returns
-    -------
-    folder : Path
-
-    Raises
-    ------
-    NumericalError
-        If the field has no surface.
-    IncompatibleError
-        If another version interrupted a refinement of this run.
+    Raises:
+        NumericalError: If the field has no surface.
+        IncompatibleError: If another version interrupted a refinement of this run.
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder.of(run)

@@ -48,23 +48,15 @@ def refine_surface(
 ) -> Refined:
     """Refine start surfaces of a run, or go on where an interrupted refinement stopped.
 
-    Parameters
-    ----------
-    run : RunFolder
-        Keeps the state until the refinement is done.
-    starts : mapping of str to Trimesh
-        Start surfaces, m, by their method.
-    accelerator : {"auto", "cpu", "gpu"}
-        What to compute on.
-    progress : Progress
-        Where to show it.
+    Args:
+        run: Keeps the state until the refinement is done.
+        starts: Start surfaces, m, by their method.
+        accelerator: What to compute on.
+        progress: Where to show it.
 
-    Raises
-    ------
-    InputError, IncompatibleError
-        If the run's echoes are not there, or are others.
-    ResourceError
-        If ``gpu`` was asked for and there is none.
+    Raises:
+        InputError, IncompatibleError: If the run's echoes are not there, or are others.
+        ResourceError: If ``gpu`` was asked for and there is none.
     """
     require_accelerator(accelerator)
     settings, head = run.fitted.settings, run.fitted.head
@@ -101,10 +93,8 @@ def refine_surface(
 def check_state(run: RunFolder) -> None:
     """Refuse the state of a refinement that went through other stages than those of this version.
 
-    Raises
-    ------
-    IncompatibleError
-        If such a state is in the run.
+    Raises:
+        IncompatibleError: If such a state is in the run.
     """
     file = run.path / STATE
     found = _metadata(file)

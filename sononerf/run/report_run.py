@@ -38,32 +38,23 @@ def report(
 ) -> Path:
     """Write one page of Markdown with its pictures beside it; it can be moved as it is.
 
-    Parameters
-    ----------
-    path : Path
-        A fitted run.
-    paper : bool
-        Whether the counterparts of the paper's figures 4 to 8 are drawn too: the scene with its
-        poses, an iso-surface of the summed reflectivity, and, where the run was compared with
-        others, what was heard in it and not in them.
-    output : Path or None
-        Folder of the page; ``RUN/report`` where None.
-    progress : Progress or None
-        Where to show it.
+    Args:
+        path: A fitted run.
+        paper: Whether the counterparts of the paper's figures 4 to 8 are drawn too: the scene with
+            its poses, an iso-surface of the summed reflectivity, and, where the run was compared
+            with others, what was heard in it and not in them.
+        output: Folder of the page; ``RUN/report`` where None.
+        progress: Where to show it.
 
-    Returns
-    -------
-    page : Path
-        ``report.md``. What the run has not come to yet is named with the command that makes it.
+    Returns:
+        page: ``report.md``. What the run has not come to yet is named with the command that makes
+            it.
 
-    Raises
-    ------
-    InputError
-        If it is no fitted run, or one of its files is damaged.
+    Raises:
+        InputError: If it is no fitted run, or one of its files is damaged.
 
-    References
-    ----------
-    .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, figures 4 to 8.
+    References:
+        .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, figures 4 to 8.
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder(path)

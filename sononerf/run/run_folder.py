@@ -58,12 +58,9 @@ def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 def results_folder(folder: Path) -> Iterator[None]:
     """Make a folder for results; remove it afterwards if it is empty.
 
-    Raises
-    ------
-    InputError
-        If it is a run's own, in which results would lie among its files.
-    StorageError
-        If it cannot be created or written.
+    Raises:
+        InputError: If it is a run's own, in which results would lie among its files.
+        StorageError: If it cannot be created or written.
     """
     if any((folder / name).exists() for name in ("config.yaml", DESCRIPTION_NAME)):
         raise InputError(f"{folder}: is the folder of a run; give --output a folder of its own")
@@ -88,10 +85,8 @@ def differing_keys(old: Settings, new: Settings) -> list[str]:
 class RunFolder:
     """One run on disk.
 
-    Parameters
-    ----------
-    path : Path
-        Its folder.
+    Args:
+        path: Its folder.
     """
 
     def __init__(self, path: Path) -> None:
@@ -111,17 +106,12 @@ class RunFolder:
     def locked(self, output: Path | None = None) -> Iterator[None]:
         """Hold the run against other processes; within one process it can be held repeatedly.
 
-        Parameters
-        ----------
-        output : Path or None
-            Where results go; outside of the run's folder no lock is needed.
+        Args:
+            output: Where results go; outside of the run's folder no lock is needed.
 
-        Raises
-        ------
-        LockedError
-            If another process holds the run.
-        StorageError
-            If the lock file cannot be written.
+        Raises:
+            LockedError: If another process holds the run.
+            StorageError: If the lock file cannot be written.
         """
         elsewhere = output is not None and not output.resolve().is_relative_to(self.path.resolve())
         if self._locks or elsewhere:
@@ -155,10 +145,8 @@ class RunFolder:
     def mesh(self) -> trimesh.Trimesh:
         """Read the reconstructed surface.
 
-        Raises
-        ------
-        InputError
-            If it is missing, damaged or empty.
+        Raises:
+            InputError: If it is missing, damaged or empty.
         """
         file = self.reconstruction / "mesh.ply"
         if not file.is_file():
@@ -224,10 +212,8 @@ class RunFolder:
     def open(self) -> Settings:
         """Return the settings of a run that is there.
 
-        Raises
-        ------
-        InputError
-            If there is none.
+        Raises:
+            InputError: If there is none.
         """
         if not self.config.is_file():
             raise InputError(f"{self.path}: no run (no config.yaml); make one with `sononerf fit`")
@@ -236,12 +222,9 @@ class RunFolder:
     def check(self, settings: Settings) -> None:
         """Make sure that the folder is free, or holds a run of the same settings.
 
-        Raises
-        ------
-        IncompatibleError
-            If the folder holds a run of other settings.
-        InputError
-            If the folder holds something else.
+        Raises:
+            IncompatibleError: If the folder holds a run of other settings.
+            InputError: If the folder holds something else.
         """
         if self.config.is_file():
             different = differing_keys(self.open(), settings)
@@ -264,12 +247,9 @@ class RunFolder:
     def begin_fit(self, settings: Settings) -> None:
         """Write the settings of a new run, or make sure that an old one has the same.
 
-        Raises
-        ------
-        IncompatibleError
-            If the folder holds a run of other settings.
-        InputError
-            If the folder holds something else.
+        Raises:
+            IncompatibleError: If the folder holds a run of other settings.
+            InputError: If the folder holds something else.
         """
         self.check(settings)
         if not self.config.is_file():
@@ -279,14 +259,10 @@ class RunFolder:
     def move_aside(self) -> Path | None:
         """Rename the folder so that a new run can take its place; nothing is deleted.
 
-        Raises
-        ------
-        InputError
-            If the folder holds something that is no run.
-        LockedError
-            If another process works in it.
-        StorageError
-            If it cannot be renamed.
+        Raises:
+            InputError: If the folder holds something that is no run.
+            LockedError: If another process works in it.
+            StorageError: If it cannot be renamed.
         """
         if not self.path.exists():
             return None

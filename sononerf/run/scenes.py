@@ -30,11 +30,10 @@ from sononerf.simulation.ensemble import pose_seed
 def describe_scenes() -> list[dict[str, Any]]:
     """Return what there is to know of every scene, built as it is without options.
 
-    Returns
-    -------
-    rows : list of dict
-        Plain data. ``needs`` are the options without a default; where there are any, ``size_m``
-        and ``triangles`` are None. A broken scene says in its ``summary`` why, and hurts no other.
+    Returns:
+        rows: Plain data. ``needs`` are the options without a default; where there are any,
+            ``size_m`` and ``triangles`` are None. A broken scene says in its ``summary`` why, and
+            hurts no other.
     """
     rows = []
     for plugin in list_scenes():
@@ -84,24 +83,19 @@ def scene_table(rows: list[dict[str, Any]]) -> list[str]:
 def describe_scene(name: str) -> dict[str, Any]:
     """Return what one scene is, and what may be set of it.
 
-    Returns
-    -------
-    scene : dict
-        ``name``, ``description``, all of it but what is returned and raised, and ``options``, as
-        :func:`sononerf.settings.plugins.describe_options` has them.
+    Returns:
+        scene: ``name``, ``description``, all of it but what is returned and raised, and
+            ``options``, as :func:`sononerf.settings.plugins.describe_options` has them.
 
-    Raises
-    ------
-    SettingsError
-        If there is no such scene.
-    InputError
-        If it is broken.
+    Raises:
+        SettingsError: If there is no such scene.
+        InputError: If it is broken.
     """
     with _quietly():
         factory = plugins.load(plugins.SCENES, name)
         return {
             "name": name,
-            "description": (inspect.getdoc(factory) or "").partition("\n\nReturns\n")[0],
+            "description": (inspect.getdoc(factory) or "").partition("\n\nReturns:\n")[0],
             "options": plugins.describe_options(factory),
         }
 
@@ -151,22 +145,15 @@ def _quietly() -> Iterator[None]:
 def draw_scenes(folder: Path) -> tuple[list[Path], list[str]]:
     """Draw every scene that needs no options.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the pictures, ``NAME.png`` each.
+    Args:
+        folder: Of the pictures, ``NAME.png`` each.
 
-    Returns
-    -------
-    written : list of Path
-        The pictures.
-    skipped : list of str
-        Each other scene, and why it is not drawn.
+    Returns:
+        written: The pictures.
+        skipped: Each other scene, and why it is not drawn.
 
-    Raises
-    ------
-    StorageError
-        If the folder cannot be written, before anything is drawn.
+    Raises:
+        StorageError: If the folder cannot be written, before anything is drawn.
     """
     storage.probe_writable(folder)
     written, skipped = [], []
@@ -192,24 +179,16 @@ def draw_ensemble(settings: Settings, store: EnsembleStore, folder: Path) -> lis
 
     The first pose of all where none is for the test.
 
-    Parameters
-    ----------
-    settings : Settings
-        Of the ensemble.
-    store : EnsembleStore
-        Complete.
-    folder : Path
-        Of the pictures.
+    Args:
+        settings: Of the ensemble.
+        store: Complete.
+        folder: Of the pictures.
 
-    Returns
-    -------
-    written : list of Path
-        ``scene.png`` and ``pose_0000.png``, numbered as in the store.
+    Returns:
+        written: ``scene.png`` and ``pose_0000.png``, numbered as in the store.
 
-    Raises
-    ------
-    StorageError
-        If a picture cannot be written.
+    Raises:
+        StorageError: If a picture cannot be written.
     """
     with _quietly():  # who simulated it has been warned
         scene = scene_of(settings)

@@ -77,12 +77,9 @@ def _heard_settings(settings: Settings) -> dict[str, Any]:
 def scene_of(settings: Settings) -> Scene:
     """Return the scene that settings name.
 
-    Raises
-    ------
-    SettingsError
-        If they name none: their echoes come from a store.
-    InputError
-        If the scene is unknown or broken.
+    Raises:
+        SettingsError: If they name none: their echoes come from a store.
+        InputError: If the scene is unknown or broken.
     """
     if settings.scene is None:
         raise SettingsError("scene: missing; set scene.name to simulate echoes")
@@ -106,10 +103,8 @@ def default_store(settings: Settings, echoes: str) -> Path:
 def background_path(settings: Settings) -> Path | None:
     """Return where the ensemble of the surroundings alone lies; None where none is taken off.
 
-    Raises
-    ------
-    SettingsError
-        If the scene's own are asked for, and it marks none.
+    Raises:
+        SettingsError: If the scene's own are asked for, and it marks none.
     """
     chosen = settings.data.background
     return _own_background(settings)[0] if chosen == "scene" else chosen
@@ -165,36 +160,22 @@ def simulate(
 ) -> EnsembleStore:
     """Simulate what is missing of an ensemble, and seal it.
 
-    Parameters
-    ----------
-    settings : Settings
-        The experiment.
-    scene : Scene or None
-        Another one than the settings'.
-    output : Path or None
-        The store; ``data/<scene>-<hash>`` where None.
-    workers : int or None
-        Processes; as many as there are cores, at most 8, where None.
-    scheduler : str or None
-        Address of a Dask scheduler to use instead.
-    progress : Progress or None
-        Where to show it.
+    Args:
+        settings: The experiment.
+        scene: Another one than the settings'.
+        output: The store; ``data/<scene>-<hash>`` where None.
+        workers: Processes; as many as there are cores, at most 8, where None.
+        scheduler: Address of a Dask scheduler to use instead.
+        progress: Where to show it.
 
-    Returns
-    -------
-    store : EnsembleStore
-        Complete; opened for reading.
+    Returns:
+        store: Complete; opened for reading.
 
-    Raises
-    ------
-    InputError
-        If scene or poses are no good.
-    NumericalError
-        If no pose hears anything.
-    StorageError
-        If the store cannot be written.
-    IncompatibleError
-        If the folder holds another ensemble.
+    Raises:
+        InputError: If scene or poses are no good.
+        NumericalError: If no pose hears anything.
+        StorageError: If the store cannot be written.
+        IncompatibleError: If the folder holds another ensemble.
     """
     progress = progress or Progress(quiet=True)
     if scene is None:

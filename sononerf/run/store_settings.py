@@ -20,22 +20,15 @@ def with_store(settings: Settings) -> Settings:
 
     Settings with a scene are left as they are.
 
-    Parameters
-    ----------
-    settings : Settings
-        As the user gave them. A key that was not given takes the store's value.
+    Args:
+        settings: As the user gave them. A key that was not given takes the store's value.
 
-    Returns
-    -------
-    settings : Settings
-        With air, ears, call and analysis of the store.
+    Returns:
+        settings: With air, ears, call and analysis of the store.
 
-    Raises
-    ------
-    IncompatibleError
-        If the settings contradict the store.
-    InputError
-        If there is no such store, or it does not say how it was recorded.
+    Raises:
+        IncompatibleError: If the settings contradict the store.
+        InputError: If there is no such store, or it does not say how it was recorded.
     """
     if settings.scene is not None or settings.data.store is None:
         return settings
@@ -73,10 +66,8 @@ def with_store(settings: Settings) -> Settings:
 def complete_store(path: Path) -> EnsembleStore:
     """Open a store of which nothing is missing.
 
-    Raises
-    ------
-    InputError
-        If a pose is missing, or the store is not finished.
+    Raises:
+        InputError: If a pose is missing, or the store is not finished.
     """
     store = EnsembleStore.open(path)
     missing = store.missing()
@@ -93,19 +84,13 @@ FOLDER = "attached"
 def attach(settings: Settings, folder: Path) -> None:
     """Copy the files that settings name into a folder, if they are not there yet.
 
-    Parameters
-    ----------
-    settings : Settings
-        Of the run or the store.
-    folder : Path
-        Of the run or the store.
+    Args:
+        settings: Of the run or the store.
+        folder: Of the run or the store.
 
-    Raises
-    ------
-    InputError
-        If a file cannot be read.
-    StorageError
-        If a copy cannot be written.
+    Raises:
+        InputError: If a file cannot be read.
+        StorageError: If a copy cannot be written.
     """
     for section in FILE_SECTIONS:
         file = getattr(settings, section).file

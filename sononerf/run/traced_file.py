@@ -36,10 +36,8 @@ def save_traced(path: Path, traced: Traced) -> None:
 def load_traced(path: Path) -> Traced | None:
     """Read ``RUN/traced.safetensors``; None where there is none, or it belongs to another fit.
 
-    Raises
-    ------
-    InputError
-        If it is damaged.
+    Raises:
+        InputError: If it is damaged.
     """
     file = path / NAME
     if not file.is_file():

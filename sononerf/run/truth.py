@@ -36,10 +36,8 @@ def true_scene(settings: Settings) -> Scene | None:
 def true_mesh(settings: Settings) -> trimesh.Trimesh | None:
     """Return ``evaluation.truth``, or else the scene's own surface; None where neither is known.
 
-    Raises
-    ------
-    InputError
-        If the file of ``evaluation.truth`` is no mesh.
+    Raises:
+        InputError: If the file of ``evaluation.truth`` is no mesh.
     """
     if settings.evaluation.truth is not None:
         return read_truth(settings.evaluation.truth)
@@ -50,10 +48,8 @@ def true_mesh(settings: Settings) -> trimesh.Trimesh | None:
 def read_truth(path: Path) -> trimesh.Trimesh:
     """Read a true surface from a file.
 
-    Raises
-    ------
-    InputError
-        If it is missing, of another kind, damaged, empty or not finite.
+    Raises:
+        InputError: If it is missing, of another kind, damaged, empty or not finite.
     """
     if path.suffix.lower() not in KINDS:
         raise InputError(f"{path}: evaluation.truth: expected one of {', '.join(KINDS)}")

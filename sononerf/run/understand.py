@@ -48,34 +48,21 @@ OWN_SETTINGS = "import.yaml"
 class Understood:
     """All that an import knows.
 
-    Attributes
-    ----------
-    form : str
-        Format of the source.
-    recording : Recording
-        All pings that were read.
-    settings : Settings
-        Air, ears, call and analysis, complete.
-    wanted : ImportSettings
-        How it was read.
-    cutter : Cutter
-        Cuts and calibrates pings.
-    head : Head
-        Of these settings.
-    pings : (P,) int
-        Which of the recording's pings are kept.
-    poses : Poses
-        Of all pings of the recording.
-    split : (P,) int8
-        Of the kept pings.
-    clipped : int
-        How many pings are rejected.
-    level_db : float, dB
-        Loudest echo over the noise, power averaged over frequency; the middle ping of those asked.
-    calibration : dict
-        What was applied, as plain data.
-    notes : tuple of str
-        What may surprise.
+    Attributes:
+        form: Format of the source.
+        recording: All pings that were read.
+        settings: Air, ears, call and analysis, complete.
+        wanted: How it was read.
+        cutter: Cuts and calibrates pings.
+        head: Of these settings.
+        pings (P,): Which of the recording's pings are kept.
+        poses: Of all pings of the recording.
+        split ((P,) int8): Of the kept pings.
+        clipped: How many pings are rejected.
+        level_db (dB): Loudest echo over the noise, power averaged over frequency; the middle ping
+            of those asked.
+        calibration: What was applied, as plain data.
+        notes: What may surprise.
     """
 
     form: str
@@ -103,26 +90,18 @@ def understand(
 ) -> Understood:
     """Read recordings and settings, and complete each by the other.
 
-    Parameters
-    ----------
-    form : str
-        A name of :data:`READERS`.
-    source : Path
-        File or folder.
-    output : Path
-        The store to be.
-    settings_file : Path or None
-        Sections ``import``, ``air``, ``ears``, ``call``, ``spectrogram``; ``import.yaml`` beside
-        the recordings where None, if it is there.
-    overrides : iterable of str
-        ``KEY=VALUE``.
+    Args:
+        form: A name of :data:`READERS`.
+        source: File or folder.
+        output: The store to be.
+        settings_file: Sections ``import``, ``air``, ``ears``, ``call``, ``spectrogram``;
+            ``import.yaml`` beside the recordings where None, if it is there.
+        overrides: ``KEY=VALUE``.
 
-    Raises
-    ------
-    SettingsError
-        If a key or value is not allowed, or settings and recordings contradict one another.
-    InputError
-        If recordings or poses are no good.
+    Raises:
+        SettingsError: If a key or value is not allowed, or settings and recordings contradict one
+            another.
+        InputError: If recordings or poses are no good.
     """
     if form not in READERS:
         raise SettingsError(f"unknown format {form!r}; known: {', '.join(READERS)}")

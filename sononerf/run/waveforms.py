@@ -32,30 +32,19 @@ def write_waveforms(
     ``poses.csv``, and ``import.yaml`` with air, ears, call and analysis. Poses, echoes and noise
     are those of :func:`sononerf.run.simulate.simulate`.
 
-    Parameters
-    ----------
-    settings : Settings
-        The experiment; its scene is needed.
-    folder : Path
-        Empty, or not there.
-    scene : Scene or None
-        Another one than the settings'.
-    progress : Progress or None
-        Where to show it.
+    Args:
+        settings: The experiment; its scene is needed.
+        folder: Empty, or not there.
+        scene: Another one than the settings'.
+        progress: Where to show it.
 
-    Returns
-    -------
-    written : list of Path
-        Table, settings, and the first WAV file.
+    Returns:
+        written: Table, settings, and the first WAV file.
 
-    Raises
-    ------
-    SettingsError
-        If there is no scene, or a WAV file cannot hold the sampling rate.
-    InputError
-        If the folder is not empty.
-    StorageError
-        If it cannot be written.
+    Raises:
+        SettingsError: If there is no scene, or a WAV file cannot hold the sampling rate.
+        InputError: If the folder is not empty.
+        StorageError: If it cannot be written.
     """
     progress = progress or Progress(quiet=True)
     if scene is None:

@@ -29,22 +29,14 @@ SQUARE = 1e-6
 class Part:
     """A scene and its place among others: scaled, then turned, then moved.
 
-    Attributes
-    ----------
-    scene : Scene
-        Stays as it is.
-    position : (3,) float, m
-        Where its origin comes to lie.
-    rotation : (3, 3) float
-        From its own frame to the world's.
-    scale : float, 1
-        Above 0, at most 1000.
-    material : Material or None
-        For all of it; its own where None.
-    background : bool
-        Whether all of it is surroundings and not the target.
-    name : str
-        For messages; may be empty.
+    Attributes:
+        scene: Stays as it is.
+        position ((3,), m): Where its origin comes to lie.
+        rotation (3, 3): From its own frame to the world's.
+        scale (1): Above 0, at most 1000.
+        material: For all of it; its own where None.
+        background: Whether all of it is surroundings and not the target.
+        name: For messages; may be empty.
     """
 
     scene: Scene
@@ -59,22 +51,17 @@ class Part:
 def compose(parts: Sequence[Part], *, may_cross: bool = False) -> Scene:
     """Put scenes together into one.
 
-    Parameters
-    ----------
-    parts : sequence of Part
-        At least one; their triangles follow one another in this order.
-    may_cross : bool
-        Whether it is meant that parts cut through one another. Otherwise it is warned of.
+    Args:
+        parts: At least one; their triangles follow one another in this order.
+        may_cross: Whether it is meant that parts cut through one another. Otherwise it is warned
+            of.
 
-    Returns
-    -------
-    scene : Scene
-        Materials that are alike share a number; one that all parts have stands alone.
+    Returns:
+        scene: Materials that are alike share a number; one that all parts have stands alone.
 
-    Raises
-    ------
-    SettingsError
-        If there are no parts or nothing but background, or a position, rotation or scale is none.
+    Raises:
+        SettingsError: If there are no parts or nothing but background, or a position, rotation or
+            scale is none.
     """
     if not parts:
         raise SettingsError("parts: found none; give at least one")
@@ -176,16 +163,12 @@ def surfaces_cross(one: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:
     Where triangles meet, an edge of one of them passes through the other; so all edges of each
     surface are tried against the other one.
 
-    Parameters
-    ----------
-    one, other : Trimesh
-        Metres, world frame.
+    Args:
+        one, other: Metres, world frame.
 
-    Returns
-    -------
-    cross : bool
-        False also where one lies wholly inside the other. Surfaces that touch may be taken for
-        either, as single precision has it.
+    Returns:
+        cross: False also where one lies wholly inside the other. Surfaces that touch may be taken
+            for either, as single precision has it.
     """
     low = np.maximum(one.bounds[0], other.bounds[0])
     high = np.minimum(one.bounds[1], other.bounds[1])

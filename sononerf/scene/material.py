@@ -31,28 +31,23 @@ class Material:
     of the total curvature
     :math:`\kappa = \sqrt{k_1^2 + k_2^2}` (SonoTraceLab's law, with curvature in 1/m).
 
-    Attributes
-    ----------
-    frequency : (K,) float, Hz
-        Nodes, ascending.
-    lobe_width : (K,) float, rad, or None
-        Standard deviation of the lobe about the mirror direction; None for a smooth surface,
-        which has none of its own: its shape alone decides what it sends where.
-    strength : (K,) float, 1
-        Of what is heard of a hit, relative to a rigid surface.
-    reflection : (K,) float, 1
-        What is kept of the pressure when the sound travels on after a bounce, 0 to 1.
-    curved_lobe_width : (K,) float, rad, or None
-        Lobe of strongly curved places; None where it is the same.
-    curved_strength : (K,) float, 1, or None
-        Strength of strongly curved places; None where it is the same.
-    transition_curvature : float, 1/m
-        :math:`\kappa_0`, where half is curved; infinite where no place counts as strongly curved.
-    transition_slope : float, m
-        :math:`b`.
-    diffraction : (K,) float, 1, or None
-        Strength of edges and strongly curved places as sources of their own, relative to rigid
-        wedges; None for none.
+    Attributes:
+        frequency ((K,), Hz): Nodes, ascending.
+        lobe_width ((K,), rad, or None): Standard deviation of the lobe about the mirror direction;
+            None for a smooth surface, which has none of its own: its shape alone decides what it
+            sends where.
+        strength ((K,), 1): Of what is heard of a hit, relative to a rigid surface.
+        reflection ((K,), 1): What is kept of the pressure when the sound travels on after a bounce,
+            0 to 1.
+        curved_lobe_width ((K,), rad, or None): Lobe of strongly curved places; None where it is the
+            same.
+        curved_strength ((K,), 1, or None): Strength of strongly curved places; None where it is the
+            same.
+        transition_curvature (1/m): :math:`\kappa_0`, where half is curved; infinite where no place
+            counts as strongly curved.
+        transition_slope (m): :math:`b`.
+        diffraction ((K,), 1, or None): Strength of edges and strongly curved places as sources of
+            their own, relative to rigid wedges; None for none.
     """
 
     frequency: Curve = (20e3, 150e3)
@@ -115,22 +110,16 @@ def roughened(material: Material, height: float) -> Material:
     A surface whose height scatters by a standard deviation :math:`\sigma` sends back the part
     :math:`e^{-2 (k \sigma)^2}` of the pressure in step.
 
-    Parameters
-    ----------
-    material : Material
-        The smooth one.
-    height : float, m
-        Standard deviation of the height.
+    Args:
+        material: The smooth one.
+        height (m): Standard deviation of the height.
 
-    Returns
-    -------
-    material : Material
-        At nodes from 20 to 150 kHz; what goes on after a bounce is weakened alike.
+    Returns:
+        material: At nodes from 20 to 150 kHz; what goes on after a bounce is weakened alike.
 
-    References
-    ----------
-    .. [1] P. Beckmann and A. Spizzichino, "The Scattering of Electromagnetic Waves from Rough
-       Surfaces", Pergamon 1963, chapter 5.
+    References:
+        .. [1] P. Beckmann and A. Spizzichino, "The Scattering of Electromagnetic Waves from Rough
+           Surfaces", Pergamon 1963, chapter 5.
     """
     nodes = np.array([20e3, 40e3, 60e3, 80e3, 100e3, 150e3])
     in_step = np.exp(-2.0 * (2.0 * math.pi * nodes / 343.0 * height) ** 2)

@@ -39,10 +39,8 @@ LARGE, SMALL = 5.0, 5e-3  # m, beyond which a mistaken unit is likelier than suc
 class SurfaceSizeError(InputError):
     """A surface far larger or smaller than any scene.
 
-    Parameters
-    ----------
-    size : float, m
-        Along its longest side.
+    Args:
+        size (m): Along its longest side.
     """
 
     def __init__(self, size: float) -> None:
@@ -54,25 +52,19 @@ class SurfaceSizeError(InputError):
 class Scene:
     """A surface and its material.
 
-    Attributes
-    ----------
-    mesh : trimesh.Trimesh
-        Metres, world frame; bodies may overlap.
-    material : Material or tuple of Material
-        One for all of it, or one for each of its parts.
-    part : (T,) int, optional
-        Which of the materials each triangle is of, where there are several.
-    background : (T,) bool, optional
-        True where a triangle is surroundings and not the target. It sounds all the same.
+    Attributes:
+        mesh: Metres, world frame; bodies may overlap.
+        material: One for all of it, or one for each of its parts.
+        part (T,): Which of the materials each triangle is of, where there are several.
+        background (T,): True where a triangle is surroundings and not the target. It sounds all the
+            same.
 
-    Raises
-    ------
-    ValueError
-        If materials, parts or background do not fit, or if nothing is left to be the target.
-    InputError
-        If the mesh has no triangles, a vertex that is no finite number, or an index to no vertex.
-    SurfaceSizeError
-        If it is far too large or too small.
+    Raises:
+        ValueError: If materials, parts or background do not fit, or if nothing is left to be the
+            target.
+        InputError: If the mesh has no triangles, a vertex that is no finite number, or an index to
+            no vertex.
+        SurfaceSizeError: If it is far too large or too small.
     """
 
     mesh: trimesh.Trimesh
@@ -138,10 +130,8 @@ class Scene:
 def check_surface(mesh: trimesh.Trimesh) -> None:
     """Refuse a mesh that is no surface of a sensible size in metres.
 
-    Raises
-    ------
-    InputError, SurfaceSizeError
-        As :class:`Scene` says.
+    Raises:
+        InputError, SurfaceSizeError: As :class:`Scene` says.
     """
     faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices)
     if len(faces) == 0:
@@ -190,27 +180,18 @@ def load_scene(
 ) -> Scene:
     """Build a scene by its name.
 
-    Parameters
-    ----------
-    name : str
-        Of an entry point of the group ``sononerf.scenes``.
-    options : mapping
-        Keyword arguments of its factory.
-    source : str, optional
-        Where the settings were read from, for messages.
+    Args:
+        name: Of an entry point of the group ``sononerf.scenes``.
+        options: Keyword arguments of its factory.
+        source: Where the settings were read from, for messages.
 
-    Returns
-    -------
-    scene : Scene
-        Checked.
+    Returns:
+        scene: Checked.
 
-    Raises
-    ------
-    SettingsError
-        If the name is unknown or claimed twice, an option is not allowed, or options make a
-        surface that is far too large or too small.
-    InputError
-        If the plugin cannot be imported, fails, or returns no scene.
+    Raises:
+        SettingsError: If the name is unknown or claimed twice, an option is not allowed, or options
+            make a surface that is far too large or too small.
+        InputError: If the plugin cannot be imported, fails, or returns no scene.
     """
     with faults_of(source):
         factory = plugins.load(plugins.SCENES, name)

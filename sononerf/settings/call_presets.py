@@ -16,14 +16,10 @@ from typing import Any
 class CallPreset:
     """A call.
 
-    Attributes
-    ----------
-    keys : dict
-        Of the section ``call``, with their values.
-    about : str
-        One line: whose call, and when it is emitted.
-    source : str
-        Publications, and which numbers are typical values only.
+    Attributes:
+        keys: Of the section ``call``, with their values.
+        about: One line: whose call, and when it is emitted.
+        source: Publications, and which numbers are typical values only.
     """
 
     keys: dict[str, Any]

@@ -104,17 +104,12 @@ class ImportSettings(_Section):
 def read_import_settings(data: Mapping[str, Any], where: str) -> ImportSettings:
     """Check the section ``import`` of a settings file.
 
-    Parameters
-    ----------
-    data : mapping
-        The section as plain data.
-    where : str
-        The file, for messages.
+    Args:
+        data: The section as plain data.
+        where: The file, for messages.
 
-    Raises
-    ------
-    SettingsError
-        One line for each fault.
+    Raises:
+        SettingsError: One line for each fault.
     """
     if not isinstance(data, Mapping):
         raise SettingsError(f"{where}: import: holds {data!r}, expected `key: value` lines")

@@ -81,10 +81,8 @@ def _parse_yaml(text: str, where: str) -> Any:
 def read_yaml(path: Path) -> dict[str, Any]:
     """Read one settings file as plain data.
 
-    Raises
-    ------
-    SettingsError
-        If the file is missing, not UTF-8, too large, or no YAML mapping.
+    Raises:
+        SettingsError: If the file is missing, not UTF-8, too large, or no YAML mapping.
     """
     try:
         if path.stat().st_size > MAX_SETTINGS_BYTES:
@@ -111,10 +109,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
 def apply_override(data: dict[str, Any], assignment: str) -> None:
     """Set one dotted ``KEY=VALUE`` in ``data``, in place.
 
-    Raises
-    ------
-    SettingsError
-        If the text is no assignment or runs through a value that is no section.
+    Raises:
+        SettingsError: If the text is no assignment or runs through a value that is no section.
     """
     key, equals, value = assignment.partition("=")
     parts = key.strip().split(".")
@@ -144,10 +140,8 @@ def _drop_options_of_another(data: dict[str, Any], assignment: str) -> None:
 def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
     """Check plain data against the settings.
 
-    Raises
-    ------
-    SettingsError
-        One line per fault, naming ``source``, the dotted key and what is allowed.
+    Raises:
+        SettingsError: One line per fault, naming ``source``, the dotted key and what is allowed.
     """
     try:
         settings = Settings.model_validate(dict(data))
@@ -241,19 +235,13 @@ def refuse_truths(
 ) -> None:
     """Refuse yes and no where a number is meant; pydantic takes them for 1 and 0.
 
-    Parameters
-    ----------
-    given : mapping
-        What the settings say.
-    taken : BaseModel
-        What pydantic made of it.
-    source, prefix : str
-        Where it was read from, and the dotted key of all of it, for messages.
+    Args:
+        given: What the settings say.
+        taken: What pydantic made of it.
+        source, prefix: Where it was read from, and the dotted key of all of it, for messages.
 
-    Raises
-    ------
-    SettingsError
-        One line for each.
+    Raises:
+        SettingsError: One line for each.
     """
     head = "" if source is None else f"{source}: "
     keys = [".".join([*([prefix] if prefix else []), *key]) for key in _truths(given, taken)]

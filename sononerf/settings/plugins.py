@@ -52,12 +52,9 @@ def registered(group: str) -> list[Plugin]:
 def load(group: str, name: str) -> Callable[..., Any]:
     """Import the one plugin that is asked for.
 
-    Raises
-    ------
-    SettingsError
-        If the name is unknown, or two distributions claim it.
-    InputError
-        If the plugin cannot be imported, or is no factory.
+    Raises:
+        SettingsError: If the name is unknown, or two distributions claim it.
+        InputError: If the plugin cannot be imported, or is no factory.
     """
     kind = group.rpartition(".")[2].removesuffix("s")
     plugins = registered(group)
@@ -90,28 +87,18 @@ def check_options(
 ) -> dict[str, Any]:
     """Check options against a factory's keyword arguments and fill in its defaults.
 
-    Parameters
-    ----------
-    factory : callable
-        Its annotated keyword arguments are what may be set.
-    options : mapping
-        What the settings say.
-    where : str
-        Dotted key of the options, for messages.
-    given : int
-        How many leading arguments the caller passes itself.
+    Args:
+        factory: Its annotated keyword arguments are what may be set.
+        options: What the settings say.
+        where: Dotted key of the options, for messages.
+        given: How many leading arguments the caller passes itself.
 
-    Returns
-    -------
-    options : dict
-        Every argument with its value, converted to its annotation.
+    Returns:
+        options: Every argument with its value, converted to its annotation.
 
-    Raises
-    ------
-    SettingsError
-        If a key is unknown, missing, or its value is not allowed.
-    InputError
-        If the factory's annotations cannot be read.
+    Raises:
+        SettingsError: If a key is unknown, missing, or its value is not allowed.
+        InputError: If the factory's annotations cannot be read.
     """
     model = _options_model(factory, where, given)
     try:
@@ -125,18 +112,13 @@ def check_options(
 def describe_options(factory: Callable[..., Any], *, given: int = 0) -> list[dict[str, Any]]:
     """Return what may be set of a factory's keyword arguments.
 
-    Parameters
-    ----------
-    factory : callable
-        Its annotated keyword arguments are what may be set.
-    given : int
-        How many leading arguments the caller passes itself.
+    Args:
+        factory: Its annotated keyword arguments are what may be set.
+        given: How many leading arguments the caller passes itself.
 
-    Returns
-    -------
-    rows : list of dict
-        ``name``; ``default``, plain data, or None where there is none; ``needed``, where it has
-        to be set; ``allowed``, in words.
+    Returns:
+        rows: ``name``; ``default``, plain data, or None where there is none; ``needed``, where it
+            has to be set; ``allowed``, in words.
     """
     rows = []
     for name, field in _options_model(factory, "options", given).model_fields.items():

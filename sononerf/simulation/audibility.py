@@ -41,16 +41,11 @@ def row_dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float6
 class Audibility:
     """Judges the hits of a bounce.
 
-    Attributes
-    ----------
-    wavenumber : float, rad/m
-        At the frequency that bundles must resolve.
-    farthest : float, m
-        Longest detour that is heard.
-    radius : float, m
-        Of the scene.
-    bounces : int
-        How often a ray may hit.
+    Attributes:
+        wavenumber (rad/m): At the frequency that bundles must resolve.
+        farthest (m): Longest detour that is heard.
+        radius (m): Of the scene.
+        bounces: How often a ray may hit.
     """
 
     wavenumber: float
@@ -111,15 +106,11 @@ window of 32 us nothing is heard more than 10 mm before the nearest point."""
 class Arrival:
     """The shortest ways from an emitter over the surface of a scene to an ear.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is ensonified.
+    Args:
+        scene: What is ensonified.
 
-    Attributes
-    ----------
-    radius : float, m
-        Of a sphere around the scene.
+    Attributes:
+        radius (m): Of a sphere around the scene.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -138,12 +129,9 @@ class Arrival:
     ) -> NDArray[np.float64]:
         """Return the shortest way (P, E), m.
 
-        Parameters
-        ----------
-        emitters : (P, 3) float64, m
-            World frame.
-        ears : (P, E, 3) float64, m
-            World frame.
+        Args:
+            emitters ((P, 3), m): World frame.
+            ears ((P, E, 3), m): World frame.
         """
         found = np.zeros(ears.shape[:2])
         square = np.einsum("nd,nd->n", self._points, self._points)
@@ -166,19 +154,13 @@ def silence_before(
     the echo. Everything that is more than 26 us earlier than the first possible arrival is set to
     zero. Onsets and free space are then found from sound that has arrived.
 
-    Parameters
-    ----------
-    echo : (E, S) float64
-        Pressure from the emission on.
-    first : (E,) float64, s
-        First possible arrival at each ear.
-    sampling_rate : float, Hz
-        Of the echo.
+    Args:
+        echo (E, S): Pressure from the emission on.
+        first ((E,), s): First possible arrival at each ear.
+        sampling_rate (Hz): Of the echo.
 
-    Returns
-    -------
-    echo : (E, S) float64
-        Zero up to 26 us before the first arrival, whole from there on.
+    Returns:
+        echo (E, S): Zero up to 26 us before the first arrival, whole from there on.
     """
     before = first[:, None] - np.arange(echo.shape[1]) / sampling_rate
     return np.where(before < SILENT, echo, 0.0)

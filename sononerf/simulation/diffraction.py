@@ -22,20 +22,13 @@ from sononerf.simulation.reflection import Reflection
 class Edges:
     """Edges at which a surface turns outwards, or ends.
 
-    Attributes
-    ----------
-    ends : (K, 2, 3) float64, m
-        World frame.
-    away : (K, 3) float64
-        Unit vectors off the surface.
-    inward : (K, 3) float64
-        Unit vectors from the edge along one of its faces.
-    normal : (K, 3) float64
-        Outward normals of that face.
-    open_angle : (K,) float64, rad
-        Of the air around the edge: pi for a plane, 2 pi where a sheet ends.
-    triangle : (K,) int64
-        That face.
+    Attributes:
+        ends ((K, 2, 3), m): World frame.
+        away (K, 3): Unit vectors off the surface.
+        inward (K, 3): Unit vectors from the edge along one of its faces.
+        normal (K, 3): Outward normals of that face.
+        open_angle ((K,), rad): Of the air around the edge: pi for a plane, 2 pi where a sheet ends.
+        triangle (K,): That face.
     """
 
     ends: NDArray[np.float64]
@@ -118,26 +111,18 @@ def wedge_directivity(
     itself is there, fading out over the edge within :math:`1/k` of detour: see
     :meth:`Reflection.heard`. What it brings is taken from the term with that pole.
 
-    Parameters
-    ----------
-    inward, normal : (N, 3) float64
-        Unit vectors along one face and out of it, square to the edge.
-    open_angle : (N,) float64, rad
-        :math:`\theta_w`, of the air around the edge.
-    to_source, to_receiver : (N, 3) float64, m
-        From the point.
-    fade : (F,) float64, 1/m
-        Of the mirror over the detour.
+    Args:
+        inward, normal (N, 3): Unit vectors along one face and out of it, square to the edge.
+        open_angle ((N,), rad): :math:`\theta_w`, of the air around the edge.
+        to_source, to_receiver ((N, 3), m): From the point.
+        fade ((F,), 1/m): Of the mirror over the detour.
 
-    Returns
-    -------
-    directivity : (N, F) float64
-        Finite everywhere.
+    Returns:
+        directivity (N, F): Finite everywhere.
 
-    References
-    ----------
-    .. [1] U. P. Svensson, R. I. Fred and J. Vanderkooy, "An analytic secondary source model of
-       edge diffraction impulse responses", JASA 106, 1999, equations (5) to (7).
+    References:
+        .. [1] U. P. Svensson, R. I. Fred and J. Vanderkooy, "An analytic secondary source model of
+           edge diffraction impulse responses", JASA 106, 1999, equations (5) to (7).
     """
     along = np.cross(normal, inward)
     angles, heights, radii, distances = [], [], [], []
@@ -183,14 +168,10 @@ class Diffraction:
     where emitter and ear both see it, with the material's strength :math:`D`; on an edge
     :math:`dM` is the length alone and :math:`D` is multiplied by the directivity of a rigid wedge.
 
-    Parameters
-    ----------
-    scene : Scene
-        Mesh and materials.
-    caster : RayCaster
-        Of the mesh.
-    reflections : tuple of Reflection
-        The materials at the nodes.
+    Args:
+        scene: Mesh and materials.
+        caster: Of the mesh.
+        reflections: The materials at the nodes.
     """
 
     def __init__(
@@ -225,23 +206,15 @@ class Diffraction:
     ) -> Sound:
         """Collect what the ears of a pose hear of edges and curved places.
 
-        Parameters
-        ----------
-        hearing : Hearing
-            Head and air.
-        position : (3,) float64, m
-            Of the head.
-        rotation : (3, 3) float64
-            Head to world.
-        points : int
-            How many, spaced evenly over all that diffracts.
-        offset : float
-            In [0, 1), shifts them.
+        Args:
+            hearing: Head and air.
+            position ((3,), m): Of the head.
+            rotation (3, 3): Head to world.
+            points: How many, spaced evenly over all that diffracts.
+            offset: In [0, 1), shifts them.
 
-        Returns
-        -------
-        sound : Sound
-            For :meth:`Hearing.echo` with the synthesis' ``hats``.
+        Returns:
+            sound: For :meth:`Hearing.echo` with the synthesis' ``hats``.
         """
         sound = hearing.silence()
         share = self._end[-1] / points

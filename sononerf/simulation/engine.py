@@ -19,21 +19,15 @@ from sononerf.simulation.reflection import Reflection, reflection
 class Engine:
     """From a pose to what the ears hear of a scene.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is ensonified.
-    hearing : Hearing
-        Head and air.
+    Args:
+        scene: What is ensonified.
+        hearing: Head and air.
 
-    Attributes
-    ----------
-    reflections : tuple of Reflection
-        The scene's materials at the nodes of the synthesis.
-    note : str
-        What a user should know about how this scene is simulated; empty for nothing.
-    prepares : bool
-        Whether :meth:`prepare` does all the work, so that nothing is left for other processes.
+    Attributes:
+        reflections: The scene's materials at the nodes of the synthesis.
+        note: What a user should know about how this scene is simulated; empty for nothing.
+        prepares: Whether :meth:`prepare` does all the work, so that nothing is left for other
+            processes.
     """
 
     prepares: ClassVar[bool] = False
@@ -81,14 +75,10 @@ class Engine:
     ) -> None:
         """Do at once what can be done for all poses at once.
 
-        Parameters
-        ----------
-        positions : (P, 3) float64, m
-            Of the head, world frame.
-        rotations : (P, 3, 3) float64
-            Head to world.
-        progress : callable, optional
-            Takes how many parts are done and how many there are.
+        Args:
+            positions ((P, 3), m): Of the head, world frame.
+            rotations (P, 3, 3): Head to world.
+            progress: Takes how many parts are done and how many there are.
         """
 
     def echo(
@@ -96,19 +86,13 @@ class Engine:
     ) -> NDArray[np.float64]:
         """Pressure at both ears for a call that is one sample of height 1.
 
-        Parameters
-        ----------
-        position : (3,) float64, m
-            Of the head, world frame.
-        rotation : (3, 3) float64
-            Head to world.
-        seed : int
-            Of whatever is random.
+        Args:
+            position ((3,), m): Of the head, world frame.
+            rotation (3, 3): Head to world.
+            seed: Of whatever is random.
 
-        Returns
-        -------
-        echo : (E, S) float64
-            From the emission to the end of the last analysis frame.
+        Returns:
+            echo (E, S): From the emission to the end of the last analysis frame.
         """
         raise NotImplementedError
 
@@ -119,11 +103,8 @@ class Engine:
 
         Position, rotation and seed are those of :meth:`echo`.
 
-        Returns
-        -------
-        points : (N, 3) float64, m
-            World frame.
-        strength : (N,) float64
-            Relative, zero or more: what a patch of one size sends to both ears.
+        Returns:
+            points ((N, 3), m): World frame.
+            strength (N,): Relative, zero or more: what a patch of one size sends to both ears.
         """
         raise NotImplementedError

@@ -53,14 +53,11 @@ def pose_seed(seed: int, index: int) -> int:
 def check_poses(scene: Scene, poses: Poses, *, offsets: NDArray[np.float64] | None = None) -> None:
     """Refuse poses that are no numbers or lie inside the surface.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is ensonified.
-    poses : Poses
-        To be checked.
-    offsets : (K, 3) float64, m, optional
-        Further points of the head that must be outside, such as emitter and ears; head frame.
+    Args:
+        scene: What is ensonified.
+        poses: To be checked.
+        offsets ((K, 3), m): Further points of the head that must be outside, such as emitter and
+            ears; head frame.
     """
     finite = np.isfinite(poses.positions).all(axis=1) & np.isfinite(poses.rotations).all((1, 2))
     _refuse(~finite, "no finite numbers")
@@ -91,21 +88,14 @@ def check_reach(
 ) -> None:
     """Warn of poses that no echo can reach within the range limits.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is ensonified.
-    poses : Poses
-        To be checked.
-    bounces : int
-        How often sound may hit.
-    range_min, range_max : float, m
-        The limits of the spectrograms.
+    Args:
+        scene: What is ensonified.
+        poses: To be checked.
+        bounces: How often sound may hit.
+        range_min, range_max (m): The limits of the spectrograms.
 
-    Raises
-    ------
-    NumericalError
-        If it is so for all poses; the tails of the analysis would pass for echoes.
+    Raises:
+        NumericalError: If it is so for all poses; the tails of the analysis would pass for echoes.
     """
     lower, upper = np.asarray(scene.mesh.bounds)
     radius = float(np.linalg.norm(upper - lower)) / 2.0
@@ -147,22 +137,14 @@ def simulate(
 
     The test poses are simulated twice, with other rays, which gives the noise floor.
 
-    Parameters
-    ----------
-    simulator : Simulator
-        Scene and head.
-    poses : Poses
-        Those of the store.
-    store : EnsembleStore
-        Opened for writing.
-    options : SimulationSettings
-        Seed, and number of test poses for the noise floor.
-    workers : int or None
-        Processes; as many as there are cores, at most 8, where None.
-    scheduler : str or None
-        Address of a Dask scheduler to use instead.
-    progress : Progress
-        Where to show it.
+    Args:
+        simulator: Scene and head.
+        poses: Those of the store.
+        store: Opened for writing.
+        options: Seed, and number of test poses for the noise floor.
+        workers: Processes; as many as there are cores, at most 8, where None.
+        scheduler: Address of a Dask scheduler to use instead.
+        progress: Where to show it.
     """
     missing = store.missing()
     if workers is None:
@@ -217,22 +199,14 @@ def simulate_ensemble(
 
     The result of a pose depends on ``seed`` and its index alone, not on workers or order.
 
-    Parameters
-    ----------
-    simulator : Simulator
-        Scene and head.
-    poses : Poses
-        All poses of the ensemble.
-    indices : iterable of int
-        Which of them to simulate.
-    write : callable
-        Takes an index and its spectrogram (E, R, F); called here, one at a time.
-    seed : int
-        Of the ensemble.
-    workers : int
-        Processes on this machine; one means this process.
-    scheduler : str, optional
-        Address of a Dask scheduler whose workers are used instead.
+    Args:
+        simulator: Scene and head.
+        poses: All poses of the ensemble.
+        indices: Which of them to simulate.
+        write: Takes an index and its spectrogram (E, R, F); called here, one at a time.
+        seed: Of the ensemble.
+        workers: Processes on this machine; one means this process.
+        scheduler: Address of a Dask scheduler whose workers are used instead.
     """
     wanted = [int(index) for index in indices]
     engine = simulator.engine

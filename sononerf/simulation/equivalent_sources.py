@@ -70,27 +70,19 @@ class Sources(Solved):
     solved for; :func:`hybrid` leaves both to the rays. A smooth body needs a tenth of
     the unknowns of boundary elements, so this engine solves the low band of :class:`Hybrid`.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is ensonified; closed and rigid.
-    hearing : Hearing
-        Head and air.
-    most : int
-        Sources at the highest frequency. With the area of the surface they say which it is.
-    fall : float
-        See :class:`Solved`.
+    Args:
+        scene: What is ensonified; closed and rigid.
+        hearing: Head and air.
+        most: Sources at the highest frequency. With the area of the surface they say which it is.
+        fall: See :class:`Solved`.
 
-    Attributes
-    ----------
-    error : dict of float to float
-        Error of the normal velocity on the surface relative to the incident one, root mean
-        square over all poses solved for, by frequency in Hz.
+    Attributes:
+        error: Error of the normal velocity on the surface relative to the incident one, root mean
+            square over all poses solved for, by frequency in Hz.
 
-    References
-    ----------
-    .. [1] G. H. Koopmann, L. Song and J. B. Fahnline, "A method for computing acoustic fields
-       based on the principle of wave superposition", JASA 86, 1989.
+    References:
+        .. [1] G. H. Koopmann, L. Song and J. B. Fahnline, "A method for computing acoustic fields
+           based on the principle of wave superposition", JASA 86, 1989.
     """
 
     path, lead = PATH, LEAD

@@ -17,26 +17,19 @@ class Footprint:
 
     Directions at the emitter are turned by u and v (rad) about two axes square to the ray.
 
-    Attributes
-    ----------
-    shift : (2, 3, H) float32, m/rad
-        How the hit moves on the surface over u and over v.
-    square : (3, H) float32, m²/rad²
-        Products of the shifts: of the first with itself, the second with itself, of both.
-    bend : (3, H) float32, m/rad²
-        How the path to the hit bends over u twice, v twice, u and v, on a flat surface.
-    curving : (3, H) float32, m/rad²
-        How far the surface falls off from the flat one, likewise.
-    onward : (2, H) float32, m/rad
-        Shifts along the mirrored ray.
-    sink : (H,) float32
-        Cosine between the ray and the outward normal, below zero.
-    tube : (H,) float32, m²/sr
-        Cross-section of the bundle.
+    Attributes:
+        shift ((2, 3, H) float32, m/rad): How the hit moves on the surface over u and over v.
+        square ((3, H) float32, m²/rad²): Products of the shifts: of the first with itself, the
+            second with itself, of both.
+        bend ((3, H) float32, m/rad²): How the path to the hit bends over u twice, v twice, u and v,
+            on a flat surface.
+        curving ((3, H) float32, m/rad²): How far the surface falls off from the flat one, likewise.
+        onward ((2, H) float32, m/rad): Shifts along the mirrored ray.
+        sink ((H,) float32): Cosine between the ray and the outward normal, below zero.
+        tube ((H,) float32, m²/sr): Cross-section of the bundle.
 
-    References
-    ----------
-    .. [1] H. Igehy, "Tracing ray differentials", SIGGRAPH 1999.
+    References:
+        .. [1] H. Igehy, "Tracing ray differentials", SIGGRAPH 1999.
     """
 
     shift: Real
@@ -63,25 +56,16 @@ class Footprint:
         :math:`H`; the path by which a mirror would send the sound is shorter (or longer) by
         :math:`g^T |H|^{-1} g / 2`.
 
-        Parameters
-        ----------
-        towards : (3, H) float32
-            Unit vectors from the hits to the listener.
-        rise : (H,) float32
-            Their cosine to the outward normal.
-        distance : (H,) float32, m
-            From the hits to the listener.
-        solid_angle : float or (H,) float64, sr
-            Of the cell, taken as a square.
+        Args:
+            towards ((3, H) float32): Unit vectors from the hits to the listener.
+            rise ((H,) float32): Their cosine to the outward normal.
+            distance ((H,) float32, m): From the hits to the listener.
+            solid_angle (float or (H,) float64, sr): Of the cell, taken as a square.
 
-        Returns
-        -------
-        detour : (H,) float32, m
-            Zero or more.
-        spread : (H,) float32, m
-            Standard deviation of the path's length over the cell.
-        stiffness : (H,) float32, m/rad²
-            The greater eigenvalue of :math:`|H|`.
+        Returns:
+            detour ((H,) float32, m): Zero or more.
+            spread ((H,) float32, m): Standard deviation of the path's length over the cell.
+            stiffness ((H,) float32, m/rad²): The greater eigenvalue of :math:`|H|`.
         """
         off = np.einsum("kdn,dn->kn", self.shift, towards)
         # From the mirror direction and not from the incoming one: the same on the smooth surface
@@ -148,26 +132,19 @@ def land(
 ) -> tuple[Footprint, Real]:
     """Let bundles fall on the surface.
 
-    Parameters
-    ----------
-    shift : (2, 3, H) float32, m/rad
-        How the rays move square to themselves over u and v; overwritten.
-    turn : (2, 3, H) float32
-        How their directions turn.
-    incoming : (3, H) float32
-        Their directions.
-    flat, normals : (3, H) float32
-        Of the triangle and of the smooth surface, unit vectors on the side of the ray.
-    gradients : (4, 3, H) float32
-        Of the weights of the second and third corner, and by how much the smooth normals there
-        differ from that at the first, on the side of the ray.
+    Args:
+        shift ((2, 3, H) float32, m/rad): How the rays move square to themselves over u and v;
+            overwritten.
+        turn ((2, 3, H) float32): How their directions turn.
+        incoming ((3, H) float32): Their directions.
+        flat, normals ((3, H) float32): Of the triangle and of the smooth surface, unit vectors on
+            the side of the ray.
+        gradients ((4, 3, H) float32): Of the weights of the second and third corner, and by how
+            much the smooth normals there differ from that at the first, on the side of the ray.
 
-    Returns
-    -------
-    footprint : Footprint
-        On the surface.
-    turned : (2, 3, H) float32
-        How the mirrored directions turn.
+    Returns:
+        footprint: On the surface.
+        turned ((2, 3, H) float32): How the mirrored directions turn.
     """
     sink = np.minimum(dots(incoming, flat), np.float32(-1e-6))
     tube = np.abs(dots(_cross(shift[0], shift[1]), incoming))

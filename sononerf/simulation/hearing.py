@@ -36,17 +36,12 @@ class Listener(Protocol):
 class Sound:
     """What the ears of one pose hear, while it is collected.
 
-    Parameters
-    ----------
-    synthesis : Synthesis
-        Time bins.
-    ears : int
-        How many, E.
+    Args:
+        synthesis: Time bins.
+        ears: How many, E.
 
-    Attributes
-    ----------
-    bins : list of Bins
-        Of each ear, filled by :meth:`settle`.
+    Attributes:
+        bins: Of each ear, filled by :meth:`settle`.
     """
 
     def __init__(self, synthesis: Synthesis, ears: int) -> None:
@@ -83,21 +78,14 @@ class Sound:
 class Hearing:
     """What a head hears of echoes of points.
 
-    Parameters
-    ----------
-    head : Head
-        Emitter, receivers and air.
-    synthesis : Synthesis
-        Time bins and filters.
+    Args:
+        head: Emitter, receivers and air.
+        synthesis: Time bins and filters.
 
-    Attributes
-    ----------
-    ears : Ears
-        Gains at the nodes of the synthesis.
-    absorption : (F,) float64, dB/m
-        Of the air at the nodes.
-    speed_of_sound : float, m/s
-        Of the air.
+    Attributes:
+        ears: Gains at the nodes of the synthesis.
+        absorption ((F,), dB/m): Of the air at the nodes.
+        speed_of_sound (m/s): Of the air.
     """
 
     def __init__(self, head: Head, synthesis: Synthesis) -> None:
@@ -152,27 +140,19 @@ class Hearing:
         the air's loss to the pressure, with :math:`a` its level and :math:`r_2` the way to the
         ear.
 
-        Parameters
-        ----------
-        sound : Sound
-            To this it is added.
-        ear : int
-            0 left, 1 right.
-        points : (N, 3) float64, m
-            World frame.
-        length : (N,) float64, m
-            From the emitter to the points, along the path.
-        spread : (N,) float, m
-            Standard deviation of the whole path's length over what a point stands for.
-        level : (N, F) or (N, 1) float, m
-            The beam's gain is part of it.
-        position : (3,) float64, m
-            Of the head.
-        rotation : (3, 3) float64
-            Head to world.
-        shaded : tuple, optional
-            A second sound, indices (M,) of points that are partly hidden, and what passes of them
-            (M, F). The second sound takes the imaginary part, to be heard a quarter turn later.
+        Args:
+            sound: To this it is added.
+            ear: 0 left, 1 right.
+            points ((N, 3), m): World frame.
+            length ((N,), m): From the emitter to the points, along the path.
+            spread ((N,), m): Standard deviation of the whole path's length over what a point stands
+                for.
+            level ((N, F) or (N, 1), m): The beam's gain is part of it.
+            position ((3,), m): Of the head.
+            rotation (3, 3): Head to world.
+            shaded: A second sound, indices (M,) of points that are partly hidden, and what passes
+                of them (M, F). The second sound takes the imaginary part, to be heard a quarter
+                turn later.
         """
         place = position + rotation @ self.ears.positions[ear]
         towards = points - place
@@ -194,17 +174,13 @@ class Hearing:
     ) -> NDArray[np.float64]:
         """Return the pressure at the ears for a call that is one sample of height 1.
 
-        Parameters
-        ----------
-        sound : Sound
-            What was collected.
-        basis : (K, F) complex128, optional
-            Filters of the synthesis; its ``basis``, for what surfaces send back, where not given.
+        Args:
+            sound: What was collected.
+            basis ((K, F) complex128): Filters of the synthesis; its ``basis``, for what surfaces
+                send back, where not given.
 
-        Returns
-        -------
-        echo : (E, S) float64
-            At the sampling rate.
+        Returns:
+            echo (E, S): At the sampling rate.
         """
         filters = self.synthesis.basis if basis is None else basis
         return np.stack(

@@ -32,12 +32,9 @@ class Hybrid(Engine):
     Both engines give pressure with level and delay, so they are added. Between the bands the low
     one falls as a raised cosine, and the high one rises.
 
-    Parameters
-    ----------
-    low : Sources
-        For low frequencies.
-    high : Rays
-        For high frequencies; its band begins where that of ``low`` ends.
+    Args:
+        low: For low frequencies.
+        high: For high frequencies; its band begins where that of ``low`` ends.
     """
 
     def __init__(self, low: Sources, high: Rays) -> None:
@@ -83,23 +80,16 @@ def hybrid(
 ) -> Engine:
     """Return the hybrid engine, or the rays alone where the low band cannot be solved for.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is ensonified.
-    hearing : Hearing
-        Head and air.
-    sources : int
-        The most that may be used, which bounds the time.
-    frequency_min : float, Hz
-        The lowest that is analysed.
-    **rays
-        What :class:`Rays` takes.
+    Args:
+        scene: What is ensonified.
+        hearing: Head and air.
+        sources: The most that may be used, which bounds the time.
+        frequency_min (Hz): The lowest that is analysed.
+        **rays: What :class:`Rays` takes.
 
-    Returns
-    -------
-    engine : Hybrid or Rays
-        Rays where a surface is open, not rigid, too large or too thin; its ``note`` says why.
+    Returns:
+        engine: Rays where a surface is open, not rigid, too large or too thin; its ``note`` says
+            why.
     """
     most = min(sources, sources_worth(scene))
     found = _low_band(scene, hearing, most, frequency_min)

@@ -13,9 +13,8 @@ Most of a record is silent. Only the stretch of bins that holds echoes is filter
 were a half or a quarter as long, with every second or fourth frequency of the filters. This is the
 same where the filters have faded out before the shorter record begins anew.
 
-References
-----------
-.. [1] L. Williams, "Pyramidal parametrics", SIGGRAPH 1983.
+References:
+    .. [1] L. Williams, "Pyramidal parametrics", SIGGRAPH 1983.
 """
 
 from __future__ import annotations
@@ -55,22 +54,15 @@ LEVEL_VARIANCE = 1.0 / 3.0
 class Synthesis:
     """Time bins, frequency nodes and the filters that join them.
 
-    Attributes
-    ----------
-    nodes : (F,) float64, Hz
-        Where strengths are wanted.
-    hats : (K, F) complex128
-        Spectrum that each node stands for.
-    basis : (K, F) complex128
-        The same times ``j f`` in Hz, for what surfaces send back.
-    odd_hats : (K, F) complex128
-        As ``hats``, for strengths that are odd functions of frequency, as imaginary parts are.
-    sampling_rate : float, Hz
-        Of the echo.
-    samples : int
-        Length of the echo, S.
-    length : int
-        Of the transform, at the sampling rate.
+    Attributes:
+        nodes ((F,), Hz): Where strengths are wanted.
+        hats ((K, F) complex128): Spectrum that each node stands for.
+        basis ((K, F) complex128): The same times ``j f`` in Hz, for what surfaces send back.
+        odd_hats ((K, F) complex128): As ``hats``, for strengths that are odd functions of
+            frequency, as imaginary parts are.
+        sampling_rate (Hz): Of the echo.
+        samples: Length of the echo, S.
+        length: Of the transform, at the sampling rate.
     """
 
     nodes: NDArray[np.float64]
@@ -100,12 +92,10 @@ class Synthesis:
 class Bins:
     """Time bins that echoes are laid into.
 
-    Attributes
-    ----------
-    values : (B, F) float
-        All levels, one after the other.
-    first, last : float, samples
-        All echoes lie between these two; the last is below the first where there is none.
+    Attributes:
+        values (B, F): All levels, one after the other.
+        first, last (samples): All echoes lie between these two; the last is below the first where
+            there is none.
     """
 
     values: NDArray[Any]
@@ -122,17 +112,12 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     reflection has is part of the filters: a flat reflection is then a short derivative pulse and
     no long tail.
 
-    Parameters
-    ----------
-    settings : SpectrogramSettings
-        The analysis the echo is made for.
-    samples : int
-        How long the echo is to be, S.
+    Args:
+        settings: The analysis the echo is made for.
+        samples: How long the echo is to be, S.
 
-    Returns
-    -------
-    synthesis : Synthesis
-        Time bins, nodes and filters.
+    Returns:
+        synthesis: Time bins, nodes and filters.
     """
     rate = settings.sampling_rate
     top = min(max(HIGHEST, 1.2 * settings.frequency_max), 0.45 * rate)
@@ -170,19 +155,13 @@ def between(
     values are continued as an even function about the upper end, and as an even or an odd one about
     zero. An odd one continued as an even one would jump at zero, and ring on as one over time.
 
-    Parameters
-    ----------
-    frequency : (K,) float64, Hz
-        From zero to the upper end, half a spacing above the last node.
-    nodes : (F,) float64, Hz
-        Odd multiples of half their spacing.
+    Args:
+        frequency ((K,), Hz): From zero to the upper end, half a spacing above the last node.
+        nodes ((F,), Hz): Odd multiples of half their spacing.
 
-    Returns
-    -------
-    even : (K, F) float64
-        They sum to one for each frequency, within 1e-6.
-    odd : (K, F) float64
-        For values that are odd about zero.
+    Returns:
+        even (K, F): They sum to one for each frequency, within 1e-6.
+        odd (K, F): For values that are odd about zero.
     """
     spacing = 2.0 * nodes[0]
     period = 2.0 * len(nodes) * spacing
@@ -208,18 +187,12 @@ def deposit(
 ) -> None:
     """Lay echoes into time bins, each between the two nearest of the two levels it lies between.
 
-    Parameters
-    ----------
-    synthesis : Synthesis
-        The bins.
-    bins : Bins
-        To these the echoes are added, in place.
-    delay : (N,) float64, s
-        From the emission; echoes too late for the last frame are left out.
-    spread : (N,) float64, s
-        Standard deviation of the arrival times of what an echo stands for.
-    strength : (N, F) float
-        Per node.
+    Args:
+        synthesis: The bins.
+        bins: To these the echoes are added, in place.
+        delay ((N,), s): From the emission; echoes too late for the last frame are left out.
+        spread ((N,), s): Standard deviation of the arrival times of what an echo stands for.
+        strength (N, F): Per node.
     """
     rate = synthesis.sampling_rate * OVERSAMPLING
     last = OVERSAMPLING * (synthesis.samples + GUARD // 2)
@@ -277,21 +250,14 @@ def synthesise(
 ) -> NDArray[np.float64]:
     """Weaken each node's bins by the air, filter them with its part of the spectrum, add up.
 
-    Parameters
-    ----------
-    synthesis : Synthesis
-        The filters.
-    bins : Bins
-        From :func:`deposit`.
-    air : (B, F) float
-        From :func:`air_loss`.
-    basis : (K, F) complex128
-        The synthesis' ``basis``, or its ``hats``.
+    Args:
+        synthesis: The filters.
+        bins: From :func:`deposit`.
+        air (B, F): From :func:`air_loss`.
+        basis ((K, F) complex128): The synthesis' ``basis``, or its ``hats``.
 
-    Returns
-    -------
-    echo : (S,) float64
-        Pressure for a call that is one sample of height 1, at the sampling rate.
+    Returns:
+        echo (S,): Pressure for a call that is one sample of height 1, at the sampling rate.
     """
     echo = np.zeros(synthesis.samples)
     if bins.last < bins.first:

@@ -13,19 +13,13 @@ from sononerf.geometry.normals import CREASE, bodies, corner_normals, weight_gra
 class Outlines:
     """The edges of a mesh that may be the outline of an obstacle, seen from somewhere.
 
-    Parameters
-    ----------
-    mesh : trimesh.Trimesh
-        The scene.
+    Args:
+        mesh: The scene.
 
-    Attributes
-    ----------
-    body : (T,) int64
-        Which connected part a triangle belongs to.
-    closed : (T,) bool
-        Whether that part has no rim.
-    several : bool
-        Whether there is more than one part, or any that is not convex.
+    Attributes:
+        body (T,): Which connected part a triangle belongs to.
+        closed (T,): Whether that part has no rim.
+        several: Whether there is more than one part, or any that is not convex.
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
@@ -66,16 +60,13 @@ class Outlines:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
         """Return outline edges as seen from a place.
 
-        Returns
-        -------
-        ends : (K, 2, 3) float64, m
-            The obstacle lies on the left as one goes from the first to the second.
-        away : (K, 3) float64
-            Unit vectors off the surface.
-        body : (K,) int64
-            Of each edge.
-        radius : (K,) float64, m
-            Of the surface's curvature along the way from the place; zero where it is sharp.
+        Returns:
+            ends ((K, 2, 3), m): The obstacle lies on the left as one goes from the first to the
+                second.
+            away (K, 3): Unit vectors off the surface.
+            body (K,): Of each edge.
+            radius ((K,), m): Of the surface's curvature along the way from the place; zero where it
+                is sharp.
         """
         front = self._normals @ place > self._height
         one, two = self._pairs.T

@@ -28,32 +28,19 @@ Beyond = Callable[[Hits, NDArray[np.float64]], tuple[Hits, NDArray[np.float64]]]
 class Bounce:
     """The rays that hit the surface for the n-th time.
 
-    Attributes
-    ----------
-    number : int
-        n, the first hit being 1.
-    solid_angle : float or (H,) float64, sr
-        What each ray stands for.
-    ray : (H,) int64
-        Which of the emitted rays.
-    emitted : (H, 3) float64
-        Their directions from the emitter.
-    incoming : (H, 3) float64
-        Their directions before the hit.
-    points : (H, 3) float64, m
-        Where they hit.
-    flat : (H, 3) float64
-        Normals of the triangles, on the side of the ray.
-    mirrored : (H, 3) float64
-        Where a mirror would send them.
-    length : (H,) float64, m
-        From the emitter along the path.
-    footprint : Footprint
-        Of the bundles.
-    triangles : (H, n) int64
-        Which were hit, this one last.
-    hidden : bool
-        Whether the rays went through an obstacle as if it were not there.
+    Attributes:
+        number: n, the first hit being 1.
+        solid_angle (float or (H,) float64, sr): What each ray stands for.
+        ray (H,): Which of the emitted rays.
+        emitted (H, 3): Their directions from the emitter.
+        incoming (H, 3): Their directions before the hit.
+        points ((H, 3), m): Where they hit.
+        flat (H, 3): Normals of the triangles, on the side of the ray.
+        mirrored (H, 3): Where a mirror would send them.
+        length ((H,), m): From the emitter along the path.
+        footprint: Of the bundles.
+        triangles (H, n): Which were hit, this one last.
+        hidden: Whether the rays went through an obstacle as if it were not there.
     """
 
     number: int
@@ -74,19 +61,13 @@ class Bounce:
     ) -> tuple[Real, Real, Real, Real]:
         """Compare paths to a listener with those of a mirror.
 
-        Parameters
-        ----------
-        towards : (H, 3) float64
-            Unit vectors from the hits to the listener.
-        distance : (H,) float64, m
-            From the hits to the listener.
+        Args:
+            towards (H, 3): Unit vectors from the hits to the listener.
+            distance ((H,), m): From the hits to the listener.
 
-        Returns
-        -------
-        rise : (H,) float32
-            Cosine between the way to the listener and the outward normal.
-        detour, spread, stiffness : (H,) float32
-            See :meth:`Footprint.detour`.
+        Returns:
+            rise ((H,) float32): Cosine between the way to the listener and the outward normal.
+            detour, spread, stiffness ((H,) float32): See :meth:`Footprint.detour`.
         """
         there = _single(towards)
         rise = dots(there, _single(self.flat))
@@ -158,19 +139,13 @@ def aim(
 ) -> tuple[NDArray[np.float64], float]:
     """Axis and half angle of the cap under which a point sees a ball.
 
-    Parameters
-    ----------
-    emitter, centre : (3,) float64, m
-        The point, and the ball's middle.
-    radius : float, m
-        Of the ball.
+    Args:
+        emitter, centre ((3,), m): The point, and the ball's middle.
+        radius (m): Of the ball.
 
-    Returns
-    -------
-    axis : (3,) float64, m
-        Towards the middle, not normalised.
-    half_angle : float, rad
-        pi where the point is inside.
+    Returns:
+        axis ((3,), m): Towards the middle, not normalised.
+        half_angle (rad): pi where the point is inside.
     """
     axis = centre - emitter
     distance = float(np.linalg.norm(axis))
@@ -192,26 +167,17 @@ def trace(
 
     A surface is the same from both sides: what a ray hits is outside for it.
 
-    Parameters
-    ----------
-    caster : RayCaster
-        The surface.
-    emitter : (3,) float64, m
-        Where all rays start.
-    directions : (N, 3) float64
-        Unit vectors.
-    bounces : int
-        How often a ray may hit.
-    solid_angle : float, sr
-        What each ray stands for.
-    beyond : callable, optional
-        Takes what is hit first and all directions (N, 3); returns what is to count as hit instead,
-        and how far it is from the emitter (M,), m.
+    Args:
+        caster: The surface.
+        emitter ((3,), m): Where all rays start.
+        directions (N, 3): Unit vectors.
+        bounces: How often a ray may hit.
+        solid_angle (sr): What each ray stands for.
+        beyond: Takes what is hit first and all directions (N, 3); returns what is to count as hit
+            instead, and how far it is from the emitter (M,), m.
 
-    Yields
-    ------
-    bounce : Bounce
-        One per bounce, as long as any ray hits.
+    Yields:
+        bounce: One per bounce, as long as any ray hits.
     """
     origins = np.broadcast_to(emitter, directions.shape)
     hits = caster.first_hit(origins, directions)
@@ -284,30 +250,19 @@ def echo_paths(
     their parts again, until none is in doubt or the extra rays are used up: stratified sampling,
     refined where the integrand is not resolved.
 
-    Parameters
-    ----------
-    caster : RayCaster
-        The surface.
-    emitter : (3,) float64, m
-        Where all rays start.
-    cap : CapSpiral
-        First rays, world frame.
-    bounces : int
-        How often a ray may hit.
-    extra : int
-        At most so many rays come to the first ones.
-    judge : callable
-        Takes hits; returns which of them (H,) can be heard at all, and how much of each (H,) may
-        be wrong for the size of its cell, in any unit, zero where it is small enough.
-    beyond : callable, optional
-        See :func:`trace`.
-    index : (N,) int64, optional
-        Of the first rays, those that may hit anything; all where not given.
+    Args:
+        caster: The surface.
+        emitter ((3,), m): Where all rays start.
+        cap: First rays, world frame.
+        bounces: How often a ray may hit.
+        extra: At most so many rays come to the first ones.
+        judge: Takes hits; returns which of them (H,) can be heard at all, and how much of each (H,)
+            may be wrong for the size of its cell, in any unit, zero where it is small enough.
+        beyond: See :func:`trace`.
+        index (N,): Of the first rays, those that may hit anything; all where not given.
 
-    Yields
-    ------
-    bounce : Bounce
-        Audible hits of cells that are left as they are.
+    Yields:
+        bounce: Audible hits of cells that are left as they are.
     """
     rays = np.arange(cap.count) if index is None else index
     directions, parts, count = cap.directions(rays), 1, cap.count

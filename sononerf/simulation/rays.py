@@ -61,20 +61,14 @@ class Rays(Engine):
     ways has a factor, :class:`Shadow`. What lies behind an obstacle is sought by rays that go
     through it. Shadows of later bounces are sharp.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is ensonified.
-    hearing : Hearing
-        Head and air.
-    rays : int
-        Per pose.
-    bounces : int
-        How often a ray may hit.
-    diffraction_points : int
-        Per pose, where a material diffracts.
-    band : (K,) float64, optional
-        By how much each frequency of the synthesis is multiplied; all whole where not given.
+    Args:
+        scene: What is ensonified.
+        hearing: Head and air.
+        rays: Per pose.
+        bounces: How often a ray may hit.
+        diffraction_points: Per pose, where a material diffracts.
+        band (K,): By how much each frequency of the synthesis is multiplied; all whole where not
+            given.
     """
 
     def __init__(

@@ -30,22 +30,14 @@ FADE_FREQUENCY = 25e3  # Hz
 class Reflection:
     """A material at the frequencies of a simulation.
 
-    Attributes
-    ----------
-    fade : (F,) float64, 1/m
-        Of a smooth surface, over the detour from the mirror's path.
-    lobe_width : (F,) float64, rad
-        Standard deviation of the lobe; of a smooth surface, not used.
-    strength : (F,) float64, 1
-        Of what is heard of a hit.
-    kept : (F,) float64, 1
-        Of the pressure after a bounce.
-    curved_lobe_width, curved_strength : (F,) float64
-        The same where the surface is strongly curved.
-    diffraction : (F,) float64, 1
-        Strength of edges and strongly curved places as sources of their own.
-    material : Material
-        What these are the values of.
+    Attributes:
+        fade ((F,), 1/m): Of a smooth surface, over the detour from the mirror's path.
+        lobe_width ((F,), rad): Standard deviation of the lobe; of a smooth surface, not used.
+        strength ((F,), 1): Of what is heard of a hit.
+        kept ((F,), 1): Of the pressure after a bounce.
+        curved_lobe_width, curved_strength (F,): The same where the surface is strongly curved.
+        diffraction ((F,), 1): Strength of edges and strongly curved places as sources of their own.
+        material: What these are the values of.
     """
 
     fade: NDArray[np.float64]
@@ -75,19 +67,13 @@ class Reflection:
         A smooth surface fades by :math:`e^{-\epsilon k \delta}` with the detour :math:`\delta`;
         :func:`unfaded` makes good what that takes.
 
-        Parameters
-        ----------
-        cosine : (N,) float64
-            Of the angle between the mirror direction and that towards the listener.
-        detour : (N,) float, m
-            From :meth:`Bounce.detour`.
-        curvature : (N,) float64, 1/m
-            Total curvature at the hits.
+        Args:
+            cosine (N,): Of the angle between the mirror direction and that towards the listener.
+            detour ((N,), m): From :meth:`Bounce.detour`.
+            curvature ((N,), 1/m): Total curvature at the hits.
 
-        Returns
-        -------
-        gain : (N, F) float
-            Linear.
+        Returns:
+            gain (N, F): Linear.
         """
         strength = self.strength
         share = None
@@ -146,19 +132,13 @@ def unfaded(
     :math:`\int e^{-(\epsilon + j) k \delta} d\delta = 1 / (\epsilon + j) k` in place of
     :math:`1 / j k`, at all curvatures; the factor :math:`1 - j \epsilon` is the same everywhere.
 
-    Parameters
-    ----------
-    frequency : (F,) float64, Hz
-        Zero or more.
-    speed_of_sound : float, m/s
-        Of the air.
+    Args:
+        frequency ((F,), Hz): Zero or more.
+        speed_of_sound (m/s): Of the air.
 
-    Returns
-    -------
-    fade : (F,) float64, 1/m
-        :math:`\epsilon k`, over the detour.
-    gain : (F,) complex128, Hz
-        :math:`j f (1 - j \epsilon)`.
+    Returns:
+        fade ((F,), 1/m): :math:`\epsilon k`, over the detour.
+        gain ((F,) complex128, Hz): :math:`j f (1 - j \epsilon)`.
     """
     faded = FADE * np.hypot(frequency, FADE_FREQUENCY)
     gain = (1j * frequency + faded).astype(np.complex128)
@@ -173,16 +153,12 @@ def coarse_gain(bend: NDArray[np.float32]) -> NDArray[np.float32]:
     all places of a mirror point among the cells the slope's spread acts as a further fade by
     :math:`b / 12`, and the bend's as a loss of :math:`e^{-b^2 / 720}`: variances over a square.
 
-    Parameters
-    ----------
-    bend : (N, F) float32, rad
-        Of a cell.
+    Args:
+        bend ((N, F) float32, rad): Of a cell.
 
-    Returns
-    -------
-    gain : (N, F) float32
-        One where cells are fine; no more than that of 10 rad, beyond which there is little left
-        to be made good.
+    Returns:
+        gain ((N, F) float32): One where cells are fine; no more than that of 10 rad, beyond which
+            there is little left to be made good.
     """
     b = np.minimum(bend, np.float32(COARSEST))
     fade = np.square(np.float32(FADE) + b / np.float32(12.0)) + np.float32(1.0)
@@ -194,17 +170,12 @@ def coarse_gain(bend: NDArray[np.float32]) -> NDArray[np.float32]:
 def mirror(directions: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
     """Mirror directions about planes.
 
-    Parameters
-    ----------
-    directions : (N, 3) float64
-        Unit vectors towards the surface.
-    normals : (N, 3) float64
-        Unit normals; their sign does not matter.
+    Args:
+        directions (N, 3): Unit vectors towards the surface.
+        normals (N, 3): Unit normals; their sign does not matter.
 
-    Returns
-    -------
-    mirrored : (N, 3) float64
-        Unit vectors.
+    Returns:
+        mirrored (N, 3): Unit vectors.
     """
     along = np.einsum("nd,nd->n", directions, normals)
     mirrored: NDArray[np.float64] = directions - (2.0 * along)[:, None] * normals
@@ -216,17 +187,12 @@ def keep_outside(directions: NDArray[np.float64], flat: NDArray[np.float64]) -> 
 
     A mirror direction about a smooth normal may point into the flat triangle that was hit.
 
-    Parameters
-    ----------
-    directions : (N, 3) float64
-        Unit vectors.
-    flat : (N, 3) float64
-        Unit normals of the triangles, on the side of the ray.
+    Args:
+        directions (N, 3): Unit vectors.
+        flat (N, 3): Unit normals of the triangles, on the side of the ray.
 
-    Returns
-    -------
-    directions : (N, 3) float64
-        Unit vectors.
+    Returns:
+        directions (N, 3): Unit vectors.
     """
     rise = np.einsum("nd,nd->n", directions, flat)
     low = np.flatnonzero(rise < LEAST_RISE)
@@ -241,17 +207,12 @@ def lobe_exponent(
 ) -> NDArray[np.float64]:
     """Logarithm of the lobe, ``-theta**2 / (2 w**2)``.
 
-    Parameters
-    ----------
-    cosine : (N,) float64
-        Of the angle theta between the mirror direction and that towards the listener.
-    lobe_width : (F,) or (N, F) float64, rad
-        Standard deviations.
+    Args:
+        cosine (N,): Of the angle theta between the mirror direction and that towards the listener.
+        lobe_width ((F,) or (N, F), rad): Standard deviations.
 
-    Returns
-    -------
-    exponent : (N, F) float64
-        Zero in the mirror direction, falling away from it.
+    Returns:
+        exponent (N, F): Zero in the mirror direction, falling away from it.
     """
     theta = np.arccos(np.clip(cosine, -1.0, 1.0))
     return -0.5 * np.square(theta)[:, None] / np.square(lobe_width)

@@ -67,26 +67,18 @@ class Shadow:
 
     What passes is the same over a cell of the surface, and solved for where it is asked for.
 
-    Parameters
-    ----------
-    outlines : Outlines
-        Of the scene.
-    caster : RayCaster
-        Of the scene.
-    place : (3,) float64, m
-        Emitter or ear.
-    wavenumber : (F,) float64, 1/m
-        At the nodes.
-    speed_of_sound : float, m/s
-        Of the air.
-    size : float, m
-        Of the scene.
+    Args:
+        outlines: Of the scene.
+        caster: Of the scene.
+        place ((3,), m): Emitter or ear.
+        wavenumber ((F,), 1/m): At the nodes.
+        speed_of_sound (m/s): Of the air.
+        size (m): Of the scene.
 
-    References
-    ----------
-    .. [1] A. Rubinowicz, "Thomas Young and the theory of diffraction", Nature 180, 1957.
-    .. [2] P. H. Pathak, "An asymptotic analysis of the scattering of plane waves by a smooth
-       convex cylinder", Radio Science 14, 1979.
+    References:
+        .. [1] A. Rubinowicz, "Thomas Young and the theory of diffraction", Nature 180, 1957.
+        .. [2] P. H. Pathak, "An asymptotic analysis of the scattering of plane waves by a smooth
+           convex cylinder", Radio Science 14, 1979.
     """
 
     def __init__(
@@ -183,12 +175,9 @@ class Shadow:
     ) -> tuple[NDArray[np.int32], NDArray[np.complex64]]:
         """Return the row (N,) of each point in a table (C, F) of what passes; -1: no outline near.
 
-        Parameters
-        ----------
-        points : (N, 3) float64, m
-            On the surface.
-        triangle : (N,) int64
-            On which.
+        Args:
+            points ((N, 3), m): On the surface.
+            triangle (N,): On which.
         """
         if self._pieces is None or len(points) == 0:
             return np.full(len(points), -1, dtype=np.int32), self._table

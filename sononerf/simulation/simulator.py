@@ -48,15 +48,11 @@ VERSION = 4  # to be raised when the same settings give other echoes: stores are
 class Simulator:
     """What the receivers of a pose hear of a scene.
 
-    Parameters
-    ----------
-    engine : Engine
-        Brings the sound to the receivers; its head makes spectrograms of it.
+    Args:
+        engine: Brings the sound to the receivers; its head makes spectrograms of it.
 
-    Attributes
-    ----------
-    head : Head
-        What hears.
+    Attributes:
+        head: What hears.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -67,14 +63,10 @@ class Simulator:
     def of(cls, scene: Scene, head: Head, options: SimulationSettings) -> Simulator:
         """Return the simulator of a scene and a head.
 
-        Parameters
-        ----------
-        scene : Scene
-            What is ensonified.
-        head : Head
-            What hears.
-        options : SimulationSettings
-            The engine and what bounds its work.
+        Args:
+            scene: What is ensonified.
+            head: What hears.
+            options: The engine and what bounds its work.
         """
         hearing, analysis = hearing_of(head), head.analysis
         if options.engine in ("spheres", "bem"):
@@ -109,16 +101,11 @@ class Simulator:
     ) -> Simulator:
         """Return the hybrid engine on a reconstructed surface, without noise.
 
-        Parameters
-        ----------
-        mesh : Trimesh
-            m.
-        head : Head
-            What hears.
-        options : SimulationSettings
-            Engine and number of rays are replaced.
-        rays : int
-            Per pose.
+        Args:
+            mesh: m.
+            head: What hears.
+            options: Engine and number of rays are replaced.
+            rays: Per pose.
         """
         wanted = options.model_copy(update={"engine": "hybrid", "rays": rays})
         return cls.of(quiet_scene(mesh), head.without_noise(), wanted)
@@ -131,14 +118,10 @@ class Simulator:
     ) -> None:
         """Let the engine do its work for all poses at once, and show how far it is.
 
-        Parameters
-        ----------
-        positions : (P, 3) float64, m
-            Of the head, world frame.
-        rotations : (P, 3, 3) float64
-            Head to world.
-        progress : Progress
-            Where to show it.
+        Args:
+            positions ((P, 3), m): Of the head, world frame.
+            rotations (P, 3, 3): Head to world.
+            progress: Where to show it.
         """
         if len(positions) and self.engine.parts:
             with progress.task("solving", self.engine.parts) as task:
@@ -176,10 +159,8 @@ class Simulator:
 
         Position, rotation and seed are those of :meth:`Engine.echo`.
 
-        Returns
-        -------
-        magnitude : (E, R, F) float32
-            Linear.
+        Returns:
+            magnitude ((E, R, F) float32): Linear.
         """
         return self.receive(position, rotation, seed=seed)[1].astype(np.float32)
 
@@ -190,12 +171,9 @@ class Simulator:
 
         Position, rotation and seed are those of :meth:`Engine.echo`.
 
-        Returns
-        -------
-        waveform : (E, S) float64
-            Pressure from the start of the emission on.
-        magnitude : (E, R, F) float64
-            Linear; dechirped where the call is a sweep.
+        Returns:
+            waveform (E, S): Pressure from the start of the emission on.
+            magnitude (E, R, F): Linear; dechirped where the call is a sweep.
         """
         echo = self.echo(position, rotation, seed=seed)
         return self.head.receive(echo, seed=seed)
@@ -240,17 +218,12 @@ def ensemble_poses(wanted: PoseSettings) -> tuple[Poses, NDArray[np.int8]]:
     Each set draws from a generator of its own, so that the number of one does not move another.
     The poses of a path stay in the order of its table.
 
-    Parameters
-    ----------
-    wanted : PoseSettings
-        Arrangement, numbers and seed.
+    Args:
+        wanted: Arrangement, numbers and seed.
 
-    Returns
-    -------
-    poses : Poses
-        All of them.
-    split : (P,) int8
-        0 train, 1 validation, 2 test.
+    Returns:
+        poses: All of them.
+        split ((P,) int8): 0 train, 1 validation, 2 test.
     """
     if wanted.path is not None:
         return _path_poses(wanted, wanted.path)

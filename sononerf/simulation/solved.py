@@ -34,16 +34,11 @@ LONGEST = 7.0 * 86_400.0  # s; a longer computation is refused
 class Heads:
     """All poses at one frequency.
 
-    Attributes
-    ----------
-    emitters : (P, 3) float64, m
-        World frame.
-    ears : (P, E, 3) float64, m
-        World frame.
-    rotations : (P, 3, 3) float64
-        Head to world.
-    gains : Ears
-        Tables of one frequency.
+    Attributes:
+        emitters ((P, 3), m): World frame.
+        ears ((P, E, 3), m): World frame.
+        rotations (P, 3, 3): Head to world.
+        gains: Tables of one frequency.
     """
 
     emitters: NDArray[np.float64]
@@ -99,25 +94,16 @@ class Solved(Engine):
     single echoes arrive within four radii of the first one. What is later than the duration wraps
     around; for ``three_spheres`` it is more than 80 dB below the greatest pressure.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is ensonified.
-    hearing : Hearing
-        Head and air.
-    frequency_max : float, Hz
-        Where the response has fallen to zero.
-    fall : float
-        That over the frequency from which on it falls.
+    Args:
+        scene: What is ensonified.
+        hearing: Head and air.
+        frequency_max (Hz): Where the response has fallen to zero.
+        fall: That over the frequency from which on it falls.
 
-    Attributes
-    ----------
-    frequency : (K,) float64, Hz
-        Those that are solved for.
-    frequency_full : float, Hz
-        Up to which the response is whole.
-    period : int
-        Samples of a response.
+    Attributes:
+        frequency ((K,), Hz): Those that are solved for.
+        frequency_full (Hz): Up to which the response is whole.
+        period: Samples of a response.
     """
 
     prepares = True
@@ -162,17 +148,13 @@ class Solved(Engine):
     def respond(self, wavenumber: complex, poses: Heads) -> NDArray[np.complex128]:
         """Scattered pressure at the ears at one frequency.
 
-        Parameters
-        ----------
-        wavenumber : complex, 1/m
-            Of sound in air; its imaginary part is not positive.
-        poses : Heads
-            Where emitters and ears are, and their gains.
+        Args:
+            wavenumber (1/m): Of sound in air; its imaginary part is not positive.
+            poses: Where emitters and ears are, and their gains.
 
-        Returns
-        -------
-        pressure : (P, E) complex128
-            For an emission of pressure 1 at 1 m where the beam's gain is 1, ear's gain included.
+        Returns:
+            pressure ((P, E) complex128): For an emission of pressure 1 at 1 m where the beam's gain
+                is 1, ear's gain included.
         """
         raise NotImplementedError
 
@@ -186,14 +168,10 @@ class Solved(Engine):
 
         Poses that are no finite numbers are left out; :meth:`echo` refuses them.
 
-        Parameters
-        ----------
-        positions : (P, 3) float64, m
-            Of the head, world frame.
-        rotations : (P, 3, 3) float64
-            Head to world.
-        progress : callable, optional
-            Takes how many frequencies are done and how many there are.
+        Args:
+            positions ((P, 3), m): Of the head, world frame.
+            rotations (P, 3, 3): Head to world.
+            progress: Takes how many frequencies are done and how many there are.
         """
         finite = np.isfinite(positions).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
         pairs = zip(positions[finite], rotations[finite], strict=True)

@@ -26,26 +26,16 @@ from sononerf.surface.start.volume import Volume
 class Surface:
     """A reconstructed surface.
 
-    Attributes
-    ----------
-    mesh : Trimesh
-        World frame, m.
-    volume : Volume
-        The field's energy, or its loudness for an iso-surface.
-    method : {"open", "filled", "hull", "sheet", "isosurface"}
-        How the surface was found, or the start that was refined.
-    level : float or None
-        Of an iso-surface, in the unit of the volume; None for other methods.
-    openness : Openness or None
-        What kind of surface it is; None for an iso-surface.
-    support : (V,) int32 or None
-        How many poses heard the surface around each vertex.
-    refined : bool
-        True where the refined mesh explains the validation poses better than its start.
-    error_db : float or None, dB
-        Objective of the refinement on validation poses; None without a refinement.
-    faults : sequence of str
-        What went wrong in the refinement, one line each.
+    Attributes:
+        mesh: World frame, m.
+        volume: The field's energy, or its loudness for an iso-surface.
+        method: How the surface was found, or the start that was refined.
+        level: Of an iso-surface, in the unit of the volume; None for other methods.
+        openness: What kind of surface it is; None for an iso-surface.
+        support ((V,) int32 or None): How many poses heard the surface around each vertex.
+        refined: True where the refined mesh explains the validation poses better than its start.
+        error_db (dB): Objective of the refinement on validation poses; None without a refinement.
+        faults: What went wrong in the refinement, one line each.
     """
 
     mesh: trimesh.Trimesh
@@ -73,18 +63,12 @@ def finished_surface(
 
     An open surface also ends where the evidence for it ends.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        A start surface or a refined one, m.
-    method : {"open", "filled", "hull", "sheet"}
-        How its start was found.
-    reading : FieldReading
-        Evidence that the start was made of.
-    support : (V,) int32, optional
-        How many poses heard each vertex; counted in the evidence where None.
-    refined, error_db, faults
-        As of :class:`Surface`.
+    Args:
+        mesh: A start surface or a refined one, m.
+        method: How its start was found.
+        reading: Evidence that the start was made of.
+        support ((V,) int32): How many poses heard each vertex; counted in the evidence where None.
+        refined, error_db, faults: As of :class:`Surface`.
     """
     known = reading.gathered
     if support is None:
@@ -127,12 +111,11 @@ _CHUNK = 4096  # triangles at a time, a bound of memory
 class Openness:
     """What kind of surface it is.
 
-    Attributes
-    ----------
-    unseen : (T,) bool
-        The triangles that no pose can have heard, or that are unknown, see :func:`known_part`.
-    unseen_share, thin_share : float
-        Fractions of the area: of these triangles; that has the other side close behind it.
+    Attributes:
+        unseen (T,): The triangles that no pose can have heard, or that are unknown, see
+            :func:`known_part`.
+        unseen_share, thin_share: Fractions of the area: of these triangles; that has the other side
+            close behind it.
     """
 
     unseen: NDArray[np.bool_]
@@ -150,18 +133,10 @@ class Openness:
 def judge_openness(mesh: trimesh.Trimesh, sources: Array, *, resolution: float) -> Openness:
     """Tell a body's skin from an open surface.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        A closed reconstruction, normals outward, m.
-    sources : (P, 3) float, m
-        Where it was heard from.
-    resolution : float, m
-        Range resolution of the analysis.
-
-    Returns
-    -------
-    openness : Openness
+    Args:
+        mesh: A closed reconstruction, normals outward, m.
+        sources ((P, 3), m): Where it was heard from.
+        resolution (m): Range resolution of the analysis.
     """
     middles = np.asarray(mesh.triangles_center, dtype=np.float64)
     normals = np.asarray(mesh.face_normals, dtype=np.float64)
@@ -205,21 +180,15 @@ def known_part(
     onsets end. Between them is in their convex hull, or as little out of it as one smooth surface
     may be. Where the onsets end is no deeper than a range resolution behind one of them.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        m.
-    heard : (V,) int32
-        How many poses heard the surface around each vertex, see
-        :func:`~sononerf.surface.start.reliability.poses_that_heard`.
-    hull : EchoHull
-        The onsets.
-    resolution : float, m
-        Range resolution of the analysis.
+    Args:
+        mesh: m.
+        heard ((V,) int32): How many poses heard the surface around each vertex, see
+            :func:`~sononerf.surface.start.reliability.poses_that_heard`.
+        hull: The onsets.
+        resolution (m): Range resolution of the analysis.
 
-    Returns
-    -------
-    known : (T,) bool
+    Returns:
+        known: (T,).
     """
     middles = np.asarray(mesh.triangles_center, dtype=np.float64)
     bounded = hull.clearance(middles)[0] < resolution

@@ -60,35 +60,22 @@ def run_experiment(
 ) -> dict[str, Any]:
     """Run an experiment as a user would, in a process of its own.
 
-    Parameters
-    ----------
-    folder : Path
-        Of the run; a finished one is left as it is. What was said goes to ``<folder>.log``.
-    data : Path
-        Of the ensembles, each by its hash, so that runs of the same echoes share one.
-    settings : sequence of str
-        ``KEY=VALUE``, laid over the file.
-    config : Path
-        The settings file; the defaults' where none is given.
-    enough : str or None
-        The section of ``metrics.json`` that is asked for: a command that wrote it has not failed,
-        whatever came after, as where a short fit holds no surface yet.
-    store : Path or None
-        The ensemble, where it is not one of those in ``data``.
+    Args:
+        folder: Of the run; a finished one is left as it is. What was said goes to ``<folder>.log``.
+        data: Of the ensembles, each by its hash, so that runs of the same echoes share one.
+        settings: ``KEY=VALUE``, laid over the file.
+        config: The settings file; the defaults' where none is given.
+        enough: The section of ``metrics.json`` that is asked for: a command that wrote it has not
+            failed, whatever came after, as where a short fit holds no surface yet.
+        store: The ensemble, where it is not one of those in ``data``.
 
-    Returns
-    -------
-    metrics : dict
-        All of ``metrics.json``.
+    Returns:
+        metrics: All of ``metrics.json``.
 
-    Raises
-    ------
-    SonoNerfError
-        If the settings are wrong, or the folder holds a run of others.
-    RuntimeError
-        If the command failed; with its last line.
-    KeyboardInterrupt
-        If it was stopped.
+    Raises:
+        SonoNerfError: If the settings are wrong, or the folder holds a run of others.
+        RuntimeError: If the command failed; with its last line.
+        KeyboardInterrupt: If it was stopped.
     """
     chosen = load_settings(config, settings)
     run = RunFolder(folder)
@@ -168,10 +155,8 @@ def device_name(accelerator: str) -> str:
 def keep(output: Path, what: str, device: str, found: dict[str, Any]) -> Path:
     """Write figures to ``WHAT-VERSION-MACHINE-DEVICE.json``.
 
-    Returns
-    -------
-    path : Path
-        Of the file.
+    Returns:
+        path: Of the file.
     """
     chip = torch.cuda.get_device_name() if device == "cuda" else device
     parts = (what, __version__, platform.node() or platform.machine(), chip)

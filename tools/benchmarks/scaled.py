@@ -23,17 +23,12 @@ def scaled_settings(plain: Settings, factor: float) -> list[str]:
     Air of a lower pressure and with the same share of water takes as much of an echo on the longer
     way. The ears' lobes widen with the root of the wavelength, so they are set narrower.
 
-    Parameters
-    ----------
-    plain : Settings
-        Of a scene whose ``radius`` scales all of it, without a notch in its ears.
-    factor : float
-        Of all lengths and times.
+    Args:
+        plain: Of a scene whose ``radius`` scales all of it, without a notch in its ears.
+        factor: Of all lengths and times.
 
-    Returns
-    -------
-    assignments : list of str
-        ``KEY=VALUE``.
+    Returns:
+        assignments: ``KEY=VALUE``.
     """
     radius = load_scene(plain.scene.name).mesh.extents.min() / 2.0
     analysis, ears, air = plain.spectrogram, plain.ears, plain.air
@@ -60,16 +55,11 @@ def scaled_store(source: Path, target: Path, settings: Settings, factor: float) 
 
     The simulator's own constants, such as the frequencies of its nodes, have no part in it.
 
-    Parameters
-    ----------
-    source : Path
-        The finished ensemble of the unscaled world.
-    target : Path
-        Where the new one comes to lie; one that is complete is left as it is.
-    settings : Settings
-        Of the scaled world.
-    factor : float
-        Of all lengths and times.
+    Args:
+        source: The finished ensemble of the unscaled world.
+        target: Where the new one comes to lie; one that is complete is left as it is.
+        settings: Of the scaled world.
+        factor: Of all lengths and times.
     """
     old = EnsembleStore.open(source)
     scene = load_scene(settings.scene.name, settings.scene.options)

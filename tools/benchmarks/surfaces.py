@@ -46,14 +46,10 @@ NEW = ("beaker", "cone", "rings", "tower", "blob", "stool", "helix")
 class Case:
     """One row of the table.
 
-    Attributes
-    ----------
-    name : str
-        Of the row, and of its folder up to the seed.
-    settings : tuple of str
-        ``KEY=VALUE``, laid over the defaults.
-    repeated : bool
-        Whether it is fitted with every seed, and not with the first alone.
+    Attributes:
+        name: Of the row, and of its folder up to the seed.
+        settings: ``KEY=VALUE``, laid over the defaults.
+        repeated: Whether it is fitted with every seed, and not with the first alone.
     """
 
     name: str
@@ -251,15 +247,11 @@ GROUPS = {"procedural": [f"procedural-{seed}" for seed in PROCEDURAL], "new scen
 def table(rows: Sequence[Row]) -> str:
     """Return rows as lines of text, and medians and worst values of those that belong together.
 
-    Parameters
-    ----------
-    rows : sequence of dict
-        As :func:`surfaces` writes them.
+    Args:
+        rows: As :func:`surfaces` writes them.
 
-    Returns
-    -------
-    text : str
-        A worst value of one column may be of another run than that of the next.
+    Returns:
+        text: A worst value of one column may be of another run than that of the next.
     """
     order = {case.name: number for number, case in enumerate(CASES)}
     listed = sorted(rows, key=lambda row: (order.get(row["name"], len(order)), row["seed"]))

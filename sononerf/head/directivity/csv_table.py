@@ -28,10 +28,8 @@ Array = NDArray[np.float64]
 def read_csv(path: Path) -> Directivity:
     """Read a table of gains.
 
-    Raises
-    ------
-    InputError
-        If columns, values or lines are missing; the message names the line.
+    Raises:
+        InputError: If columns, values or lines are missing; the message names the line.
     """
     if path.stat().st_size > MOST_BYTES:
         raise InputError(f"{path}: larger than {MOST_BYTES} bytes")

@@ -41,15 +41,11 @@ Field = Callable[[str], NDArray[Any] | None]
 def read_mat(path: Path) -> Directivity:
     """Read a `.mat` file of version 5 or 7.3.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
+    Args:
+        path: The file.
 
-    Returns
-    -------
-    directivity : Directivity
-        Receiver 0 is the left ear. Azimuth counts to the left, elevation upward.
+    Returns:
+        directivity: Receiver 0 is the left ear. Azimuth counts to the left, elevation upward.
     """
     with path.open("rb") as file:
         is_new = b"MATLAB 7.3" in file.read(116)
@@ -179,10 +175,8 @@ NUMBERS = "biufc"
 def opened(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading; what the library says of a damaged one becomes one line.
 
-    Raises
-    ------
-    InputError
-        If it is missing, too large, damaged, or no HDF5 file.
+    Raises:
+        InputError: If it is missing, too large, damaged, or no HDF5 file.
     """
     try:
         if path.stat().st_size > MOST_BYTES:
@@ -199,10 +193,8 @@ def opened(path: Path) -> Iterator[h5py.File]:
 def find(group: h5py.Group, name: str) -> Any:
     """Return the group or dataset of a name in a group; None where there is none.
 
-    Raises
-    ------
-    InputError
-        If it is a link to somewhere else.
+    Raises:
+        InputError: If it is a link to somewhere else.
     """
     link = group.get(name, getlink=True)
     if link is None:
@@ -215,10 +207,8 @@ def find(group: h5py.Group, name: str) -> Any:
 def numbers(group: h5py.Group, name: str) -> NDArray[Any]:
     """Return a numeric dataset whole, real or complex.
 
-    Raises
-    ------
-    InputError
-        If it is missing, is no array of numbers, or lies outside the file.
+    Raises:
+        InputError: If it is missing, is no array of numbers, or lies outside the file.
     """
     path = group.file.filename
     array = find(group, name)

@@ -22,10 +22,8 @@ def read_directivity(path: Path) -> Directivity:
 def content_hash(path: Path) -> str:
     """Return the SHA-256 of a file.
 
-    Raises
-    ------
-    InputError
-        If it cannot be read.
+    Raises:
+        InputError: If it cannot be read.
     """
     try:
         with path.open("rb") as file:

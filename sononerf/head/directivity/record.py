@@ -21,25 +21,17 @@ Array = NDArray[np.float64]
 class Directivity:
     """Linear gains in the head frame (x forward, y left, z up).
 
-    Attributes
-    ----------
-    source : str
-        Where it was read from, for messages.
-    directions : (M, 3) float64
-        Unit vectors from the head to where sound comes from or goes to, in any order.
-    frequency : (F,) float64, Hz
-        Ascending.
-    gains : (E, M, F) float64
-        Of each receiver, zero or more.
-    beam : (M, F) float64 or None
-        Of the emitter; None where the file has none.
-    places : (E, 3) float64 or None, m
-        Of the receivers; None where the file does not state them.
+    Attributes:
+        source: Where it was read from, for messages.
+        directions (M, 3): Unit vectors from the head to where sound comes from or goes to, in any
+            order.
+        frequency ((F,), Hz): Ascending.
+        gains (E, M, F): Of each receiver, zero or more.
+        beam ((M, F) or None): Of the emitter; None where the file has none.
+        places ((E, 3) or None, m): Of the receivers; None where the file does not state them.
 
-    Raises
-    ------
-    InputError
-        If shapes do not fit, or a value is not allowed.
+    Raises:
+        InputError: If shapes do not fit, or a value is not allowed.
     """
 
     source: str

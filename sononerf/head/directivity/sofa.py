@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """Directivities as SOFA files, the standard AES69 [1]_: HDF5 with agreed names.
 
-References
-----------
-.. [1] AES69-2022, "AES standard for file exchange - Spatial acoustic data file format".
+References:
+    .. [1] AES69-2022, "AES standard for file exchange - Spatial acoustic data file format".
 """
 
 from __future__ import annotations
@@ -40,20 +39,14 @@ def read_sofa(path: Path) -> Directivity:
     direction. ``FreeFieldDirectivityTF`` is one transducer, measured as a source by receivers in
     all directions; it is taken to hear as it sends. Phases and delays are left out.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
+    Args:
+        path: The file.
 
-    Returns
-    -------
-    directivity : Directivity
-        In the listener's frame (of a transducer, the source's): its view is ahead.
+    Returns:
+        directivity: In the listener's frame (of a transducer, the source's): its view is ahead.
 
-    Raises
-    ------
-    InputError
-        If it is no SOFA file of these conventions, or a value is not allowed.
+    Raises:
+        InputError: If it is no SOFA file of these conventions, or a value is not allowed.
     """
     with opened(path) as file:
         if text(file, "Conventions") != "SOFA":
@@ -187,12 +180,9 @@ NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable.%10d"
 def directivity_of(ears: Ears, *, source: str = "settings") -> Directivity:
     """Return the tables of a head as a directivity, both ends of the azimuth axis once.
 
-    Parameters
-    ----------
-    ears : Ears
-        At the frequencies that are wanted.
-    source : str
-        Its name in messages.
+    Args:
+        ears: At the frequencies that are wanted.
+        source: Its name in messages.
     """
     directions = ears.directions[:, :-1].reshape(-1, 3)
 
@@ -211,14 +201,10 @@ def write_sofa(path: Path, directivity: Directivity, *, title: str = "directivit
     The emitter's gain, if there is one, is a last receiver with the description ``emitter``.
     Gains are written as real parts.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    directivity : Directivity
-        What is written.
-    title : str
-        Of the file.
+    Args:
+        path: The file.
+        directivity: What is written.
+        title: Of the file.
     """
     gains, places = directivity.gains, directivity.places
     names = [f"receiver {number}" for number in range(len(gains))]

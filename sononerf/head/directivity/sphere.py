@@ -39,17 +39,13 @@ Array = NDArray[np.float64]
 def interpolation(known: Array, wanted: Array) -> csr_array:
     """Return weights that bring values from known directions to wanted ones.
 
-    Parameters
-    ----------
-    known : (M, 3) float64
-        Unit vectors, at least one. Equal ones are averaged.
-    wanted : (N, 3) float64
-        Unit vectors.
+    Args:
+        known (M, 3): Unit vectors, at least one. Equal ones are averaged.
+        wanted (N, 3): Unit vectors.
 
-    Returns
-    -------
-    weights : (N, M) sparse float64
-        Rows sum to 1 in the measured area, to 0 farther than :data:`FADE` from it.
+    Returns:
+        weights ((N, M) sparse float64): Rows sum to 1 in the measured area, to 0 farther than
+            :data:`FADE` from it.
     """
     cells = np.round(known / SAME).astype(np.int64)
     _, first, same = np.unique(cells, axis=0, return_index=True, return_inverse=True)

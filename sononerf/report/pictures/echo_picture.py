@@ -62,41 +62,25 @@ def echo_png(
 
     Of more than three receivers three are drawn.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        The scene, metres.
-    points : (N, 3) float, m
-        Where sound was reflected towards the ears, world frame; none is allowed.
-    level_db : (N,) float, dB
-        How loud each is heard; drawn below the loudest.
-    position : (3,) float, m
-        Of the head, world frame.
-    rotation : (3, 3) float
-        Head to world.
-    echo : (E, S) float
-        Pressure at the receivers from the emission on, over that of the call at 1 m. Two of them
-        are the left and the right ear.
-    sampling_rate : float, Hz
-        Of the echo.
-    spectrogram_db : (E, R, F) float, dB
-        0 dB is silence.
-    range_m : (R,) float, m
-        Range axis, ascending; drawn only around what sounds.
-    frequency_hz : (F,) float, Hz
-        Frequency axis, ascending; drawn in kHz.
-    speed_of_sound : float, m/s
-        Puts the echo on the range axis.
-    title : str
-        One line above.
+    Args:
+        mesh: The scene, metres.
+        points ((N, 3), m): Where sound was reflected towards the ears, world frame; none is
+            allowed.
+        level_db ((N,), dB): How loud each is heard; drawn below the loudest.
+        position ((3,), m): Of the head, world frame.
+        rotation (3, 3): Head to world.
+        echo (E, S): Pressure at the receivers from the emission on, over that of the call at 1 m.
+            Two of them are the left and the right ear.
+        sampling_rate (Hz): Of the echo.
+        spectrogram_db ((E, R, F), dB): 0 dB is silence.
+        range_m ((R,), m): Range axis, ascending; drawn only around what sounds.
+        frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
+        speed_of_sound (m/s): Puts the echo on the range axis.
+        title: One line above.
 
-
-    Raises
-    ------
-    ValueError
-        If shapes do not fit.
-    NumericalError
-        If the mesh is empty or something is not finite.
+    Raises:
+        ValueError: If shapes do not fit.
+        NumericalError: If the mesh is empty or something is not finite.
     """
     ranges, frequencies = (np.asarray(axis, dtype=np.float64) for axis in (range_m, frequency_hz))
     hits = np.asarray(points, dtype=np.float64).reshape(-1, 3)
@@ -211,31 +195,21 @@ def hits_image(
 ) -> NDArray[np.uint8]:
     """Draw a scene with its hits and the head that hears them, seen over the head's shoulder.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        The scene, metres.
-    points : (N, 3) float, m
-        Hits, world frame; those behind something are hidden, and the faintest left out.
-    relative_db : (N,) float, dB
-        Their levels below the loudest, zero at most.
-    position : (3,) float, m
-        Of the head.
-    rotation : (3, 3) float
-        Head to world.
-    receivers : int
-        How many hear; of two, the head has ears.
-    size : (int, int)
-        Width and height in pixels.
+    Args:
+        mesh: The scene, metres.
+        points ((N, 3), m): Hits, world frame; those behind something are hidden, and the faintest
+            left out.
+        relative_db ((N,), dB): Their levels below the loudest, zero at most.
+        position ((3,), m): Of the head.
+        rotation (3, 3): Head to world.
+        receivers: How many hear; of two, the head has ears.
+        size (int, int): Width and height in pixels.
 
-    Returns
-    -------
-    pixels : (H, W, 3) uint8
+    Returns:
+        pixels: (H, W, 3) uint8.
 
-    Raises
-    ------
-    NumericalError
-        If the mesh is empty or something is not finite.
+    Raises:
+        NumericalError: If the mesh is empty or something is not finite.
     """
     if not len(mesh.faces):
         raise NumericalError("there is nothing to draw: the scene is empty")

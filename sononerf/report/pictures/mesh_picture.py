@@ -36,17 +36,11 @@ def mesh_png(
 ) -> bytes:
     """Draw a mesh in parallel projection, shaded, with a scale bar.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Metres; open meshes are seen from both sides.
-    size : (int, int)
-        Width and height in pixels.
-    view : (3,) float
-        Direction from the mesh to the camera, world frame; z is up.
-    colours : (3,) or (V, 3) float, optional
-        Colour in 0 to 1, one for all or one per vertex.
-
+    Args:
+        mesh: Metres; open meshes are seen from both sides.
+        size (int, int): Width and height in pixels.
+        view (3,): Direction from the mesh to the camera, world frame; z is up.
+        colours ((3,) or (V, 3)): Colour in 0 to 1, one for all or one per vertex.
     """
     _require_drawable(mesh, "the mesh")
     camera = camera_for(mesh.vertices, size=size, view=view)
@@ -63,17 +57,11 @@ def side_by_side_png(
 ) -> bytes:
     """Draw two meshes next to each other through the same camera.
 
-    Parameters
-    ----------
-    left, right : Trimesh
-        Metres, world frame.
-    titles : (str, str)
-        One line above each.
-    size : (int, int)
-        Width and height of each half in pixels.
-    view : (3,) float
-        Direction to the camera, world frame.
-
+    Args:
+        left, right: Metres, world frame.
+        titles (str, str): One line above each.
+        size (int, int): Width and height of each half in pixels.
+        view (3,): Direction to the camera, world frame.
     """
     for mesh, title in zip((left, right), titles, strict=True):
         _require_drawable(mesh, title or "a mesh")
@@ -97,24 +85,15 @@ def confidence_png(
 ) -> bytes:
     """Draw a mesh in the colours of its confidence, with a bar that tells what they mean.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Metres.
-    counts : (V,) int
-        How many poses heard the surface around each vertex.
-    size : (int, int)
-        Width and height in pixels.
-    view : (3,) float
-        Direction from the mesh to the camera, world frame; z is up.
+    Args:
+        mesh: Metres.
+        counts (V,): How many poses heard the surface around each vertex.
+        size (int, int): Width and height in pixels.
+        view (3,): Direction from the mesh to the camera, world frame; z is up.
 
-
-    Raises
-    ------
-    ValueError
-        If size, view or counts have a wrong shape.
-    NumericalError
-        If the mesh is empty or not finite.
+    Raises:
+        ValueError: If size, view or counts have a wrong shape.
+        NumericalError: If the mesh is empty or not finite.
     """
     _require_drawable(mesh, "the mesh")
     if np.shape(counts) != (len(mesh.vertices),):

@@ -58,19 +58,13 @@ def mip_png(
 ) -> bytes:
     """Draw one projection in millimetres.
 
-    Parameters
-    ----------
-    projection : (A, B) float
-        Greatest energy along the axis that is missing.
-    extents : ((low, high), (low, high)) float, m
-        Outer edges of the first (to the right) and the second axis (upwards).
-    labels : (str, str)
-        Names of the two axes.
-    title : str
-        One line above.
-    scale : {"db", "linear"}
-        Decibels below the greatest value (10 log10, 40 dB shown), or linear from zero.
-
+    Args:
+        projection (A, B): Greatest energy along the axis that is missing.
+        extents (((low, high), (low, high)), m): Outer edges of the first (to the right) and the
+            second axis (upwards).
+        labels (str, str): Names of the two axes.
+        title: One line above.
+        scale: Decibels below the greatest value (10 log10, 40 dB shown), or linear from zero.
     """
     values = _scaled(projection, scale)
     low, high = _limits(values, scale)
@@ -137,15 +131,12 @@ def mip_pngs(volume: Volume, *, scale: Scale = "db") -> dict[str, bytes]:
 def maximum_intensity_projections(volume: Volume) -> dict[str, NDArray[np.floating]]:
     """Return the greatest value along each axis.
 
-    Parameters
-    ----------
-    volume : Volume
-        Values (X, Y, Z).
+    Args:
+        volume: Values (X, Y, Z).
 
-    Returns
-    -------
-    projections : dict
-        ``"x"`` (Y, Z), ``"y"`` (X, Z) and ``"z"`` (X, Y), named by the axis looked along.
+    Returns:
+        projections: ``"x"`` (Y, Z), ``"y"`` (X, Z) and ``"z"`` (X, Y), named by the axis looked
+            along.
     """
     require_finite(volume)
     return {name: volume.values.max(axis=axis) for axis, name in enumerate("xyz")}
@@ -162,19 +153,13 @@ def difference_pngs(
 ) -> dict[str, bytes]:
     """Draw two volumes and their difference along each axis: ``"x"``, ``"y"``, ``"z"``.
 
-    Parameters
-    ----------
-    comparison : Comparison
-        What to draw; a ring marks the strongest difference, where there is one.
-    titles : (str, str)
-        Names of the two.
-    truth : (3,) float, m, optional
-        Where something was truly added; a cross marks it.
+    Args:
+        comparison: What to draw; a ring marks the strongest difference, where there is one.
+        titles (str, str): Names of the two.
+        truth ((3,), m): Where something was truly added; a cross marks it.
 
-    Returns
-    -------
-    pictures : dict
-        PNG files by the axis looked along.
+    Returns:
+        pictures: PNG files by the axis looked along.
     """
     volumes = (comparison.first, comparison.second, comparison.difference)
     projections = [maximum_intensity_projections(volume) for volume in volumes[:2]]
@@ -234,14 +219,10 @@ def overlay_png(
 ) -> bytes:
     """Draw a mesh coloured by the difference next to its surface: red where the first has more.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Metres, world frame.
-    comparison : Comparison
-        The difference.
-    view : (3,) float
-        Direction to the camera.
+    Args:
+        mesh: Metres, world frame.
+        comparison: The difference.
+        view (3,): Direction to the camera.
     """
     from matplotlib import colormaps
     from scipy.ndimage import map_coordinates

@@ -31,22 +31,14 @@ def pings_png(
 ) -> bytes:
     """Draw the first pings of an import, so that a wrong convention can be seen.
 
-    Parameters
-    ----------
-    waveforms : sequence of (E, S) float
-        From the emission on.
-    spectrograms : sequence of (E, R, F) float
-        Linear magnitude.
-    labels : sequence of str
-        Names of these pings.
-    sampling_rate : float, Hz
-        Of the waveforms.
-    range_m : (R,) float, m
-        Ascending.
-    frequency_hz : (F,) float, Hz
-        Ascending.
-    poses : Poses
-        Of all pings; the first ones are marked.
+    Args:
+        waveforms (sequence of (E, S) float): From the emission on.
+        spectrograms (sequence of (E, R, F) float): Linear magnitude.
+        labels: Names of these pings.
+        sampling_rate (Hz): Of the waveforms.
+        range_m ((R,), m): Ascending.
+        frequency_hz ((F,), Hz): Ascending.
+        poses: Of all pings; the first ones are marked.
     """
     rows = len(labels)
     with figure(10.5, 3.4 + 2.2 * rows, 100, layout="constrained") as drawn:

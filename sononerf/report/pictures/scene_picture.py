@@ -44,30 +44,19 @@ def scene_png(
 ) -> bytes:
     """Draw a scene with where the calls come from and where they go.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        The scene, metres.
-    poses_positions : (P, 3) float, m
-        Heads, drawn as dots; paler the further away.
-    poses_forward : (P, 3) float
-        Directions of look, drawn as strokes.
-    region_box : ((3,), (3,)) float, m, optional
-        Opposite corners of the box that is fitted.
-    split : (P,) int, optional
-        What each pose is for: 0 train, 1 validation, 2 test; each has a colour of its own.
-    size : (int, int)
-        Width and height in pixels.
-    view : (3,) float
-        Direction to the camera, world frame.
+    Args:
+        mesh: The scene, metres.
+        poses_positions ((P, 3), m): Heads, drawn as dots; paler the further away.
+        poses_forward (P, 3): Directions of look, drawn as strokes.
+        region_box (((3,), (3,)), m): Opposite corners of the box that is fitted.
+        split (P,): What each pose is for: 0 train, 1 validation, 2 test; each has a colour of its
+            own.
+        size (int, int): Width and height in pixels.
+        view (3,): Direction to the camera, world frame.
 
-
-    Raises
-    ------
-    ValueError
-        If the poses' shapes do not fit.
-    NumericalError
-        If the mesh is empty or something is not finite.
+    Raises:
+        ValueError: If the poses' shapes do not fit.
+        NumericalError: If the mesh is empty or something is not finite.
     """
     heads = np.asarray(poses_positions, dtype=np.float64).reshape(-1, 3)
     looks = np.asarray(poses_forward, dtype=np.float64).reshape(-1, 3)

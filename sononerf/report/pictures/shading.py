@@ -26,16 +26,11 @@ AMBIENT = 0.27
 class Camera:
     """A parallel projection.
 
-    Parameters
-    ----------
-    axes : (3, 3) float
-        Rows: towards the camera, to the right, upwards; orthonormal.
-    centre : (3,) float, m
-        What stands in the middle of the picture.
-    width, height : int
-        Pixels.
-    scale : float
-        Pixels per metre.
+    Args:
+        axes (3, 3): Rows: towards the camera, to the right, upwards; orthonormal.
+        centre ((3,), m): What stands in the middle of the picture.
+        width, height: Pixels.
+        scale: Pixels per metre.
     """
 
     axes: NDArray[np.float64]
@@ -61,12 +56,9 @@ def camera_for(
 ) -> Camera:
     """Place a camera so that points (N, 3) fill a share of a picture (width, height).
 
-    Raises
-    ------
-    ValueError
-        If the view has no direction or the size is not positive.
-    NumericalError
-        If there is no point, or one is not finite.
+    Raises:
+        ValueError: If the view has no direction or the size is not positive.
+        NumericalError: If there is no point, or one is not finite.
     """
     cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     towards = np.asarray(view, dtype=np.float64)
@@ -115,21 +107,14 @@ def draw_mesh(
 ) -> NDArray[np.float64]:
     """Draw a mesh over pixels, in place.
 
-    Parameters
-    ----------
-    pixels : (H, W, 3) float
-        Colours in 0 to 1.
-    mesh : Trimesh
-        Metres.
-    camera : Camera
-        Of the same width and height as the pixels.
-    colour : (3,) or (V, 3) float
-        Colour in 0 to 1, one for all or one per vertex.
+    Args:
+        pixels (H, W, 3): Colours in 0 to 1.
+        mesh: Metres.
+        camera: Of the same width and height as the pixels.
+        colour ((3,) or (V, 3)): Colour in 0 to 1, one for all or one per vertex.
 
-    Returns
-    -------
-    nearness : (H, W) float, m
-        Of what was drawn; minus infinity where nothing was.
+    Returns:
+        nearness ((H, W), m): Of what was drawn; minus infinity where nothing was.
     """
     height, width = pixels.shape[:2]
     local = (np.asarray(mesh.vertices) - camera.centre) @ camera.axes.T

@@ -32,19 +32,13 @@ def spectrogram_png(
 ) -> bytes:
     """Draw one pose's spectrograms, one row per receiver, of eight at most.
 
-    Parameters
-    ----------
-    measured_db : (E, R, F) float or None, dB
-        0 dB is silence; the prediction alone is drawn where None.
-    predicted_db : (E, R, F) float, dB
-        The same.
-    range_m : (R,) float, m
-        Range axis, ascending; drawn only around what sounds.
-    frequency_hz : (F,) float, Hz
-        Frequency axis, ascending; drawn in kHz.
-    title : str
-        One line above.
-
+    Args:
+        measured_db ((E, R, F) or None, dB): 0 dB is silence; the prediction alone is drawn where
+            None.
+        predicted_db ((E, R, F), dB): The same.
+        range_m ((R,), m): Range axis, ascending; drawn only around what sounds.
+        frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
+        title: One line above.
     """
     return png_from_pixels(_pixels(measured_db, predicted_db, range_m, frequency_hz, title, 130))
 
@@ -102,12 +96,9 @@ def _checked(
 def drawn_receivers(count: int, most: int = MOST_ROWS) -> tuple[NDArray[np.int64], list[str]]:
     """Return which receivers are drawn, evenly chosen, and their names.
 
-    Parameters
-    ----------
-    count : int
-        How many there are.
-    most : int
-        How many are drawn at most.
+    Args:
+        count: How many there are.
+        most: How many are drawn at most.
     """
     chosen = np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
     if count == 2:

@@ -57,31 +57,23 @@ class Boundary(Solved):
     and its flat triangles are taken as they are: of a sphere that is given as an inscribed
     polyhedron, the echo comes later by twice the depth of the facets.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is ensonified.
-    hearing : Hearing
-        Head and air.
-    frequency_max : float, Hz
-        Where the response has fallen to zero.
-    edges_per_wavelength : float
-        Mean edges of the mesh over which the wavelength reaches.
+    Args:
+        scene: What is ensonified.
+        hearing: Head and air.
+        frequency_max (Hz): Where the response has fallen to zero.
+        edges_per_wavelength: Mean edges of the mesh over which the wavelength reaches.
 
-    Raises
-    ------
-    InputError
-        If a body is open, or two of them overlap.
-    ResourceError
-        If the matrix needs more memory than is free, or the solution more than a week.
+    Raises:
+        InputError: If a body is open, or two of them overlap.
+        ResourceError: If the matrix needs more memory than is free, or the solution more than a
+            week.
 
-    References
-    ----------
-    .. [1] A. J. Burton and G. F. Miller, "The application of integral equation methods to the
-       numerical solution of some exterior boundary-value problems", Proceedings of the Royal
-       Society A 323, 1971.
-    .. [2] S. Marburg, "The Burton and Miller method: unlocking another mystery of its coupling
-       parameter", Journal of Computational Acoustics 24, 2016.
+    References:
+        .. [1] A. J. Burton and G. F. Miller, "The application of integral equation methods to the
+           numerical solution of some exterior boundary-value problems", Proceedings of the Royal
+           Society A 323, 1971.
+        .. [2] S. Marburg, "The Burton and Miller method: unlocking another mystery of its coupling
+           parameter", Journal of Computational Acoustics 24, 2016.
     """
 
     def __init__(
@@ -195,16 +187,11 @@ def excitation(
 ) -> NDArray[np.complex128]:
     """Return the right-hand sides (V, P), m: the incident waves and their normal derivatives.
 
-    Parameters
-    ----------
-    panels : Panels
-        The surface.
-    wavenumber : complex, 1/m
-        Its imaginary part is not positive.
-    emitters : (P, 3) float64, m
-        Points that send e^{-jkr} / r.
-    beam : (P, Q) float64
-        Their gains towards the panels' points.
+    Args:
+        panels: The surface.
+        wavenumber (1/m): Its imaginary part is not positive.
+        emitters ((P, 3), m): Points that send e^{-jkr} / r.
+        beam (P, Q): Their gains towards the panels' points.
     """
     distance, cosine = _ways(panels, emitters)
     slope = coupling(wavenumber) * (1j * wavenumber + 1.0 / distance) * cosine
@@ -221,21 +208,15 @@ def radiated(
 ) -> NDArray[np.complex128]:
     """Return the scattered pressure at ears.
 
-    Parameters
-    ----------
-    panels : Panels
-        The surface.
-    wavenumber : complex, 1/m
-        Its imaginary part is not positive.
-    pressure : (P, Q) complex
-        On the panels' points, for each pose; the ear's gain included.
-    ears : (P, 3) float64, m
-        One for each pose.
+    Args:
+        panels: The surface.
+        wavenumber (1/m): Its imaginary part is not positive.
+        pressure ((P, Q) complex): On the panels' points, for each pose; the ear's gain included.
+        ears ((P, 3), m): One for each pose.
 
-    Returns
-    -------
-    heard : (P,) complex128
-        The integral of the pressure times the normal derivative of e^{-jkr} / 4 pi r.
+    Returns:
+        heard ((P,) complex128): The integral of the pressure times the normal derivative of
+            e^{-jkr} / 4 pi r.
     """
     distance, cosine = _ways(panels, ears)
     kernel = (1j * wavenumber + 1.0 / distance) * np.exp(-1j * wavenumber * distance) / distance

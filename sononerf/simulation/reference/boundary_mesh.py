@@ -29,20 +29,14 @@ def expected_vertices(area: float, edge: float) -> int:
 def closed_bodies(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Return a surface with each vertex once, if its bodies are closed.
 
-    Parameters
-    ----------
-    mesh : trimesh.Trimesh
-        Anticlockwise triangles as seen from outside.
+    Args:
+        mesh: Anticlockwise triangles as seen from outside.
 
-    Returns
-    -------
-    bodies : trimesh.Trimesh
-        Without triangles that have no area.
+    Returns:
+        bodies: Without triangles that have no area.
 
-    Raises
-    ------
-    InputError
-        If a body is open.
+    Raises:
+        InputError: If a body is open.
     """
     bodies = trimesh.Trimesh(
         np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), process=False
@@ -63,10 +57,8 @@ def closed_bodies(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 def check_apart(bodies: trimesh.Trimesh) -> None:
     """Refuse bodies that overlap, touch, or are inside out.
 
-    Raises
-    ------
-    InputError
-        If other triangles than the own one are just above a triangle's middle.
+    Raises:
+        InputError: If other triangles than the own one are just above a triangle's middle.
     """
     size = np.sqrt(bodies.area_faces)
     above = bodies.triangles_center + OUTSIDE * size[:, None] * bodies.face_normals
@@ -86,22 +78,16 @@ def suited(bodies: trimesh.Trimesh, edge: float) -> trimesh.Trimesh:
     The coarsest mesh is taken that deviates by no more than a twentieth of ``edge``. Long edges
     are halved; curved surfaces stay as flat as they are.
 
-    Parameters
-    ----------
-    bodies : trimesh.Trimesh
-        As :func:`closed_bodies` returns them.
-    edge : float, m
-        The wanted length of edges.
+    Args:
+        bodies: As :func:`closed_bodies` returns them.
+        edge (m): The wanted length of edges.
 
-    Returns
-    -------
-    mesh : trimesh.Trimesh
-        Closed as well.
+    Returns:
+        mesh: Closed as well.
 
-    References
-    ----------
-    .. [1] M. Garland and P. S. Heckbert, "Surface simplification using quadric error metrics",
-       SIGGRAPH 1997.
+    References:
+        .. [1] M. Garland and P. S. Heckbert, "Surface simplification using quadric error metrics",
+           SIGGRAPH 1997.
     """
     least = expected_vertices(bodies.area, edge)
     best = halved(bodies, LONG * edge)
@@ -149,22 +135,17 @@ def halved(mesh: trimesh.Trimesh, longest: float) -> trimesh.Trimesh:
     other edges. Then diagonals of flat quadrilaterals are turned where that makes them shorter
     in Delaunay's sense. So long thin triangles become shorter and not thinner.
 
-    Parameters
-    ----------
-    mesh : trimesh.Trimesh
-        Closed or not.
-    longest : float, m
-        No edge stays longer.
+    Args:
+        mesh: Closed or not.
+        longest (m): No edge stays longer.
 
-    Returns
-    -------
-    mesh : trimesh.Trimesh
-        The same surface, within ``FLAT`` of the longest edge. Closed if it was closed.
+    Returns:
+        mesh: The same surface, within ``FLAT`` of the longest edge. Closed if it was closed.
 
-    References
-    ----------
-    .. [1] M.-C. Rivara, "Algorithms for refining triangular grids suitable for adaptive and
-       multigrid techniques", International Journal for Numerical Methods in Engineering 20, 1984.
+    References:
+        .. [1] M.-C. Rivara, "Algorithms for refining triangular grids suitable for adaptive and
+           multigrid techniques", International Journal for Numerical Methods in Engineering 20,
+           1984.
     """
     vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
     while True:
@@ -189,16 +170,11 @@ def halved(mesh: trimesh.Trimesh, longest: float) -> trimesh.Trimesh:
 class _Edges:
     """The edges of triangles, each once.
 
-    Attributes
-    ----------
-    ends : (Q, 2) int64
-        Vertices.
-    sides : (T, 3) int64
-        Edge opposite to each corner.
-    length : (Q,) float64, m
-        Of each.
-    pair : (Q, 2) int64
-        Its two triangles; -1 where there are not just two.
+    Attributes:
+        ends (Q, 2): Vertices.
+        sides (T, 3): Edge opposite to each corner.
+        length ((Q,), m): Of each.
+        pair (Q, 2): Its two triangles; -1 where there are not just two.
     """
 
     def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:

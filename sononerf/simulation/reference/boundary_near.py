@@ -5,13 +5,12 @@ The kernel is :math:`e^{-jkR} / R`. Its terms :math:`1 / R` and :math:`-k^2 R / 
 normal derivative, are integrated over a triangle in closed form [1]_ [2]_. What is left is smooth
 and does not depend on how near the triangles are. So one table serves all frequencies.
 
-References
-----------
-.. [1] D. R. Wilton, S. M. Rao, A. W. Glisson, D. H. Schaubert, O. M. Al-Bundak and C. M. Butler,
-   "Potential integrals for uniform and linear source distributions on polygonal and polyhedral
-   domains", IEEE Transactions on Antennas and Propagation 32, 1984.
-.. [2] R. D. Graglia, "On the numerical integration of the linear shape functions times the 3-D
-   Green's function or its gradient on a plane triangle", the same journal 41, 1993.
+References:
+    .. [1] D. R. Wilton, S. M. Rao, A. W. Glisson, D. H. Schaubert, O. M. Al-Bundak and C. M.
+       Butler, "Potential integrals for uniform and linear source distributions on polygonal and
+       polyhedral domains", IEEE Transactions on Antennas and Propagation 32, 1984.
+    .. [2] R. D. Graglia, "On the numerical integration of the linear shape functions times the 3-D
+       Green's function or its gradient on a plane triangle", the same journal 41, 1993.
 """
 
 from __future__ import annotations
@@ -49,21 +48,14 @@ def potentials(corners: Reals, normals: Reals, slopes: Reals, points: Reals) -> 
     above the triangle's plane, the functions of the three corners are integrated times
     :math:`1/R`, :math:`R`, :math:`z/R^3` and :math:`z/R`. In the plane itself the third is 0.
 
-    Parameters
-    ----------
-    corners : (N, 3, 3) float64, m
-        Of the triangles.
-    normals : (N, 3) float64
-        Unit vectors.
-    slopes : (N, 3, 3) float64, 1/m
-        Gradients of the corners' functions.
-    points : (N, K, 3) float64, m
-        On none of the edges.
+    Args:
+        corners ((N, 3, 3), m): Of the triangles.
+        normals (N, 3): Unit vectors.
+        slopes ((N, 3, 3), 1/m): Gradients of the corners' functions.
+        points ((N, K, 3), m): On none of the edges.
 
-    Returns
-    -------
-    found : (4, N, K, 3) float64
-        In m, m3, 1 and m2, for each corner.
+    Returns:
+        found (4, N, K, 3): In m, m3, 1 and m2, for each corner.
     """
     away = corners[:, None] - points[:, :, None]  # (N, K, 3, 3): to the corners
     far = np.sqrt(_dot(away, away))
@@ -140,11 +132,10 @@ def near_pairs(panels: Panels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 def corrections(panels: Panels) -> tuple[csr_array, ...]:
     r"""Integrate what the middles of edges leave out between near triangles.
 
-    Returns
-    -------
-    found : five of (V, V)
-        Of the hypersingular operator the terms in :math:`k^0`, :math:`k^2` and :math:`k^4`, then
-        those of the double layer in :math:`k^0` and :math:`k^2`, times :math:`4 \pi`.
+    Returns:
+        found (five of (V, V)): Of the hypersingular operator the terms in :math:`k^0`, :math:`k^2`
+            and :math:`k^4`, then those of the double layer in :math:`k^0` and :math:`k^2`, times
+            :math:`4 \pi`.
     """
     one, other = near_pairs(panels)
     sums: list[Any] = [0.0] * 5
@@ -207,28 +198,17 @@ Reals = NDArray[np.float64]
 class Panels:
     """A closed surface and its quadrature points, the middles of its edges.
 
-    Attributes
-    ----------
-    vertices : (V, 3) float64, m
-        Unknowns are the pressures here.
-    faces : (T, 3) int64
-        Anticlockwise as seen from outside.
-    area : (T,) float64, m2
-        Of the triangles.
-    normals : (T, 3) float64
-        Outward unit vectors.
-    slopes : (T, 3, 3) float64, 1/m
-        Gradients of the three corners' linear functions.
-    ends : (Q, 2) int64
-        Vertices of the edges.
-    sides : (T, 3) int64
-        Edge opposite to each corner.
-    points : (Q, 3) float64, m
-        Middles of the edges.
-    weights : (Q,) float64, m2
-        A third of the triangles about an edge.
-    vectors : (Q, 3) float64, m2
-        The same, times their normals.
+    Attributes:
+        vertices ((V, 3), m): Unknowns are the pressures here.
+        faces (T, 3): Anticlockwise as seen from outside.
+        area ((T,), m2): Of the triangles.
+        normals (T, 3): Outward unit vectors.
+        slopes ((T, 3, 3), 1/m): Gradients of the three corners' linear functions.
+        ends (Q, 2): Vertices of the edges.
+        sides (T, 3): Edge opposite to each corner.
+        points ((Q, 3), m): Middles of the edges.
+        weights ((Q,), m2): A third of the triangles about an edge.
+        vectors ((Q, 3), m2): The same, times their normals.
     """
 
     vertices: Reals

@@ -5,12 +5,11 @@ Pressure is linear between the vertices. Both operators are Galerkin's. The norm
 the double layer is written by Maue's formula, with the kernel of the single layer alone [1]_ [2]_.
 Pairs of triangles are integrated by the middles of their edges; near pairs are corrected.
 
-References
-----------
-.. [1] A.-W. Maue, "Zur Formulierung eines allgemeinen Beugungsproblems durch eine
-   Integralgleichung", Zeitschrift für Physik 126, 1949.
-.. [2] J.-C. Nédélec, "Integral equations with non integrable kernels", Integral Equations and
-   Operator Theory 5, 1982.
+References:
+    .. [1] A.-W. Maue, "Zur Formulierung eines allgemeinen Beugungsproblems durch eine
+       Integralgleichung", Zeitschrift für Physik 126, 1949.
+    .. [2] J.-C. Nédélec, "Integral equations with non integrable kernels", Integral Equations and
+       Operator Theory 5, 1982.
 """
 
 from __future__ import annotations
@@ -30,15 +29,11 @@ BLOCK = 1 << 21  # entries of the kernel at a time
 class Operators:
     """The matrix of Burton and Miller's equation on a surface, for any wavenumber.
 
-    Parameters
-    ----------
-    panels : Panels
-        The surface.
+    Args:
+        panels: The surface.
 
-    Attributes
-    ----------
-    panels : Panels
-        The surface.
+    Attributes:
+        panels: The surface.
     """
 
     def __init__(self, panels: Panels) -> None:
@@ -51,10 +46,8 @@ class Operators:
     def matrix(self, wavenumber: complex) -> NDArray[np.complex64]:
         r"""Return :math:`\frac12 M - D - \beta H` (V, V), m2, with :math:`\beta = -j / k`.
 
-        Parameters
-        ----------
-        wavenumber : complex, 1/m
-            Its imaginary part is zero or less.
+        Args:
+            wavenumber (1/m): Its imaginary part is zero or less.
         """
         k = complex(wavenumber)
         beta = coupling(k)

@@ -28,12 +28,9 @@ Array = NDArray[np.complex128]
 class Ball:
     """A sphere.
 
-    Attributes
-    ----------
-    centre : (3,) float64, m
-        World frame.
-    radius : float, m
-        Of its surface.
+    Attributes:
+        centre ((3,), m): World frame.
+        radius (m): Of its surface.
     """
 
     centre: NDArray[np.float64]
@@ -44,14 +41,10 @@ class Ball:
 class Link:
     """The axis between two spheres.
 
-    Attributes
-    ----------
-    one, two : int
-        Numbers of the spheres; the axis points from the first to the second.
-    length : float, m
-        Between the centres.
-    polar, azimuth : float, rad
-        Of the axis.
+    Attributes:
+        one, two: Numbers of the spheres; the axis points from the first to the second.
+        length (m): Between the centres.
+        polar, azimuth (rad): Of the axis.
     """
 
     one: int
@@ -67,18 +60,13 @@ class Coupling:
     Waves are arrays (K, P): for each sphere the harmonics ``n, m`` at row ``n (n + 1) + m`` of its
     rows, each relative to its Hankel function on the sphere; P poses.
 
-    Parameters
-    ----------
-    balls : list of Ball
-        The spheres.
-    degrees : list of int
-        Highest degree of each.
-    wavenumber : complex, 1/m
-        Of sound in air.
-    links : list of Link
-        The axes between them.
-    turns : list of list of (2 n + 1, 2 n + 1) float64
-        Wigner's matrices of each link by degree.
+    Args:
+        balls: The spheres.
+        degrees: Highest degree of each.
+        wavenumber (1/m): Of sound in air.
+        links: The axes between them.
+        turns (list of list of (2 n + 1, 2 n + 1) float64): Wigner's matrices of each link by
+            degree.
     """
 
     def __init__(

@@ -23,20 +23,13 @@ BORDER_CUTS = 4  # of pieces that are seen in part: into 16, a quarter as long
 class Elements:
     """Small flat pieces of surface, on the side that the emitter sees.
 
-    Attributes
-    ----------
-    points : (N, 3) float64, m
-        Their middles.
-    corners : (N, 3, 3) float64, m
-        Seen from the middles.
-    triangle : (N,) int64
-        Of the mesh.
-    area : (N,) float64, m2
-        Of each.
-    normals : (N, 3) float64
-        Of the smooth surface, unit vectors.
-    heard : (N, E) bool
-        Whether emitter and ear see them.
+    Attributes:
+        points ((N, 3), m): Their middles.
+        corners ((N, 3, 3), m): Seen from the middles.
+        triangle (N,): Of the mesh.
+        area ((N,), m2): Of each.
+        normals (N, 3): Of the smooth surface, unit vectors.
+        heard (N, E): Whether emitter and ear see them.
     """
 
     points: NDArray[np.float64]
@@ -73,22 +66,16 @@ class Kirchhoff(Engine):
     the flat triangles, angles those of the smooth surface: a sphere of triangles up to one
     wavelength long is as good as a round one.
 
-    Parameters
-    ----------
-    scene : Scene
-        What is ensonified.
-    hearing : Hearing
-        Head and air.
-    frequency_max : float, Hz
-        Up to which the echo is right; higher ones fade.
-    elements_per_wavelength : float
-        Pieces over which the way varies by one wavelength of ``frequency_max``; no piece is
-        longer than the wavelength.
+    Args:
+        scene: What is ensonified.
+        hearing: Head and air.
+        frequency_max (Hz): Up to which the echo is right; higher ones fade.
+        elements_per_wavelength: Pieces over which the way varies by one wavelength of
+            ``frequency_max``; no piece is longer than the wavelength.
 
-    References
-    ----------
-    .. [1] J. J. Bowman, T. B. A. Senior and P. L. E. Uslenghi, "Electromagnetic and Acoustic
-       Scattering by Simple Shapes", North-Holland 1969, chapter 1 (physical optics).
+    References:
+        .. [1] J. J. Bowman, T. B. A. Senior and P. L. E. Uslenghi, "Electromagnetic and Acoustic
+           Scattering by Simple Shapes", North-Holland 1969, chapter 1 (physical optics).
     """
 
     def __init__(

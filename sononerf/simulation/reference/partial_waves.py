@@ -19,19 +19,13 @@ def log_outgoing(degree: int, argument: Array) -> tuple[Array, Array]:
     The ratio of neighbours follows by the recurrence upwards, which is stable for them
     (DLMF 10.51.1); functions of degrees far above the argument do not overflow.
 
-    Parameters
-    ----------
-    degree : int
-        Highest, N.
-    argument : (X,) complex128
-        Not zero.
+    Args:
+        degree: Highest, N.
+        argument ((X,) complex128): Not zero.
 
-    Returns
-    -------
-    logarithm : (N + 1, X) complex128
-        Of the function, up to multiples of 2 pi j.
-    slope : (N + 1, X) complex128
-        Derivative over function.
+    Returns:
+        logarithm ((N + 1, X) complex128): Of the function, up to multiples of 2 pi j.
+        slope ((N + 1, X) complex128): Derivative over function.
     """
     logarithm = np.zeros((degree + 1, len(argument)), dtype=np.complex128)
     slope = np.zeros_like(logarithm)
@@ -48,17 +42,13 @@ def log_outgoing(degree: int, argument: Array) -> tuple[Array, Array]:
 def legendre(degree: int, cosine: NDArray[np.float64]) -> NDArray[np.float64]:
     """Associated Legendre functions, normalised for spherical harmonics, with (-1)^m in them.
 
-    Parameters
-    ----------
-    degree : int
-        Highest, N.
-    cosine : (X,) float64
-        Of the polar angle.
+    Args:
+        degree: Highest, N.
+        cosine (X,): Of the polar angle.
 
-    Returns
-    -------
-    values : (N + 1, N + 1, X) float64
-        By order m, then by degree n; zero where n < m. Times exp(j m phi) they are orthonormal.
+    Returns:
+        values (N + 1, N + 1, X): By order m, then by degree n; zero where n < m. Times exp(j m phi)
+            they are orthonormal.
     """
     values = np.zeros((degree + 1, degree + 1, len(cosine)))
     sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
@@ -78,17 +68,12 @@ def legendre(degree: int, cosine: NDArray[np.float64]) -> NDArray[np.float64]:
 def harmonics(degree: int, directions: NDArray[np.float64]) -> Array:
     """Orthonormal spherical harmonics.
 
-    Parameters
-    ----------
-    degree : int
-        Highest, N.
-    directions : (X, 3) float64
-        Unit vectors.
+    Args:
+        degree: Highest, N.
+        directions (X, 3): Unit vectors.
 
-    Returns
-    -------
-    values : ((N + 1)^2, X) complex128
-        At row n (n + 1) + m.
+    Returns:
+        values (((N + 1)^2, X) complex128): At row n (n + 1) + m.
     """
     table = legendre(degree, np.clip(directions[:, 2], -1.0, 1.0))
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
@@ -106,17 +91,12 @@ def harmonics(degree: int, directions: NDArray[np.float64]) -> Array:
 def wigner(degree: int, angles: list[float]) -> list[NDArray[np.float64]]:
     """Matrices of one degree n that turn spherical harmonics about y.
 
-    Parameters
-    ----------
-    degree : int
-        n.
-    angles : list of float, rad
-        Of the turns.
+    Args:
+        degree: n.
+        angles (list of float, rad): Of the turns.
 
-    Returns
-    -------
-    matrices : list of (2 n + 1, 2 n + 1) float64
-        Of exp(-j angle J_y), orders ascending.
+    Returns:
+        matrices (list of (2 n + 1, 2 n + 1) float64): Of exp(-j angle J_y), orders ascending.
     """
     m = np.arange(-degree, degree + 1)
     off = 0.5 * np.sqrt(degree * (degree + 1) - m[:-1] * (m[:-1] + 1.0))

@@ -65,39 +65,29 @@ class Spheres(Solved):
 
     Beam and ears are taken towards the centres of the spheres.
 
-    Parameters
-    ----------
-    scene : Scene
-        Rigid spheres that do not touch, as closed meshes.
-    hearing : Hearing
-        Head and air.
-    frequency_max
-        See :class:`Solved`.
-    orders : int, optional
-        Sum orders of scattering up to this one and solve nothing: 1 leaves out what one sphere
-        sends to another. For diagnosis.
+    Args:
+        scene: Rigid spheres that do not touch, as closed meshes.
+        hearing: Head and air.
+        frequency_max: See :class:`Solved`.
+        orders: Sum orders of scattering up to this one and solve nothing: 1 leaves out what one
+            sphere sends to another. For diagnosis.
 
-    Attributes
-    ----------
-    balls : list of Ball
-        The spheres of the scene.
+    Attributes:
+        balls: The spheres of the scene.
 
-    Raises
-    ------
-    InputError
-        If the scene has anything else than rigid spheres, if two of them touch, or if they need
-        too many partial waves.
+    Raises:
+        InputError: If the scene has anything else than rigid spheres, if two of them touch, or if
+            they need too many partial waves.
 
-    References
-    ----------
-    .. [1] NIST Digital Library of Mathematical Functions, 10.60.1 and 10.60.2.
-    .. [2] N. A. Gumerov and R. Duraiswami, "Fast Multipole Methods for the Helmholtz Equation in
-       Three Dimensions", Elsevier 2004; the same, "Computation of scattering from N spheres using
-       multipole reexpansion", Journal of the Acoustical Society of America 112, 2002.
-    .. [3] X. M. Feng, P. Wang, W. Yang and G. R. Jin, "High-precision evaluation of Wigner's d
-       matrix by exact diagonalization", Physical Review E 92, 043307, 2015.
-    .. [4] S. C. Eisenstat, H. C. Elman and M. H. Schultz, "Variational iterative methods for
-       nonsymmetric systems of linear equations", SIAM Journal on Numerical Analysis 20, 1983.
+    References:
+        .. [1] NIST Digital Library of Mathematical Functions, 10.60.1 and 10.60.2.
+        .. [2] N. A. Gumerov and R. Duraiswami, "Fast Multipole Methods for the Helmholtz Equation
+           in Three Dimensions", Elsevier 2004; the same, "Computation of scattering from N spheres
+           using multipole reexpansion", Journal of the Acoustical Society of America 112, 2002.
+        .. [3] X. M. Feng, P. Wang, W. Yang and G. R. Jin, "High-precision evaluation of Wigner's d
+           matrix by exact diagonalization", Physical Review E 92, 043307, 2015.
+        .. [4] S. C. Eisenstat, H. C. Elman and M. H. Schultz, "Variational iterative methods for
+           nonsymmetric systems of linear equations", SIAM Journal on Numerical Analysis 20, 1983.
     """
 
     def __init__(
@@ -122,12 +112,9 @@ class Spheres(Solved):
     def degrees(self, wavenumber: float, nearest: float) -> list[int]:
         """Highest degree of each sphere's partial waves.
 
-        Parameters
-        ----------
-        wavenumber : float, 1/m
-            Of sound in air.
-        nearest : float
-            Distance of the nearest emitter or ear from a sphere's centre, over its radius.
+        Args:
+            wavenumber (1/m): Of sound in air.
+            nearest: Distance of the nearest emitter or ear from a sphere's centre, over its radius.
         """
         found = []
         for index, ball in enumerate(self.balls):
@@ -172,19 +159,13 @@ class Spheres(Solved):
     ) -> Array:
         """Scattered pressure at points, of an emitter that sends alike in all directions.
 
-        Parameters
-        ----------
-        wavenumber : complex, 1/m
-            Of sound in air; its imaginary part is not positive.
-        emitter : (3,) float64, m
-            World frame; its pressure is 1 at 1 m.
-        points : (X, 3) float64, m
-            World frame, outside the spheres or on them.
+        Args:
+            wavenumber (1/m): Of sound in air; its imaginary part is not positive.
+            emitter ((3,), m): World frame; its pressure is 1 at 1 m.
+            points ((X, 3), m): World frame, outside the spheres or on them.
 
-        Returns
-        -------
-        pressure : (X,) complex128
-            Without the emission itself.
+        Returns:
+            pressure ((X,) complex128): Without the emission itself.
         """
         coupling = self._coupling(wavenumber, emitter[None])
         waves = self._scattered(coupling, coupling.emitted(emitter[None]))
@@ -271,15 +252,11 @@ class Spheres(Solved):
 def find_balls(scene: Scene) -> list[Ball]:
     """Recognise the spheres of a scene.
 
-    Parameters
-    ----------
-    scene : Scene
-        Closed meshes.
+    Args:
+        scene: Closed meshes.
 
-    Returns
-    -------
-    balls : list of Ball
-        One for each connected part of the mesh.
+    Returns:
+        balls: One for each connected part of the mesh.
     """
     vertices = np.asarray(scene.mesh.vertices, dtype=np.float64)
     same = np.round(vertices / (TWICE * np.ptp(vertices, axis=0).max()))

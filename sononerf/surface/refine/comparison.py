@@ -34,16 +34,11 @@ class Comparison:
     quiet poses hear edges, whose echoes change by decibels where one is rounded by a tenth of a
     wavelength. Physical optics instead of rays ranks surfaces with edges badly.
 
-    Parameters
-    ----------
-    echoes : Echoes
-        What was measured.
-    optics : Optics
-        The head.
-    onsets : OnsetRanges
-        Onsets of the training poses.
-    seed : int
-        Of the rays.
+    Args:
+        echoes: What was measured.
+        optics: The head.
+        onsets: Onsets of the training poses.
+        seed: Of the rays.
     """
 
     def __init__(self, echoes: Echoes, optics: Optics, onsets: OnsetRanges, seed: int) -> None:
@@ -54,19 +49,14 @@ class Comparison:
     def objective(self, mesh: trimesh.Trimesh, level: Level, *, smooth: bool) -> float:
         """Return how badly a surface explains what was heard, dB; infinite if all poses are silent.
 
-        Parameters
-        ----------
-        mesh : Trimesh
-            m.
-        level : Level
-            Its gains are applied.
-        smooth : bool
-            Whether the vertices lie on a smooth surface, and coarse triangles may be divided.
+        Args:
+            mesh: m.
+            level: Its gains are applied.
+            smooth: Whether the vertices lie on a smooth surface, and coarse triangles may be
+                divided.
 
-        Raises
-        ------
-        SonoNerfError
-            If no echoes can be traced off the surface.
+        Raises:
+            SonoNerfError: If no echoes can be traced off the surface.
         """
         gain = level.gain.exp().cpu().numpy()[:, None]
         positions, rotations = self.echoes.positions, self.echoes.rotations

@@ -7,12 +7,11 @@ cell, corrects what is rendered of a surface nearby. This is defect correction [
 engineering design as space mapping [2]_: a fast model with gradients is aligned with an accurate
 one without.
 
-References
-----------
-.. [1] H. J. Stetter, "The defect correction principle and discretization methods", Numerische
-   Mathematik 29, 1978.
-.. [2] J. W. Bandler et al., "Space mapping technique for electromagnetic optimization", IEEE Trans.
-   Microwave Theory and Techniques 42, 1994.
+References:
+    .. [1] H. J. Stetter, "The defect correction principle and discretization methods", Numerische
+       Mathematik 29, 1978.
+    .. [2] J. W. Bandler et al., "Space mapping technique for electromagnetic optimization", IEEE
+       Trans. Microwave Theory and Techniques 42, 1994.
 """
 
 from __future__ import annotations
@@ -35,20 +34,13 @@ from sononerf.surface.refine.visibility import listen
 class Correction:
     """Simulated and rendered echoes of one surface, for some poses.
 
-    Parameters
-    ----------
-    optics : Optics
-        Renders.
-    mesh : Trimesh
-        The surface, m.
-    simulator : Simulator
-        Of the same surface.
-    echoes : Echoes
-        Where the poses are.
-    numbers : (N,) int64
-        Of the poses.
-    seed : int
-        Of the simulated rays.
+    Args:
+        optics: Renders.
+        mesh: The surface, m.
+        simulator: Of the same surface.
+        echoes: Where the poses are.
+        numbers (N,): Of the poses.
+        seed: Of the simulated rays.
     """
 
     def __init__(
@@ -85,17 +77,12 @@ class Correction:
     def magnitudes(self, numbers: list[int], heard: Heard) -> tuple[Tensor, Tensor]:
         """Return what is simulated and what is rendered of the surface.
 
-        Parameters
-        ----------
-        numbers : list of int
-            Poses.
-        heard : Heard
-            Whose rows are taken.
+        Args:
+            numbers: Poses.
+            heard: Whose rows are taken.
 
-        Returns
-        -------
-        simulated, rendered : (P, E, W, F) float32
-            Linear; zero beyond the axis.
+        Returns:
+            simulated, rendered ((P, E, W, F) float32): Linear; zero beyond the axis.
         """
         for number in numbers:
             if number not in self._kept:

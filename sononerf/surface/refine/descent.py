@@ -47,26 +47,17 @@ NEAR = 0.5
 class Descent:
     """Preconditioned descent on one connectivity.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Start, m.
-    echoes, optics, level
-        What was measured, what hears, and gains, which are brought up to date.
-    smoothing : float, m
-        Length over which steps are smoothed.
-    rate : float
-        Length of the first steps over the length of smoothing: how much the surface may tilt.
-    later : LaterBounces or None
-        To be added as power.
-    correction : Correction or None
-        Of the start, by the simulator.
-    onsets : OnsetRanges or None
-        Where the surface must begin.
-    sheet : bool
-        Whether it is a sheet, whose sides are kept apart.
-    seed : int
-        Of poses and rays.
+    Args:
+        mesh: Start, m.
+        echoes, optics, level: What was measured, what hears, and gains, which are brought up to
+            date.
+        smoothing (m): Length over which steps are smoothed.
+        rate: Length of the first steps over the length of smoothing: how much the surface may tilt.
+        later: To be added as power.
+        correction: Of the start, by the simulator.
+        onsets: Where the surface must begin.
+        sheet: Whether it is a sheet, whose sides are kept apart.
+        seed: Of poses and rays.
     """
 
     def __init__(
@@ -111,17 +102,12 @@ class Descent:
     def step(self, number: int, part: float) -> float:
         """Do one step.
 
-        Parameters
-        ----------
-        number : int
-            Of the step, counted from the first of all stages: it decides the poses.
-        part : float
-            Of the stage that is behind us, 0 to 1.
+        Args:
+            number: Of the step, counted from the first of all stages: it decides the poses.
+            part: Of the stage that is behind us, 0 to 1.
 
-        Returns
-        -------
-        mismatch : float, dB
-            Mean over the poses, before the step.
+        Returns:
+            mismatch (dB): Mean over the poses, before the step.
         """
         normals = unit(self.operators.areas(self.vertices))
         gradient, error = self._gradient(number, normals)
@@ -147,12 +133,10 @@ class Descent:
     def render(self, numbers: list[int]) -> tuple[Heard | None, Tensor, Tensor]:
         """Render poses of the surface as it is now.
 
-        Returns
-        -------
-        heard : Heard or None
-            None where no pose hears any of it.
-        points, areas : (V, 3) float32
-            Leaves that gradients run to, about the middle of the surface.
+        Returns:
+            heard: None where no pose hears any of it.
+            points, areas ((V, 3) float32): Leaves that gradients run to, about the middle of the
+                surface.
         """
         area = self.operators.areas(self.vertices)
         bending = self.operators.bending(self.vertices, unit(area), self.passes)
@@ -247,12 +231,9 @@ _AROUND = 16  # vertices among which that of the other side is looked for
 class Sides:
     """Which vertices of a sheet lie opposite each other; those of the rim have no partner.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        A closed sheet, m, whose sides do not cross.
-    least : float, m
-        Thickness that is kept.
+    Args:
+        mesh: A closed sheet, m, whose sides do not cross.
+        least (m): Thickness that is kept.
     """
 
     def __init__(self, mesh: trimesh.Trimesh, least: float) -> None:
@@ -267,12 +248,9 @@ class Sides:
     def apart(self, vertices: Tensor, normals: Tensor) -> Tensor:
         """Return the vertices (V, 3), moved outward where the sides are too close.
 
-        Parameters
-        ----------
-        vertices : (V, 3) float64, m
-            As they are now.
-        normals : (V, 3) float64
-            Outward unit vectors.
+        Args:
+            vertices ((V, 3), m): As they are now.
+            normals (V, 3): Outward unit vectors.
         """
         one, other = (part.to(vertices.device) for part in (self._vertex, self._other))
         gap = ((vertices[one] - vertices[other]) * normals[one]).sum(1, keepdim=True)
@@ -284,22 +262,15 @@ class Sides:
 class Stage:
     """One stage; lengths in the shortest wavelength of the analysed band.
 
-    Attributes
-    ----------
-    smoothing : float
-        Length over which steps are smoothed.
-    edge : float
-        Of the triangles.
-    blur : float
-        Of the signed distance before the stage.
-    rate : float
-        Length of the first steps, smoothing lengths.
-    steps : int
-        Of descent.
-    beyond : {"none", "trace", "keep", "simulate"}
-        What is added to the first bounce by physical optics: nothing; the power of later bounces,
-        traced off the surface that the stage starts from, or those that were traced last; or the
-        correction by the simulator, see :mod:`sononerf.surface.refine.correction`.
+    Attributes:
+        smoothing: Length over which steps are smoothed.
+        edge: Of the triangles.
+        blur: Of the signed distance before the stage.
+        rate: Length of the first steps, smoothing lengths.
+        steps: Of descent.
+        beyond: What is added to the first bounce by physical optics: nothing; the power of later
+            bounces, traced off the surface that the stage starts from, or those that were traced
+            last; or the correction by the simulator, see :mod:`sononerf.surface.refine.correction`.
     """
 
     smoothing: float

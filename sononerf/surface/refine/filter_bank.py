@@ -29,23 +29,15 @@ FINE = 5.0
 class FilterBank:
     """Filters of one call and analysis, made when a length is first asked for.
 
-    Parameters
-    ----------
-    head : Head
-        Its call and analysis.
-    nodes : (N,) float64, Hz
-        Of the synthesis: odd multiples of half their spacing.
-    soft : float, Hz
-        Frequency below which the fade of smooth surfaces falls no further.
+    Args:
+        head: Its call and analysis.
+        nodes ((N,), Hz): Of the synthesis: odd multiples of half their spacing.
+        soft (Hz): Frequency below which the fade of smooth surfaces falls no further.
 
-    Attributes
-    ----------
-    kept_nodes : (N',) int64
-        Which of the nodes matter for the analysed band.
-    finer : int
-        Time bins per sample.
-    spacing : float, Hz
-        Of the nodes.
+    Attributes:
+        kept_nodes (N',): Which of the nodes matter for the analysed band.
+        finer: Time bins per sample.
+        spacing (Hz): Of the nodes.
     """
 
     def __init__(self, head: Head, nodes: NDArray[np.float64], soft: float) -> None:
@@ -72,23 +64,15 @@ class FilterBank:
     ) -> Tensor:
         """Power of echoes in each frame and row.
 
-        Parameters
-        ----------
-        strength : (Q,) float32
-            Of the echoes.
-        at : (Q,) float32
-            When they come, in samples from the start of the first frame.
-        weight : (Q, N') float32
-            At the kept nodes.
-        receiver : (Q,) int64
-            Who hears them.
-        receivers, frames : int
-            How many there are.
+        Args:
+            strength ((Q,) float32): Of the echoes.
+            at ((Q,) float32): When they come, in samples from the start of the first frame.
+            weight ((Q, N') float32): At the kept nodes.
+            receiver (Q,): Who hears them.
+            receivers, frames: How many there are.
 
-        Returns
-        -------
-        power : (receivers, frames, F) float32
-            Gradients run to strength and time.
+        Returns:
+            power ((receivers, frames, F) float32): Gradients run to strength and time.
         """
         length = frames * self.analysis.hop * self.finer
         bins = _Deposit.apply(

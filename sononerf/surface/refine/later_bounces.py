@@ -30,14 +30,11 @@ FAINT = 3e-3
 class Later:
     """Echoes of one pose after the first bounce.
 
-    Attributes
-    ----------
-    ear : (N,) int64
-        Which ear hears it.
-    delay : (N,) float64, s
-        From the emission.
-    weight : (N, F) float32
-        Strength at the nodes that the optics keep, with spread and absorption.
+    Attributes:
+        ear (N,): Which ear hears it.
+        delay ((N,), s): From the emission.
+        weight ((N, F) float32): Strength at the nodes that the optics keep, with spread and
+            absorption.
     """
 
     ear: NDArray[np.int64]
@@ -48,16 +45,11 @@ class Later:
 class Tracer:
     """The simulator's rays on a surface.
 
-    Parameters
-    ----------
-    optics : Optics
-        Head, air, call and analysis.
-    mesh : Trimesh
-        The surface, m.
-    rays : int
-        Per pose.
-    seed : int
-        Of the pattern of rays.
+    Args:
+        optics: Head, air, call and analysis.
+        mesh: The surface, m.
+        rays: Per pose.
+        seed: Of the pattern of rays.
     """
 
     def __init__(self, optics: Optics, mesh: trimesh.Trimesh, *, rays: int, seed: int) -> None:
@@ -88,16 +80,11 @@ class Tracer:
 class LaterBounces:
     """Later bounces off one surface, traced for a pose when first asked for.
 
-    Parameters
-    ----------
-    optics : Optics
-        What hears.
-    mesh : Trimesh
-        The surface, m.
-    echoes : Echoes
-        Of whose poses.
-    seed : int
-        Of the rays.
+    Args:
+        optics: What hears.
+        mesh: The surface, m.
+        echoes: Of whose poses.
+        seed: Of the rays.
     """
 
     def __init__(self, optics: Optics, mesh: trimesh.Trimesh, echoes: Echoes, *, seed: int) -> None:

@@ -23,21 +23,14 @@ MOST_ITERATIONS = 200
 class MeshOperators:
     """Operators of one connectivity, on the device of its tensors.
 
-    Parameters
-    ----------
-    faces : (T, 3) int64
-        Triangles.
-    count : int
-        Number of vertices, V.
+    Args:
+        faces (T, 3): Triangles.
+        count: Number of vertices, V.
 
-    Attributes
-    ----------
-    faces : (T, 3) int64
-        Triangles.
-    edges : (K, 2) int64
-        Each once.
-    degree : (V,) float64
-        Neighbours of each vertex.
+    Attributes:
+        faces (T, 3): Triangles.
+        edges (K, 2): Each once.
+        degree (V,): Neighbours of each vertex.
     """
 
     def __init__(self, faces: Tensor, count: int) -> None:
@@ -91,17 +84,12 @@ class MeshOperators:
 
         On an even mesh of edge h it smooths over the length :math:`h \sqrt{1.5 \lambda}`.
 
-        Parameters
-        ----------
-        values : (V, K) float64
-            Per vertex.
-        strength : float, 1
-            :math:`\lambda`.
+        Args:
+            values (V, K): Per vertex.
+            strength (1): :math:`\lambda`.
 
-        Returns
-        -------
-        smoothed : (V, K) float64
-            By conjugate gradients.
+        Returns:
+            smoothed (V, K): By conjugate gradients.
         """
         diagonal = 1.0 + strength * self.degree[:, None]
 
@@ -136,18 +124,13 @@ class MeshOperators:
     def bending(self, vertices: Tensor, normals: Tensor, passes: int) -> Tensor:
         """Curvature tensors, 1/m, positive where the surface is convex.
 
-        Parameters
-        ----------
-        vertices, normals : (V, 3) float64
-            Places (m) and outward unit normals.
-        passes : int
-            How often they are averaged over neighbours.
+        Args:
+            vertices, normals (V, 3): Places (m) and outward unit normals.
+            passes: How often they are averaged over neighbours.
 
-        Returns
-        -------
-        bending : (V, 6) float64, 1/m
-            Components xx, yy, zz, xy, xz, yz of the symmetric tensor that gives the change of the
-            normal along a way on the surface.
+        Returns:
+            bending ((V, 6), 1/m): Components xx, yy, zz, xy, xz, yz of the symmetric tensor that
+                gives the change of the normal along a way on the surface.
         """
         a, b, c = vertices[self.faces].unbind(1)
         na, nb, nc = normals[self.faces].unbind(1)
@@ -186,9 +169,8 @@ def unit(vectors: Tensor) -> Tensor:
 def tangents(normals: Tensor) -> tuple[Tensor, Tensor]:
     """Two unit vectors (N, 3) square to unit normals (N, 3) and to each other [1]_.
 
-    References
-    ----------
-    .. [1] T. Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
+    References:
+        .. [1] T. Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
     """
     x, y, z = normals.unbind(1)
     sign = torch.where(z >= 0.0, 1.0, -1.0).to(normals.dtype)

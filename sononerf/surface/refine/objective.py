@@ -32,23 +32,15 @@ _DB = 20.0 / math.log(10.0)
 class Level:
     """Running estimates on the training poses: gain, and error per ear and frequency.
 
-    Parameters
-    ----------
-    ears, rows : int
-        E and F.
-    like : Tensor
-        Whose device they lie on.
+    Args:
+        ears, rows: E and F.
+        like: Whose device they lie on.
 
-    Attributes
-    ----------
-    gain : (E, F) float32
-        Logarithm of measured over rendered magnitude.
-    error : (E, F) float32, dB
-        Mean over active cells.
-    steps : int
-        How often they were brought up to date.
-    learns : {"none", "each"}
-        No gain, or one for each ear and frequency.
+    Attributes:
+        gain ((E, F) float32): Logarithm of measured over rendered magnitude.
+        error ((E, F) float32, dB): Mean over active cells.
+        steps: How often they were brought up to date.
+        learns: No gain, or one for each ear and frequency.
     """
 
     def __init__(self, ears: int, rows: int, like: Tensor) -> None:
@@ -81,14 +73,10 @@ class Level:
 def measured(echoes: Echoes, numbers: list[int], heard: Heard) -> tuple[Tensor, Tensor, Tensor]:
     """Return what poses measured on the rows that were rendered.
 
-    Returns
-    -------
-    magnitude : (P, E, W, F) float32
-        Zero beyond the axis.
-    inside : (P, 1, W, 1) bool
-        Rows on the axis.
-    loudest : (P,) float32
-        Of each whole pose.
+    Returns:
+        magnitude ((P, E, W, F) float32): Zero beyond the axis.
+        inside (P, 1, W, 1): Rows on the axis.
+        loudest ((P,) float32): Of each whole pose.
     """
     wholes = [echoes.magnitude(number) for number in numbers]
     width, count = heard.power.shape[2], wholes[0].shape[1]
@@ -114,21 +102,15 @@ def mismatch(
 ) -> Tensor:
     """Mean absolute difference in compressed decibels over the active cells of each pose (P,).
 
-    Parameters
-    ----------
-    heard : Heard
-        What was rendered of the first bounce.
-    later : (P, E, W, F) float32, optional
-        Power of the later bounces.
-    found : tuple
-        From :func:`measured`.
-    level : Level
-        Gains and weights.
-    corrected : simulated, rendered, both (P, E, W, F) float32, optional
-        Of a surface nearby: their difference in decibels is added to what is rendered. Cells count
-        less, the larger it is; the frequencies' weights are not needed then.
-    learn : bool
-        Whether gains and errors are brought up to date.
+    Args:
+        heard: What was rendered of the first bounce.
+        later ((P, E, W, F) float32): Power of the later bounces.
+        found: From :func:`measured`.
+        level: Gains and weights.
+        corrected (simulated, rendered, both (P, E, W, F) float32): Of a surface nearby: their
+            difference in decibels is added to what is rendered. Cells count less, the larger it is;
+            the frequencies' weights are not needed then.
+        learn: Whether gains and errors are brought up to date.
     """
     magnitude, inside, loudest = found
     power = heard.power if later is None else heard.power + later
@@ -182,19 +164,13 @@ def _learn(
 def on_rows(wholes: list[Tensor], row: Tensor, like: Tensor) -> Tensor:
     """Return the range slices of whole spectrograms from given rows on.
 
-    Parameters
-    ----------
-    wholes : list of (E, R, F) float32
-        One per pose.
-    row : (P,) int64
-        Each pose's first row; may lie before the axis.
-    like : (P, E, W, F) Tensor
-        Whose width and device the result has.
+    Args:
+        wholes (list of (E, R, F) float32): One per pose.
+        row (P,): Each pose's first row; may lie before the axis.
+        like ((P, E, W, F) Tensor): Whose width and device the result has.
 
-    Returns
-    -------
-    parts : (P, E, W, F) float32
-        Zero beyond the axis.
+    Returns:
+        parts ((P, E, W, F) float32): Zero beyond the axis.
     """
     width = like.shape[2]
     parts = []

@@ -27,14 +27,10 @@ _POSES = 64  # drawn per step, to bound the time
 class OnsetRanges:
     """The onsets of the training poses, to compare surfaces with.
 
-    Parameters
-    ----------
-    hull : EchoHull
-        Onsets; those of weight zero take no part.
-    resolution : float, m
-        Range resolution of the analysis.
-    seed : int
-        Of the order in which poses are drawn.
+    Args:
+        hull: Onsets; those of weight zero take no part.
+        resolution (m): Range resolution of the analysis.
+        seed: Of the order in which poses are drawn.
     """
 
     def __init__(self, hull: EchoHull, resolution: float, seed: int) -> None:

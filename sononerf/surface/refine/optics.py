@@ -44,12 +44,9 @@ SPREAD = 5.0 / 52.0
 class Heard:
     """Rendered spectrograms of some poses, over the ranges at which there is anything.
 
-    Attributes
-    ----------
-    power : (P, E, W, F) float32
-        Squared magnitude; gradients flow through it.
-    row : (P,) int64
-        Index of the first range slice on the store's axis; may be below zero.
+    Attributes:
+        power ((P, E, W, F) float32): Squared magnitude; gradients flow through it.
+        row (P,): Index of the first range slice on the store's axis; may be below zero.
     """
 
     power: Tensor
@@ -60,15 +57,11 @@ class Heard:
 class Pieces:
     """What some poses hear of a surface, one row per pose and vertex.
 
-    Attributes
-    ----------
-    pose, vertex : (Q,) int64
-        Which of the poses, which vertex.
-    weight : (Q, E, N) float32
-        Gains, absorption, spread, fade and visibility at the nodes.
-    reach : (Q, E) float32
-        Fade and spread at the lowest analysed frequency, 0 to 1: how near a piece is to its
-        mirror point.
+    Attributes:
+        pose, vertex (Q,): Which of the poses, which vertex.
+        weight ((Q, E, N) float32): Gains, absorption, spread, fade and visibility at the nodes.
+        reach ((Q, E) float32): Fade and spread at the lowest analysed frequency, 0 to 1: how near a
+            piece is to its mirror point.
     """
 
     pose: Tensor
@@ -80,23 +73,15 @@ class Pieces:
 class Optics(nn.Module):
     """Physical optics of one head; constant tensors move with the module.
 
-    Parameters
-    ----------
-    head : Head
-        What hears; its noise is left out.
-    hearing : Hearing or None
-        Gains at the nodes of a synthesis; those of the simulator where None.
+    Args:
+        head: What hears; its noise is left out.
+        hearing: Gains at the nodes of a synthesis; those of the simulator where None.
 
-    Attributes
-    ----------
-    head : Head
-        Without noise.
-    wavelength : float, m
-        The shortest of the analysed band.
-    rows, ears : int
-        Range slices of a spectrogram, R, and ears, E.
-    kept_nodes : (N,) int64
-        Which of the synthesis' nodes matter for the band.
+    Attributes:
+        head: Without noise.
+        wavelength (m): The shortest of the analysed band.
+        rows, ears: Range slices of a spectrogram, R, and ears, E.
+        kept_nodes (N,): Which of the synthesis' nodes matter for the band.
     """
 
     def __init__(self, head: Head, hearing: Hearing | None = None) -> None:
@@ -152,22 +137,16 @@ class Optics(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return which pieces send sound towards an ear, and what dims them.
 
-        Parameters
-        ----------
-        points, area : (..., 3) float
-            Places (m) and vector areas (m²).
-        bending : (..., 6) float, 1/m
-            Of the smooth surface.
-        emitters, ears : (..., 3) float, m
-            Where the sound comes from, where it is heard.
+        Args:
+            points, area (..., 3): Places (m) and vector areas (m²).
+            bending ((..., 6), 1/m): Of the smooth surface.
+            emitters, ears ((..., 3), m): Where the sound comes from, where it is heard.
 
-        Returns
-        -------
-        facing : (...,) bool
-            Both are above the surface.
-        spread, detour, path, exponent : (...,) float
-            Variance of the path's length (m²), detour (m), path (m), and what fade and spread
-            together have as exponent at the lowest analysed frequency.
+        Returns:
+            facing (...,): Both are above the surface.
+            spread, detour, path, exponent (...,): Variance of the path's length (m²), detour (m),
+                path (m), and what fade and spread together have as exponent at the lowest analysed
+                frequency.
         """
         size = area.norm(dim=-1)
         normal = area / size.clamp_min(1e-30)[..., None]
@@ -238,16 +217,11 @@ class Optics(nn.Module):
     ) -> Pieces:
         """Weigh pieces: everything of the sum but path, obliquity and area.
 
-        Parameters
-        ----------
-        points, area, bending : (V, 3), (V, 3), (V, 6) float32
-            The surface.
-        pose, vertex : (Q,) int64
-            Which pieces which pose hears.
-        visible : (Q, E) float32
-            How far emitter and ear see them, 0 to 1.
-        heads : emitters (P, 3), ears (P, E, 3), rotations (P, 3, 3), float32
-            Of the poses.
+        Args:
+            points, area, bending ((V, 3), (V, 3), (V, 6) float32): The surface.
+            pose, vertex (Q,): Which pieces which pose hears.
+            visible ((Q, E) float32): How far emitter and ear see them, 0 to 1.
+            heads (emitters (P, 3), ears (P, E, 3), rotations (P, 3, 3), float32): Of the poses.
         """
         emitters, ears, rotations = heads
         place, normal, bent = points[vertex], area[vertex], bending[vertex]
@@ -323,16 +297,11 @@ class Optics(nn.Module):
     ) -> Tensor:
         """Power (P, E, W, F) of single echoes, on the rows of others.
 
-        Parameters
-        ----------
-        pose, ear : (N,) int64
-            Who hears them.
-        delay : (N,) float64, s
-            From the emission.
-        weight : (N, N') float32
-            At the nodes.
-        like : Heard
-            Rows are the same.
+        Args:
+            pose, ear (N,): Who hears them.
+            delay ((N,), s): From the emission.
+            weight ((N, N') float32): At the nodes.
+            like: Rows are the same.
         """
         poses, _, frames, _ = like.power.shape
         start = ((like.row + self._first) * self.analysis.hop).to(delay.dtype)

@@ -48,26 +48,18 @@ would tear it."""
 class Refined:
     """A refined surface.
 
-    Attributes
-    ----------
-    mesh : Trimesh
-        m.
-    gain : (E, F) float64
-        What rendered magnitudes are multiplied by, learned on training poses.
-    support : (V,) float64
-        How many training poses see each vertex near the direction of a mirror.
-    start : str
-        Name of the start that was refined.
-    kept : bool
-        True where the refined surface explains the validation poses better than the start.
-    error_db : float
-        Objective on validation poses, see :class:`~sononerf.surface.refine.comparison.Comparison`.
-    history : list of dict
-        Per stage: its number, its way, the mismatch of its last step, and the objective on
-        validation poses after it.
-    faults : list of str
-        What went wrong on the way, one line each: a surface that could not be traced and counted
-        as the worst, or a stage that went without the simulator's correction.
+    Attributes:
+        mesh: m.
+        gain (E, F): What rendered magnitudes are multiplied by, learned on training poses.
+        support (V,): How many training poses see each vertex near the direction of a mirror.
+        start: Name of the start that was refined.
+        kept: True where the refined surface explains the validation poses better than the start.
+        error_db: Objective on validation poses, see
+            :class:`~sononerf.surface.refine.comparison.Comparison`.
+        history: Per stage: its number, its way, the mismatch of its last step, and the objective on
+            validation poses after it.
+        faults: What went wrong on the way, one line each: a surface that could not be traced and
+            counted as the worst, or a stage that went without the simulator's correction.
     """
 
     mesh: trimesh.Trimesh
@@ -92,16 +84,11 @@ def refine(
 ) -> Refined:
     """Refine start surfaces against echoes.
 
-    Parameters
-    ----------
-    starts, echoes, simulate, seed
-        As of :class:`Refinement`.
-    optics : Optics or None
-        On the device of the computation; that of the echoes' head on the CPU where None.
-    state : dict or None
-        Where an interrupted refinement of the same starts and echoes goes on.
-    after_step : callable, optional
-        Called after each step with the refinement and the step's mismatch, dB.
+    Args:
+        starts, echoes, simulate, seed: As of :class:`Refinement`.
+        optics: On the device of the computation; that of the echoes' head on the CPU where None.
+        state: Where an interrupted refinement of the same starts and echoes goes on.
+        after_step: Called after each step with the refinement and the step's mismatch, dB.
     """
     work = Refinement(starts, echoes, optics or Optics(echoes.head), simulate=simulate, seed=seed)
     if state is not None:
@@ -126,23 +113,17 @@ def _ways(starts: Iterable[str]) -> list[Way]:
 class Refinement:
     """Refine step by step; between any two steps it can be stopped, saved and taken up again.
 
-    Parameters
-    ----------
-    meshes : mapping of str to Trimesh
-        Where to start, m; of several the one that explains the validation poses best. One that is
-        called ``sheet`` is a sheet: it takes part in the first stage beside the best of the others.
-    echoes : Echoes
-        Measured spectrograms and onsets; the surface must begin at the onsets. If their level is
-        absolute, gains are learned in the last stage alone: a rough surface is too faint, and a
-        gain would hide that. Otherwise gains are learned from the first stage on.
-    optics : Optics
-        The head; its device is that of the computation.
-    simulate : callable
-        Makes the simulator of a surface, for the stages that are corrected by it.
-    seed : int
-        Of the order of poses and of traced rays.
-    stages : tuple of Stage or None
-        From coarse to fine; ``STAGES`` where None.
+    Args:
+        meshes: Where to start, m; of several the one that explains the validation poses best. One
+            that is called ``sheet`` is a sheet: it takes part in the first stage beside the best of
+            the others.
+        echoes: Measured spectrograms and onsets; the surface must begin at the onsets. If their
+            level is absolute, gains are learned in the last stage alone: a rough surface is too
+            faint, and a gain would hide that. Otherwise gains are learned from the first stage on.
+        optics: The head; its device is that of the computation.
+        simulate: Makes the simulator of a surface, for the stages that are corrected by it.
+        seed: Of the order of poses and of traced rays.
+        stages: From coarse to fine; ``STAGES`` where None.
     """
 
     def __init__(

@@ -39,20 +39,14 @@ Array = NDArray[np.float64]
 def remesh(mesh: trimesh.Trimesh, edge: float, blur: float = 0.0) -> trimesh.Trimesh | None:
     """Return a surface with even triangles.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        A closed surface, m; what overlaps becomes one.
-    edge : float, m
-        Mean length of the edges.
-    blur : float, m
-        Standard deviation of a Gaussian over the signed distance; it removes dents, bumps and
-        necks of this size.
+    Args:
+        mesh: A closed surface, m; what overlaps becomes one.
+        edge (m): Mean length of the edges.
+        blur (m): Standard deviation of a Gaussian over the signed distance; it removes dents, bumps
+            and necks of this size.
 
-    Returns
-    -------
-    surface : Trimesh or None
-        None where the mesh is open or would lose thin parts, or nothing is left.
+    Returns:
+        surface: None where the mesh is open or would lose thin parts, or nothing is left.
     """
     if not mesh.is_watertight or not len(mesh.faces):
         return None
@@ -95,25 +89,18 @@ def finer(mesh: trimesh.Trimesh, values: Array, wavelength: float) -> tuple[trim
     Each triangle becomes four. The middle of an edge is put where a curve runs that is square to
     the normals at both ends [1]_.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Its vertices lie on the smooth surface.
-    values : (V,) float64
-        Per vertex; new ones get the mean of both ends.
-    wavelength : float, m
-        The shortest.
+    Args:
+        mesh: Its vertices lie on the smooth surface.
+        values (V,): Per vertex; new ones get the mean of both ends.
+        wavelength (m): The shortest.
 
-    Returns
-    -------
-    finer : Trimesh
-        The mesh itself where its edges' middles lie deep by less than :data:`CHORD` on average.
-    values : (V',) float64
-        Of its vertices.
+    Returns:
+        finer: The mesh itself where its edges' middles lie deep by less than :data:`CHORD` on
+            average.
+        values (V',): Of its vertices.
 
-    References
-    ----------
-    .. [1] A. Vlachos et al., "Curved PN triangles", I3D 2001.
+    References:
+        .. [1] A. Vlachos et al., "Curved PN triangles", I3D 2001.
     """
     places, normals = np.asarray(mesh.vertices), np.asarray(mesh.vertex_normals)
     edges, of = np.asarray(mesh.edges_unique), np.asarray(mesh.edges_unique_inverse)
@@ -143,21 +130,15 @@ def signed_distance(
 ) -> tuple[Array, NDArray[np.float32]]:
     """Signed distance near closed bodies on a lattice, positive outside of all of them.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Closed bodies, which may overlap; cavities are filled.
-    spacing : float, m
-        Of the lattice.
-    margin : int
-        Voxels around the surface.
+    Args:
+        mesh: Closed bodies, which may overlap; cavities are filled.
+        spacing (m): Of the lattice.
+        margin: Voxels around the surface.
 
-    Returns
-    -------
-    lower : (3,) float64, m
-        The lattice's first place.
-    distance : (X, Y, Z) float32, m
-        Exact near the surface, elsewhere no more than the width of the band.
+    Returns:
+        lower ((3,), m): The lattice's first place.
+        distance ((X, Y, Z) float32, m): Exact near the surface, elsewhere no more than the width of
+            the band.
     """
     bounds = np.asarray(mesh.bounds)
     lower = bounds[0] - margin * spacing

@@ -10,9 +10,8 @@ surface that was fitted to wrong ranges has taken them up. All derivatives are f
 Each pose has unknowns of its own, so the normal equations have the shape of an arrow and are
 reduced to those of the shared errors (Schur complement). Their inverse gives the uncertainties.
 
-References
-----------
-.. [1] B. Triggs et al., "Bundle adjustment, a modern synthesis", Vision Algorithms, 2000.
+References:
+    .. [1] B. Triggs et al., "Bundle adjustment, a modern synthesis", Vision Algorithms, 2000.
 """
 
 from __future__ import annotations
@@ -53,18 +52,12 @@ _DB = 20.0 / math.log(10.0)
 class Calibration:
     """Errors of a recording; zero where nothing is wrong.
 
-    Attributes
-    ----------
-    gain : (E,) float64
-        Natural logarithm of how much too loud each receiver is.
-    range_offset : float, m
-        How much too far everything is heard.
-    speed_of_sound : float
-        Logarithm of the true speed over the assumed one.
-    position : (P, 3) float64, m
-        To be added to the stated positions.
-    aim : (P, 3) float64, rad
-        Rotation vectors, world frame, to be applied to the stated rotations.
+    Attributes:
+        gain (E,): Natural logarithm of how much too loud each receiver is.
+        range_offset (m): How much too far everything is heard.
+        speed_of_sound: Logarithm of the true speed over the assumed one.
+        position ((P, 3), m): To be added to the stated positions.
+        aim ((P, 3), rad): Rotation vectors, world frame, to be applied to the stated rotations.
     """
 
     gain: Array
@@ -83,15 +76,11 @@ class Calibration:
 class Estimate:
     """What was found, and how well.
 
-    Attributes
-    ----------
-    calibration : Calibration
-        The errors.
-    deviation : dict
-        One standard deviation of each kind: shared errors in their own unit; position (m) and aim
-        (rad) as the root mean square over poses and axes.
-    error_db : list of float
-        Mean absolute difference over active cells before each step, and after the last.
+    Attributes:
+        calibration: The errors.
+        deviation: One standard deviation of each kind: shared errors in their own unit; position
+            (m) and aim (rad) as the root mean square over poses and axes.
+        error_db: Mean absolute difference over active cells before each step, and after the last.
     """
 
     calibration: Calibration
@@ -102,12 +91,9 @@ class Estimate:
 class Body:
     """A surface whose spectrograms are rendered for poses with errors.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        m.
-    optics : Optics
-        The head.
+    Args:
+        mesh: m.
+        optics: The head.
     """
 
     def __init__(self, mesh: trimesh.Trimesh, optics: Optics) -> None:
@@ -126,12 +112,9 @@ class Body:
     ) -> NDArray[np.float32]:
         """Return magnitudes (P, E, R, F) on the whole axis.
 
-        Parameters
-        ----------
-        positions, rotations : (P, 3), (P, 3, 3)
-            Of the heads, m.
-        stretch, late : (P,), (P,)
-            Factor on paths, and m added to them.
+        Args:
+            positions, rotations ((P, 3), (P, 3, 3)): Of the heads, m.
+            stretch, late ((P,), (P,)): Factor on paths, and m added to them.
         """
         optics = self.optics
         shape = (len(positions), optics.ears, optics.rows, len(optics.frequencies))
@@ -178,24 +161,16 @@ class _Column:
 class Calibrator:
     """Gauss-Newton steps on the errors of a recording.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        The surface, m.
-    echoes : Echoes
-        What was measured; its training and validation poses take part.
-    optics : Optics
-        The head.
-    kinds : sequence of str
-        Which errors are looked for; see :data:`KINDS`.
-    dependent : float
-        How many cells of a spectrogram share their noise.
+    Args:
+        mesh: The surface, m.
+        echoes: What was measured; its training and validation poses take part.
+        optics: The head.
+        kinds: Which errors are looked for; see :data:`KINDS`.
+        dependent: How many cells of a spectrogram share their noise.
 
-    Attributes
-    ----------
-    change : float
-        Length of the last step over one standard deviation, of the error that changed most; of
-        poses the root mean square.
+    Attributes:
+        change: Length of the last step over one standard deviation, of the error that changed most;
+            of poses the root mean square.
     """
 
     def __init__(

@@ -22,14 +22,10 @@ def seen(
 ) -> NDArray[np.bool_]:
     """Which points (N, 3) on the surface are seen from targets (N, 3), m.
 
-    Parameters
-    ----------
-    sight : Occlusion
-        Of the surface.
-    points, target : (N, 3) float64, m
-        World frame.
-    free : float, m
-        So much of the way, from the point on, cannot be blocked.
+    Args:
+        sight: Of the surface.
+        points, target ((N, 3), m): World frame.
+        free (m): So much of the way, from the point on, cannot be blocked.
     """
     span = target - points
     distance = np.sqrt(np.einsum("nd,nd->n", span, span))[:, None]
@@ -49,27 +45,19 @@ def listen(
 ) -> tuple[Pieces, tuple[Tensor, Tensor, Tensor], Tensor]:
     """Find what poses hear of a surface.
 
-    Parameters
-    ----------
-    optics : Optics
-        The head.
-    operators : MeshOperators
-        Of the surface.
-    vertices, area, bending : (V, 3), (V, 3), (V, 6) float64
-        Places, vector areas and curvature.
-    sight : Occlusion
-        Of the same surface, or of one a little earlier.
-    positions, rotations : (P, 3), (P, 3, 3) float64
-        Of the heads.
+    Args:
+        optics: The head.
+        operators: Of the surface.
+        vertices, area, bending ((V, 3), (V, 3), (V, 6) float64): Places, vector areas and
+            curvature.
+        sight: Of the same surface, or of one a little earlier.
+        positions, rotations ((P, 3), (P, 3, 3) float64): Of the heads.
 
-    Returns
-    -------
-    pieces : Pieces
-        What is heard.
-    heads : emitters (P, 3), ears (P, E, 3), rotations (P, 3, 3), float32
-        About the middle of the surface, as :meth:`Optics.render` wants them.
-    middle : (3,) float64, m
-        To be taken off the vertices before they are rendered.
+    Returns:
+        pieces: What is heard.
+        heads (emitters (P, 3), ears (P, E, 3), rotations (P, 3, 3), float32): About the middle of
+            the surface, as :meth:`Optics.render` wants them.
+        middle ((3,), m): To be taken off the vertices before they are rendered.
     """
     middle = 0.5 * (vertices.amin(0) + vertices.amax(0))
     emitters, ears = optics.heads(positions, rotations)

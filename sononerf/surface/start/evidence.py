@@ -38,17 +38,12 @@ _CUTOFF = 2.5  # standard deviations after which the Gaussian is cut off
 class Evidence:
     """Points of a surface as poses hear them.
 
-    Attributes
-    ----------
-    points : (G, 3) float, m
-        World frame.
-    normals : (G, 3) float
-        Unit vectors towards the poses.
-    weight : (G,) float
-        Compressed power of the echo without spreading; at most 1, which half of the poses reach
-        with the loudest that they hear.
-    pose : (G,) int
-        Which pose hears it.
+    Attributes:
+        points ((G, 3), m): World frame.
+        normals (G, 3): Unit vectors towards the poses.
+        weight (G,): Compressed power of the echo without spreading; at most 1, which half of the
+            poses reach with the loudest that they hear.
+        pose (G,): Which pose hears it.
     """
 
     points: Array
@@ -72,23 +67,15 @@ def locate_sound(
 ) -> Evidence:
     """Listen to a field from where it was heard, and put its sound at its ranges.
 
-    Parameters
-    ----------
-    field : Field
-        What was fitted.
-    places : (N, 3) float, m
-        Where it is not silent.
-    sources : (P, 3) float, m
-        Half way between emitter and ears of each pose.
-    resolution : float, m
-        Range resolution; points of one pose in one cube of this side become one.
-    progress : callable, optional
-        Called with the poses done and the poses in all.
+    Args:
+        field: What was fitted.
+        places ((N, 3), m): Where it is not silent.
+        sources ((P, 3), m): Half way between emitter and ears of each pose.
+        resolution (m): Range resolution; points of one pose in one cube of this side become one.
+        progress: Called with the poses done and the poses in all.
 
-    Returns
-    -------
-    evidence : Evidence
-        Empty where nothing is heard.
+    Returns:
+        evidence: Empty where nothing is heard.
     """
     bands = torch.arange(_BANDS, device=places.device) * (len(field.frequency) - 1) // (_BANDS - 1)
     where = places.cpu().double().numpy()
@@ -169,24 +156,16 @@ def signed_distance(
 ) -> Grid:
     """Return the signed distance, positive outside.
 
-    Parameters
-    ----------
-    weight : (X, Y, Z) float
-        Of the targets, from 0 to 1.
-    target : (X, Y, Z) float, voxels
-        Signed distance by the evidence.
-    bound : (X, Y, Z) float, voxels
-        What the distance must not lie below.
-    pull : float
-        Weight of the distance to the bound.
-    empty : (X, Y, Z) float
-        Weight with which a place is outside.
-    bending : float
-        Weight of the squared Laplacian.
+    Args:
+        weight (X, Y, Z): Of the targets, from 0 to 1.
+        target ((X, Y, Z), voxels): Signed distance by the evidence.
+        bound ((X, Y, Z), voxels): What the distance must not lie below.
+        pull: Weight of the distance to the bound.
+        empty (X, Y, Z): Weight with which a place is outside.
+        bending: Weight of the squared Laplacian.
 
-    Returns
-    -------
-    distance : (X, Y, Z) float, voxels
+    Returns:
+        distance: (X, Y, Z), voxels.
     """
     if min(weight.shape) >= 2 * _COARSEST:
         coarse = _halved(weight)

@@ -24,18 +24,13 @@ def thinness(lattice: Lattice, points: Array, normals: Array, weight: Array) -> 
     There the blurred normals are short beside the blurred weights, or point the other way behind a
     point. In a narrow gap they do so in front of it.
 
-    Parameters
-    ----------
-    lattice : Lattice
-        The voxels.
-    points, normals : (G, 3) float
-        Oriented points, m and unit vectors.
-    weight : (G,) float
-        How far they are believed.
+    Args:
+        lattice: The voxels.
+        points, normals (G, 3): Oriented points, m and unit vectors.
+        weight (G,): How far they are believed.
 
-    Returns
-    -------
-    thin : (X, Y, Z) float
+    Returns:
+        thin: (X, Y, Z).
     """
     if not len(points):
         return np.zeros(lattice.shape, np.float32)
@@ -61,21 +56,15 @@ def thinness(lattice: Lattice, points: Array, normals: Array, weight: Array) -> 
 def planes(lattice: Lattice, points: Array, normals: Array, weight: Array) -> tuple[Grid, Grid]:
     """Return how far voxels near points are known, and their distance to the planes.
 
-    Parameters
-    ----------
-    lattice : Lattice
-        The voxels.
-    points, normals : (G, 3) float
-        Oriented points, m and unit vectors.
-    weight : (G,) float
-        How far they are believed.
+    Args:
+        lattice: The voxels.
+        points, normals (G, 3): Oriented points, m and unit vectors.
+        weight (G,): How far they are believed.
 
-    Returns
-    -------
-    known : (X, Y, Z) float
-        From 0 to 1.
-    target : (X, Y, Z) float, voxels
-        Mean distance to the planes of the points around, positive on the side of the normals.
+    Returns:
+        known (X, Y, Z): From 0 to 1.
+        target ((X, Y, Z), voxels): Mean distance to the planes of the points around, positive on
+            the side of the normals.
     """
     size = int(np.prod(lattice.shape))
     total, moment = np.zeros(size), np.zeros(size)
@@ -99,20 +88,15 @@ def planes(lattice: Lattice, points: Array, normals: Array, weight: Array) -> tu
 def winding_of(lattice: Lattice, points: Array, normals: Array, weight: Array) -> Grid:
     """Return the winding number of oriented points, each place of the surface counted once.
 
-    Parameters
-    ----------
-    lattice : Lattice
-        The voxels.
-    points, normals : (G, 3) float
-        Oriented points, m and unit vectors; at least one.
-    weight : (G,) float
-        Their power. It is divided by the power around, so that loud places count no more than
-        others.
+    Args:
+        lattice: The voxels.
+        points, normals (G, 3): Oriented points, m and unit vectors; at least one.
+        weight (G,): Their power. It is divided by the power around, so that loud places count no
+            more than others.
 
-    Returns
-    -------
-    winding : (X, Y, Z) float
-        About 1 inside of a body, 0 outside, negative where mostly backs of surfaces are seen.
+    Returns:
+        winding (X, Y, Z): About 1 inside of a body, 0 outside, negative where mostly backs of
+            surfaces are seen.
     """
     around = lattice.spread(points, weight, _LOCAL)
     # A plane of density 1 has this value at its points when it is blurred.
@@ -131,15 +115,12 @@ _AIR = 0.25  # fraction of the longest side, empty on each side: periodic images
 def winding_number(flux: Sequence[Grid]) -> Grid:
     """Return the winding number of a density of surface.
 
-    Parameters
-    ----------
-    flux : three (X, Y, Z) float, 1/voxel
-        Area per volume along outward normals: across a surface it adds up to one.
+    Args:
+        flux (three (X, Y, Z) float, 1/voxel): Area per volume along outward normals: across a
+            surface it adds up to one.
 
-    Returns
-    -------
-    winding : (X, Y, Z) float
-        Zero far away.
+    Returns:
+        winding (X, Y, Z): Zero far away.
     """
     shape = flux[0].shape
     air = 2 * round(_AIR * max(shape))

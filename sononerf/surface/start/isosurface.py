@@ -21,22 +21,15 @@ def isosurface(volume: Volume, level: float) -> trimesh.Trimesh:
 
     Beyond the grid there is nothing: a body that reaches the grid's border is closed there.
 
-    Parameters
-    ----------
-    volume : Volume
-        Greater values are inside.
-    level : float
-        Value on the surface, in the volume's own unit.
+    Args:
+        volume: Greater values are inside.
+        level: Value on the surface, in the volume's own unit.
 
-    Returns
-    -------
-    mesh : Trimesh
-        Metres, world frame, normals outward, positive volume.
+    Returns:
+        mesh: Metres, world frame, normals outward, positive volume.
 
-    Raises
-    ------
-    NumericalError
-        If a value is not finite, or the level lies outside the range of the values.
+    Raises:
+        NumericalError: If a value is not finite, or the level lies outside the range of the values.
     """
     require_finite(volume)
     values = np.asarray(volume.values, dtype=np.float64)
@@ -83,24 +76,17 @@ def automatic_level(volume: Volume) -> float:
     comes within 0.04 of the F-score at 5 mm of the best of twelve levels; thresholds on decibels or
     at the steepest gradient, tried in its place, swell or shatter the body.
 
-    Parameters
-    ----------
-    volume : Volume
-        Reflectivity (energy) or an indicator; greater values are inside.
+    Args:
+        volume: Reflectivity (energy) or an indicator; greater values are inside.
 
-    Returns
-    -------
-    level : float
-        In the volume's own unit.
+    Returns:
+        level: In the volume's own unit.
 
-    Raises
-    ------
-    NumericalError
-        If a value is not finite or all are equal.
+    Raises:
+        NumericalError: If a value is not finite or all are equal.
 
-    References
-    ----------
-    .. [1] N. Otsu, "A threshold selection method from gray-level histograms", 1979.
+    References:
+        .. [1] N. Otsu, "A threshold selection method from gray-level histograms", 1979.
     """
     require_finite(volume)
     values = np.asarray(volume.values, dtype=np.float64)

@@ -66,24 +66,17 @@ _CONTRADICTED = 4.0  # range resolutions; if every place lies so far in front, t
 class Gathered:
     """All evidence, on one lattice; a surface of it is found by :func:`estimate_occupancy`.
 
-    Attributes
-    ----------
-    evidence : Evidence
-        The oriented points.
-    weight : (G,) float
-        How far they are believed, from 0 to 1: their own weight times their reliability.
-    points : (G, 3) float, m
-        Where they stand on the lattice: moved outward where the body is thin.
-    lattice : Lattice
-        The voxels.
-    thin : (X, Y, Z) float
-        How far the body is thin, from 0 to 1.
-    bound : (X, Y, Z) float, voxels
-        Signed distance of the boundary of free space; no body lies below it.
-    hull : EchoHull
-        The free space.
-    resolution : float, m
-        Range resolution.
+    Attributes:
+        evidence: The oriented points.
+        weight (G,): How far they are believed, from 0 to 1: their own weight times their
+            reliability.
+        points ((G, 3), m): Where they stand on the lattice: moved outward where the body is thin.
+        lattice: The voxels.
+        thin (X, Y, Z): How far the body is thin, from 0 to 1.
+        bound ((X, Y, Z), voxels): Signed distance of the boundary of free space; no body lies below
+            it.
+        hull: The free space.
+        resolution (m): Range resolution.
     """
 
     evidence: Evidence
@@ -107,25 +100,16 @@ def gather_evidence(
 ) -> Gathered:
     """Return what the field and the onsets tell about a region.
 
-    Parameters
-    ----------
-    field : Field
-        What was fitted.
-    places : (N, 3) float, m
-        Where it is not silent.
-    hull : EchoHull
-        Free space in front of the onsets.
-    lower, upper : (3,) float, m
-        The region.
-    spacing : float, m
-        Of the voxels.
-    resolution : float, m
-        Range resolution of the analysis.
+    Args:
+        field: What was fitted.
+        places ((N, 3), m): Where it is not silent.
+        hull: Free space in front of the onsets.
+        lower, upper ((3,), m): The region.
+        spacing (m): Of the voxels.
+        resolution (m): Range resolution of the analysis.
 
-    Raises
-    ------
-    NumericalError
-        If nothing was heard.
+    Raises:
+        NumericalError: If nothing was heard.
     """
     evidence = locate_sound(field, places, hull.sources, resolution=resolution)
     evidence = evidence.where(evidence.weight > QUIET)
@@ -145,18 +129,13 @@ def gather_evidence(
 def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> trimesh.Trimesh:
     """Return the closed surface of the body, m, normals outward.
 
-    Parameters
-    ----------
-    known : Gathered
-        The evidence.
-    belief : {"open", "filled", "hull"}
-        How far the field's sound is believed, see ``Belief``.
+    Args:
+        known: The evidence.
+        belief: How far the field's sound is believed, see ``Belief``.
 
-    Raises
-    ------
-    NumericalError
-        If the onsets contradict one another: no place is left by nearly all of them. With the
-        belief ``hull`` also if there is no onset.
+    Raises:
+        NumericalError: If the onsets contradict one another: no place is left by nearly all of
+            them. With the belief ``hull`` also if there is no onset.
     """
     lattice, spacing = known.lattice, known.lattice.spacing
     if not (known.bound < _CONTRADICTED * known.resolution / spacing).any():
@@ -248,18 +227,14 @@ _COARSER = 4  # voxels between the places of the first look; only saves time
 def clearance_grid(hull: EchoHull, lattice: Lattice) -> NDArray[np.float64]:
     """Return how far each voxel lies behind the onsets, (X, Y, Z) m; exact near zero.
 
-    Parameters
-    ----------
-    hull : EchoHull
-        What the onsets leave.
-    lattice : Lattice
-        The voxels.
+    Args:
+        hull: What the onsets leave.
+        lattice: The voxels.
 
-    Returns
-    -------
-    clearance : (X, Y, Z) float, m
-        Its slope is at most one, so voxels that a coarse look finds far from zero need no second
-        one. At most the diagonal of the lattice, where no pose says anything.
+    Returns:
+        clearance ((X, Y, Z), m): Its slope is at most one, so voxels that a coarse look finds far
+            from zero need no second one. At most the diagonal of the lattice, where no pose says
+            anything.
     """
     far = lattice.spacing * float(np.linalg.norm(lattice.shape))
     coarse = [np.unique(np.append(np.arange(0, n, _COARSER), n - 1)) for n in lattice.shape]

@@ -40,12 +40,9 @@ Method = Literal["open", "filled", "hull", "sheet", "isosurface"]
 class FieldReading:
     """A field on a grid, and the evidence that field and onsets give.
 
-    Attributes
-    ----------
-    volume : Volume
-        The field's energy.
-    gathered : Gathered
-        The evidence.
+    Attributes:
+        volume: The field's energy.
+        gathered: The evidence.
     """
 
     volume: Volume
@@ -63,20 +60,13 @@ def read_field(
 ) -> FieldReading:
     """Read volume and evidence out of a field.
 
-    Parameters
-    ----------
-    field : Field
-        A fitted field.
-    hull : EchoHull
-        The onsets and the poses that they were heard from.
-    resolution : float, m
-        Range resolution of the analysis.
-    spacing : float or None, m
-        Voxel size; half of the field's own resolution where None.
-    directions : int
-        Size of the spherical lattice that is summed over where the field has no lobes.
-    progress : callable, optional
-        Called with the voxels done and the voxels in all.
+    Args:
+        field: A fitted field.
+        hull: The onsets and the poses that they were heard from.
+        resolution (m): Range resolution of the analysis.
+        spacing (m): Voxel size; half of the field's own resolution where None.
+        directions: Size of the spherical lattice that is summed over where the field has no lobes.
+        progress: Called with the voxels done and the voxels in all.
     """
     lower, upper, step = _grid_of(field, spacing)
     energy = _energy(field, directions)
@@ -92,18 +82,13 @@ def start_surfaces(
 ) -> Iterator[tuple[StartMethod, trimesh.Trimesh]]:
     """Yield each method that gives a surface, and its closed mesh, m.
 
-    Parameters
-    ----------
-    reading : FieldReading
-        Evidence of a field.
-    methods : sequence of {"open", "filled", "hull", "sheet"}
-        In this order.
+    Args:
+        reading: Evidence of a field.
+        methods: In this order.
 
-    Raises
-    ------
-    NumericalError
-        If no method gives a surface: the onsets contradict one another, or the evidence does not
-        lie on one sheet.
+    Raises:
+        NumericalError: If no method gives a surface: the onsets contradict one another, or the
+            evidence does not lie on one sheet.
     """
     first: NumericalError | None = None
     found = False
@@ -131,24 +116,16 @@ def read_isosurface(
 ) -> tuple[trimesh.Trimesh, Volume, float]:
     """Return an iso-surface of a field's loudness, the volume it lies in, and its level.
 
-    Parameters
-    ----------
-    field, spacing, directions, progress
-        As of :func:`read_field`.
-    level : float or "auto"
-        Value of the volume on the surface; by Otsu's rule where "auto".
-    smoothing : float, m
-        Side of a box over which the volume is averaged first, an odd number of voxels; the
-        published code of the paper takes 9 of 5 mm.
+    Args:
+        field, spacing, directions, progress: As of :func:`read_field`.
+        level: Value of the volume on the surface; by Otsu's rule where "auto".
+        smoothing (m): Side of a box over which the volume is averaged first, an odd number of
+            voxels; the published code of the paper takes 9 of 5 mm.
 
-    Raises
-    ------
-    SettingsError
-        If the spacing is larger than the region.
-    NumericalError
-        If the field is silent everywhere, or nowhere at the level.
-    ResourceError
-        If the grid does not fit in memory.
+    Raises:
+        SettingsError: If the spacing is larger than the region.
+        NumericalError: If the field is silent everywhere, or nowhere at the level.
+        ResourceError: If the grid does not fit in memory.
     """
     lower, upper, step = _grid_of(field, spacing)
     loudness = _loudness(field, directions)
@@ -178,14 +155,10 @@ def _grid_of(field: Field, spacing: float | None) -> tuple[Array, Array, float]:
 def energy_volume(field: Field, spacing: float, directions: int) -> Volume:
     """Return the energy of a field on a grid over its region.
 
-    Parameters
-    ----------
-    field : Field
-        What was fitted.
-    spacing : float, m
-        Voxel size.
-    directions : int
-        Size of the spherical lattice that is summed over where the field has no lobes.
+    Args:
+        field: What was fitted.
+        spacing (m): Voxel size.
+        directions: Size of the spherical lattice that is summed over where the field has no lobes.
     """
     lower, upper = (corner.cpu().double().numpy() for corner in field.region)
     return volume_from_function(_energy(field, directions), lower, upper, spacing, chunk=_CHUNK)

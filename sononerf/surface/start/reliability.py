@@ -33,14 +33,10 @@ _CHUNK = 4000  # points at a time, a bound of memory
 def reliability(evidence: Evidence, hull: EchoHull, resolution: float) -> Array:
     """Return how far each point is believed, (G,) from 0 to 1.
 
-    Parameters
-    ----------
-    evidence : Evidence
-        Of all poses.
-    hull : EchoHull
-        The onsets of the same poses.
-    resolution : float, m
-        Range resolution.
+    Args:
+        evidence: Of all poses.
+        hull: The onsets of the same poses.
+        resolution (m): Range resolution.
     """
     if not len(evidence.points):
         return np.zeros(0)
@@ -95,18 +91,13 @@ def poses_that_heard(
     A pose counts where a point of its evidence lies within two range resolutions of the vertex,
     looks the same way within 60 degrees, and lies on one smooth surface with it.
 
-    Parameters
-    ----------
-    mesh : Trimesh
-        Normals outward, m.
-    evidence : Evidence
-        Of all poses.
-    resolution : float, m
-        Range resolution.
+    Args:
+        mesh: Normals outward, m.
+        evidence: Of all poses.
+        resolution (m): Range resolution.
 
-    Returns
-    -------
-    poses : (V,) int32
+    Returns:
+        poses: (V,) int32.
     """
     counts = np.zeros(len(mesh.vertices), np.int32)
     if not len(evidence.points):

@@ -14,9 +14,8 @@ with half of the thickness :math:`d` and the loss of Geman and McClure :math:`\r
 falls from round to round (graduated non-convexity [1]_). The bending energy is that of a thin
 plate.
 
-References
-----------
-.. [1] A. Blake, A. Zisserman, "Visual Reconstruction", MIT Press, 1987.
+References:
+    .. [1] A. Blake, A. Zisserman, "Visual Reconstruction", MIT Press, 1987.
 """
 
 from __future__ import annotations
@@ -56,17 +55,13 @@ _DENSITY = 3.0  # columns over which the density of points is measured
 class _Frame:
     """A grid in the plane of the sheet, and its height above that plane.
 
-    Attributes
-    ----------
-    centre, axes : (3,), (3, 3)
-        Origin, m, and the directions along, across and above as columns.
-    lower : (2,)
-        Of the grid, m.
-    step : float, m
-    depth : (U, V, Z)
-        Greatest depth below the onsets, m, positive inside.
-    heights : (Z,)
-        m.
+    Attributes:
+        centre, axes ((3,), (3, 3)): Origin, m, and the directions along, across and above as
+            columns.
+        lower (2,): Of the grid, m.
+        step: m.
+        depth (U, V, Z): Greatest depth below the onsets, m, positive inside.
+        heights (Z,): m.
     """
 
     centre: Array
@@ -80,20 +75,14 @@ class _Frame:
 def fit_sheet(known: Gathered) -> trimesh.Trimesh:
     """Return the sheet that the evidence lies on.
 
-    Parameters
-    ----------
-    known : Gathered
-        The evidence.
+    Args:
+        known: The evidence.
 
-    Returns
-    -------
-    sheet : Trimesh
-        One closed body, m, with even triangles.
+    Returns:
+        sheet: One closed body, m, with even triangles.
 
-    Raises
-    ------
-    NumericalError
-        If the evidence does not lie on one sheet.
+    Raises:
+        NumericalError: If the evidence does not lie on one sheet.
     """
     evidence, weight, resolution = known.evidence, known.weight, known.resolution
     frame = _framed(known)

@@ -20,19 +20,13 @@ BYTES_PER_VOXEL = 80
 class Volume:
     """Values on a regular grid.
 
-    Parameters
-    ----------
-    values : (X, Y, Z) float
-        One value per voxel.
-    origin : (3,) float, m
-        Centre of voxel [0, 0, 0], world frame.
-    spacing : float, m
-        Distance between the centres of neighbouring voxels, equal on all axes.
+    Args:
+        values (X, Y, Z): One value per voxel.
+        origin ((3,), m): Centre of voxel [0, 0, 0], world frame.
+        spacing (m): Distance between the centres of neighbouring voxels, equal on all axes.
 
-    Raises
-    ------
-    ValueError
-        If the shapes or the spacing are wrong.
+    Raises:
+        ValueError: If the shapes or the spacing are wrong.
     """
 
     values: NDArray[np.floating]
@@ -100,10 +94,8 @@ def _box(lower: ArrayLike, upper: ArrayLike) -> tuple[NDArray[np.float64], NDArr
 def grid_shape(lower: ArrayLike, upper: ArrayLike, spacing: float) -> tuple[int, int, int]:
     """Return how many voxels cover a box, so that the outermost centres lie on it or beyond.
 
-    Raises
-    ------
-    ValueError
-        If the box is empty or the spacing is not positive.
+    Raises:
+        ValueError: If the box is empty or the spacing is not positive.
     """
     low, high = _box(lower, upper)
     if not (np.isfinite(spacing) and spacing > 0):
@@ -126,10 +118,8 @@ def check_memory(
 ) -> None:
     """Refuse a grid that would not fit in memory, before anything is computed.
 
-    Raises
-    ------
-    ResourceError
-        With the bytes needed, the bytes free, and the finest spacing that fits.
+    Raises:
+        ResourceError: With the bytes needed, the bytes free, and the finest spacing that fits.
     """
     needed = estimated_bytes(lower, upper, spacing, bytes_per_voxel=bytes_per_voxel)
     free = available_memory()
@@ -149,17 +139,12 @@ def check_memory(
 def grid_over(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Volume:
     """Return a volume of zeros whose voxel centres cover a box, centred on it.
 
-    Parameters
-    ----------
-    lower, upper : (3,) float, m
-        Opposite corners of the box.
-    spacing : float, m
-        Distance between voxel centres.
+    Args:
+        lower, upper ((3,), m): Opposite corners of the box.
+        spacing (m): Distance between voxel centres.
 
-    Returns
-    -------
-    volume : Volume
-        float64 zeros; the outermost centres lie on the box or less than one spacing beyond.
+    Returns:
+        volume: float64 zeros; the outermost centres lie on the box or less than one spacing beyond.
     """
     shape = grid_shape(lower, upper, spacing)
     check_memory(lower, upper, spacing)
@@ -182,32 +167,21 @@ def volume_from_function(
     A position does not depend on the chunk that it falls into, so that a function of the position
     alone gives the same volume whatever ``chunk`` is.
 
-    Parameters
-    ----------
-    function : callable
-        Maps positions (N, 3) m to values (N,).
-    lower, upper : (3,) float, m
-        Opposite corners of the box.
-    spacing : float, m
-        Distance between voxel centres.
-    chunk : int
-        Greatest N.
-    progress : callable, optional
-        Called with the voxels done and the voxels in all, after each chunk.
+    Args:
+        function: Maps positions (N, 3) m to values (N,).
+        lower, upper ((3,), m): Opposite corners of the box.
+        spacing (m): Distance between voxel centres.
+        chunk: Greatest N.
+        progress: Called with the voxels done and the voxels in all, after each chunk.
 
-    Returns
-    -------
-    volume : Volume
-        The values, float64.
+    Returns:
+        volume: The values, float64.
 
-    Raises
-    ------
-    ValueError
-        If the box, the spacing, the chunk, or the shape that the function returns is wrong.
-    ResourceError
-        If the grid would not fit in memory.
-    NumericalError
-        If a value is not finite.
+    Raises:
+        ValueError: If the box, the spacing, the chunk, or the shape that the function returns is
+            wrong.
+        ResourceError: If the grid would not fit in memory.
+        NumericalError: If a value is not finite.
     """
     if chunk < 1:
         raise ValueError(f"chunk: {chunk}, expected 1 or more")
@@ -236,10 +210,8 @@ def volume_from_function(
 def require_finite(volume: Volume) -> None:
     """Refuse a volume that holds NaN or infinity.
 
-    Raises
-    ------
-    NumericalError
-        With the number of voxels that are not finite.
+    Raises:
+        NumericalError: With the number of voxels that are not finite.
     """
     faulty = volume.values.size - int(np.isfinite(volume.values).sum())
     if faulty:
@@ -251,22 +223,15 @@ def require_finite(volume: Volume) -> None:
 def vti_bytes(volume: Volume, name: str = "reflectivity") -> bytes:
     """Return a VTK image file (``.vti``) that ParaView and 3D Slicer open, in metres.
 
-    Parameters
-    ----------
-    volume : Volume
-        Stored as float32, x fastest, as VTK has it.
-    name : str
-        Name of the values inside the file; letters, digits and underscores.
+    Args:
+        volume: Stored as float32, x fastest, as VTK has it.
+        name: Name of the values inside the file; letters, digits and underscores.
 
-    Returns
-    -------
-    data : bytes
-        The file, the same for the same volume.
+    Returns:
+        data: The file, the same for the same volume.
 
-    Raises
-    ------
-    ValueError
-        If the name holds anything else.
+    Raises:
+        ValueError: If the name holds anything else.
     """
     if not name.isidentifier():
         raise ValueError(f"name: {name!r}, expected letters, digits and underscores")
