@@ -1,13 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""What callbacks share: epochs counted from the step, the fit's progress, its number of threads."""
+"""Epochs counted from the step; the fit's progress, its number of threads, its checkpoints."""
 
 from __future__ import annotations
 
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import lightning
 import torch
 
+from sononerf.errors import StoppedError
 from sononerf.field.module import EchoModule
 from sononerf.progress import Task
 
@@ -133,3 +141,118 @@ class ThreadsCallback(lightning.Callback):
         """Give all threads back."""
         del trainer, pl_module, stage
         torch.set_num_threads(self.most)
+
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class CheckpointCallback(EpochCallback):
+    """Keeps ``checkpoints/last.ckpt``; the step it holds is where the fit goes on.
+
+    Args:
+        folder: The run.
+        seconds: Longest time between two checkpoints.
+    """
+
+    def __init__(self, folder: Path, seconds: float) -> None:
+        self.path = folder / "checkpoints" / "last.ckpt"
+        self.seconds = seconds
+        self.stopped_by: int | None = None
+        self._saved = self._began = time.monotonic()
+        self._earlier = 0.0
+        self._before: dict[signal.Signals, Callable[..., Any] | int] = {}
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of fitting so far, those before an interruption included."""
+        return self._earlier + time.monotonic() - self._began
+
+    def state_dict(self) -> dict[str, float]:
+        """Return what a checkpoint keeps of this callback."""
+        return {"elapsed": self.elapsed}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Go on counting where the interrupted fit stopped."""
+        self._earlier = float(state_dict["elapsed"])
+        self._began = time.monotonic()
+
+    @contextmanager
+    def watching(self) -> Iterator[None]:
+        """Turn signals into an orderly stop; a second one does what it did without us."""
+        if threading.current_thread() is threading.main_thread():
+            for number in SIGNALS:
+                handler = signal.getsignal(number)
+                # What was ignored when we were started (nohup, a shell's &) stays ignored.
+                if handler is not None and handler is not signal.SIG_IGN:
+                    self._before[number] = handler
+        self._watch()
+        try:
+            yield
+        finally:
+            self._let_go()
+
+    def _watch(self) -> None:
+        for number in self._before:
+            signal.signal(number, self._note)
+
+    def _let_go(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        del frame
+        if self.stopped_by is not None:
+            self._let_go()
+            signal.raise_signal(number)
+        self.stopped_by = number
+
+    def _save(self, trainer: lightning.Trainer) -> None:
+        trainer.save_checkpoint(self.path)
+        self._saved = time.monotonic()
+
+    def _stop(self, module: EchoModule) -> None:
+        # Lightning's own way of stopping validates once more first.
+        raise StoppedError(
+            self.stopped_by or signal.SIGTERM,
+            f"stopped at step {module.global_step} of {module.total_steps}; "
+            "the same command goes on",
+        )
+
+    def _is_asked_to_stop(self, trainer: lightning.Trainer, module: EchoModule) -> bool:
+        # All devices stop together; a fit that is over has nothing to stop.
+        asked = trainer.strategy.reduce_boolean_decision(self.stopped_by is not None, all=False)
+        return asked and module.global_step < module.total_steps
+
+    def on_train_start(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Take SIGTERM back from Lightning, which would end with exit code 0."""
+        del trainer, pl_module
+        self._watch()
+
+    def on_epoch(self, trainer: lightning.Trainer, module: EchoModule, epoch: int) -> None:
+        """Save what the epoch reached."""
+        del epoch
+        self._save(trainer)
+        if self._is_asked_to_stop(trainer, module):
+            self._stop(module)
+
+    def on_train_batch_end(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        outputs: Any,
+        batch: Any,
+        batch_idx: int,
+    ) -> None:
+        """Save when it is time, or when asked to stop."""
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+        module = echo_module(pl_module)
+        if self._boundary(module):
+            return  # saved after its validation, so that none is left out by who goes on from it
+        asked = self._is_asked_to_stop(trainer, module)
+        late = time.monotonic() - self._saved >= self.seconds
+        if asked or trainer.strategy.reduce_boolean_decision(late, all=False):
+            self._save(trainer)
+        if asked:
+            self._stop(module)

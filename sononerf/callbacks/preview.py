@@ -13,14 +13,14 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from sononerf import storage
 from sononerf.callbacks.epoch import EpochCallback
 from sononerf.errors import NumericalError
+from sononerf.field.datamodule import WholePoses
 from sononerf.field.module import EchoModule, decibels
-from sononerf.field.range_slices import WholePoses
 from sononerf.report.mesh_files import mesh_bytes
 from sononerf.report.pictures.figure import png_from_pixels
 from sononerf.report.pictures.mip_picture import maximum_intensity_projections, mip_image
 from sononerf.report.pictures.spectrogram_picture import spectrogram_image
-from sononerf.surface.start.isosurface import automatic_level, isosurface
 from sononerf.surface.start.read_out import energy_volume
+from sononerf.surface.start.volume import automatic_level, isosurface
 
 
 class PreviewCallback(EpochCallback):

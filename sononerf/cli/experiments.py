@@ -68,7 +68,7 @@ def simulate(
             for path in draw_ensemble(settings, store, preview):
                 say(f"wrote {path}")
     if waveforms is not None:
-        from sononerf.run.waveforms import write_waveforms
+        from sononerf.run.simulate import write_waveforms
 
         for path in write_waveforms(settings, waveforms, progress=Progress()):
             say(f"wrote {path}")

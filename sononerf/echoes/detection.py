@@ -45,7 +45,7 @@ from scipy.special import gammaincinv
 from scipy.stats import poisson
 
 from sononerf.echoes.store import EnsembleStore
-from sononerf.head.point_echo import PointEcho, own_top
+from sononerf.head.head import PointEcho, own_top
 from sononerf.head.row_filters import band_mean
 
 Array = NDArray[np.float64]

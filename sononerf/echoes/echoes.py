@@ -12,9 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from sononerf.echoes.consistency import weighted
 from sononerf.echoes.detection import Onsets, find_onsets
-from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.echoes.layout import AXES
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
 from sononerf.echoes.store import EnsembleStore

@@ -13,10 +13,11 @@ References:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy import sparse
 from scipy.spatial.distance import cdist
 
 Array = NDArray[np.float64]
@@ -131,3 +132,129 @@ class EchoHull:
         spare = min(self.undetected, left.shape[1] - 1)
         pose = np.argpartition(left, spare, axis=1)[:, spare] if spare else left.argmin(axis=1)
         return left[np.arange(len(points)), pose], pose
+
+
+Mask = NDArray[np.bool_]
+
+ACCURACY = 0.1
+"""Usual error of an onset's range, in range resolutions. Of simulated bodies half of all onsets are
+read to a twentieth of the resolution, and nearly all that are not late to a fifth."""
+
+# Sizes of the search, not of what it finds: cells of the first lattice along the longest side, the
+# greatest number of pairs of a cell and an onset, and how often the half diagonal of the last cells
+# is halved down to the error of an onset.
+COARSE, MOST_PAIRS, LEVELS = 24, 1.2e8, 4
+OCTANTS = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def weighted(hull: EchoHull, resolution: float) -> EchoHull:
+    """Return the hull with weight zero for onsets that the others contradict.
+
+    A first echo comes from some place at its range that all other poses leave free to hold
+    something. Where there is none, one of them is wrong. An onset is *late* if the nearest point of
+    a body answered too faintly to be detected, as the edge of a thin sheet does beside the flash of
+    its face: then it rules out places that several others heard. It is *early* if noise was taken
+    for an echo: then many others rule out all places at its range.
+
+    Each onset without an origin looks for the places at its range that the fewest others rule out,
+    and these, n of them, get a blame of 1/n. An onset is an outlier if its blame reaches the number
+    of ears, as if it alone contradicted a whole pose. The most blamed ones, down to half of the
+    greatest blame, are removed, and so on until none is left. An onset whose places are all ruled
+    out by more than a few is an outlier itself. Gross outliers go first, at a coarse look at
+    places: fewer are then left to confuse a fine one.
+
+    Args:
+        hull: What the onsets leave.
+        resolution (m): Range resolution.
+    """
+    box, ears = _heard_box(hull), hull.first.shape[1]
+    if box is None:
+        return hull
+    error = ACCURACY * resolution
+    for scale in 2.0 ** -np.arange(LEVELS):  # gross outliers first
+        reach = error * scale * 2.0 ** (LEVELS - 1)
+        weight = np.array(hull.weight).reshape(-1)
+        heard = np.flatnonzero(weight)
+        homeless = heard[~_cells(hull, box, heard, 0, error, reach)[1].any(axis=0)]
+        if len(homeless):
+            few = max(int(UNDETECTED * scale * len(heard)), 4 * ears)
+            against, meets = _cells(hull, box, homeless, few, error, reach)
+            _remove(weight, homeless, against, meets, few, float(ears))
+            hull = replace(hull, weight=weight.reshape(hull.first.shape))
+    return hull
+
+
+def _remove(
+    weight: Array,
+    homeless: NDArray[np.intp],
+    against: Mask,
+    meets: Mask,
+    few: int,
+    enough: float,
+) -> None:
+    """Set the weight of outliers to zero; arrays as of ``_cells``."""
+    count = against.sum(axis=1).astype(int)
+    blocks = sparse.csr_matrix(against.astype(np.float64))
+    while True:
+        least = np.where(meets, count[:, None], few + 1).min(axis=0, initial=few + 1)
+        asks = np.flatnonzero((least > 0) & (least <= few) & (weight[homeless] > 0))
+        if not len(asks):
+            break
+        origins = sparse.csr_matrix(
+            (meets[:, asks] & (count[:, None] == least[asks])).astype(float)
+        )
+        lost = (origins.T @ blocks) > 0  # (asks, onsets)
+        blame = np.asarray(lost.multiply(1.0 / least[asks][:, None]).sum(axis=0)).reshape(-1)
+        blame[weight == 0] = 0.0
+        worst = np.flatnonzero(blame >= max(enough, blame.max() / 2))
+        if not len(worst):
+            break
+        weight[worst] = 0.0
+        count -= against[:, worst].sum(axis=1)
+    weight[homeless[least > few]] = 0.0
+
+
+def _heard_box(hull: EchoHull) -> Array | None:
+    """Return a box around where each first echo comes from if it lies ahead, (2, 3) m."""
+    first = hull.trusted.max(axis=1)
+    known = np.isfinite(first)
+    if not known.any():
+        return None
+    ahead = hull.sources[known] + hull.axes[known] * first[known, None]
+    lower, upper = ahead.min(axis=0), ahead.max(axis=0)
+    # To the sides as well: half of the mean range at least.
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    half = np.maximum(half * 1.5, first[known].mean() / 2)
+    return np.stack((middle - half, middle + half))
+
+
+def _cells(
+    hull: EchoHull, box: Array, wanted: NDArray[np.intp], few: int, error: float, least: float
+) -> tuple[Mask, Mask]:
+    """Return cells at the range of wanted onsets that at most a few others rule out.
+
+    They are halved until half their diagonal is the least, m.
+
+    Returns:
+        against (N, P E): Which onsets rule a cell out.
+        meets (N, W): At which wanted onsets' range it lies.
+    """
+    lower, upper = box
+    side = float((upper - lower).max()) / COARSE
+    axes = [np.arange(a + side / 2, b + side / 2, side) for a, b in zip(lower, upper, strict=True)]
+    cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    while True:
+        reach = side * np.sqrt(3) / 2 + error
+        kept = []
+        for start in range(0, len(cells), hull.chunk):
+            part = cells[start : start + hull.chunk]
+            behind = hull.behind(part).reshape(len(part), -1)
+            against, meets = behind < -reach, np.abs(behind[:, wanted]) <= reach
+            keep = (against.sum(axis=1) <= few) & meets.any(axis=1)
+            kept.append((part[keep], against[keep], meets[keep]))
+        cells, against, meets = (np.concatenate(each) for each in zip(*kept, strict=True))
+        finer = 8.0 * len(cells) * hull.first.size
+        if reach <= least + error or finer > MOST_PAIRS or not len(cells):
+            return against, meets
+        cells = (cells[:, None] + side * OCTANTS).reshape(-1, 3)
+        side /= 2

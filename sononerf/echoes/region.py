@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.distance import cdist
 
-from sononerf.echoes.consistency import ACCURACY
 from sononerf.echoes.detection import FALSE_ALARMS, Onsets, threshold_levels
-from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.free_space import ACCURACY, EchoHull
 from sononerf.errors import NumericalError
 from sononerf.head.ears import Ears
 

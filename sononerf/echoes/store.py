@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The ensemble on disk: what the receivers heard at every pose, each pose whole or not there."""
+"""The ensemble on disk: what the receivers heard at every pose; each pose is whole or missing."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from sononerf.echoes.layout import (
     SPECTROGRAM,
     SPLITS,
     DurableStore,
+    Manifest,
+    PoseRecord,
     checked_axes,
     chunk_path,
     create_arrays,
@@ -25,8 +27,8 @@ from sononerf.echoes.layout import (
     read_axes,
     write_group,
 )
-from sononerf.echoes.manifest import Manifest, PoseRecord
 from sononerf.errors import IncompatibleError, InputError, NumericalError
+from sononerf.head.decibels import RANGE_DB, compress, mae_db
 
 
 class EnsembleStore:
@@ -298,3 +300,28 @@ def _refuse_foreign(path: Path) -> None:
     foreign = sorted(p.name for p in path.iterdir() if p.name not in ours and p.name[0] != ".")
     if foreign:
         raise InputError(f"{path}: holds {foreign[0]!r} and is no ensemble store; choose another")
+
+
+def seal(store: EnsembleStore, again: dict[int, NDArray[np.float32]], *, silent: str) -> None:
+    """Fix the reported decibels and the noise floor of a complete ensemble, and seal it.
+
+    Args:
+        store: No pose is missing.
+        again: By number of a test pose, what the same pose heard another time, (E, R, F).
+        silent: What to say if no training pose heard anything.
+
+    Raises:
+        NumericalError: If no training pose heard anything.
+    """
+    loudest = max(float(store.read_pose(int(i)).max()) for i in store.indices("train"))
+    if loudest <= 0.0:
+        raise NumericalError(silent)
+    reference = loudest * 10.0 ** (-RANGE_DB / 20.0)
+    noise: dict[str, float | None] = {"noise_floor_mae_db": None, "noise_floor_mae_db_active": None}
+    if again:
+        first = compress(np.stack([store.read_pose(i) for i in again]), reference)
+        second = compress(np.stack(list(again.values())), reference)
+        noise["noise_floor_mae_db"] = mae_db(first, second)
+        noise["noise_floor_mae_db_active"] = mae_db(first, second, active=True)
+    store.update_attributes(reference=reference, **noise)
+    store.seal()

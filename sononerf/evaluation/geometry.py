@@ -1,25 +1,155 @@
 # SPDX-License-Identifier: MIT
-"""A reconstructed surface, and the baselines that need no learning, beside the true surface."""
+"""A reconstructed surface and the baselines beside the true surface, registered if need be."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from trimesh.registration import procrustes
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import NumericalError
-from sononerf.evaluation.baseline import backprojection, best_level_surface
+from sononerf.evaluation.baseline import backprojection, best_level_surface, voxel_fit
 from sononerf.evaluation.metrics import geometry_metrics, target_metrics
-from sononerf.evaluation.registration import Kind, Registration, register
 from sononerf.evaluation.solid import Solid
-from sononerf.evaluation.voxels import voxel_fit
 from sononerf.geometry.poses import Poses
 from sononerf.scene.scene import Scene
 from sononerf.surface.start.volume import Volume
+
+Kind = Literal["none", "rigid", "similarity"]
+
+COARSE = 500
+"""Samples of each surface while all starts are compared."""
+FINE = 10_000
+"""Samples of each surface for the best starts."""
+BEST = 3
+"""Number of starts that are refined with all samples."""
+STEPS = 100
+"""Most iterations from one start; most end after 20 to 50."""
+SETTLED = 1e-5
+"""Relative change of the mean distance at which the iteration ends."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """A rigid motion or similarity.
+
+    Attributes:
+        matrix (4, 4): From the reconstruction's frame to the true one, lengths in m.
+        scale: Of lengths; 1 for a rigid motion.
+    """
+
+    matrix: NDArray[np.float64]
+    scale: float
+
+    def inverse(self) -> Registration:
+        """Return the motion from the true frame to that of the reconstruction."""
+        return Registration(
+            np.asarray(np.linalg.inv(self.matrix), dtype=np.float64), 1.0 / self.scale
+        )
+
+    def of(self, mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+        """Return a moved copy of a mesh."""
+        moved = mesh.copy()
+        moved.apply_transform(self.matrix)
+        return moved
+
+
+def register(
+    found: trimesh.Trimesh, truth: trimesh.Trimesh, kind: Kind, *, seed: int = 0
+) -> Registration:
+    """Find the motion that lays one surface over another, by iterated closest points [1]_.
+
+    Each point of either surface is drawn to the nearest one of the other, so that a part of one
+    surface is not laid over a whole. The iteration starts as the surfaces lie and from all proper
+    alignments of their principal axes; the best result counts. A mirror image is never taken.
+
+    Args:
+        found: Reconstruction, m.
+        truth: True surface, any unit if ``kind`` is ``similarity``.
+        kind: No motion; rotation and translation; and one scale.
+        seed: Of the samples. The same seed gives the same motion.
+
+    Returns:
+        registration: Identity for ``none``.
+
+    References:
+        .. [1] P. J. Besl and N. D. McKay, "A method for registration of 3-D shapes", IEEE PAMI
+           14(2), 1992.
+    """
+    if kind == "none":
+        return Registration(np.eye(4), 1.0)
+    scaled = kind == "similarity"
+    points, target = (
+        np.asarray(trimesh.sample.sample_surface(mesh, FINE, seed=seed)[0])
+        for mesh in (found, truth)
+    )
+    tried = [
+        _closest(points[:COARSE], target[:COARSE], start, scaled)
+        for start in _starts(points, target, scaled)
+    ]
+    tried.sort(key=lambda pair: pair[0])
+    best = min(
+        (_closest(points, target, start, scaled) for _, start in tried[:BEST]),
+        key=lambda pair: pair[0],
+    )
+    return Registration(best[1], float(np.cbrt(np.linalg.det(best[1][:3, :3]))))
+
+
+def _starts(
+    points: NDArray[np.float64], target: NDArray[np.float64], scaled: bool
+) -> list[NDArray[np.float64]]:
+    """Return the first guesses (4, 4): as they lie, moved to one centre, and axes aligned."""
+    middles = points.mean(axis=0), target.mean(axis=0)
+    spread = [
+        np.sqrt(((p - m) ** 2).sum(axis=1).mean())
+        for p, m in zip((points, target), middles, strict=True)
+    ]
+    scale = spread[1] / spread[0] if scaled else 1.0
+    axes = [np.linalg.svd(p - m, full_matrices=False)[2] for p, m in
+            zip((points, target), middles, strict=True)]  # fmt: skip
+    turns = [np.eye(3)]
+    for order in itertools.permutations(range(3)):
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            turn = axes[1].T @ (np.array(signs)[:, None] * axes[0][list(order)])
+            if np.linalg.det(turn) > 0:
+                turns.append(turn)
+    starts = [] if scaled else [np.eye(4)]
+    for turn in turns:
+        start = np.eye(4)
+        start[:3, :3] = scale * turn
+        start[:3, 3] = middles[1] - scale * turn @ middles[0]
+        starts.append(start)
+    return starts
+
+
+def _closest(
+    points: NDArray[np.float64],
+    target: NDArray[np.float64],
+    start: NDArray[np.float64],
+    scaled: bool,
+) -> tuple[float, NDArray[np.float64]]:
+    """Iterate from a start; return the mean distance, m, and the motion."""
+    tree, motion, before = cKDTree(target), start, np.inf
+    for _ in range(STEPS):
+        moved = trimesh.transform_points(points, motion)
+        out, near = tree.query(moved)
+        back, origin = cKDTree(moved).query(target)
+        error = 0.5 * float(out.mean() + back.mean())
+        if error > (1.0 - SETTLED) * before:
+            break
+        before = error
+        pairs = np.concatenate([points, points[origin]]), np.concatenate([target[near], target])
+        motion = procrustes(*pairs, reflection=False, scale=scaled, return_cost=False)
+    return before, np.asarray(motion)
+
 
 BASELINE_VOXELS = 64
 """Voxels of a baseline along the region's longest side: finer than the window in any scene of

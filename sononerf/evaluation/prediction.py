@@ -14,8 +14,8 @@ from scipy.spatial import cKDTree
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import NumericalError
 from sononerf.evaluation.traced import Traced, mix, trace_poses
+from sononerf.field.datamodule import WholePoses
 from sononerf.field.fitting import FittedField, render_poses
-from sononerf.field.range_slices import WholePoses
 from sononerf.head.decibels import (
     ACTIVE_DB,
     RANGE_DB,

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import ResourceError, SonoNerfError
+from sononerf.field.datamodule import WholePoses
 from sononerf.field.fitting import FittedField, poses_of, render_poses
-from sononerf.field.range_slices import WholePoses
 from sononerf.head.decibels import compress
 from sononerf.head.head import Head
 from sononerf.progress import Progress

@@ -20,9 +20,8 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError, ResourceError
 from sononerf.field.checkpoint_io import DurableCheckpointIO
-from sononerf.field.datamodule import EchoDataModule
+from sononerf.field.datamodule import EchoDataModule, PoseReader, WholePoses
 from sononerf.field.module import EchoModule
-from sononerf.field.range_slices import PoseReader, WholePoses
 from sononerf.field.renderer import Renderer
 from sononerf.head.head import Head
 from sononerf.progress import Progress

@@ -12,8 +12,8 @@ from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torchmetrics import MeanMetric
 
 from sononerf.errors import NumericalError
+from sononerf.field.datamodule import RangeSlices, seed_of
 from sononerf.field.field import Field
-from sononerf.field.range_slices import RangeSlices, seed_of
 from sononerf.field.renderer import Possible, Renderer
 from sononerf.head.decibels import ACTIVE_DB, RANGE_DB
 

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sononerf.geometry.inside import winding_numbers
+from sononerf.geometry.raycast import winding_numbers
 
 FLAT = 1e-7
 """A triangle lower than this share of its longest side has no area in single precision."""

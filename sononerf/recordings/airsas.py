@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 
 from sononerf.errors import InputError
 from sononerf.recordings import matlab as hdf5
+from sononerf.recordings.audio import Recording
 from sononerf.recordings.columns import PLACE, Columns
-from sononerf.recordings.writer import Recording
 from sononerf.settings.import_schema import ImportSettings
 
 ACROSS = np.pi / 2  # yaw of a head that looks to positive y, rad

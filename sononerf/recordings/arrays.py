@@ -30,8 +30,8 @@ from numpy.typing import NDArray
 from sononerf.echoes.layout import SPLITS
 from sononerf.errors import InputError
 from sononerf.recordings import matlab as hdf5
+from sononerf.recordings.audio import Recording
 from sononerf.recordings.columns import EULER, PLACE, Columns, columns_of
-from sononerf.recordings.writer import Recording
 from sononerf.settings.import_schema import ImportSettings
 
 HDF5 = (".h5", ".hdf5", ".hdf")

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from sononerf.errors import InputError
 from sononerf.recordings import arrays, audio
+from sononerf.recordings.audio import Recording
 from sononerf.recordings.columns import Columns, read_table
-from sononerf.recordings.writer import Recording
 from sononerf.settings.import_schema import ImportSettings
 
 SUFFIXES = (*audio.SUFFIXES, *arrays.SUFFIXES)

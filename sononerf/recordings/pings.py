@@ -15,9 +15,8 @@ import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.errors import InputError
-from sononerf.head.matched_filter import inverse_filter
-from sononerf.recordings.audio import as_float
-from sononerf.recordings.writer import Recording
+from sononerf.head.call import inverse_filter
+from sononerf.recordings.audio import Recording, as_float
 
 Array = NDArray[np.float64]
 

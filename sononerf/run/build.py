@@ -1,27 +1,138 @@
 # SPDX-License-Identifier: MIT
-"""Settings into field, renderer and module."""
+"""Settings into objects: the store's settings, head, simulator, field, renderer, true surface."""
 
 from __future__ import annotations
 
+import logging
+from pathlib import Path
+
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sononerf import storage
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import InputError, SettingsError
+from sononerf.errors import IncompatibleError, InputError, SettingsError, SonoNerfError
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.field import Field
 from sononerf.field.module import EchoModule
 from sononerf.field.renderer import Possible, Renderer
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.head.head import Head
-from sononerf.scene.scene import Scene
+from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings import plugins
-from sononerf.settings.loading import faults_of
-from sononerf.settings.schema import Settings
+from sononerf.settings.loading import faults_of, validate_settings
+from sononerf.settings.schema import FILE_SECTIONS, HEAD_SECTIONS, Settings
 from sononerf.simulation.simulator import Simulator
+
+OWN_KEYS = ("spectrogram.dynamic_range_db",)
+"""Keys of these sections that an experiment may choose: they do not describe the echoes."""
+
+
+def with_store(settings: Settings) -> Settings:
+    """Complete the settings by what the store knows, if the echoes come from a store.
+
+    Settings with a scene are left as they are.
+
+    Args:
+        settings: As the user gave them. A key that was not given takes the store's value.
+
+    Returns:
+        settings: With air, ears, call and analysis of the store.
+
+    Raises:
+        IncompatibleError: If the settings contradict the store.
+        InputError: If there is no such store, or it does not say how it was recorded.
+    """
+    if settings.scene is not None or settings.data.store is None:
+        return settings
+    path = settings.data.store
+    known = EnsembleStore.open(path).attributes.get("settings")
+    if not isinstance(known, dict) or not all(
+        isinstance(known.get(k), dict) for k in HEAD_SECTIONS
+    ):
+        raise InputError(
+            f"{path}: does not state its head (settings of {', '.join(HEAD_SECTIONS)}); "
+            "import the recordings again"
+        )
+    resolved = settings.plain()
+    different = []
+    for section in HEAD_SECTIONS:
+        # The store's own values are checked like a file's; a newer key takes its default.
+        given = getattr(settings, section)
+        for key in given.model_fields_set:
+            name = f"{section}.{key}"
+            if name in OWN_KEYS:
+                known[section][key] = resolved[section][key]
+            elif key in known[section] and known[section][key] != resolved[section][key]:
+                different.append(
+                    f"{name}: found {resolved[section][key]}, the store has {known[section][key]}"
+                )
+        resolved[section] = known[section]
+    if different:
+        raise IncompatibleError(
+            f"{path}: the settings contradict the store; leave these keys out: "
+            + "; ".join(sorted(different))
+        )
+    return with_attached(validate_settings(resolved, settings.source or str(path)), path)
+
+
+def complete_store(path: Path) -> EnsembleStore:
+    """Open a store of which nothing is missing.
+
+    Raises:
+        InputError: If a pose is missing, or the store is not finished.
+    """
+    store = EnsembleStore.open(path)
+    missing = store.missing()
+    if missing or "reference" not in store.attributes:
+        what = f"{len(missing)} poses are missing" if missing else "it is not finished"
+        raise InputError(f"{path}: {what}; give the same simulate or import command again")
+    return store
+
+
+FOLDER = "attached"
+"""Where the copies are, in the folder of a run or a store."""
+
+
+def attach(settings: Settings, folder: Path) -> None:
+    """Copy the files that settings name into a folder, if they are not there yet.
+
+    Args:
+        settings: Of the run or the store.
+        folder: Of the run or the store.
+
+    Raises:
+        InputError: If a file cannot be read.
+        StorageError: If a copy cannot be written.
+    """
+    for section in FILE_SECTIONS:
+        file = getattr(settings, section).file
+        if file is None or (copy := _copy_of(file, section, folder)).is_file():
+            continue
+        try:
+            content = file.read_bytes()
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read ({error.strerror})") from None
+        storage.make_folder(copy.parent)
+        storage.commit_bytes(copy, content)
+
+
+def with_attached(settings: Settings, folder: Path) -> Settings:
+    """Return the settings with the paths of copies in a folder, where there are copies."""
+    found = {}
+    for section in FILE_SECTIONS:
+        own = getattr(settings, section)
+        if own.file is not None and (copy := _copy_of(own.file, section, folder)).is_file():
+            found[section] = own.model_copy(update={"file": copy})
+    return settings.model_copy(update=found) if found else settings
+
+
+def _copy_of(file: Path, section: str, folder: Path) -> Path:
+    return folder / FOLDER / f"{section}{file.suffix}"
 
 
 def _tensor(values: NDArray[np.floating]) -> Tensor:
@@ -164,3 +275,60 @@ def module_for(
         silent_weight=fit.silent_weight,
         seed=fit.seed,
     )
+
+
+logger = logging.getLogger("sononerf")
+
+MOST_BYTES = 2_000_000_000
+"""A larger file is refused before it is read."""
+KINDS = (".ply", ".stl", ".obj", ".off", ".glb")
+
+
+def true_scene(settings: Settings) -> Scene | None:
+    """Return the scene of a run; None without one, and with a warning if it cannot be loaded."""
+    if settings.scene is None:
+        return None
+    try:
+        return load_scene(settings.scene.name, settings.scene.options)
+    except SonoNerfError as error:
+        logger.warning(
+            "the true surface is unknown: %s; evaluation.truth=FILE names another file of it", error
+        )
+        return None
+
+
+def true_mesh(settings: Settings) -> trimesh.Trimesh | None:
+    """Return ``evaluation.truth``, or else the scene's own surface; None where neither is known.
+
+    Raises:
+        InputError: If the file of ``evaluation.truth`` is no mesh.
+    """
+    if settings.evaluation.truth is not None:
+        return read_truth(settings.evaluation.truth)
+    scene = true_scene(settings)
+    return None if scene is None else scene.mesh
+
+
+def read_truth(path: Path) -> trimesh.Trimesh:
+    """Read a true surface from a file.
+
+    Raises:
+        InputError: If it is missing, of another kind, damaged, empty or not finite.
+    """
+    if path.suffix.lower() not in KINDS:
+        raise InputError(f"{path}: evaluation.truth: expected one of {', '.join(KINDS)}")
+    if not path.is_file():
+        raise InputError(f"{path}: evaluation.truth: no such file")
+    if path.stat().st_size > MOST_BYTES:
+        raise InputError(f"{path}: evaluation.truth: larger than {MOST_BYTES} bytes")
+    try:
+        mesh = trimesh.load_mesh(path)
+        if isinstance(mesh, trimesh.Scene):
+            mesh = mesh.to_mesh()
+        good = isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 0
+        good = good and bool(np.isfinite(mesh.vertices).all())
+    except Exception as error:  # trimesh's readers raise whatever they met first
+        raise InputError(f"{path}: evaluation.truth: damaged ({error})") from error
+    if not good:
+        raise InputError(f"{path}: evaluation.truth: holds no surface of finite triangles")
+    return mesh

@@ -16,15 +16,14 @@ from scipy.spatial.transform import Rotation
 
 from sononerf import storage
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.sealing import seal
-from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.store import EnsembleStore, seal
 from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
+from sononerf.run.build import attach
 from sononerf.run.fitted import Fitted
 from sononerf.run.run_folder import RunFolder
-from sononerf.run.store_settings import attach
 from sononerf.settings.schema import HEAD_SECTIONS, SpectrogramSettings
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.self_calibration import KINDS, Calibration, Calibrator, Estimate, Kind

@@ -14,15 +14,15 @@ from sononerf import storage
 from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.evaluation.baseline import backprojection
 from sononerf.evaluation.prediction import added_part, compare
+from sononerf.field.datamodule import WholePoses
 from sononerf.field.fitting import render_poses
-from sononerf.field.range_slices import WholePoses
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.mip_picture import difference_pngs, overlay_png
+from sononerf.run.build import true_mesh
 from sononerf.run.fitted import Fitted, all_poses
 from sononerf.run.run_folder import RunFolder, differing_keys, results_folder
-from sononerf.run.truth import true_mesh
 from sononerf.simulation.simulator import TRAIN
 from sononerf.surface.start.volume import Volume, vti_bytes
 

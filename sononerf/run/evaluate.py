@@ -7,12 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from sononerf import storage
-from sononerf.evaluation.geometry import Truth, baselines
-from sononerf.evaluation.registration import Kind
+from sononerf.evaluation.geometry import Kind, Truth, baselines
 from sononerf.progress import Progress
+from sononerf.run.build import read_truth, true_scene
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
-from sononerf.run.truth import read_truth, true_scene
 
 
 def evaluate(

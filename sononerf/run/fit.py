@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Fit a field to an ensemble; go on where an interrupted fit stopped."""
+"""Fit a field to an ensemble, then reconstruct, predict and evaluate; go on where it stopped."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from sononerf import storage
-from sononerf.callbacks.checkpoint import CheckpointCallback
-from sononerf.callbacks.epoch import ProgressCallback, ThreadsCallback
+from sononerf.callbacks.epoch import CheckpointCallback, ProgressCallback, ThreadsCallback
 from sononerf.callbacks.preview import PreviewCallback, SpectrogramImages
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import ResourceError, StoppedError
+from sononerf.errors import NumericalError, ResourceError, StoppedError
+from sononerf.evaluation.traced import Traced, learn_traced
 from sononerf.field.checkpoint_io import DurableCheckpointIO, save_weights
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import FittedField, require_accelerator
@@ -34,8 +34,11 @@ from sononerf.run.build import (
     head_of,
     module_for,
     region_of,
+    with_store,
 )
-from sononerf.run.finish import finish
+from sononerf.run.evaluate import evaluate
+from sononerf.run.predict import predict
+from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
 from sononerf.run.simulate import (
     background_path,
@@ -43,8 +46,71 @@ from sononerf.run.simulate import (
     open_ensemble,
     store_path,
 )
-from sononerf.run.store_settings import with_store
 from sononerf.settings.schema import Settings
+
+
+def finish(
+    run: Path | RunFolder, *, accelerator: str = "auto", progress: Progress | None = None
+) -> dict[str, Any]:
+    """Reconstruct, find the weight of the surface's echoes, predict held-out poses, evaluate.
+
+    Stages that are done are left out, so that an interrupted call goes on with its own stage.
+
+    Args:
+        run: A fitted run.
+        accelerator: What to render on.
+        progress: Where to show it.
+
+    Returns:
+        metrics: ``RUN/metrics.json``.
+
+    Raises:
+        NumericalError: If the field has no surface; its predictions are written all the same.
+    """
+    progress = progress or Progress(quiet=True)
+    run = RunFolder.of(run)
+    shown: dict[str, Any] = {"accelerator": accelerator, "progress": progress}
+    no_surface: NumericalError | None = None
+    with run.locked():
+        try:
+            if not run.is_done("surface"):
+                reconstruct(run, **shown)
+            if not run.is_done("traced"):
+                _learn_traced(run, accelerator, progress)
+        except NumericalError as error:
+            no_surface = error
+        if not run.is_done("prediction"):
+            predict(run, **shown)
+        if no_surface is not None:
+            raise no_surface
+        if not run.is_done("evaluation"):
+            evaluate(run, progress=progress)
+    return run.read_metrics()
+
+
+def _learn_traced(run: RunFolder, accelerator: str, progress: Progress) -> None:
+    settings, mesh = run.fitted.settings, run.mesh()
+    run.begin("traced")
+    if settings.prediction.traced == "off":
+        traced = Traced.none(mesh, run.fitted.head)
+    else:
+        try:
+            traced = learn_traced(
+                run.fitted,
+                run.echoes,
+                mesh,
+                settings.simulation,
+                seed=settings.fit.seed,
+                accelerator=accelerator,
+                progress=progress,
+            )
+        except ResourceError as error:
+            progress.say(
+                f"no echoes are traced off the surface; the same command tries again: {error}"
+            )
+            return
+    run.keep_traced(traced)
+
 
 WAIT_SECONDS = 0.5
 PATIENCE_SECONDS = 120.0
@@ -115,7 +181,7 @@ def fit(
         num_nodes: How many machines.
         overwrite: Move a folder that is there aside.
         workers: Processes that simulate.
-        finishes: True also runs the stages after the fit, see :func:`sononerf.run.finish.finish`.
+        finishes: True also runs the stages after the fit, see :func:`sononerf.run.fit.finish`.
         progress: Where to show it.
 
     Returns:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A fitted field read back from a run's two files, and the echoes that it was fitted to."""
+"""A fitted field and its traced echoes read back from a run, and the echoes it was fitted to."""
 
 from __future__ import annotations
 
@@ -9,18 +9,22 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import safetensors.torch
 import torch
+import trimesh
 from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
 
+from sononerf import storage
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import IncompatibleError, InputError, SettingsError
-from sononerf.field.checkpoint_io import DESCRIPTION_NAME, load_weights
+from sononerf.evaluation.traced import Traced
+from sononerf.field.checkpoint_io import DESCRIPTION_NAME, load_weights, model_checksum
 from sononerf.field.fitting import FittedField
 from sononerf.geometry.poses import Poses
-from sononerf.run.build import field_and_renderer, head_of, module_for
+from sononerf.run.build import field_and_renderer, head_of, module_for, with_attached
 from sononerf.run.simulate import default_store, open_ensemble
-from sononerf.run.store_settings import with_attached
 from sononerf.settings.loading import validate_settings
 from sononerf.settings.schema import Settings
 from sononerf.simulation.simulator import ensemble_poses
@@ -121,3 +125,52 @@ def all_poses(fitted: Fitted) -> tuple[Poses, NDArray[np.int8]]:
         return ensemble_poses(fitted.settings.poses)
     store = echoes_of(fitted).store
     return Poses(store.positions, store.rotations), store.split
+
+
+NAME = "traced.safetensors"
+
+
+def save_traced(path: Path, traced: Traced) -> None:
+    """Write what was learned of the surface of a run."""
+    tensors = {
+        "vertices": torch.as_tensor(np.array(traced.mesh.vertices, dtype=np.float64)),
+        "faces": torch.as_tensor(np.array(traced.mesh.faces, dtype=np.int64)),
+        "gain_db": torch.as_tensor(traced.gain_db),
+        "weight": torch.as_tensor(traced.weight),
+        # Not in the metadata: several entries are written in any order, and the file differs.
+        "fault": torch.tensor(list(traced.fault.encode()), dtype=torch.uint8),
+    }
+    data = safetensors.torch.save(tensors, metadata={"model": model_checksum(path)})
+    storage.commit_bytes(path / NAME, data)
+
+
+def load_traced(path: Path) -> Traced | None:
+    """Read ``RUN/traced.safetensors``; None where there is none, or it belongs to another fit.
+
+    Raises:
+        InputError: If it is damaged.
+    """
+    file = path / NAME
+    if not file.is_file():
+        return None
+    try:
+        with safe_open(str(file), "pt") as opened:
+            found = {name: opened.get_tensor(name).numpy() for name in opened.keys()}
+            model = (opened.metadata() or {}).get("model")
+        if model != model_checksum(path):
+            return None
+        faces, vertices = found["faces"], found["vertices"]
+        gain, weight = found["gain_db"], found["weight"]
+        if not (np.isfinite(vertices).all() and np.isfinite(gain).all()):
+            raise ValueError("numbers that are not finite")
+        if not ((weight >= 0) & (weight <= 1)).all():
+            raise ValueError("weights outside 0 to 1")
+        if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
+            raise ValueError("a triangle names a vertex that is not there")
+        fault = found["fault"].tobytes().decode() if "fault" in found else ""  # older files
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        return Traced(mesh, gain, weight, fault)
+    except (SafetensorError, KeyError, ValueError, OSError) as error:
+        raise InputError(
+            f"{file}: damaged ({error}); remove it, and `sononerf fit` makes it again"
+        ) from None

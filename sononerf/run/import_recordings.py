@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from sononerf import __version__, storage
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.sealing import seal
-from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.store import EnsembleStore, seal
 from sononerf.errors import IncompatibleError
 from sononerf.head.reception import warn_of_call
 from sononerf.progress import Progress
 from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses
 from sononerf.recordings.splits import repeats
-from sononerf.report.pictures.ping_picture import pings_png
-from sononerf.run.store_settings import attach
+from sononerf.report.pictures.spectrogram_picture import pings_png
+from sononerf.run.build import attach
 from sononerf.run.understand import Understood, understand
 from sononerf.settings.schema import HEAD_SECTIONS, CallSettings
 

@@ -15,15 +15,15 @@ from sononerf import storage
 from sononerf.errors import InputError
 from sononerf.evaluation.prediction import predict as predict_poses
 from sononerf.evaluation.traced import Traced
+from sononerf.field.datamodule import WholePoses
 from sononerf.field.fitting import Split, poses_of
-from sononerf.field.range_slices import WholePoses
 from sononerf.geometry.poses import Poses, read_pose_csv
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.spectrogram_picture import spectrogram_png
+from sononerf.run.fitted import NAME as TRACED_NAME
 from sononerf.run.fitted import Fitted
 from sononerf.run.run_folder import RunFolder, results_folder
-from sononerf.run.traced_file import NAME as TRACED_NAME
 
 
 def predict(

@@ -21,9 +21,8 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.errors import IncompatibleError, InputError
 from sononerf.evaluation.traced import Traced
 from sononerf.field.checkpoint_io import DESCRIPTION_NAME
-from sononerf.run.fitted import Fitted, echoes_of, load_fitted
-from sononerf.run.store_settings import attach
-from sononerf.run.traced_file import load_traced, save_traced
+from sononerf.run.build import attach
+from sononerf.run.fitted import Fitted, echoes_of, load_fitted, load_traced, save_traced
 from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
 from sononerf.settings.schema import Settings
 

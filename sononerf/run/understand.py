@@ -20,13 +20,13 @@ from sononerf.head.reception import warn_of_band
 from sononerf.head.spectrogram import echo_samples
 from sononerf.recordings.airsas import read_airsas
 from sononerf.recordings.arrays import read_numpy
+from sononerf.recordings.audio import Recording
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.folder import read_folder
 from sononerf.recordings.import_ranges import calibrated, found_ranges
 from sononerf.recordings.pings import Cutter, check_numbers, clipped_pings, mix
 from sononerf.recordings.sonotrace import read_sononerf_matlab, read_sonotracelab
 from sononerf.recordings.splits import assign_split
-from sononerf.recordings.writer import Recording
 from sononerf.run.build import head_of
 from sononerf.settings.import_schema import ImportSettings, read_import_settings
 from sononerf.settings.loading import apply_override, read_yaml, validate_settings

@@ -16,11 +16,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.sealing import seal
-from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.store import EnsembleStore, seal
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
-from sononerf.geometry.inside import winding_numbers
 from sononerf.geometry.poses import Poses
+from sononerf.geometry.raycast import winding_numbers
 from sononerf.memory import available_cores
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene

@@ -29,7 +29,7 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
-from sononerf.head.gains import NOTCH_WIDTH
+from sononerf.head.ears import NOTCH_WIDTH
 from sononerf.settings.schema import SpectrogramSettings
 
 HIGHEST = 150e3

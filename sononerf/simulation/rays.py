@@ -21,10 +21,9 @@ from sononerf.simulation.diffraction import Diffraction
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.footprint import Real
 from sononerf.simulation.hearing import Hearing, Listener
-from sononerf.simulation.outlines import Outlines
 from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
 from sononerf.simulation.reflection import coarse_gain, unfaded
-from sononerf.simulation.shadows import LEAST, Shadow, behind
+from sononerf.simulation.shadows import LEAST, Outlines, Shadow, behind
 
 HIDDEN_SHARE = 0.15  # as many rays again, for what lies behind obstacles
 HIDDEN_DIVIDED = 0.4  # of these, kept as above

@@ -15,9 +15,9 @@ from scipy.spatial import ConvexHull, QhullError
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.region import ENOUGH
 from sononerf.geometry.raycast import RayCaster
+from sononerf.surface.start.evidence import ALIGNED, poses_that_heard
 from sononerf.surface.start.occupancy import QUIET
 from sononerf.surface.start.read_out import FieldReading, Method
-from sononerf.surface.start.reliability import ALIGNED, poses_that_heard
 from sononerf.surface.start.sheet import THIN
 from sononerf.surface.start.volume import Volume
 
@@ -183,7 +183,7 @@ def known_part(
     Args:
         mesh: m.
         heard ((V,) int32): How many poses heard the surface around each vertex, see
-            :func:`~sononerf.surface.start.reliability.poses_that_heard`.
+            :func:`~sononerf.surface.start.evidence.poses_that_heard`.
         hull: The onsets.
         resolution (m): Range resolution of the analysis.
 

@@ -14,7 +14,7 @@ from sononerf.echoes.detection import (
     find_onsets,
     threshold_factor,
 )
-from sononerf.head.point_echo import PointEcho
+from sononerf.head.head import PointEcho
 from sononerf.head.reception import effective_window
 from sononerf.head.spectrogram import frequency_axis, range_axis
 from sononerf.settings.schema import CallSettings, SpectrogramSettings

@@ -4,9 +4,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sononerf.echoes.consistency import weighted
 from sononerf.echoes.detection import PointEcho, find_onsets
-from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.echoes.region import EchoRegion
 from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere

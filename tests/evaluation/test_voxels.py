@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import NumericalError
-from sononerf.evaluation.voxels import voxel_fit
+from sononerf.evaluation.baseline import voxel_fit
 from sononerf.geometry.poses import Poses
 
 EMITTER = np.array([0.0, 0.0, -0.01])

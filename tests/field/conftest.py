@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from sononerf.field.field import Field
-from sononerf.head.point_echo import PointEcho
+from sononerf.head.head import PointEcho
 
 
 class Head:

@@ -10,13 +10,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import NumericalError
-from sononerf.field.datamodule import EchoDataModule
+from sononerf.field.datamodule import EchoDataModule, RangeSlices
 from sononerf.field.grid import GridField
 from sononerf.field.module import EchoModule, decibels
 from sononerf.field.profile import ProfileRenderer
-from sononerf.field.range_slices import RangeSlices
-from sononerf.field.renderer import Renderer
-from sononerf.field.shell import ShellRenderer
+from sononerf.field.renderer import Renderer, ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.poses import look_at
 

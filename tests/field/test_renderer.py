@@ -10,8 +10,7 @@ from sononerf.field.field import sphere_directions
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.field.profile import ProfileRenderer
-from sononerf.field.renderer import Renderer, look_up
-from sononerf.field.shell import ShellRenderer
+from sononerf.field.renderer import Renderer, ShellRenderer, look_up
 from sononerf.geometry.poses import look_at
 from sononerf.head.ears import beam_gain, ear_tables
 from sononerf.settings.schema import EarSettings

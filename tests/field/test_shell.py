@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from sononerf.field.fourier import FourierField
-from sononerf.field.shell import ShellRenderer
+from sononerf.field.renderer import ShellRenderer
 from sononerf.geometry.poses import rotation_from_euler
 
 REGION = torch.tensor([[-0.05, -0.06, -0.04], [0.05, 0.04, 0.06]], dtype=torch.float64)

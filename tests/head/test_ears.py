@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: MIT
+
+
 import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
@@ -8,12 +10,15 @@ from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.call import call_waveform, sweep_delay
 from sononerf.head.directivity.sofa import write_sofa
 from sononerf.head.ears import (
+    SPEED,
     Ears,
     analysed_ears,
     beam_gain,
     directivity_content,
+    ear,
     ear_gain,
     ear_tables,
+    piston,
     receiver_places,
 )
 from sononerf.head.spectrogram import echo_samples, frequency_axis, range_axis, spectrogram
@@ -252,9 +257,9 @@ def test_a_file_gives_ears_beam_and_places(file):
     np.testing.assert_allclose(ears.positions, PLACES)
     for n, (azimuth, elevation) in enumerate((a, e) for a in AZIMUTH for e in ELEVATION):
         towards = direction(azimuth, elevation)
-        for ear in (0, 1):
+        for side in (0, 1):
             np.testing.assert_allclose(
-                ear_gain(ears, ear, towards)[0], known.gains[ear, n, :2], atol=1e-5
+                ear_gain(ears, side, towards)[0], known.gains[side, n, :2], atol=1e-5
             )
         np.testing.assert_allclose(beam_gain(ears, towards)[0], known.beam[n, :2], atol=1e-5)
 
@@ -325,3 +330,36 @@ def test_a_changed_file_is_heard(file):
     np.testing.assert_allclose(after.ears, before.ears / 2, rtol=1e-5)
     assert directivity_content(measured(file)) != content
     assert directivity_content(EarSettings()) is None
+
+
+def ring(*angles_deg):
+    """Directions in the horizontal plane, (1, A, 3)."""
+    angle = np.radians(angles_deg)
+    return np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=-1)[None]
+
+
+@pytest.mark.parametrize(
+    ("ka", "degrees", "expected"),
+    # 2 J1(x) / x at x = ka sin(angle): tables of Bessel functions.
+    [(2.0, 90.0, 0.5767248), (2.0, 30.0, 2 * 0.4400506), (5.0, 90.0, 2 * 0.3275791 / 5)],
+)
+def test_a_piston_in_a_baffle(ka, degrees, expected):
+    frequency = np.array([40e3])
+    radius = ka * SPEED / (2 * np.pi * 40e3)
+    gain = piston(ring(degrees), radius, frequency)[0, 0, 0]
+    fade = (1 + np.cos(np.radians(degrees))) / 2
+    assert gain == pytest.approx(fade * expected, rel=1e-5)
+
+
+def test_a_piston_is_whole_ahead_silent_behind_and_alike_without_a_radius():
+    frequency = np.array([20e3, 80e3])
+    np.testing.assert_allclose(piston(ring(0.0, 180.0), 0.003, frequency)[:, 0], [[1, 0], [1, 0]])
+    assert (piston(ring(0.0, 90.0, 180.0), 0.0, frequency) == 1.0).all()
+
+
+@pytest.mark.parametrize(("side", "best"), [(1.0, 25.0), (0.0, 0.0), (-1.0, -25.0)])
+def test_an_ear_hears_best_on_its_side(side, best):
+    angles = np.arange(-180.0, 180.0, 5.0)
+    head = EarSettings(elevation_deg=0.0)
+    gain = ear(ring(*angles), side, head, np.array([20e3]))
+    assert angles[gain[0, 0].argmax()] == best

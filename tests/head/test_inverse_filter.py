@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sononerf.head.call import call_waveform
-from sononerf.head.matched_filter import inverse_filter
+from sononerf.head.call import call_waveform, inverse_filter
 from sononerf.settings.schema import CallSettings
 
 RATE = 500e3

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
+from sononerf.recordings.audio import Recording
 from sononerf.recordings.columns import Columns
 from sononerf.recordings.pings import Clipping, Cutter, check_numbers, clipped_pings, cut, mix
-from sononerf.recordings.writer import Recording
 
 RATE = 1e5
 

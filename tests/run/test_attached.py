@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.run.store_settings import attach, with_attached
+from sononerf.run.build import attach, with_attached
 from sononerf.settings.loading import validate_settings
 
 

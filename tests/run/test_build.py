@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -19,12 +21,12 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.region import WITNESS_GAIN
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import InputError, SettingsError
+from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.field.hash import HashField
 from sononerf.field.profile import ProfileRenderer
-from sononerf.field.shell import ShellRenderer
+from sononerf.field.renderer import ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.reception import effective_window
 from sononerf.run.build import (
@@ -33,12 +35,17 @@ from sononerf.run.build import (
     field_and_renderer,
     head_of,
     module_for,
+    read_truth,
     region_of,
+    true_mesh,
+    with_store,
 )
+from sononerf.run.fit import finish, fit
 from sononerf.run.simulate import simulate
 from sononerf.settings import plugins
-from sononerf.settings.loading import load_settings
-from sononerf.surface.refine.onset_ranges import SCALE
+from sononerf.settings.loading import load_settings, validate_settings
+from sononerf.settings.schema import HEAD_SECTIONS
+from sononerf.surface.refine.objective import SCALE
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.refinement import Refinement
 from tests.memory import echoes_of
@@ -360,3 +367,131 @@ def test_renderer_and_refinement_have_the_range_resolution_of_the_head(config):
     )
     assert work.onsets.scale == SCALE * head.resolution
     assert ProfileRenderer(BOX, head, surroundings=1.0).surroundings == head.resolution
+
+
+def test_a_file_comes_before_the_scene(tiny, tmp_path):
+    box = trimesh.creation.box((0.1, 0.2, 0.3))
+    box.export(tmp_path / "true.ply")
+    assert true_mesh(tiny()).extents == pytest.approx([0.04] * 3)
+    given = tiny(evaluation={"truth": str(tmp_path / "true.ply")})
+    assert true_mesh(given).extents == pytest.approx([0.1, 0.2, 0.3])
+
+
+def test_without_scene_and_file_there_is_no_truth(tiny, echoes):
+    assert true_mesh(tiny().model_copy(update={"scene": None})) is None
+
+
+def test_a_scene_whose_file_has_moved_is_told(tiny, tmp_path, caplog):
+    file = tmp_path / "mug.stl"
+    trimesh.creation.box((0.1, 0.2, 0.3)).export(file)
+    settings = tiny(scene={"name": "mesh", "options": {"path": str(file), "unit": "m"}})
+    assert true_mesh(settings) is not None
+    file.unlink()
+    assert true_mesh(settings) is None
+    assert "the true surface is unknown: " in caplog.text
+    assert str(file) in caplog.text
+    assert "evaluation.truth=FILE" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("true.txt", b"x", "expected one of .ply"),
+        ("true.ply", b"ply\nnonsense", "evaluation.truth: damaged"),
+        ("true.obj", b"# nothing\n", "evaluation.truth: "),
+        (None, b"", "no such file"),
+    ],
+)
+def test_a_bad_true_surface_is_refused_in_one_line(tmp_path, name, content, says):
+    path = tmp_path / (name or "missing.ply")
+    if name:
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=says) as raised:
+        read_truth(path)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.fixture
+def alone(tiny_settings, echoes):
+    """Settings of the tiny experiment that name nothing but the store."""
+
+    def settings(**sections):
+        plain = tiny_settings().plain()
+        kept = {
+            k: v
+            for k, v in plain.items()
+            if k not in (*HEAD_SECTIONS, "scene", "poses", "simulation")
+        }
+        for name, values in sections.items():
+            kept[name] = {**kept.get(name, {}), **values}
+        return validate_settings(kept, "alone")
+
+    return settings
+
+
+def test_settings_without_a_scene_take_the_store_s(alone, tiny_settings):
+    found = with_store(alone())
+    for section in HEAD_SECTIONS:
+        assert getattr(found, section) == getattr(tiny_settings(), section)
+    assert found.scene is None
+
+
+def test_settings_with_a_scene_are_left_alone(tiny_settings):
+    assert with_store(tiny_settings()) == tiny_settings()
+
+
+def test_what_contradicts_the_store_is_refused_and_what_agrees_is_not(alone):
+    assert with_store(alone(spectrogram={"range_min": 0.34}))
+    with pytest.raises(IncompatibleError, match=r"air\.temperature_c: found 30") as raised:
+        with_store(alone(air={"temperature_c": 30.0}))
+    assert "\n" not in str(raised.value)
+    wider = with_store(alone(spectrogram={"dynamic_range_db": 50.0}))
+    assert wider.spectrogram.dynamic_range_db == 50.0
+
+
+def test_a_fit_of_a_store_needs_no_scene(alone, tmp_path):
+    run = tmp_path / "run"
+    fit(alone(), run, accelerator="cpu")
+    metrics = finish(run, accelerator="cpu")
+    assert metrics["prediction"]["poses"] == 2
+    assert metrics["geometry"] is None
+    assert (run / "reconstruction" / "mesh.ply").is_file()
+    again = fit(alone(evaluation={"registration": "rigid"}), run, accelerator="cpu")
+    assert again.is_done("fit")
+
+
+def test_an_unfinished_or_silent_store_is_refused(alone, echoes, tmp_path):
+    copy = tmp_path / "store"
+    shutil.copytree(echoes, copy)
+    EnsembleStore.open(copy)._chunk(3).unlink()
+    with pytest.raises(InputError, match="1 poses are missing"):
+        fit(alone(data={"store": str(copy)}), tmp_path / "run", accelerator="cpu")
+    EnsembleStore.open(echoes)
+    bare = tmp_path / "bare"
+    store = EnsembleStore.create(
+        bare,
+        poses_positions=np.zeros((1, 3)),
+        poses_rotations=np.eye(3)[None],
+        split=[0],
+        range=[0.1, 0.2],
+        frequency=[1e4],
+        attributes={},
+    )
+    assert store.receivers == 2
+    with pytest.raises(InputError, match="does not state its head"):
+        with_store(alone(data={"store": str(bare)}))
+
+
+def test_neither_scene_nor_store_is_a_fault_of_the_settings(alone):
+    with pytest.raises(SettingsError, match=r"set scene\.name, or data\.store"):
+        alone(data={"store": None})
+    with pytest.raises(SettingsError, match=r"scene: missing; set scene\.name"):
+        simulate(alone())
+
+
+def test_a_run_of_a_store_knows_its_settings(alone, tmp_path):
+    run = tmp_path / "run"
+    fit(alone(), run, accelerator="cpu")
+    saved = json.loads((run / "model.json").read_text())["settings"]
+    assert saved["scene"] is None
+    assert saved["spectrogram"]["range_max"] == 0.45

@@ -14,7 +14,7 @@ from PIL import Image
 from sononerf.errors import InputError, NumericalError
 from sononerf.evaluation import baseline
 from sononerf.evaluation import geometry as geometry_module
-from sononerf.run import truth
+from sononerf.run import build
 from sononerf.run.evaluate import evaluate
 from sononerf.run.reconstruct import reconstruct
 from sononerf.scene.scene import Scene
@@ -90,7 +90,7 @@ def test_what_needs_a_closed_surface_is_null_for_an_open_one(
     open_mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
     open_mesh.update_faces(np.arange(len(open_mesh.faces)) > 40)
     open_scene = Scene(open_mesh)
-    monkeypatch.setattr(truth, "load_scene", lambda *given: open_scene)
+    monkeypatch.setattr(build, "load_scene", lambda *given: open_scene)
     geometry = evaluate(run)["geometry"]
     for key in ("volume_ratio", "iou", "thickness_bias_m"):
         assert geometry[key] is None, key
@@ -105,7 +105,7 @@ def test_amid_surroundings_the_target_is_judged_alone_too(
     slab.apply_translation((0, 0, -0.09))
     both = trimesh.util.concatenate([slab, sphere])
     scene = Scene(both, background=np.arange(len(both.faces)) < len(slab.faces))
-    monkeypatch.setattr(truth, "load_scene", lambda *given: scene)
+    monkeypatch.setattr(build, "load_scene", lambda *given: scene)
     geometry = evaluate(run)["geometry"]
     assert geometry.keys() == GEOMETRY | {"target"}
     assert geometry["target"]["share"] == 1.0  # nothing was reconstructed near the slab

@@ -12,9 +12,10 @@ import scipy.io
 import zarr
 
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import InputError, SettingsError
+from sononerf.errors import InputError, ResourceError, SettingsError
 from sononerf.geometry.poses import read_pose_csv
-from sononerf.run.export import export
+from sononerf.run import export as export_module
+from sononerf.run.export import Named, export, file_bytes
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
@@ -95,3 +96,52 @@ def test_what_is_missing_or_damaged_is_named(tmp_path, fitted):
     (tmp_path / "prediction" / "spectrograms.npz").write_bytes(b"no archive")
     with pytest.raises(InputError, match="damaged"):
         export(tmp_path, tmp_path / "x.mat")
+
+
+ARRAYS = {
+    "level": Named(np.arange(6, dtype=np.float32).reshape(2, 3), ("pose", "range"), "dB", "level"),
+    "range": Named(np.array([0.1, 0.2, 0.3]), ("range",), "m", "one-way distance"),
+    "number": Named(np.array([7, 8], dtype=np.int64), ("pose",), "", "of the pose"),
+}
+
+
+def test_matlab():
+    found = scipy.io.loadmat(io.BytesIO(file_bytes("mat", ARRAYS, {"origin": "simulated"})))
+    assert np.array_equal(found["level"], ARRAYS["level"].values)
+    assert found["range"].shape == (3, 1)
+    assert found["units"]["level"][0, 0][0] == "dB"
+    assert found["axes"]["level"][0, 0][0] == "pose, range"
+    assert found["attributes"]["origin"][0, 0][0] == "simulated"
+
+
+def test_hdf5():
+    with h5py.File(io.BytesIO(file_bytes("h5", ARRAYS, {"origin": "simulated"}))) as file:
+        assert np.array_equal(file["number"][...], [7, 8])
+        assert file["level"].attrs["units"] == "dB"
+        assert [axis.label for axis in file["level"].dims] == ["pose", "range"]
+        assert np.array_equal(file["level"].dims[1][0][...], ARRAYS["range"].values)
+        assert file.attrs["origin"] == "simulated"
+
+
+def test_netcdf():
+    data = file_bytes("nc", ARRAYS, {"origin": "simulated"})
+    with scipy.io.netcdf_file(io.BytesIO(data), mmap=False) as file:
+        assert file.variables["level"].dimensions == ("pose", "range")
+        assert np.array_equal(file.variables["level"][...], ARRAYS["level"].values)
+        assert file.variables["level"].units == b"dB"
+        assert file.variables["number"][...].tolist() == [7, 8]
+        assert file.origin == b"simulated"
+
+
+@pytest.mark.parametrize("kind", ["mat", "h5", "nc"])
+def test_the_same_arrays_give_the_same_bytes(kind, monkeypatch):
+    first = file_bytes(kind, ARRAYS, {})
+    monkeypatch.setattr("time.asctime", lambda *given: "another day")
+    assert file_bytes(kind, ARRAYS, {}) == first
+
+
+@pytest.mark.parametrize("kind", ["mat", "nc"])
+def test_what_is_too_large_for_a_format_is_refused(kind, monkeypatch):
+    monkeypatch.setitem(export_module.LARGEST, kind, 20)
+    with pytest.raises(ResourceError, match=r"level: .* choose a \.h5 file"):
+        file_bytes(kind, ARRAYS, {})

@@ -17,15 +17,15 @@ from sononerf.evaluation import baseline
 from sononerf.evaluation import geometry as geometry_module
 from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.progress import Progress
-from sononerf.run import finish as finish_module
+from sononerf.run import fit as finish_module
 from sononerf.run import fitted as fitted_module
 from sononerf.run import run_folder as run_module
 from sononerf.run.evaluate import evaluate
-from sononerf.run.finish import finish
+from sononerf.run.fit import finish
+from sononerf.run.fitted import NAME
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import STAGES, RunFolder
-from sononerf.run.traced_file import NAME
 
 SPHERE = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
 

@@ -20,8 +20,7 @@ import trimesh
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 
 from sononerf import storage
-from sononerf.callbacks.checkpoint import SIGNALS, CheckpointCallback
-from sononerf.callbacks.epoch import ProgressCallback
+from sononerf.callbacks.epoch import SIGNALS, CheckpointCallback, ProgressCallback
 from sononerf.callbacks.preview import PreviewCallback
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull

@@ -15,9 +15,7 @@ import trimesh
 from sononerf.errors import IncompatibleError, ResourceError
 from sononerf.progress import Progress
 from sononerf.run import reconstruct as reconstruct_module
-from sononerf.run import refine as module
-from sononerf.run.reconstruct import reconstruct
-from sononerf.run.refine import STATE, refine_surface
+from sononerf.run.reconstruct import STATE, reconstruct, refine_surface
 from sononerf.run.run_folder import RunFolder
 from sononerf.storage import read_json
 from sononerf.surface.refine import comparison as core
@@ -49,7 +47,7 @@ class Heard(Progress):
 
 @pytest.fixture
 def run(fitted_run, tmp_path, monkeypatch):
-    for where, name in ((core, "RAYS"), (module, "RAYS")):
+    for where, name in ((core, "RAYS"), (reconstruct_module, "RAYS")):
         monkeypatch.setattr(where, name, 500)
     for where in (refinement_module, stages):
         monkeypatch.setattr(where, "STAGES", SHORT)

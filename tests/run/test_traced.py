@@ -22,14 +22,13 @@ from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.field.fitting import poses_of, render_poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
-from sononerf.run import finish as finish_module
+from sononerf.run import fit as finish_module
 from sononerf.run import predict as predict_module
 from sononerf.run import run_folder as run_module
 from sononerf.run.build import head_of, simulator_of
-from sononerf.run.fitted import echoes_of, load_fitted
+from sononerf.run.fitted import NAME, echoes_of, load_fitted, load_traced
 from sononerf.run.predict import predict
 from sononerf.run.run_folder import RunFolder
-from sononerf.run.traced_file import NAME, load_traced
 from sononerf.scene.scene import Scene
 from sononerf.simulation.simulator import Simulator
 

@@ -9,9 +9,9 @@ import pytest
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError
 from sononerf.head.call import call_waveform
-from sononerf.recordings.writer import wav_bytes
+from sononerf.recordings.audio import wav_bytes
+from sononerf.run.build import with_store
 from sononerf.run.import_recordings import echo_hash, import_understood, spectrogram_of
-from sononerf.run.store_settings import with_store
 from sononerf.run.understand import understand
 from sononerf.settings.loading import validate_settings
 from sononerf.settings.schema import CallSettings

@@ -4,7 +4,7 @@ import itertools
 import numpy as np
 import pytest
 
-from sononerf.head.gains import NOTCH_WIDTH
+from sononerf.head.ears import NOTCH_WIDTH
 from sononerf.head.spectrogram import echo_samples
 from sononerf.settings.schema import SpectrogramSettings
 from sononerf.simulation import impulse_response

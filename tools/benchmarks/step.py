@@ -33,7 +33,7 @@ from sononerf.field.field import Field
 from sononerf.field.fitting import quiet_lightning, require_accelerator
 from sononerf.field.fourier import FourierField
 from sononerf.field.module import EchoModule
-from sononerf.field.shell import ShellRenderer
+from sononerf.field.renderer import ShellRenderer
 from sononerf.progress import Progress
 from sononerf.run.build import (
     data_for,

@@ -1,15 +1,122 @@
 # SPDX-License-Identifier: MIT
-"""A directivity from a file of any format that is known, told apart by its content."""
+"""A directivity from a file of any known format, told apart by its content; tables of text."""
 
 from __future__ import annotations
 
+import csv
 import hashlib
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from sononerf.errors import InputError
-from sononerf.head.directivity.csv_table import read_csv
-from sononerf.head.directivity.record import Directivity
+from sononerf.head.directivity.record import MOST_RECEIVERS, Directivity, unit_vectors
+
+MOST_BYTES = 500_000_000
+ANGLES = ("azimuth_deg", "elevation_deg")
+EMITTER = -1
+
+Array = NDArray[np.float64]
+
+
+def read_csv(path: Path) -> Directivity:
+    """Read a table of gains.
+
+    Columns ``azimuth_deg`` (to the left), ``elevation_deg`` (up), ``frequency_hz``, ``gain``
+    (linear) or ``gain_db``, and perhaps ``receiver``: a number from 0 on, or ``emitter``. Every
+    receiver has every direction at every frequency, once, in any order.
+
+    Raises:
+        InputError: If columns, values or lines are missing; the message names the line.
+    """
+    if path.stat().st_size > MOST_BYTES:
+        raise InputError(f"{path}: larger than {MOST_BYTES} bytes")
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            return _table(path, _rows(path, csv.reader(file)))
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(
+            f"{path}: no SOFA file, no .mat file and no table of text ({error})"
+        ) from None
+
+
+def _rows(path: Path, lines: Any) -> Array:
+    """Return receiver, azimuth, elevation, frequency, linear gain (N, 5)."""
+    names = [name.strip().lower() for name in next(lines, [])]
+    missing = [name for name in (*ANGLES, "frequency_hz") if name not in names]
+    gains = [name for name in ("gain", "gain_db") if name in names]
+    if missing or len(gains) != 1:
+        raise InputError(
+            f"{path}: columns {', '.join(names)[:200] or 'none'}; expected azimuth_deg, "
+            "elevation_deg, frequency_hz, one of gain and gain_db, and perhaps receiver"
+        )
+    where = [names.index(name) for name in (*ANGLES, "frequency_hz", gains[0])]
+    receiver = names.index("receiver") if "receiver" in names else None
+    rows = []
+    for line in lines:
+        if not any(cell.strip() for cell in line):
+            continue
+        try:
+            if len(line) != len(names):
+                raise ValueError(f"{len(line)} values, expected {len(names)}")
+            number = 0 if receiver is None else _receiver(line[receiver].strip().lower())
+            rows.append((number, *(float(line[column]) for column in where)))
+        except ValueError as error:
+            raise InputError(f"{path}: line {lines.line_num}: {error}") from None
+    values = np.array(rows, dtype=np.float64).reshape(-1, 5)
+    wrong = np.flatnonzero(~np.isfinite(values).all(axis=1) | (np.abs(values[:, 2]) > 90.0))
+    if len(wrong):
+        raise InputError(
+            f"{path}: data line {wrong[0] + 1}: a value is NaN or infinite, or an elevation is "
+            "beyond 90 degrees"
+        )
+    if gains[0] == "gain_db":
+        values[:, 4] = 10.0 ** (values[:, 4].clip(max=200.0) / 20.0)
+    return values
+
+
+def _receiver(text: str) -> int:
+    if text == "emitter":
+        return EMITTER
+    if not text.isdecimal() or int(text) >= MOST_RECEIVERS:
+        raise ValueError(f"receiver {text!r}, expected a number from 0 on, or emitter")
+    return int(text)
+
+
+def _table(path: Path, rows: NDArray[np.float64]) -> Directivity:
+    if not len(rows):
+        raise InputError(f"{path}: holds no gains")
+    receivers, which = np.unique(rows[:, 0], return_inverse=True)
+    # Angles count to a millionth of a degree.
+    angles, direction = np.unique(rows[:, 1:3].round(6), axis=0, return_inverse=True)
+    frequency, row = np.unique(rows[:, 3], return_inverse=True)
+    shape = (len(receivers), len(angles), len(frequency))
+    place = np.ravel_multi_index((which, direction.reshape(-1), row), shape)
+    times = np.bincount(place, minlength=int(np.prod(shape)))
+    if (times != 1).any():
+        first = int(np.flatnonzero(times != 1)[0])
+        e, m, f = np.unravel_index(first, shape)
+        name = "emitter" if receivers[e] == EMITTER else f"receiver {receivers[e]:g}"
+        raise InputError(
+            f"{path}: the gain of {name} at azimuth {angles[m, 0]:g}, elevation {angles[m, 1]:g}, "
+            f"{frequency[f]:g} Hz stands there {times[first]} times, expected once"
+        )
+    gains = np.zeros(place.size)
+    gains[place] = rows[:, 4]
+    gains = gains.reshape(shape)
+    beam = gains[0] if receivers[0] == EMITTER else None
+    hearing = receivers != EMITTER
+    if not np.array_equal(receivers[hearing], np.arange(hearing.sum())) or not hearing.any():
+        raise InputError(
+            f"{path}: the receivers are {', '.join(f'{n:g}' for n in receivers[hearing]) or 'none'}"
+            "; expected 0, 1, ... without a gap"
+        )
+    directions = unit_vectors(*np.radians(angles.T))
+    return Directivity(str(path), directions, frequency, gains[hearing], beam)
+
 
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 

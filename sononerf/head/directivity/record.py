@@ -3,18 +3,141 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from sononerf.errors import InputError
-from sononerf.head.directivity.sphere import interpolation
+from sononerf.geometry.directions import fibonacci_sphere
 
-MOST_RECEIVERS = 256
+FADE = math.radians(10.0)
+"""Over this angle the gain falls to zero outside the measured area."""
+GAP = 3.0
+"""A triangle belongs to no measured area if its circumscribed circle is wider than this many times
+the usual one."""
+BACKGROUND = 2000
+"""Directions that fill the rest of the sphere, about 4.5 degrees apart."""
+LEAST_SPACING, MOST_SPACING = math.radians(0.5), math.radians(12.0)
+BULGE = 1e-4
+"""The sphere is deformed by this fraction before it is triangulated. So the diagonals of the
+cells of a regular grid do not depend on rounding or on the order of the directions."""
+SAME = 1e-6  # rad; directions nearer than this are one
+EDGE = 1e-9  # weight of a corner; below minus this a direction lies beyond the edge
+NEAR = 24  # triangles that are tried for a direction before all are
+CHUNK = 512
 
 Array = NDArray[np.float64]
+
+
+def interpolation(known: Array, wanted: Array) -> csr_array:
+    """Return weights that bring values from known directions to wanted ones.
+
+    Directions are triangulated on the sphere. Within a triangle values are linear, so that measured
+    directions are reproduced exactly. Beyond the measured area the value of the nearest measured
+    direction is faded to zero.
+
+    Args:
+        known (M, 3): Unit vectors, at least one. Equal ones are averaged.
+        wanted (N, 3): Unit vectors.
+
+    Returns:
+        weights ((N, M) sparse float64): Rows sum to 1 in the measured area, to 0 farther than
+            :data:`FADE` from it.
+    """
+    cells = np.round(known / SAME).astype(np.int64)
+    _, first, same = np.unique(cells, axis=0, return_index=True, return_inverse=True)
+    same = same.reshape(-1)
+    counts = np.bincount(same)
+    merge = csr_array((1.0 / counts[same], (same, np.arange(len(known)))))
+    points = known[first]
+    spacing = _spacing(points)
+    tree = cKDTree(points)
+    around = fibonacci_sphere(BACKGROUND)
+    far, nearest = tree.query(around)
+    outside = 2.0 * np.arcsin(np.minimum(far / 2.0, 1.0)) > GAP * spacing
+    around, nearest = around[outside], nearest[outside]
+    every = np.concatenate([points, around])
+    # A direction that fills the rest has the value of the nearest measured one.
+    source = np.concatenate([np.arange(len(points)), nearest])
+    triangles = _hull(every)
+    measured = (triangles < len(points)).all(axis=1) & (_radius(every, triangles) <= GAP * spacing)
+    found, weights = _locate(every, triangles, measured, wanted)
+    off = 2.0 * np.arcsin(np.minimum(tree.query(wanted)[0] / 2.0, 1.0)) - spacing
+    fade = np.where(measured[found], 1.0, np.clip(1.0 - off / FADE, 0.0, 1.0))
+    rows = np.repeat(np.arange(len(wanted)), 3)
+    columns = source[triangles[found]].reshape(-1)
+    values = (weights * fade[:, None]).reshape(-1)
+    return csr_array((values, (rows, columns)), shape=(len(wanted), len(points))) @ merge
+
+
+def _hull(points: Array) -> NDArray[np.int64]:
+    x, y, z = points.T
+    radius = 1.0 + BULGE * (x * y + 0.7 * y * z + 0.4 * z * x + 0.3 * x * x + 0.1 * y * y)
+    return np.asarray(ConvexHull(points * radius[:, None]).simplices, dtype=np.int64)
+
+
+def _radius(points: Array, triangles: NDArray[np.int64]) -> Array:
+    """Return the angle from the centre of each circumscribed circle to its corners, rad."""
+    a, b, c = (points[triangles[:, corner]] for corner in range(3))
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True).clip(1e-300)
+    return np.asarray(np.arccos(np.clip(np.abs((normal * a).sum(axis=1)), 0.0, 1.0)))
+
+
+def _spacing(points: Array) -> float:
+    """Return the usual radius of the circles that hold no measured direction, rad."""
+    try:
+        radius = float(np.median(_radius(points, _hull(points))))
+    except (QhullError, ValueError):  # directions in one plane, or fewer than four
+        radius = MOST_SPACING
+        if len(points) > 1:
+            nearest = cKDTree(points).query(points, k=2)[0][:, 1]
+            radius = float(np.median(np.arcsin(np.minimum(nearest / 2.0, 1.0))))
+    return min(max(radius, LEAST_SPACING), MOST_SPACING)
+
+
+def _locate(
+    points: Array, triangles: NDArray[np.int64], first: NDArray[np.bool_], wanted: Array
+) -> tuple[NDArray[np.int64], Array]:
+    """Return the triangle that each direction runs through, and the weights (N, 3) of its corners.
+
+    The triangles enclose the origin. On the edge of two of them, those that come ``first`` count.
+    """
+
+    def best(inside: Array, of: NDArray[np.int64]) -> NDArray[np.int64]:
+        least = inside.min(axis=2)
+        return np.asarray(np.where(least > -EDGE, 1.0 + first[of], least).argmax(axis=1))
+
+    inverse = np.linalg.inv(points[triangles].transpose(0, 2, 1))
+    centres = points[triangles].sum(axis=1)
+    centres /= np.linalg.norm(centres, axis=1, keepdims=True)
+    near = cKDTree(centres).query(wanted, k=min(NEAR, len(triangles)))[1]
+    found = np.zeros(len(wanted), dtype=np.int64)
+    weights = np.zeros((len(wanted), 3))
+    for start in range(0, len(wanted), CHUNK):
+        part = slice(start, start + CHUNK)
+        tried = near[part]
+        inside = np.einsum("nkij,nj->nki", inverse[tried], wanted[part])
+        chosen, rows = best(inside, tried), np.arange(len(tried))
+        found[part], weights[part] = tried[rows, chosen], inside[rows, chosen]
+    every = np.arange(len(triangles))[None]
+    for missed in np.array_split(*_portions(np.flatnonzero(weights.min(axis=1) < -EDGE))):
+        inside = np.einsum("kij,nj->nki", inverse, wanted[missed])
+        chosen = best(inside, every)
+        found[missed], weights[missed] = chosen, inside[np.arange(len(chosen)), chosen]
+    weights = weights.clip(0.0)
+    return found, weights / weights.sum(axis=1, keepdims=True)
+
+
+def _portions(missed: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+    return missed, max(1, math.ceil(len(missed) / 64))
+
+
+MOST_RECEIVERS = 256
 
 
 @dataclass(frozen=True, eq=False)

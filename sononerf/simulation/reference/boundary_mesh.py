@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from sononerf.errors import InputError
-from sononerf.geometry.inside import winding_numbers
+from sononerf.geometry.raycast import winding_numbers
 
 LONG = 1.5  # edges over the wanted length, above which they are halved
 DEVIATION = 0.05  # of the wanted edge: how far a coarser surface may be from the given one

@@ -14,8 +14,7 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.surface.refine.descent import ONSETS
 from sononerf.surface.refine.later_bounces import Tracer
-from sononerf.surface.refine.objective import FLOOR_DB, Level
-from sononerf.surface.refine.onset_ranges import OnsetRanges
+from sononerf.surface.refine.objective import FLOOR_DB, Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.remesh import finer
 

@@ -18,8 +18,7 @@ from sononerf.geometry.raycast import Occlusion
 from sononerf.surface.refine.correction import Correction
 from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
-from sononerf.surface.refine.objective import Level, measured, mismatch
-from sononerf.surface.refine.onset_ranges import OnsetRanges
+from sononerf.surface.refine.objective import Level, OnsetRanges, measured, mismatch
 from sononerf.surface.refine.optics import Heard, Optics
 from sononerf.surface.refine.visibility import listen
 

@@ -22,8 +22,7 @@ from sononerf.surface.refine.comparison import Comparison
 from sononerf.surface.refine.correction import Correction
 from sononerf.surface.refine.descent import SHARP, STAGES, Descent, Stage, poses_that_hear
 from sononerf.surface.refine.later_bounces import LaterBounces
-from sononerf.surface.refine.objective import Level
-from sononerf.surface.refine.onset_ranges import OnsetRanges
+from sononerf.surface.refine.objective import Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.remesh import finer, remesh
 from sononerf.surface.start.read_out import StartMethod

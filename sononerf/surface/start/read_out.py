@@ -17,10 +17,15 @@ from torch import Tensor
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
-from sononerf.surface.start.isosurface import automatic_level, isosurface
 from sononerf.surface.start.occupancy import Gathered, estimate_occupancy, gather_evidence
 from sononerf.surface.start.sheet import fit_sheet
-from sononerf.surface.start.volume import Volume, grid_over, volume_from_function
+from sononerf.surface.start.volume import (
+    Volume,
+    automatic_level,
+    grid_over,
+    isosurface,
+    volume_from_function,
+)
 
 Array = NDArray[np.float64]
 _FAINTEST = (

@@ -30,8 +30,8 @@ from scipy.sparse.linalg import spsolve
 
 from sononerf.errors import NumericalError
 from sononerf.geometry.lattice import level_surface
+from sononerf.surface.start.evidence import ALIGNED
 from sononerf.surface.start.occupancy import Gathered
-from sononerf.surface.start.reliability import ALIGNED
 
 Array = NDArray[np.float64]
 THIN = 0.7

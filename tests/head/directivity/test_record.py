@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: MIT
+
+
 import dataclasses
 
 import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.head.directivity.record import unit_vectors
+from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.head.directivity.record import interpolation, unit_vectors
 from tests.head.directivity.patterns import FREQUENCY, pair
 
 
@@ -58,3 +61,71 @@ def test_what_is_not_allowed_is_refused(changes, said):
     known = pair()
     with pytest.raises(InputError, match=f"^made up: .*{said}"):
         dataclasses.replace(known, **changes(known))
+
+
+def grid(azimuth, elevation):
+    return unit_vectors(*np.radians(np.meshgrid(azimuth, elevation))).reshape(-1, 3)
+
+
+def smooth(directions):
+    return np.exp(directions @ np.array([0.9, 0.3, -0.3]))
+
+
+GRIDS = {
+    "whole": grid(np.arange(-180.0, 181.0, 5.0), np.arange(-90.0, 91.0, 5.0)),  # poles and seam
+    "front": grid(np.arange(-90.0, 91.0, 5.0), np.arange(-90.0, 91.0, 5.0)),
+    "patch": grid(np.arange(-40.0, 41.0, 5.0), np.arange(-30.0, 31.0, 5.0)),
+    "uneven": grid(np.arange(-180.0, 180.0, 2.0), np.arange(-80.0, 81.0, 10.0)),
+    "scattered": fibonacci_sphere(1000),
+}
+
+
+@pytest.mark.parametrize("known", GRIDS.values(), ids=GRIDS.keys())
+def test_measured_directions_are_reproduced(known):
+    np.testing.assert_allclose(interpolation(known, known) @ smooth(known), smooth(known), 1e-12)
+
+
+@pytest.mark.parametrize("name", ["whole", "scattered", "uneven"])
+def test_between_directions_values_are_near(name):
+    known, wanted = GRIDS[name], fibonacci_sphere(3000)
+    found = interpolation(known, wanted) @ smooth(known)
+    np.testing.assert_allclose(found, smooth(wanted), rtol=0.02)
+
+
+def test_order_and_rounding_of_directions_do_not_matter():
+    known, wanted = GRIDS["front"], fibonacci_sphere(2000)
+    order = np.random.default_rng(0).permutation(len(known))
+    expected = interpolation(known, wanted) @ smooth(known)
+    moved = known[order] + 1e-12
+    np.testing.assert_allclose(interpolation(moved, wanted) @ smooth(moved), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("beyond_deg", "low", "high"), [(1, 1, 1), (7, 0.4, 0.7), (14, 0, 0)])
+def test_outside_the_measured_area_values_fade_to_zero_over_10_degrees(beyond_deg, low, high):
+    wanted = grid(np.array([40.0 + beyond_deg, -40.0 - beyond_deg]), np.array([0.0]))
+    known = GRIDS["patch"]
+    weight = interpolation(known, wanted).sum(axis=1)
+    assert (weight >= low - 1e-9).all()
+    assert (weight <= high + 1e-9).all()
+
+
+def test_the_nearest_value_is_the_one_that_fades():
+    known = GRIDS["patch"]
+    only_left = np.where(known[:, 1] > 0.0, 1.0, 0.0)
+    left, right = grid(np.array([45.0, -45.0]), np.array([0.0]))
+    assert interpolation(known, left[None]) @ only_left > 0.4
+    assert interpolation(known, right[None]) @ only_left == 0.0
+
+
+@pytest.mark.parametrize("known", [GRIDS["patch"][:1], grid(np.arange(-90.0, 91.0, 5.0), [0.0])])
+def test_directions_in_one_plane_count_for_what_is_near_them(known):
+    weight = interpolation(known, np.array([[1.0, 0, 0], [0, 0, 1.0], known[0]])).sum(axis=1)
+    assert weight[2] == pytest.approx(1.0)
+    assert weight[1] == 0.0
+    assert weight.max() <= 1.0 + 1e-12
+
+
+def test_equal_directions_are_averaged():
+    known = np.array([[1.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0]])
+    found = interpolation(known, known[:1]) @ np.array([1.0, 3.0, 9.0])
+    np.testing.assert_allclose(found, [2.0])

@@ -1,4 +1,8 @@
 # SPDX-License-Identifier: MIT
+
+
+from __future__ import annotations
+
 import io
 
 import numpy as np
@@ -6,7 +10,9 @@ import pytest
 from PIL import Image
 
 from sononerf.errors import NumericalError
+from sononerf.geometry.poses import sphere_poses
 from sononerf.report.pictures.spectrogram_picture import (
+    pings_png,
     sounding_slice,
     spectrogram_image,
     spectrogram_png,
@@ -101,3 +107,29 @@ def test_a_logarithmic_axis_is_drawn_as_one():
     middle = bright[bright < 0.9 * (bottom - top)]
     assert middle.mean() == pytest.approx((bottom - top) / 2, abs=5)
     assert (bright > 0.95 * (bottom - top)).any()  # the lowest channel
+
+
+@pytest.mark.parametrize(("pings", "receivers"), [(1, 1), (3, 2)])
+def test_a_row_for_each_ping(pings, receivers):
+    rng = np.random.default_rng(0)
+    poses = sphere_poses(9, radius=0.4, aim_jitter=0.1, generator=rng)
+
+    def picture(level):
+        return pings_png(
+            [level * rng.standard_normal((receivers, 100)) for _ in range(pings)],
+            [level * rng.random((receivers, 20, 5)) for _ in range(pings)],
+            [f"ping {index}" for index in range(pings)],
+            sampling_rate=1e6,
+            range_m=np.linspace(0.3, 0.5, 20),
+            frequency_hz=np.linspace(20e3, 80e3, 5),
+            poses=poses,
+        )
+
+    image = np.asarray(Image.open(io.BytesIO(picture(1.0))).convert("RGB"))
+    assert image.shape[0] == round((3.4 + 2.2 * pings) * 100)
+    half = image.shape[1] // 2
+    for row in range(pings):
+        top = round((3.4 + 2.2 * row) * 100)
+        colours = np.unique(image[top : top + 220, half:].reshape(-1, 3), axis=0)
+        assert len(colours) > 60  # a spectrogram is there
+    assert picture(0.0)  # silence too

@@ -8,11 +8,10 @@ import trimesh
 from sononerf.errors import SonoNerfError
 from sononerf.surface.refine import comparison as module
 from sononerf.surface.refine.comparison import Comparison
-from sononerf.surface.refine.objective import Level
-from sononerf.surface.refine.onset_ranges import OnsetRanges
+from sononerf.surface.refine.objective import Level, OnsetRanges
 from tests.memory import changed, deaf_hull
 from tests.surface.conftest import RADIUS
-from tests.surface.refine.test_onset_ranges import heard
+from tests.surface.refine.test_objective import heard
 
 
 @pytest.fixture(autouse=True)

@@ -7,12 +7,11 @@ import torch
 import trimesh
 
 from sononerf.surface.refine.descent import Descent, poses_that_hear
-from sononerf.surface.refine.objective import Level
-from sononerf.surface.refine.onset_ranges import OnsetRanges
+from sononerf.surface.refine.objective import Level, OnsetRanges
 from sononerf.surface.refine.remesh import remesh
 from tests.memory import changed
 from tests.surface.conftest import RADIUS
-from tests.surface.refine.test_onset_ranges import heard as onsets_of
+from tests.surface.refine.test_objective import heard as onsets_of
 
 
 @pytest.fixture(scope="module")

@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: MIT
+
+
 from __future__ import annotations
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
-from sononerf.surface.refine.objective import Level, measured, mismatch
+from sononerf.echoes.free_space import EchoHull
+from sononerf.surface.refine.objective import SCALE, Level, OnsetRanges, measured, mismatch
 from sononerf.surface.refine.optics import Heard
 from tests.memory import echoes_of
 
@@ -76,3 +80,81 @@ def test_a_level_is_taken_over_whole():
     assert torch.equal(level.gain, other.gain)
     assert torch.equal(level.error, other.error)
     assert level.steps == other.steps == 1
+
+
+RESOLUTION = 0.006
+
+
+def vertices_of(mesh):
+    return torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
+
+
+def heard(mesh, count=40, weight=None):
+    """Onsets of a mesh from all around, without error."""
+    way = np.random.default_rng(3).normal(size=(count, 3))
+    places = 0.4 * way / np.linalg.norm(way, axis=1, keepdims=True)
+    beside = np.array([0.0, 0.01, 0.0])
+    ears = np.stack([places + beside, places - beside], axis=1)
+    far = np.linalg.norm(mesh.vertices[:, None] - places, axis=2)[..., None]
+    far = (far + np.linalg.norm(mesh.vertices[:, None, None] - ears, axis=3)) / 2
+    return EchoHull(places, ears, far.min(axis=0), -places / 0.4, weight=weight)
+
+
+@pytest.fixture(scope="module")
+def box():
+    return trimesh.creation.box((0.06, 0.05, 0.04)).subdivide().subdivide().subdivide()
+
+
+def test_the_body_itself_has_no_misfit_and_a_smaller_one_has(box):
+    onsets = OnsetRanges(heard(box), RESOLUTION, seed=0)
+    assert onsets.misfit(vertices_of(box)) == pytest.approx(0.0, abs=1e-9)
+    off = 2.0 * SCALE * RESOLUTION
+    smaller = box.copy()
+    smaller.vertices *= 1 - off / 0.04
+    assert 0.5 < onsets.misfit(vertices_of(smaller)) < 2.5
+
+
+def test_going_against_the_gradient_lowers_the_misfit(box):
+    onsets = OnsetRanges(heard(box), RESOLUTION, seed=0)
+    places = vertices_of(box) * 0.97
+    before = onsets.misfit(places)
+    for step in range(200):
+        slope = onsets.gradient(places, step)
+        assert slope.shape == places.shape
+        places = places - 1e-7 * slope
+    assert onsets.misfit(places) < 0.7 * before
+
+
+def test_the_gradient_is_that_of_the_misfit(box):
+    onsets = OnsetRanges(heard(box, count=12), RESOLUTION, seed=0)
+    places = vertices_of(box) * 0.999
+    slope = onsets.gradient(places, 0)
+    way = torch.randn(places.shape, generator=torch.Generator().manual_seed(1)).double()
+    size = 1e-8
+    change = onsets.misfit(places + size * way) - onsets.misfit(places - size * way)
+    assert float((slope * way).sum()) == pytest.approx(change / (2 * size), rel=1e-3)
+
+
+def test_outliers_take_no_part(box):
+    right = heard(box)
+    wrong = right.first.copy()
+    wrong[::4] -= 0.05
+    weight = np.ones_like(wrong)
+    weight[::4] = 0.0
+    hull = EchoHull(right.emitters, right.receivers, wrong, right.axes, weight=weight)
+    assert OnsetRanges(hull, RESOLUTION, seed=0).misfit(vertices_of(box)) < 1e-9
+
+
+def test_without_onsets_nothing_is_said(box):
+    silent = heard(box, weight=np.zeros((40, 2)))
+    onsets = OnsetRanges(silent, RESOLUTION, seed=0)
+    assert len(onsets) == 0
+    assert onsets.misfit(vertices_of(box)) == 0.0
+    assert not onsets.gradient(vertices_of(box), 0).any()
+
+
+def test_a_step_draws_its_onsets_by_its_number(box):
+    onsets = OnsetRanges(heard(box, count=100), RESOLUTION, seed=0)
+    places = vertices_of(box) * 0.97
+    assert torch.equal(onsets.gradient(places, 4), onsets.gradient(places, 4))
+    assert not torch.equal(onsets.gradient(places, 4), onsets.gradient(places, 5))

@@ -3,9 +3,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.surface.start import reliability as support
-from sononerf.surface.start.evidence import Evidence
-from sononerf.surface.start.reliability import ALIGNED, REACH, poses_that_heard
+from sononerf.surface.start import evidence as support
+from sononerf.surface.start.evidence import ALIGNED, REACH, Evidence, poses_that_heard
 
 RADIUS, RESOLUTION = 0.03, 0.005
 

@@ -5,7 +5,7 @@ from scipy.ndimage import gaussian_filter
 
 from sononerf.field.field import sphere_directions
 from sononerf.geometry.lattice import Lattice
-from sononerf.surface.start.evidence_grids import winding_number
+from sononerf.surface.start.occupancy import winding_number
 
 RADIUS = 12.0
 

@@ -7,7 +7,7 @@ import json
 
 import pytest
 
-from sononerf.echoes.manifest import Manifest, PoseRecord
+from sononerf.echoes.layout import Manifest, PoseRecord
 from sononerf.errors import IncompatibleError, InputError
 
 RECORDS = {index: PoseRecord(100 + index, f"{index:064x}") for index in (3, 0, 11)}

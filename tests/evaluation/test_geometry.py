@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.evaluation.registration import register
+from sononerf.evaluation.geometry import register
 
 
 @pytest.fixture(scope="module")
