@@ -40,16 +40,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 from scipy.stats import poisson
 
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.echoes.store import EnsembleStore
 from sononerf.head.head import PointEcho, own_top
 from sononerf.head.row_filters import band_mean
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 FALSE_ALARMS = 1e-6
 """Probability that a range slice of noise alone is taken for an echo, no unit. An ensemble of 400
@@ -83,11 +80,11 @@ def threshold_factor(looks: float) -> float:
 class Levels(NamedTuple):
     """What an echo must exceed."""
 
-    noise: Array  # (..., 1) power of noise alone
-    total: Array  # (..., R) of noise, precursors, and what the first slice cuts
+    noise: Floats  # (..., 1) power of noise alone
+    total: Floats  # (..., R) of noise, precursors, and what the first slice cuts
 
 
-def threshold_levels(power: Array, looks: float) -> Levels:
+def threshold_levels(power: Floats, looks: float) -> Levels:
     """Return the thresholds of noise, and of noise and precursors.
 
     Args:
@@ -110,7 +107,7 @@ def threshold_levels(power: Array, looks: float) -> Levels:
     return Levels(noise, np.where(ahead > total[..., :1], np.maximum(total, factor * ahead), total))
 
 
-def _is_top(power: Array) -> Mask:
+def _is_top(power: Floats) -> Bools:
     """Tell which slices are louder than those beside them, (..., R); the last may be one."""
     top = np.zeros(power.shape, dtype=bool)
     top[..., 1:-1] = (power[..., 1:-1] >= power[..., :-2]) & (power[..., 1:-1] > power[..., 2:])
@@ -118,7 +115,7 @@ def _is_top(power: Array) -> Mask:
     return top
 
 
-def _precursors(power: Array) -> Array:
+def _precursors(power: Floats) -> Floats:
     """Return the level in front of the loudest slice over its own, from one slice on, (L,)."""
     top = power.argmax(axis=1)
     known = power[np.arange(len(top)), top] > 0.0
@@ -134,11 +131,11 @@ def _precursors(power: Array) -> Array:
 
 
 def onsets(
-    power: Array,
+    power: Floats,
     levels: Levels,
-    window: Array | Callable[[int, int], Array],
+    window: Floats | Callable[[int, int], Floats],
     fineness: float,
-) -> Array:
+) -> Floats:
     """Return where the first echo of each row is, in slices from the first one, (N,).
 
     The range is read where the power has risen to a tenth of the echo's, or to the threshold of
@@ -169,7 +166,7 @@ def onsets(
     return found
 
 
-def _flank(window: Array) -> tuple[Array, float]:
+def _flank(window: Floats) -> tuple[Floats, float]:
     """Return the rise of a point echo up to its first top, from zero to one, and its own range."""
     if np.allclose(window, window[::-1]):
         tops = np.flatnonzero(window == window.max())
@@ -180,7 +177,7 @@ def _flank(window: Array) -> tuple[Array, float]:
     return np.concatenate(([0.0], rising)), middle + 1.0
 
 
-def _crossing(rising: Array, fraction: float) -> float:
+def _crossing(rising: Floats, fraction: float) -> float:
     """Return where decibels last rise through a fraction of one, between values."""
     before = int(np.flatnonzero(rising < fraction)[-1])
     low, high = np.log10(np.maximum(rising[before : before + 2], 1e-30))
@@ -205,11 +202,11 @@ class Onsets:
             is cut.
     """
 
-    poses: NDArray[np.int64]
-    range: Array
-    power: Array
-    heard: Mask
-    first: Array
+    poses: Ints
+    range: Floats
+    power: Floats
+    heard: Bools
+    first: Floats
 
     def chance(self, resolution: float) -> float:
         """Return the probability that noise alone makes so many onsets.
@@ -222,7 +219,7 @@ class Onsets:
         return float(poisson.sf(np.isfinite(self.first).sum() - 1, FALSE_ALARMS * tries))
 
 
-def asked_poses(store: EnsembleStore) -> NDArray[np.int64]:
+def asked_poses(store: EnsembleStore) -> Ints:
     """Return the numbers of the training poses that are asked, ascending."""
     train = np.asarray(store.indices("train"))
     chosen = np.linspace(0, len(train) - 1, min(MOST_POSES, len(train))).round().astype(int)
@@ -249,7 +246,7 @@ def find_onsets(store: EnsembleStore, echo: PointEcho) -> Onsets:
     found = []
     for ear in range(power.shape[1]):
 
-        def own_window(row: int, top: int, ear: int = ear) -> Array:
+        def own_window(row: int, top: int, ear: int = ear) -> Floats:
             return echo.of_spectrum(store.read_pose(int(poses[row]))[ear, top])
 
         window = echo.window if echo.rows is None else own_window

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from sononerf.array_types import Ints, Singles
 from sononerf.echoes.detection import Onsets, find_onsets
 from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.echoes.layout import AXES
@@ -102,7 +102,7 @@ class Echoes:
             self._bytes += size
         return self._kept[number]
 
-    def batch(self, seed: int, step: int, size: int) -> NDArray[np.int64]:
+    def batch(self, seed: int, step: int, size: int) -> Ints:
         """Return the training poses of a step: all in turn, in an order drawn from the seed."""
         count = len(self.training)
         size = min(size, count)
@@ -147,7 +147,7 @@ class SubtractedStore(EnsembleStore):
     def __reduce__(self) -> tuple[Any, ...]:
         return SubtractedStore, (self.path, self._background.path)
 
-    def read_pose(self, index: int) -> NDArray[np.float32]:
+    def read_pose(self, index: int) -> Singles:
         """Return one pose's magnitude, (E, R, F), less the surroundings."""
         whole = np.square(super().read_pose(index), dtype=np.float64)
         left = whole - np.square(self._background.read_pose(index), dtype=np.float64)

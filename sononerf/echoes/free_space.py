@@ -20,7 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 from scipy.spatial.distance import cdist
 
-Array = NDArray[np.float64]
+from sononerf.array_types import Bools, Floats
+
 UNDETECTED = 0.05
 """Fraction of the onsets that may be wrong together where a place is judged, and of outliers that
 are not detected per detected one, no unit. On a thin leaf, where every twelfth onset is late, 0.02
@@ -44,19 +45,19 @@ class EchoHull:
             nothing, to 1; all of them where None.
     """
 
-    emitters: Array
-    receivers: Array
-    first: Array
-    axes: Array
+    emitters: Floats
+    receivers: Floats
+    first: Floats
+    axes: Floats
     within: float = -1.0
-    weight: Array | None = None
+    weight: Floats | None = None
 
     def __post_init__(self) -> None:
         if self.weight is None:
             object.__setattr__(self, "weight", np.isfinite(self.first).astype(np.float64))
 
     @property
-    def trusted(self) -> Array:
+    def trusted(self) -> Floats:
         """Range of the first echoes of weight above zero, (P, E) m; else minus infinity."""
         assert self.weight is not None
         return np.where(self.weight > 0.0, self.first, -np.inf)
@@ -69,9 +70,9 @@ class EchoHull:
         return int(UNDETECTED * detected)
 
     @property
-    def sources(self) -> Array:
+    def sources(self) -> Floats:
         """Half way between emitter and ears, (P, 3) m."""
-        middle: Array = (self.emitters + self.receivers.mean(axis=1)) / 2
+        middle: Floats = (self.emitters + self.receivers.mean(axis=1)) / 2
         return middle
 
     @property
@@ -86,7 +87,7 @@ class EchoHull:
         """How many points are looked at in one go."""
         return max(AT_ONCE // max(self.first.size, 1), 1)
 
-    def clearance(self, points: ArrayLike) -> tuple[Array, NDArray[np.intp]]:
+    def clearance(self, points: ArrayLike) -> tuple[Floats, NDArray[np.intp]]:
         """Return how far points lie behind the first echoes, and which pose leaves them least.
 
         Args:
@@ -105,7 +106,7 @@ class EchoHull:
             return np.zeros(0), np.zeros(0, dtype=np.intp)
         return np.concatenate([c for c, _ in parts]), np.concatenate([p for _, p in parts])
 
-    def behind(self, points: Array) -> Array:
+    def behind(self, points: Floats) -> Floats:
         """Return how far points lie behind each first echo, (N, P, E) m.
 
         Plus infinity where it tells nothing of them.
@@ -126,15 +127,13 @@ class EchoHull:
             behind[ahead < self.within * out] = np.inf
         return behind
 
-    def _clearance(self, points: Array) -> tuple[Array, NDArray[np.intp]]:
+    def _clearance(self, points: Floats) -> tuple[Floats, NDArray[np.intp]]:
         # Both ears bound the place: the nearer bound counts.
         left = self.behind(points).min(axis=2)
         spare = min(self.undetected, left.shape[1] - 1)
         pose = np.argpartition(left, spare, axis=1)[:, spare] if spare else left.argmin(axis=1)
         return left[np.arange(len(points)), pose], pose
 
-
-Mask = NDArray[np.bool_]
 
 ACCURACY = 0.1
 """Usual error of an onset's range, in range resolutions. Of simulated bodies half of all onsets are
@@ -185,10 +184,10 @@ def weighted(hull: EchoHull, resolution: float) -> EchoHull:
 
 
 def _remove(
-    weight: Array,
+    weight: Floats,
     homeless: NDArray[np.intp],
-    against: Mask,
-    meets: Mask,
+    against: Bools,
+    meets: Bools,
     few: int,
     enough: float,
 ) -> None:
@@ -214,7 +213,7 @@ def _remove(
     weight[homeless[least > few]] = 0.0
 
 
-def _heard_box(hull: EchoHull) -> Array | None:
+def _heard_box(hull: EchoHull) -> Floats | None:
     """Return a box around where each first echo comes from if it lies ahead, (2, 3) m."""
     first = hull.trusted.max(axis=1)
     known = np.isfinite(first)
@@ -229,8 +228,8 @@ def _heard_box(hull: EchoHull) -> Array | None:
 
 
 def _cells(
-    hull: EchoHull, box: Array, wanted: NDArray[np.intp], few: int, error: float, least: float
-) -> tuple[Mask, Mask]:
+    hull: EchoHull, box: Floats, wanted: NDArray[np.intp], few: int, error: float, least: float
+) -> tuple[Bools, Bools]:
     """Return cells at the range of wanted onsets that at most a few others rule out.
 
     They are halved until half their diagonal is the least, m.

@@ -8,13 +8,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.distance import cdist
 
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.echoes.detection import FALSE_ALARMS, Onsets, threshold_levels
 from sononerf.echoes.free_space import ACCURACY, EchoHull
 from sononerf.errors import NumericalError
 from sononerf.head.ears import Ears
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 WITNESS_GAIN = 0.1
 """A pose is a witness of the places towards which its gain is at least this fraction of the best,
@@ -55,7 +53,7 @@ class EchoRegion:
     """
 
     def __init__(
-        self, heard: Onsets, hull: EchoHull, ears: Ears, rotations: Array, resolution: float
+        self, heard: Onsets, hull: EchoHull, ears: Ears, rotations: Floats, resolution: float
     ) -> None:
         if not np.isfinite(hull.trusted).any():
             raise NumericalError(NOTHING)
@@ -74,7 +72,7 @@ class EchoRegion:
         gain = (ears.beam[None] * ears.ears).max(axis=(0, 1))  # (L, A)
         self.witness_gain = gain >= WITNESS_GAIN * gain.max()
 
-    def possible(self, points: Array, tolerance: float) -> Mask:
+    def possible(self, points: Floats, tolerance: float) -> Bools:
         """Return the places that no pose rules out and that some poses heard, (N,).
 
         Args:
@@ -83,13 +81,13 @@ class EchoRegion:
         """
         return self._inside(points, tolerance / 4) & self._energy(points, tolerance)[1]
 
-    def _inside(self, points: Array, tolerance: float) -> Mask:
+    def _inside(self, points: Floats, tolerance: float) -> Bools:
         clearance = self.hull.clearance(points)[0]
         return np.asarray(clearance >= -(tolerance + ACCURACY * self.resolution))
 
     def _energy(
-        self, points: Array, tolerance: float, power: Array | None = None
-    ) -> tuple[Array, Mask]:
+        self, points: Floats, tolerance: float, power: Floats | None = None
+    ) -> tuple[Floats, Bools]:
         """Return the mean power from each place's range, and where enough poses hear any, (N,)."""
         size = 2 * int(np.ceil(tolerance / self.step)) + 1
         heard = ndimage.maximum_filter1d(self.heard, size, axis=1, mode="constant")
@@ -105,14 +103,14 @@ class EchoRegion:
             energy.append((meets * loud[pose, row]).sum(axis=0) / witness.sum(axis=0).clip(1))
         return np.concatenate(energy), np.concatenate(sounding) >= ENOUGH
 
-    def _rows(self, points: Array) -> tuple[Array, NDArray[np.int64], Mask]:
+    def _rows(self, points: Floats) -> tuple[Floats, Ints, Bools]:
         """Return each pose's distance to each place, and the slice it falls in, (P, N)."""
         distance = cdist(self.sources, points).clip(1e-9)
         row = np.round((distance - self.range[0]) / self.step).astype(np.int64)
         within = (row >= 0) & (row < len(self.range))
         return distance, row.clip(0, len(self.range) - 1), within
 
-    def _witnesses(self, points: Array, distance: Array) -> Mask:
+    def _witnesses(self, points: Floats, distance: Floats) -> Bools:
         local = [
             np.einsum("pi,ni->pn", self.rotations[:, :, axis], points)
             - (self.rotations[:, :, axis] * self.sources).sum(1)[:, None]
@@ -125,7 +123,7 @@ class EchoRegion:
         column = np.round((azimuth / (2 * np.pi) + 0.5) * (columns - 1)).astype(np.int64)
         return np.asarray(self.witness_gain[row, column])
 
-    def box(self) -> Array:
+    def box(self) -> Floats:
         """Return the box around all that explains the echoes, (2, 3) m, with a margin.
 
         The margin is two range resolutions.
@@ -154,7 +152,7 @@ class EchoRegion:
         margin = 2.0 * self.resolution
         return np.stack((lower - margin, upper + margin))
 
-    def needed(self, points: Array, tolerance: float) -> Mask:
+    def needed(self, points: Floats, tolerance: float) -> Bools:
         """Return the places that explain the echoes, the best focused first, (N,).
 
         Places out in the open lie at the range of some echo of many poses, but the echoes do not
@@ -177,8 +175,8 @@ class EchoRegion:
         return self._with_origins(points, tolerance, keep, covered, inside)
 
     def _with_origins(
-        self, points: Array, tolerance: float, keep: Mask, covered: Mask, inside: Mask
-    ) -> Mask:
+        self, points: Floats, tolerance: float, keep: Bools, covered: Bools, inside: Bools
+    ) -> Bools:
         known = np.isfinite(self.first)
         row = np.round((np.where(known, self.first, 0.0) - self.range[0]) / self.step)
         row = row.astype(int).clip(0, len(self.range) - 1)
@@ -193,7 +191,7 @@ class EchoRegion:
             keep = keep | (agree >= AGREEMENT * agree.max())
             covered = self._covered(points[keep], tolerance)
 
-    def _shared(self, points: Array, tolerance: float, asks: NDArray[np.intp]) -> Array:
+    def _shared(self, points: Floats, tolerance: float, asks: NDArray[np.intp]) -> Floats:
         """Return how many of some onsets can have come from each place, (N,)."""
         parts = []
         for start in range(0, len(points), CHUNK):
@@ -203,7 +201,7 @@ class EchoRegion:
             parts.append((witness & near).sum(axis=0))
         return np.concatenate(parts)
 
-    def _covered(self, points: Array, tolerance: float) -> Mask:
+    def _covered(self, points: Floats, tolerance: float) -> Bools:
         """Return which slices of each pose the places explain, (P, R)."""
         covered = np.zeros_like(self.heard)
         for start in range(0, len(points), CHUNK):
@@ -219,7 +217,7 @@ FEW = 0.02
 """Fraction of the poses that must hear an echo at a range or beyond it for it to count, no unit."""
 
 
-def echo_extent(power: Array, axis: Array, looks: float, margin: float) -> tuple[float, float]:
+def echo_extent(power: Floats, axis: Floats, looks: float, margin: float) -> tuple[float, float]:
     """Return the least and the greatest range (m) that hold echoes, with a margin.
 
     Args:
@@ -231,7 +229,7 @@ def echo_extent(power: Array, axis: Array, looks: float, margin: float) -> tuple
     Returns:
         limits ((float, float), m): Within the axis; all of it where nothing is heard.
     """
-    loud: NDArray[np.bool_] = power > threshold_levels(power, looks).total
+    loud: Bools = power > threshold_levels(power, looks).total
     heard = np.asarray(loud.any(axis=1))  # (P, R)
     some = np.asarray(heard.any(axis=1))
     if not some.any():

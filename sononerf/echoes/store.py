@@ -12,6 +12,7 @@ import zarr
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf import storage
+from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.layout import (
     AXES,
     SPECTROGRAM,
@@ -141,12 +142,12 @@ class EnsembleStore:
         return len(self._axes["position"])
 
     @property
-    def positions(self) -> NDArray[np.float64]:
+    def positions(self) -> Floats:
         """Head positions, (P, 3), m, world frame."""
         return self._axes["position"].copy()
 
     @property
-    def rotations(self) -> NDArray[np.float64]:
+    def rotations(self) -> Floats:
         """Head to world, (P, 3, 3)."""
         return self._axes["rotation"].copy()
 
@@ -156,12 +157,12 @@ class EnsembleStore:
         return self._axes["split"].copy()
 
     @property
-    def range(self) -> NDArray[np.float64]:
+    def range(self) -> Floats:
         """One-way distances of the slices, (R,), m."""
         return self._axes["range"].copy()
 
     @property
-    def frequency(self) -> NDArray[np.float64]:
+    def frequency(self) -> Floats:
         """Frequencies of the bins, (F,), Hz."""
         return self._axes["frequency"].copy()
 
@@ -175,7 +176,7 @@ class EnsembleStore:
         """What the ensemble says of itself, a copy: settings, versions, units, c, m0 ..."""
         return dict(self._attributes)
 
-    def indices(self, split: Literal["train", "val", "test"]) -> NDArray[np.int64]:
+    def indices(self, split: Literal["train", "val", "test"]) -> Ints:
         """Return the numbers of a split's poses, in order."""
         if split not in SPLITS:
             raise InputError(f"split {split!r}: there are {', '.join(SPLITS)}")
@@ -216,7 +217,7 @@ class EnsembleStore:
         self._manifest.add(index, record)
         self._records[index] = record
 
-    def read_pose(self, index: int) -> NDArray[np.float32]:
+    def read_pose(self, index: int) -> Singles:
         """Return one pose's magnitude, (E, R, F), verified.
 
         Raises:
@@ -286,7 +287,7 @@ def _reopen(path: Path, mode: Literal["r", "r+"]) -> EnsembleStore:
     return EnsembleStore(path, mode=mode)
 
 
-def _sha256(values: NDArray[np.float32]) -> str:
+def _sha256(values: Singles) -> str:
     return hashlib.sha256(values.astype("<f4", copy=False).tobytes()).hexdigest()
 
 
@@ -302,7 +303,7 @@ def _refuse_foreign(path: Path) -> None:
         raise InputError(f"{path}: holds {foreign[0]!r} and is no ensemble store; choose another")
 
 
-def seal(store: EnsembleStore, again: dict[int, NDArray[np.float32]], *, silent: str) -> None:
+def seal(store: EnsembleStore, again: dict[int, Singles], *, silent: str) -> None:
     """Fix the reported decibels and the noise floor of a complete ensemble, and seal it.
 
     Args:

@@ -10,6 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.array_types import Floats, Singles
 from sononerf.errors import NumericalError
 from sononerf.evaluation.solid import Nearest, Solid, sample_surface
 from sononerf.geometry.poses import Poses
@@ -131,7 +132,7 @@ def coherent_backprojection(
     return volume.with_values(summed.reshape(volume.shape))
 
 
-def _oversampling(call: NDArray[np.float64]) -> int:
+def _oversampling(call: Floats) -> int:
     """Return how much finer a compressed call is sampled, so that straight lines will do."""
     power = np.abs(np.fft.rfft(call, 2 * max(len(call), 8))) ** 2
     below = np.cumsum(power) / max(power.sum(), 1e-300)
@@ -141,7 +142,7 @@ def _oversampling(call: NDArray[np.float64]) -> int:
 
 def range_profiles(
     spectrograms: Iterable[ArrayLike], shape: tuple[int, int, int]
-) -> Iterator[NDArray[np.float64]]:
+) -> Iterator[Floats]:
     """Yield each pose's energy, summed over frequency, (E, R).
 
     Args:
@@ -170,14 +171,14 @@ def range_profiles(
         raise ValueError(f"spectrograms: {count}, expected one for each of {poses} poses")
 
 
-def _distance(points: NDArray[np.float32], place: NDArray[np.float64]) -> NDArray[np.float32]:
+def _distance(points: Singles, place: Floats) -> Singles:
     offset = points - place.astype(np.float32)
-    distance: NDArray[np.float32] = np.sqrt(np.einsum("ni,ni->n", offset, offset))
+    distance: Singles = np.sqrt(np.einsum("ni,ni->n", offset, offset))
     return distance
 
 
 def _interpolated(
-    profile: NDArray[Any], ranges: NDArray[np.float32], start: float, step: float
+    profile: NDArray[Any], ranges: Singles, start: float, step: float
 ) -> NDArray[Any]:
     """Read an evenly spaced profile linearly; zero outside it. In single precision."""
     # One silent slice at each end stands for everything beyond, and the last index stays inside.
@@ -328,9 +329,7 @@ def voxel_fit(
     return volume.with_values(power.reshape(volume.shape))
 
 
-def _kernel(
-    values: NDArray[np.float64], window_step: float, step: float, depth: float
-) -> NDArray[np.float64]:
+def _kernel(values: Floats, window_step: float, step: float, depth: float) -> Floats:
     """Return what a voxel leaves in the slices around it: the window, over the voxel's depth."""
     half = (len(values) - 1) / 2
     # So far that even the nearest part of a voxel's depth lies beyond the window: zero at the ends.
@@ -338,23 +337,21 @@ def _kernel(
     slices = step * np.arange(-reach, reach + 1)
     shifts = depth * ((np.arange(DEPTH_STEPS) + 0.5) / DEPTH_STEPS - 0.5)
     place = (slices[:, None] + shifts) / window_step + half
-    kernel: NDArray[np.float64] = np.interp(
-        place, np.arange(len(values)), values, left=0.0, right=0.0
-    ).mean(axis=1)
+    kernel: Floats = np.interp(place, np.arange(len(values)), values, left=0.0, right=0.0).mean(
+        axis=1
+    )
     return kernel
 
 
-def _heard_back(
-    profile: NDArray[np.float64], kernel: NDArray[np.float64], spread: NDArray[np.float64]
-) -> NDArray[np.float32]:
+def _heard_back(profile: Floats, kernel: Floats, spread: Floats) -> Singles:
     """Carry a profile from the slices back to the bins of range: the adjoint of hearing."""
     back = np.convolve(profile, kernel[::-1], mode="full") * spread
-    result: NDArray[np.float32] = back.astype(np.float32)
+    result: Singles = back.astype(np.float32)
     return result
 
 
-def _distances(axes: list[NDArray[np.float32]], place: NDArray[np.float64]) -> NDArray[np.float32]:
+def _distances(axes: list[Singles], place: Floats) -> Singles:
     """Return the distance of every voxel from a place, (X, Y, Z) m."""
     x, y, z = (np.square(a - np.float32(b)) for a, b in zip(axes, place, strict=True))
-    distance: NDArray[np.float32] = np.sqrt(x[:, None, None] + y[:, None] + z)
+    distance: Singles = np.sqrt(x[:, None, None] + y[:, None] + z)
     return distance

@@ -10,10 +10,10 @@ from typing import Any, Literal
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from trimesh.registration import procrustes
 
+from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import NumericalError
 from sononerf.evaluation.baseline import backprojection, best_level_surface, voxel_fit
@@ -46,7 +46,7 @@ class Registration:
         scale: Of lengths; 1 for a rigid motion.
     """
 
-    matrix: NDArray[np.float64]
+    matrix: Floats
     scale: float
 
     def inverse(self) -> Registration:
@@ -103,9 +103,7 @@ def register(
     return Registration(best[1], float(np.cbrt(np.linalg.det(best[1][:3, :3]))))
 
 
-def _starts(
-    points: NDArray[np.float64], target: NDArray[np.float64], scaled: bool
-) -> list[NDArray[np.float64]]:
+def _starts(points: Floats, target: Floats, scaled: bool) -> list[Floats]:
     """Return the first guesses (4, 4): as they lie, moved to one centre, and axes aligned."""
     middles = points.mean(axis=0), target.mean(axis=0)
     spread = [
@@ -131,11 +129,11 @@ def _starts(
 
 
 def _closest(
-    points: NDArray[np.float64],
-    target: NDArray[np.float64],
-    start: NDArray[np.float64],
+    points: Floats,
+    target: Floats,
+    start: Floats,
     scaled: bool,
-) -> tuple[float, NDArray[np.float64]]:
+) -> tuple[float, Floats]:
     """Iterate from a start; return the mean distance, m, and the motion."""
     tree, motion, before = cKDTree(target), start, np.inf
     for _ in range(STEPS):
@@ -200,9 +198,7 @@ class Truth:
         return {**geometry_metrics(self.motion.of(mesh), self.surface), "level": level}
 
 
-def baselines(
-    echoes: Echoes, lower: NDArray[np.float64], upper: NDArray[np.float64]
-) -> Iterator[tuple[str, Volume]]:
+def baselines(echoes: Echoes, lower: Floats, upper: Floats) -> Iterator[tuple[str, Volume]]:
     """Yield names and volumes of what needs no learning: backprojection and voxel fit.
 
     Args:

@@ -10,6 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sononerf.array_types import Floats
 from sononerf.evaluation.prediction import prediction_metrics
 from sononerf.evaluation.solid import Nearest, Solid, sample_surface
 from sononerf.head.decibels import mae_db
@@ -141,14 +142,12 @@ def target_metrics(
     }
 
 
-def _fscore(to_truth: NDArray[np.float64], to_found: NDArray[np.float64], limit: float) -> float:
+def _fscore(to_truth: Floats, to_found: Floats, limit: float) -> float:
     precision, recall = float((to_truth <= limit).mean()), float((to_found <= limit).mean())
     return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
 
 
-def _thickness_bias(
-    true: Solid, points: NDArray[np.float64], to_truth: NDArray[np.float64]
-) -> float | None:
+def _thickness_bias(true: Solid, points: Floats, to_truth: Floats) -> float | None:
     if not true.closed:
         return None
     return float(np.where(true.contains(points), -to_truth, to_truth).mean())
@@ -165,10 +164,10 @@ def _volume_metrics(found: Solid, true: Solid) -> dict[str, float | None]:
 
 
 def _normal_consistency(
-    points: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    true_points: NDArray[np.float64],
-    true_normals: NDArray[np.float64],
+    points: Floats,
+    normals: Floats,
+    true_points: Floats,
+    true_normals: Floats,
 ) -> float:
     there, back = _nearest_of(true_points, points), _nearest_of(points, true_points)
     forward = np.abs((normals * true_normals[there]).sum(axis=1)).mean()
@@ -176,7 +175,7 @@ def _normal_consistency(
     return float(forward + backward) / 2
 
 
-def _nearest_of(points: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.intp]:
+def _nearest_of(points: Floats, places: Floats) -> NDArray[np.intp]:
     """Return which of the points is nearest to each place, (N,)."""
     # Neighbours one after another: what one needs of the tree is still at hand for the next.
     cells = ((places - places.min(axis=0)) / max(float(np.ptp(places)), 1e-12) * 64).astype(np.intp)

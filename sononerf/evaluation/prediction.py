@@ -11,6 +11,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from sononerf.array_types import Floats, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import NumericalError
 from sononerf.evaluation.traced import Traced, mix, trace_poses
@@ -45,8 +46,8 @@ class Prediction:
         reference: Magnitude m0 of the reported decibels.
     """
 
-    magnitude: NDArray[np.float32]
-    rendered: NDArray[np.float32]
+    magnitude: Singles
+    rendered: Singles
     traced_weight: float
     traced_fault: str | None
     reference: float
@@ -195,7 +196,6 @@ def _image_metrics(
     }
 
 
-Array = NDArray[np.float64]
 SAME = 1e-6
 """Triangles are the same where their corners' mean lies no farther apart, m."""
 
@@ -215,7 +215,7 @@ class Comparison:
     first: Volume
     second: Volume
     difference: Volume
-    strongest: Array | None
+    strongest: Floats | None
     score: float
 
 

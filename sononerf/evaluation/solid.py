@@ -13,9 +13,10 @@ from manifold3d import Manifold, OpType
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sononerf.array_types import Bools, Floats
 from sononerf.errors import NumericalError
 
-Samples = tuple[NDArray[np.float64], NDArray[np.float64]]
+Samples = tuple[Floats, Floats]
 
 SMALLEST_PART = 0.01
 """Parts with less than this fraction of the largest part's area are not counted."""
@@ -92,7 +93,7 @@ class Solid:
         areas = [*(shell.surface_area() for shell in shells), *(s.area for s in self.sheets)]
         return int((np.array(areas) > SMALLEST_PART * max(areas)).sum())
 
-    def contains(self, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def contains(self, points: Floats) -> Bools:
         """Return whether points (N, 3), in m, lie inside the union, (N,)."""
         import pyvista  # its test is five times as quick as winding numbers
 
@@ -127,9 +128,7 @@ class Solid:
         return self._samples[key]
 
 
-def sample_surface(
-    mesh: trimesh.Trimesh, count: int, seed: int
-) -> tuple[NDArray[np.float64], NDArray[np.intp]]:
+def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[Floats, NDArray[np.intp]]:
     """Draw points uniformly by area.
 
     Args:
@@ -193,7 +192,6 @@ def _trimesh(solid: Manifold) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices, faces, process=False, validate=False)
 
 
-Array = NDArray[np.float64]
 # Triangles per box of the locator; more are slower far from the surface, fewer near it.
 TRIANGLES_PER_BOX = 8
 # So much farther than a corner is looked, against rounding; of the distance and of the mesh's size.
@@ -227,7 +225,7 @@ class Nearest:
         locator.BuildLocator()
         return locator
 
-    def distance(self, points: Array) -> Array:
+    def distance(self, points: Floats) -> Floats:
         """Return the distance of points (N, 3), (N,) m, zero or more."""
         given = np.asarray(points, dtype=np.float64)
         if not len(given):
@@ -243,16 +241,16 @@ class Nearest:
         found[lost] = self._within(given[lost], far, np.arange(len(lost)))
         return found
 
-    def near(self, points: Array, limit: float) -> NDArray[np.bool_]:
+    def near(self, points: Floats, limit: float) -> Bools:
         """Return whether points (N, 3) are no farther than a limit, in m; quicker still."""
         given = np.asarray(points, dtype=np.float64)
-        close: NDArray[np.bool_] = self.corners.query(given, distance_upper_bound=limit)[0] <= limit
+        close: Bools = self.corners.query(given, distance_upper_bound=limit)[0] <= limit
         rest = np.flatnonzero(~close)
         found = self._within(given[rest], np.full(len(rest), limit), np.arange(len(rest)))
         close[rest] = found <= limit
         return close
 
-    def _within(self, points: Array, bound: Array, order: NDArray[np.intp]) -> Array:
+    def _within(self, points: Floats, bound: Floats, order: NDArray[np.intp]) -> Floats:
         """Return distances up to a bound for each point, infinite where it is farther.
 
         Neighbours are asked about one after another, so that what one needs is still at hand.

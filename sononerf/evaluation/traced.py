@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sononerf.array_types import Floats, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import ResourceError, SonoNerfError
 from sononerf.field.datamodule import WholePoses
@@ -39,8 +40,8 @@ class Traced:
     """
 
     mesh: trimesh.Trimesh
-    gain_db: NDArray[np.float64]
-    weight: NDArray[np.float64]
+    gain_db: Floats
+    weight: Floats
     fault: str = ""
 
     @classmethod
@@ -115,7 +116,7 @@ def trace_poses(
     *,
     seed: int,
     progress: Progress,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Trace echoes off the surface, (P, E, R, F) linear magnitude, without noise."""
     simulator = Simulator.of_surface(traced.mesh, head, simulation, rays=RAYS)
     simulator.prepare(*_places(poses), progress)
@@ -123,11 +124,11 @@ def trace_poses(
     return found * 10 ** (traced.gain_db[:, None] / 20)
 
 
-def _measured(poses: WholePoses) -> NDArray[np.float32]:
+def _measured(poses: WholePoses) -> Singles:
     return np.concatenate([poses[i].spectrum.numpy() for i in range(len(poses))])
 
 
-def _places(poses: WholePoses) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _places(poses: WholePoses) -> tuple[Floats, Floats]:
     positions, rotations = (
         np.stack([part.double().numpy() for part in parts])
         for parts in (poses.positions, poses.rotations)
@@ -135,9 +136,7 @@ def _places(poses: WholePoses) -> tuple[NDArray[np.float64], NDArray[np.float64]
     return positions, rotations
 
 
-def _trace(
-    simulator: Simulator, poses: WholePoses, seed: int, progress: Progress
-) -> NDArray[np.float64]:
+def _trace(simulator: Simulator, poses: WholePoses, seed: int, progress: Progress) -> Floats:
     """Return the spectrograms of poses (P, E, R, F), linear."""
     traced = []
     with progress.task("tracing", len(poses)) as task:
@@ -147,13 +146,12 @@ def _trace(
     return np.stack(traced).astype(np.float64)
 
 
-Array = NDArray[np.float64]
 LOUD_DB = 20.0
 """Cells above this level, in reported decibels, give the gain: fainter ones hold the window's side
 lobes and interference."""
 
 
-def gain_db(measured_db: ArrayLike, traced_db: ArrayLike) -> Array:
+def gain_db(measured_db: ArrayLike, traced_db: ArrayLike) -> Floats:
     """Return how much louder each ear measured each frequency than it was traced.
 
     Args:
@@ -175,7 +173,7 @@ def gain_db(measured_db: ArrayLike, traced_db: ArrayLike) -> Array:
     return gain
 
 
-def mix(rendered_db: ArrayLike, traced_db: ArrayLike, weight: ArrayLike) -> Array:
+def mix(rendered_db: ArrayLike, traced_db: ArrayLike, weight: ArrayLike) -> Floats:
     """Return the weighted mean of two predictions in decibels.
 
     Args:
@@ -189,7 +187,7 @@ def mix(rendered_db: ArrayLike, traced_db: ArrayLike, weight: ArrayLike) -> Arra
     return first + np.asarray(weight) * (np.asarray(traced_db, dtype=np.float64) - first)
 
 
-def regress_weight(measured_db: ArrayLike, rendered_db: ArrayLike, traced_db: ArrayLike) -> Array:
+def regress_weight(measured_db: ArrayLike, rendered_db: ArrayLike, traced_db: ArrayLike) -> Floats:
     r"""Return the weight of the traced prediction that minimises the error per frequency.
 
     The weight minimises :math:`\sum |m - r - w (t - r)|` with :math:`0 \le w \le 1` over all
@@ -218,7 +216,7 @@ def regress_weight(measured_db: ArrayLike, rendered_db: ArrayLike, traced_db: Ar
     return weights.clip(0.0, 1.0)
 
 
-def _weighted_median(values: Array, weights: Array) -> float:
+def _weighted_median(values: Floats, weights: Floats) -> float:
     order = values.argsort(kind="stable")
     total = weights[order].cumsum()
     return float(values[order][np.searchsorted(total, 0.5 * total[-1])])

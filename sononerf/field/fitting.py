@@ -13,9 +13,9 @@ import lightning
 import numpy as np
 import torch
 from lightning.pytorch.loggers import Logger
-from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
+from sononerf.array_types import Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError, ResourceError
@@ -147,11 +147,11 @@ def poses_of(echoes: Echoes, split: Split, renderer: Renderer) -> WholePoses:
 
 def render_poses(
     fitted: FittedField, poses: WholePoses, *, accelerator: str = "auto", progress: Progress
-) -> NDArray[np.float32]:
+) -> Singles:
     """Render poses one by one, (P, E, R, F) linear magnitude."""
     quiet_lightning()
     require_accelerator(accelerator)
-    rendered: list[NDArray[np.float32]] = []
+    rendered: list[Singles] = []
 
     class Gather(lightning.Callback):
         def on_predict_batch_end(

@@ -11,6 +11,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.array_types import Floats, Ints
 from sononerf.geometry.normals import corner_normals
 
 # Turning by the golden section of a circle never lets two neighbouring rings line up.
@@ -18,7 +19,7 @@ GOLDEN_TURN = (math.sqrt(5.0) - 1.0) / 2.0
 PATCHES = (64, 128)  # of a cap, over its area and around its axis
 
 
-def fibonacci_sphere(count: int) -> NDArray[np.float64]:
+def fibonacci_sphere(count: int) -> Floats:
     """Return unit vectors on a spiral from +z to -z, each standing for the same solid angle.
 
     Args:
@@ -36,7 +37,7 @@ def fibonacci_sphere(count: int) -> NDArray[np.float64]:
 
 def fibonacci_cap(
     count: int, *, axis: ArrayLike, half_angle: float, offset: tuple[float, float]
-) -> NDArray[np.float64]:
+) -> Floats:
     """Return unit vectors on a spiral that fills the cap around an axis; equal areas, stratified.
 
     Args:
@@ -63,8 +64,8 @@ class Cells:
         parts: How many of them make up one cell of the spiral.
     """
 
-    middles: NDArray[np.float64]
-    sides: NDArray[np.float64]
+    middles: Floats
+    sides: Floats
     parts: int
 
     def __getitem__(self, chosen: NDArray[Any]) -> Cells:
@@ -101,7 +102,7 @@ class CapSpiral:
     axis: ArrayLike
     half_angle: float
     offset: tuple[float, float]
-    rotation: NDArray[np.float64] | None = None
+    rotation: Floats | None = None
 
     def __post_init__(self) -> None:
         if self.count < 1:
@@ -119,14 +120,12 @@ class CapSpiral:
         # 1 - cos(half_angle), written so that a narrow cap keeps its digits
         return 2.0 * math.sin(self.half_angle / 2.0) ** 2
 
-    def directions(self, index: NDArray[np.int64] | None = None) -> NDArray[np.float64]:
+    def directions(self, index: Ints | None = None) -> Floats:
         """Return the unit vectors (D, 3), from the axis outwards; all, or those of an index."""
         chosen = np.arange(self.count) if index is None else index
         return self._at(*self._lattice(chosen.astype(np.float64)))
 
-    def reaching(
-        self, towards: NDArray[np.float64], half_angle: NDArray[np.float64]
-    ) -> NDArray[np.int64]:
+    def reaching(self, towards: Floats, half_angle: Floats) -> Ints:
         """Return the indices, ascending, of all directions that lie in any of some cones.
 
         Others that lie near a cone are among them: whole patches of the cap are left out or not.
@@ -154,19 +153,17 @@ class CapSpiral:
         column = np.minimum((np.mod(at_turn, 1.0) * columns).astype(np.int64), columns - 1)
         return np.flatnonzero(near.any(axis=2).ravel()[row * columns + column])
 
-    def neighbourhood(self, index: NDArray[np.int64]) -> NDArray[np.int64]:
+    def neighbourhood(self, index: Ints) -> Ints:
         """Return directions' indices together with those of their four neighbours, sorted."""
         near, far = self.neighbour_steps(index)
         around = np.concatenate([index, index - near, index + near, index - far, index + far])
         return np.unique(around[(around >= 0) & (around < self.count)])
 
-    def neighbour_steps(
-        self, index: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def neighbour_steps(self, index: Ints) -> tuple[Ints, Ints]:
         """Return the two steps in index (N,) that lead to the nearest neighbours, either way."""
         return _cell_steps(self._ring(index), self._depth / self.count)
 
-    def cells(self, index: NDArray[np.int64]) -> Cells:
+    def cells(self, index: Ints) -> Cells:
         """Return the cells of directions by their index (N,)."""
         share, turn = self._lattice(index.astype(np.float64))
         steps = np.stack(self.neighbour_steps(index))
@@ -174,21 +171,19 @@ class CapSpiral:
         sides = np.stack([steps / self.count, across], axis=1)
         return Cells(np.stack([share, turn]), sides, 1)
 
-    def towards(self, cells: Cells) -> NDArray[np.float64]:
+    def towards(self, cells: Cells) -> Floats:
         """Return the unit vectors (N, 3) of the middles of cells."""
         return self._at(*cells.middles)
 
-    def _lattice(
-        self, index: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _lattice(self, index: Floats) -> tuple[Floats, Floats]:
         return (index + self.offset[0]) / self.count, index * GOLDEN_TURN + self.offset[1]
 
-    def _ring(self, index: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _ring(self, index: Ints) -> Floats:
         """Sine of the angle from the axis."""
         drop = self._depth * (index + self.offset[0]) / self.count
         return np.sqrt(drop * (2.0 - drop))
 
-    def _at(self, share: NDArray[np.float64], turn: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _at(self, share: Floats, turn: Floats) -> Floats:
         drop = self._depth * share  # 1 - cos(angle from the axis)
         # A cell may reach over the axis, or over the far pole, to the other side.
         over = (drop < 0.0) | (drop > 2.0)
@@ -201,9 +196,7 @@ class CapSpiral:
         return np.stack([1.0 - drop, ring * np.cos(turn), ring * np.sin(turn)]).T @ frame
 
 
-def _cell_steps(
-    ring: NDArray[np.float64], depth: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _cell_steps(ring: Floats, depth: float) -> tuple[Ints, Ints]:
     """Return the steps in index to the two neighbours that span the most compact cell.
 
     They are neighbouring Fibonacci numbers, which two depends on the distance from the axis; the
@@ -219,7 +212,7 @@ def _cell_steps(
     return step[best].astype(np.int64), step[best + 1].astype(np.int64)
 
 
-def _frame(axis: ArrayLike) -> NDArray[np.float64]:
+def _frame(axis: ArrayLike) -> Floats:
     """Return the axis as a unit vector and two that are square to it."""
     middle = np.asarray(axis, dtype=np.float64)
     length = np.linalg.norm(middle)
@@ -237,9 +230,7 @@ POOL = 10  # points on the surface from which one is chosen
 PLASTIC = 1.324717957244746  # root of x^3 = x + 1; its powers spread points over a square evenly
 
 
-def spread_points(
-    mesh: trimesh.Trimesh, count: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def spread_points(mesh: trimesh.Trimesh, count: int) -> tuple[Floats, Floats]:
     """Choose points of a surface, each as far as possible from those before it [1]_.
 
     So any first ones of them are spread evenly over the surface, whatever its triangles.

@@ -6,10 +6,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.geometry.raycast import winding_numbers
 
 FLAT = 1e-7
@@ -65,31 +66,31 @@ def surface_faults(vertices: ArrayLike, faces: ArrayLike) -> list[str]:
 class _Edges:
     """The edges of a surface, each once: its ends, and what is odd about it."""
 
-    ends: NDArray[np.int64]  # (K, 2)
-    open: NDArray[np.bool_]
-    crowded: NDArray[np.bool_]
-    against: NDArray[np.bool_]
+    ends: Ints  # (K, 2)
+    open: Bools
+    crowded: Bools
+    against: Bools
 
 
 def _count(number: int, what: str) -> str:
     return f"{number} {what}{'' if number == 1 else 's'}"
 
 
-def _is_flat(corners: NDArray[np.float64], triangles: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _is_flat(corners: Floats, triangles: Ints) -> Bools:
     a, b, c = (corners[triangles[:, k]] for k in range(3))
     sides = np.stack([b - a, c - b, a - c])
     longest = np.einsum("ktd,ktd->kt", sides, sides).max(axis=0)
     area = np.cross(sides[0], sides[1])
-    flat: NDArray[np.bool_] = np.einsum("td,td->t", area, area) <= (FLAT * longest) ** 2
+    flat: Bools = np.einsum("td,td->t", area, area) <= (FLAT * longest) ** 2
     return flat
 
 
-def _with_three_corners(triangles: NDArray[np.int64]) -> NDArray[np.int64]:
+def _with_three_corners(triangles: Ints) -> Ints:
     a, b, c = triangles.T
     return triangles[(a != b) & (b != c) & (c != a)]
 
 
-def _edges(triangles: NDArray[np.int64], count: int) -> _Edges:
+def _edges(triangles: Ints, count: int) -> _Edges:
     start = triangles.T.ravel().astype(np.int64)
     end = np.roll(triangles, -1, axis=1).T.ravel().astype(np.int64)
     key = np.minimum(start, end) * count + np.maximum(start, end)
@@ -102,13 +103,13 @@ def _edges(triangles: NDArray[np.int64], count: int) -> _Edges:
     return _Edges(ends, uses % 2 == 1, uses > 2, (uses % 2 == 0) & (2 * forward != uses))
 
 
-def _named(indices: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+def _named(indices: Ints, count: int) -> Ints:
     there = np.zeros(count, dtype=bool)
     there[indices] = True
     return np.flatnonzero(there)
 
 
-def _openness(corners: NDArray[np.float64], triangles: NDArray[np.int64], edges: _Edges) -> str:
+def _openness(corners: Floats, triangles: Ints, edges: _Edges) -> str:
     """Say that a surface is open, and whether vertices that stand twice are all there is to it."""
     number = int(edges.open.sum())
     rim = _named(edges.ends[edges.open], len(corners))
@@ -135,15 +136,15 @@ def _openness(corners: NDArray[np.float64], triangles: NDArray[np.int64], edges:
 class _Bodies:
     """Connected parts of a surface; which of them enclose a volume, and how much."""
 
-    of_corner: NDArray[np.int64]  # (V,) number of the body
-    of_triangle: NDArray[np.int64]  # (T,)
-    low: NDArray[np.float64]  # (K, 3)
-    high: NDArray[np.float64]  # (K, 3)
-    volume: NDArray[np.float64]  # (K,), negative where inside out
-    closed: NDArray[np.int64]  # numbers of those that enclose a volume, largest first
+    of_corner: Ints  # (V,) number of the body
+    of_triangle: Ints  # (T,)
+    low: Floats  # (K, 3)
+    high: Floats  # (K, 3)
+    volume: Floats  # (K,), negative where inside out
+    closed: Ints  # numbers of those that enclose a volume, largest first
 
 
-def _bodies(corners: NDArray[np.float64], triangles: NDArray[np.int64], edges: _Edges) -> _Bodies:
+def _bodies(corners: Floats, triangles: Ints, edges: _Edges) -> _Bodies:
     shape = (len(corners), len(corners))
     links = coo_array((np.ones(len(edges.ends), dtype=bool), edges.ends.T), shape=shape)
     count, of_corner = connected_components(links, directed=False)
@@ -160,15 +161,13 @@ def _bodies(corners: NDArray[np.float64], triangles: NDArray[np.int64], edges: _
     return _Bodies(of_corner, of_triangle, low, high, volume, largest_first[closed[largest_first]])
 
 
-def _members(of: NDArray[np.int64], count: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _members(of: Ints, count: int) -> tuple[Ints, Ints]:
     """Return indices sorted by the body they are of, and where each body starts, (K + 1,)."""
     order = np.argsort(of, kind="stable")
     return order, np.searchsorted(of[order], np.arange(count + 1))
 
 
-def _holders(
-    corners: NDArray[np.float64], triangles: NDArray[np.int64], bodies: _Bodies
-) -> NDArray[np.int64]:
+def _holders(corners: Floats, triangles: Ints, bodies: _Bodies) -> Ints:
     """Return for each body the number of one that it lies wholly inside of, or -1."""
     holder = np.full(len(bodies.volume), -1)
     closed, count = bodies.closed, len(bodies.volume)
@@ -191,9 +190,7 @@ def _holders(
     return holder
 
 
-def _oddities(
-    corners: NDArray[np.float64], triangles: NDArray[np.int64], bodies: _Bodies
-) -> list[str]:
+def _oddities(corners: Floats, triangles: Ints, bodies: _Bodies) -> list[str]:
     holder, volume, count = _holders(corners, triangles, bodies), bodies.volume, len(bodies.closed)
     # A body that faces the other way than the one around it is that one's hollow.
     hollow = (holder >= 0) & (volume * volume[holder] < 0.0)

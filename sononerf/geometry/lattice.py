@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from skimage.measure import marching_cubes
 
-Array = NDArray[np.float64]
-Grid = NDArray[np.float32]
+from sononerf.array_types import Bools, Floats, Singles
+
 MARGIN = 3
 """Voxels around the box, so that a surface at its edge is closed by air."""
 
@@ -27,31 +27,31 @@ class Lattice:
         shape: Voxels along x, y and z.
     """
 
-    origin: Array
+    origin: Floats
     spacing: float
     shape: tuple[int, int, int]
 
     @classmethod
-    def over(cls, lower: Array, upper: Array, spacing: float) -> Lattice:
+    def over(cls, lower: Floats, upper: Floats, spacing: float) -> Lattice:
         """Return a lattice over a box and a margin around it."""
         x, y, z = (int(np.ceil(n - 1e-9)) + 1 + 2 * MARGIN for n in (upper - lower) / spacing)
         return cls(np.asarray(lower, dtype=np.float64) - MARGIN * spacing, spacing, (x, y, z))
 
-    def coordinates(self, points: Array) -> Array:
+    def coordinates(self, points: Floats) -> Floats:
         """Return where points lie, in voxels from the first."""
         return (points - self.origin) / self.spacing
 
-    def points(self) -> Array:
+    def points(self) -> Floats:
         """Return the centres of all voxels, (N, 3) m."""
         return self.origin + self.spacing * np.argwhere(np.ones(self.shape, dtype=bool))
 
-    def at_wall(self, points: Array) -> NDArray[np.bool_]:
+    def at_wall(self, points: Floats) -> Bools:
         """Tell which points lie at the end of the box, within a voxel, or beyond, (N,)."""
         place, last = self.coordinates(points), np.asarray(self.shape) - 1
         inner = (place > MARGIN + 1) & (place < last - MARGIN - 1)
         return np.asarray(~inner.all(axis=1))
 
-    def spread(self, points: Array, values: Array, deviation: float = 0.0) -> Grid:
+    def spread(self, points: Floats, values: Floats, deviation: float = 0.0) -> Singles:
         """Add values (N,) of points onto the voxels around them, and blur by so many voxels."""
         place = self.coordinates(points)
         base = np.floor(place).astype(np.intp)
@@ -68,9 +68,9 @@ class Lattice:
             grid = gaussian_filter(grid, deviation, mode="constant")
         return np.asarray(grid, dtype=np.float32)
 
-    def read(self, grid: NDArray[np.floating], points: Array) -> Array:
+    def read(self, grid: NDArray[np.floating], points: Floats) -> Floats:
         """Read a grid at points, linearly between voxels, (N,)."""
-        read: Array = map_coordinates(
+        read: Floats = map_coordinates(
             grid, self.coordinates(points).T, order=1, mode="nearest", output=np.float64
         )
         return read

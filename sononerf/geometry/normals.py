@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from sononerf.array_types import Floats, Ints
+
 CREASE = math.radians(30.0)
 TIGHTER = 0.95  # radius of balls around halves, over that around the whole, that is worth it
 
 
-def corner_normals(mesh: trimesh.Trimesh, *, crease: float = CREASE) -> NDArray[np.float64]:
+def corner_normals(mesh: trimesh.Trimesh, *, crease: float = CREASE) -> Floats:
     """Smooth normal at each corner of each triangle.
 
     Around a vertex, triangles are taken together as far as their neighbours meet at less than
@@ -47,7 +49,7 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease: float = CREASE) -> NDArray[
     return normals[group].reshape(-1, 3, 3)
 
 
-def total_curvature(mesh: trimesh.Trimesh, normals: NDArray[np.float64]) -> NDArray[np.float64]:
+def total_curvature(mesh: trimesh.Trimesh, normals: Floats) -> Floats:
     """Total curvature of the smooth surface over each triangle.
 
     The square root of the sum of both principal curvatures' squares, which is the Frobenius norm
@@ -76,8 +78,8 @@ def total_curvature(mesh: trimesh.Trimesh, normals: NDArray[np.float64]) -> NDAr
 
 
 def weight_gradients(
-    corners: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    corners: Floats,
+) -> tuple[Floats, Floats]:
     """How the weights of a triangle's second and third corner grow along it.
 
     Args:
@@ -100,8 +102,8 @@ def _smooth_corners(mesh: trimesh.Trimesh, crease: float) -> NDArray[np.int32]:
     smooth = mesh.face_adjacency_angles < crease
     pairs = mesh.face_adjacency[smooth]  # two triangles
     edges = mesh.face_adjacency_edges[smooth]  # and the two vertices they share
-    first: list[NDArray[np.int64]] = []
-    second: list[NDArray[np.int64]] = []
+    first: list[Ints] = []
+    second: list[Ints] = []
     for end in range(2):
         for side, found in ((0, first), (1, second)):
             corner = (faces[pairs[:, side]] == edges[:, end, None]).argmax(axis=1)
@@ -113,18 +115,16 @@ def _smooth_corners(mesh: trimesh.Trimesh, crease: float) -> NDArray[np.int32]:
     return labels
 
 
-def bodies(mesh: trimesh.Trimesh) -> NDArray[np.int64]:
+def bodies(mesh: trimesh.Trimesh) -> Ints:
     """Return which connected part of the mesh each triangle belongs to (T,)."""
     count = len(mesh.faces)
     pairs = np.asarray(mesh.face_adjacency, dtype=np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    label: NDArray[np.int64] = connected_components(graph, directed=False)[1].astype(np.int64)
+    label: Ints = connected_components(graph, directed=False)[1].astype(np.int64)
     return label
 
 
-def enclosing_balls(
-    corners: NDArray[np.float64], label: NDArray[np.int64], count: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def enclosing_balls(corners: Floats, label: Ints, count: int) -> tuple[Floats, Floats]:
     """Return balls that hold all triangles: one for each body, and more where that is tighter.
 
     Args:
@@ -138,7 +138,7 @@ def enclosing_balls(
     """
     middles = corners.mean(axis=1)
 
-    def ball(group: NDArray[np.int64]) -> tuple[NDArray[np.float64], float, NDArray[np.int64]]:
+    def ball(group: Ints) -> tuple[Floats, float, Ints]:
         points = corners[group].reshape(-1, 3)
         centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
         return centre, float(np.linalg.norm(points - centre, axis=1).max()), group
@@ -146,7 +146,7 @@ def enclosing_balls(
     bodies = np.unique(label)
     alone = [np.flatnonzero(label == body) for body in bodies] if len(bodies) <= count else []
     open_ = [ball(group) for group in alone or [np.arange(len(corners))]]
-    done: list[tuple[NDArray[np.float64], float, NDArray[np.int64]]] = []
+    done: list[tuple[Floats, float, Ints]] = []
     while open_ and len(open_) + len(done) < count:
         whole = open_.pop(int(np.argmax([radius for _, radius, _ in open_])))
         group = whole[2]

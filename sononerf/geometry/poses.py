@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_cap, fibonacci_sphere
 from sononerf.tables import number_in, read_rows
@@ -30,8 +31,8 @@ class Poses:
         rotations (P, 3, 3): Head to world.
     """
 
-    positions: NDArray[np.float64]
-    rotations: NDArray[np.float64]
+    positions: Floats
+    rotations: Floats
 
     def __post_init__(self) -> None:
         positions = np.asarray(self.positions, dtype=np.float64)
@@ -57,7 +58,7 @@ class Poses:
         return Poses(self.positions[index], self.rotations[index])
 
 
-def rotation_from_euler(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> NDArray[np.float64]:
+def rotation_from_euler(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> Floats:
     """Rotation matrices from yaw, pitch and roll.
 
     Args:
@@ -85,7 +86,7 @@ def rotation_from_euler(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> ND
 
 def euler_from_rotation(
     rotations: ArrayLike,
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats, Floats]:
     """Yaw, pitch and roll of rotation matrices; looking straight up or down, yaw is 0.
 
     Args:
@@ -108,7 +109,7 @@ def euler_from_rotation(
     return yaw, pitch, roll
 
 
-def look_at(positions: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
+def look_at(positions: ArrayLike, target: ArrayLike) -> Floats:
     """Level rotations that look from positions at a target.
 
     Args:
@@ -130,9 +131,7 @@ def look_at(positions: ArrayLike, target: ArrayLike) -> NDArray[np.float64]:
     return rotation_from_euler(yaw, -np.arctan2(forward[..., 2], level), 0.0)
 
 
-def _aimed(
-    positions: NDArray[np.float64], aim_jitter: float, generator: np.random.Generator
-) -> Poses:
+def _aimed(positions: Floats, aim_jitter: float, generator: np.random.Generator) -> Poses:
     """Look at the origin, then off it by two random turns about the head's own y and z."""
     about_y, about_z = aim_jitter * generator.standard_normal((2, len(positions)))
     turned = look_at(positions, np.zeros(3)) @ rotation_from_euler(about_z, about_y, 0.0)

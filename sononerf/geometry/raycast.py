@@ -8,8 +8,8 @@ from typing import Any, Protocol
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from sononerf.array_types import Bools, Floats, Ints, Singles
 from sononerf.geometry.normals import corner_normals, total_curvature, weight_gradients
 
 try:
@@ -44,45 +44,37 @@ class Hits:
             from that at the first.
     """
 
-    ray: NDArray[np.int64]
-    points: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    triangle: NDArray[np.int64]
-    distance: NDArray[np.float64]
-    flat: NDArray[np.float64]
-    gradients: NDArray[np.float32]
+    ray: Ints
+    points: Floats
+    normals: Floats
+    triangle: Ints
+    distance: Floats
+    flat: Floats
+    gradients: Singles
 
 
 class _Engine(Protocol):
     """What searches triangles, in coordinates of about unit size."""
 
-    def first(
-        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
-    ) -> NDArray[np.int64]: ...
+    def first(self, origins: Floats, directions: Floats) -> Ints: ...
 
-    def blocked(
-        self, origins: NDArray[np.float64], spans: NDArray[np.float64]
-    ) -> NDArray[np.bool_]: ...
+    def blocked(self, origins: Floats, spans: Floats) -> Bools: ...
 
 
 class _EmbreeEngine:
     """Embree: millions of rays a second, single precision, processes only (it holds the GIL)."""
 
-    def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+    def __init__(self, vertices: Floats, faces: Ints) -> None:
         self._scene = EmbreeScene()
         TriangleMesh(self._scene, vertices.astype(np.float32), faces.astype(np.int32))
 
-    def first(
-        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
-    ) -> NDArray[np.int64]:
+    def first(self, origins: Floats, directions: Floats) -> Ints:
         found = self._scene.run(
             origins.astype(np.float32), directions.astype(np.float32), query="INTERSECT"
         )
         return np.asarray(found, dtype=np.int64)
 
-    def blocked(
-        self, origins: NDArray[np.float64], spans: NDArray[np.float64]
-    ) -> NDArray[np.bool_]:
+    def blocked(self, origins: Floats, spans: Floats) -> Bools:
         # Distances count in lengths of the direction, so 1 is the target. Asked for more output
         # than this, the occlusion query returns uninitialised memory.
         found = self._scene.run(
@@ -97,7 +89,7 @@ class _EmbreeEngine:
 class _VtkEngine:
     """VTK's cell locator: everywhere, and some thirty times slower."""
 
-    def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+    def __init__(self, vertices: Floats, faces: Ints) -> None:
         import pyvista as pv
         from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
 
@@ -120,22 +112,18 @@ class _VtkEngine:
         )
         return int(cell) if found else -1
 
-    def first(
-        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
-    ) -> NDArray[np.int64]:
+    def first(self, origins: Floats, directions: Floats) -> Ints:
         reach = self._reach + np.linalg.norm(origins, axis=1, keepdims=True)
         ends = origins + reach * directions
         return np.array([self._search(a, b) for a, b in zip(origins, ends, strict=True)], np.int64)
 
-    def blocked(
-        self, origins: NDArray[np.float64], spans: NDArray[np.float64]
-    ) -> NDArray[np.bool_]:
+    def blocked(self, origins: Floats, spans: Floats) -> Bools:
         ends = origins + spans
         return np.array([self._search(a, b) >= 0 for a, b in zip(origins, ends, strict=True)], bool)
 
 
-def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    product: NDArray[np.float64] = np.einsum("nd,nd->n", a, b)
+def _dot(a: Floats, b: Floats) -> Floats:
+    product: Floats = np.einsum("nd,nd->n", a, b)
     return product
 
 
@@ -180,7 +168,7 @@ class RayCaster:
             _VtkEngine(scaled, faces) if EmbreeScene is None else _EmbreeEngine(scaled, faces)
         )
 
-    def first_hit(self, origins: NDArray[np.float64], directions: NDArray[np.float64]) -> Hits:
+    def first_hit(self, origins: Floats, directions: Floats) -> Hits:
         """Return what each ray hits first; rays that hit nothing are left out.
 
         Args:
@@ -219,11 +207,11 @@ class RayCaster:
 
     def visible(
         self,
-        points: NDArray[np.float64],
-        targets: NDArray[np.float64],
+        points: Floats,
+        targets: Floats,
         *,
-        normals: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.bool_]:
+        normals: Floats | None = None,
+    ) -> Bools:
         """Whether nothing stands between points and targets.
 
         Args:
@@ -244,7 +232,7 @@ class RayCaster:
         spans = np.broadcast_to(targets, points.shape) - lifted
         return ~self._engine.blocked(self._scaled(lifted), spans * (1.0 / self._size))
 
-    def _scaled(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _scaled(self, points: Floats) -> Floats:
         """Return points in the engine's coordinates."""
         if len(points) > 1 and points.strides[0] == 0:  # one point for all
             return np.broadcast_to(self._scaled(points[:1]), points.shape)
@@ -261,7 +249,7 @@ class Occlusion:
         faces (T, 3): Triangles.
     """
 
-    def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+    def __init__(self, vertices: Floats, faces: Ints) -> None:
         lower, upper = vertices.min(axis=0), vertices.max(axis=0)
         self._middle = (lower + upper) / 2.0
         self._scale = 1.0 / float(np.linalg.norm(upper - lower))
@@ -270,9 +258,7 @@ class Occlusion:
             _VtkEngine(scaled, faces) if EmbreeScene is None else _EmbreeEngine(scaled, faces)
         )
 
-    def blocked(
-        self, points: NDArray[np.float64], targets: NDArray[np.float64]
-    ) -> NDArray[np.bool_]:
+    def blocked(self, points: Floats, targets: Floats) -> Bools:
         """Whether the straight way from points to targets (N, 3), m, meets a triangle (N,)."""
         return self._engine.blocked(
             (points - self._middle) * self._scale, (targets - points) * self._scale
@@ -284,9 +270,7 @@ TURNED = rotation_from_euler(0.5, 0.7, 0.3)
 PAIRS_AT_ONCE = 1_000_000
 
 
-def winding_numbers(
-    vertices: ArrayLike, faces: ArrayLike, points: ArrayLike
-) -> NDArray[np.float64]:
+def winding_numbers(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> Floats:
     """Count how often a surface winds round points.
 
     Six lines of sight leave each point, along three axes square to one another. On each the
@@ -314,9 +298,7 @@ def winding_numbers(
     return total
 
 
-def _both_ways(
-    corners: NDArray[np.float64], triangles: NDArray[np.int64], places: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _both_ways(corners: Floats, triangles: Ints, places: Floats) -> Floats:
     """Sum what is crossed up and down the third axis."""
     order = np.argsort(places[:, 0], kind="stable")
     sorted_places = places[order]
@@ -338,9 +320,7 @@ def _both_ways(
     return total
 
 
-def _near_pairs(
-    corners: NDArray[np.float64], triangles: NDArray[np.int64], places: NDArray[np.float64]
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+def _near_pairs(corners: Floats, triangles: Ints, places: Floats) -> Iterator[tuple[Ints, Ints]]:
     """Yield triangles and places, sorted along the first axis, whose first two axes overlap."""
     along = corners[:, 0][triangles]
     first = np.searchsorted(places[:, 0], along.min(axis=1))
@@ -364,8 +344,6 @@ def _near_pairs(
         start = stop
 
 
-def _area(
-    q: NDArray[np.float64], a: NDArray[np.float64], b: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _area(q: Floats, a: Floats, b: Floats) -> Floats:
     """Twice the signed area of triangles over the first two axes."""
     return (a[:, 0] - q[:, 0]) * (b[:, 1] - q[:, 1]) - (a[:, 1] - q[:, 1]) * (b[:, 0] - q[:, 0])

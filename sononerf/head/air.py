@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sononerf.array_types import Floats
 from sononerf.settings.schema import AirSettings
 
 DEFAULT_SPEED = 343.0  # m/s
@@ -39,7 +40,7 @@ def speed_in(air: AirSettings) -> float:
     return DEFAULT_SPEED if air.temperature_c is None else speed_of_sound(air.temperature_c)
 
 
-def absorption_in(air: AirSettings, frequency: ArrayLike) -> NDArray[np.float64]:
+def absorption_in(air: AirSettings, frequency: ArrayLike) -> Floats:
     """Return the absorption (F,), dB/m, of the air that settings describe, at (F,) Hz.
 
     Below the lowest frequency of the standard it is that of the lowest frequency.
@@ -58,7 +59,7 @@ def air_absorption(
     temperature_c: float = 20.0,
     relative_humidity: float,
     pressure: float = REFERENCE_PRESSURE,
-) -> NDArray[np.float64]:
+) -> Floats:
     r"""Attenuation of a pure tone by still air, in decibels per metre.
 
     .. math:: \alpha(f) = 8.686 f^2 \left[ A_\mathrm{cl} + A_\mathrm{O} + A_\mathrm{N} \right]
@@ -105,7 +106,7 @@ def air_absorption(
     classical = 1.84e-11 / p * np.sqrt(t)
     of_oxygen = 0.01275 * np.exp(-2239.1 / kelvin) / (oxygen + f**2 / oxygen)
     of_nitrogen = 0.1068 * np.exp(-3352.0 / kelvin) / (nitrogen + f**2 / nitrogen)
-    absorption: NDArray[np.float64] = (
+    absorption: Floats = (
         8.686 * f**2 * (classical + t**-2.5 * (of_oxygen + of_nitrogen))  # (5)
     )
     return absorption

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import scipy.fft
 import scipy.signal
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sononerf.array_types import Bools, Complexes, Floats
 from sononerf.head.call_file import CallFile, contents, load_call
 from sononerf.settings.schema import CallSettings
 
@@ -20,7 +21,7 @@ LOUD = 0.25
 not taken for onsets, whose level is a tenth of the power."""
 
 
-def call_waveform(settings: CallSettings, sampling_rate: float) -> NDArray[np.float64]:
+def call_waveform(settings: CallSettings, sampling_rate: float) -> Floats:
     r"""Pressure of the call, from the start of the emission on.
 
     Harmonic :math:`h` of relative amplitude :math:`a_h` has :math:`h` times the fundamental's
@@ -68,24 +69,24 @@ def _file(settings: CallSettings) -> CallFile:
     return load_call(settings.file)
 
 
-def _phase(settings: CallSettings, time: NDArray[np.float64]) -> NDArray[np.float64]:
+def _phase(settings: CallSettings, time: Floats) -> Floats:
     start, end = settings.frequency_start, settings.frequency_end
     if settings.kind == "linear":
         return 2.0 * np.pi * (start + (end - start) / (2.0 * settings.duration) * time) * time
     k = (1.0 / end - 1.0 / start) / settings.duration
-    phase: NDArray[np.float64] = 2.0 * np.pi / k * np.log1p(k * start * time)
+    phase: Floats = 2.0 * np.pi / k * np.log1p(k * start * time)
     return phase
 
 
-def _envelope(settings: CallSettings, time: NDArray[np.float64]) -> NDArray[np.float64]:
+def _envelope(settings: CallSettings, time: Floats) -> Floats:
     inside = np.minimum(time, settings.duration - time)  # s, from the nearer end
     flank = settings.taper * settings.duration / 2.0
     rise = np.clip(inside / flank, 0.0, 1.0) if flank > 0.0 else 1.0
-    envelope: NDArray[np.float64] = np.where(inside < 0.0, 0.0, 0.5 - 0.5 * np.cos(np.pi * rise))
+    envelope: Floats = np.where(inside < 0.0, 0.0, 0.5 - 0.5 * np.cos(np.pi * rise))
     return envelope
 
 
-def covered(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.bool_]:
+def covered(settings: CallSettings, frequency: ArrayLike) -> Bools:
     """Tell which frequencies the call emits.
 
     Args:
@@ -121,9 +122,7 @@ def has_ghosts(settings: CallSettings, frequency: ArrayLike) -> bool:
     return bool((np.sum(sweeping, axis=0) > 1).any())
 
 
-def _carrier(
-    settings: CallSettings, frequency: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _carrier(settings: CallSettings, frequency: Floats) -> tuple[Floats, Floats]:
     """Which harmonic sweeps nearest to each frequency, the first of several, and where; (F,).
 
     Those that are 12 dB fainter there than another one are passed over. The slower a harmonic
@@ -144,20 +143,18 @@ def _carrier(
     return harmonic[first], np.clip(frequency, low[first], high[first])
 
 
-def _time_of(
-    settings: CallSettings, swept: NDArray[np.float64], harmonic: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _time_of(settings: CallSettings, swept: Floats, harmonic: Floats) -> Floats:
     """Return when harmonics have frequencies (Hz) that they sweep over, s."""
     start, end = settings.frequency_start, settings.frequency_end
     if settings.kind == "linear":
         share = (swept / harmonic - start) / (end - start)
     else:
         share = (harmonic / swept - 1.0 / start) / (1.0 / end - 1.0 / start)
-    delay: NDArray[np.float64] = settings.duration * np.clip(share, 0.0, 1.0)
+    delay: Floats = settings.duration * np.clip(share, 0.0, 1.0)
     return delay
 
 
-def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.float64]:
+def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> Floats:
     r"""When each frequency is emitted, counted from the start of the emission.
 
     The fundamental is at :math:`f` at :math:`T (f - f_0) / (f_1 - f_0)` in a linear sweep and at
@@ -188,7 +185,7 @@ def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.floa
     return _time_of(settings, swept, harmonic)
 
 
-def sweep_rate(settings: CallSettings, frequency: ArrayLike) -> NDArray[np.float64]:
+def sweep_rate(settings: CallSettings, frequency: ArrayLike) -> Floats:
     r"""How fast the call sweeps over each frequency.
 
     :math:`h |f_1 - f_0| / T` for harmonic :math:`h` of a linear sweep, :math:`|k| f^2 / h` of a
@@ -226,7 +223,7 @@ def call_content(settings: CallSettings) -> dict[str, Any]:
     return {"kind": "file", "content": hashlib.sha256(contents(settings.file)).hexdigest()}
 
 
-def emit(impulse_responses: ArrayLike, waveform: NDArray[np.float64]) -> NDArray[np.float64]:
+def emit(impulse_responses: ArrayLike, waveform: Floats) -> Floats:
     """Pressure at the ears when the call is emitted in place of an impulse.
 
     Args:
@@ -239,13 +236,11 @@ def emit(impulse_responses: ArrayLike, waveform: NDArray[np.float64]) -> NDArray
     responses = np.asarray(impulse_responses, dtype=np.float64)
     if len(waveform) == 1:
         return responses * waveform[0]  # no rounding by transforms
-    echo: NDArray[np.float64] = scipy.signal.fftconvolve(responses, waveform[None], axes=-1)
+    echo: Floats = scipy.signal.fftconvolve(responses, waveform[None], axes=-1)
     return echo
 
 
-def matched_filter(
-    recordings: ArrayLike, call: ArrayLike, *, oversampling: int = 1
-) -> NDArray[np.complex128]:
+def matched_filter(recordings: ArrayLike, call: ArrayLike, *, oversampling: int = 1) -> Complexes:
     r"""Compress the echoes of a call.
 
     The recording is correlated with the call that was emitted,
@@ -295,7 +290,7 @@ def matched_filter(
     if length % 2 == 0:  # half the sampling rate is a cosine's frequency and a sine's
         one_sided[..., half] = spectrum[..., half]
     scale = oversampling / (waveform**2).sum()
-    compressed: NDArray[np.complex128] = np.fft.ifft(one_sided)[..., : samples * oversampling]
+    compressed: Complexes = np.fft.ifft(one_sided)[..., : samples * oversampling]
     return compressed * scale
 
 
@@ -304,7 +299,7 @@ EPSILON = 0.01
 far as a call counts as covering a frequency."""
 
 
-def inverse_filter(recordings: ArrayLike, call: ArrayLike) -> NDArray[np.float64]:
+def inverse_filter(recordings: ArrayLike, call: ArrayLike) -> Floats:
     """Replace each echo of a call by that of an impulse.
 
     Args:
@@ -327,5 +322,5 @@ def inverse_filter(recordings: ArrayLike, call: ArrayLike) -> NDArray[np.float64
     spectrum = np.fft.rfft(waveform, length)
     power = np.abs(spectrum) ** 2
     inverse = spectrum.conj() / np.maximum(power, EPSILON * power.max())
-    compressed: NDArray[np.float64] = np.fft.irfft(np.fft.rfft(heard, length) * inverse, length)
+    compressed: Floats = np.fft.irfft(np.fft.rfft(heard, length) * inverse, length)
     return compressed[..., :samples]

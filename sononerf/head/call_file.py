@@ -26,6 +26,7 @@ import scipy.ndimage
 import scipy.signal
 from numpy.typing import NDArray
 
+from sononerf.array_types import Bools, Floats
 from sononerf.errors import InputError
 from sononerf.head.row_filters import WINDOW_BANDWIDTH, WINDOW_DURATION
 
@@ -55,11 +56,11 @@ class CallFile:
         bandwidth (Hz): Of the window that it was looked at through.
     """
 
-    waveform: NDArray[np.float64]
+    waveform: Floats
     sampling_rate: float
-    frequency: NDArray[np.float64]
-    delay: NDArray[np.float64]
-    is_covered: NDArray[np.bool_]
+    frequency: Floats
+    delay: Floats
+    is_covered: Bools
     bandwidth: float
 
     @property
@@ -69,7 +70,7 @@ class CallFile:
         ends = edges.reshape(-1, 2)
         return [(float(self.frequency[a]), float(self.frequency[b - 1])) for a, b in ends]
 
-    def resampled(self, sampling_rate: float) -> NDArray[np.float64]:
+    def resampled(self, sampling_rate: float) -> Floats:
         """Return the waveform at another rate (Hz), its first sample at the same time."""
         ratio = Fraction(sampling_rate / self.sampling_rate).limit_denominator(LARGEST_STEP)
         if ratio == 1:
@@ -77,16 +78,16 @@ class CallFile:
         up, down = ratio.numerator, ratio.denominator
         return np.asarray(scipy.signal.resample_poly(self.waveform, up, down), dtype=np.float64)
 
-    def covers(self, frequency: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def covers(self, frequency: Floats) -> Bools:
         """Tell which frequencies (F,) the call emits."""
         return np.any([(frequency >= a) & (frequency <= b) for a, b in self.bands], axis=0)
 
-    def delay_at(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+    def delay_at(self, frequency: Floats) -> Floats:
         """Return when frequencies (F,) are emitted, s; beyond what is covered the nearest ones."""
         known = self.is_covered
         return np.interp(frequency, self.frequency[known], self.delay[known])
 
-    def rate_at(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+    def rate_at(self, frequency: Floats) -> Floats:
         """Return how fast the call sweeps over frequencies (F,), Hz/s."""
         low, high = self.frequency[self.is_covered][[0, -1]]
         below = np.clip(frequency - self.bandwidth / 2.0, low, high)
@@ -162,7 +163,7 @@ def _read(path: Path) -> tuple[int, NDArray[np.generic]]:
     return int(rate), np.asarray(samples)
 
 
-def _examined(waveform: NDArray[np.float64], rate: float) -> CallFile:
+def _examined(waveform: Floats, rate: float) -> CallFile:
     duration, band = _duration(waveform, rate), _bandwidth(waveform, rate)
     length = math.sqrt(WINDOW_BANDWIDTH / WINDOW_DURATION * duration / band)
     window = np.hamming(max(round(length * rate), SHORTEST))
@@ -187,7 +188,7 @@ def _examined(waveform: NDArray[np.float64], rate: float) -> CallFile:
     return CallFile(waveform, rate, frequency, np.maximum(delay, 0.0), loud, bandwidth)
 
 
-def _first_top(power: NDArray[np.float64]) -> int:
+def _first_top(power: Floats) -> int:
     """Return where a row is loudest when the frequency is first emitted, if not 12 dB fainter."""
     loud = np.flatnonzero(power >= LOUD * power.max())
     ends = np.flatnonzero(np.diff(loud) > 1)
@@ -195,9 +196,7 @@ def _first_top(power: NDArray[np.float64]) -> int:
     return int(loud[0]) + int(power[loud[0] : end].argmax())
 
 
-def _loud(
-    waveform: NDArray[np.float64], rate: float, frequency: NDArray[np.float64], bandwidth: float
-) -> NDArray[np.bool_]:
+def _loud(waveform: Floats, rate: float, frequency: Floats, bandwidth: float) -> Bools:
     """Tell which frequencies (F,) lie within 20 dB of the loudest."""
     power = np.abs(np.fft.rfft(waveform, 4 * len(waveform))) ** 2
     step = rate / (4 * len(waveform))
@@ -209,13 +208,13 @@ def _loud(
     return np.asarray(loud | scipy.ndimage.binary_closing(loud, np.ones(gap + 1)))
 
 
-def _duration(waveform: NDArray[np.float64], rate: float) -> float:
+def _duration(waveform: Floats, rate: float) -> float:
     energy = np.cumsum(waveform**2)
     ends = np.searchsorted(energy, energy[-1] * np.array([(1.0 - ENERGY) / 2.0, (1 + ENERGY) / 2]))
     return float(ends[1] - ends[0] + 1) / rate
 
 
-def _bandwidth(waveform: NDArray[np.float64], rate: float) -> float:
+def _bandwidth(waveform: Floats, rate: float) -> float:
     power = np.abs(np.fft.rfft(waveform, 2 * len(waveform))) ** 2
     energy = np.cumsum(power)
     ends = np.searchsorted(energy, energy[-1] * np.array([(1.0 - ENERGY) / 2.0, (1 + ENERGY) / 2]))

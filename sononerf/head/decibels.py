@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
 
 RANGE_DB = 60.0
@@ -20,7 +21,7 @@ CHUNK_POSES = 8
 """Number of poses that are compared at once; more of them would only take more memory."""
 
 
-def compress(magnitude: ArrayLike, reference: float) -> NDArray[np.float64]:
+def compress(magnitude: ArrayLike, reference: float) -> Floats:
     """Decibels above a soft floor, ``20 log10(1 + magnitude / reference)``.
 
     Args:
@@ -35,15 +36,15 @@ def compress(magnitude: ArrayLike, reference: float) -> NDArray[np.float64]:
     """
     if not reference > 0.0:
         raise ValueError(f"reference is {reference}, expected above 0")
-    level_db: NDArray[np.float64] = (20.0 / math.log(10.0)) * np.log1p(
+    level_db: Floats = (20.0 / math.log(10.0)) * np.log1p(
         np.asarray(magnitude, dtype=np.float64) / reference
     )
     return level_db
 
 
-def expand(level_db: ArrayLike, reference: float) -> NDArray[np.float64]:
+def expand(level_db: ArrayLike, reference: float) -> Floats:
     """Return the linear magnitude of compressed levels: the inverse of :func:`compress`."""
-    magnitude: NDArray[np.float64] = reference * (10.0 ** (np.asarray(level_db) / 20.0) - 1.0)
+    magnitude: Floats = reference * (10.0 ** (np.asarray(level_db) / 20.0) - 1.0)
     return magnitude
 
 
@@ -59,7 +60,7 @@ def same_shape(measured: ArrayLike, predicted: ArrayLike) -> tuple[Any, Any]:
 
 def pose_chunks(
     measured: NDArray[np.floating], predicted: NDArray[np.floating]
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+) -> Iterator[tuple[Floats, Floats]]:
     """Yield a few poses of both at a time; raises NumericalError at a value that is not finite."""
     for start in range(0, len(measured), CHUNK_POSES):
         a, b = (

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import j1
 
+from sononerf.array_types import Floats, Singles
 from sononerf.errors import SettingsError
 from sononerf.head.directivity.read import content_hash, read_directivity
 from sononerf.head.directivity.record import Directivity, unit_vectors
@@ -29,10 +30,8 @@ NOTCH_MIDDLE = 60e3  # Hz, at elevation 0
 NOTCH_RISE = 30e3  # Hz, from elevation 0 to straight up
 NOTCH_WIDTH = 8e3  # Hz, standard deviation
 
-Array = NDArray[np.float64]
 
-
-def piston(directions: Array, radius: float, frequency: Array) -> Array:
+def piston(directions: Floats, radius: float, frequency: Floats) -> Floats:
     r"""Gain of a piston in a small head that looks ahead.
 
     .. math:: |2 J_1(ka \sin\theta) / (ka \sin\theta)| (1 + \cos\theta) / 2
@@ -60,7 +59,7 @@ def piston(directions: Array, radius: float, frequency: Array) -> Array:
     return np.asarray(baffled * (1.0 + forward) / 2.0)
 
 
-def ear(directions: Array, side: float, settings: EarSettings, frequency: Array) -> Array:
+def ear(directions: Floats, side: float, settings: EarSettings, frequency: Floats) -> Floats:
     """Gain of a synthetic, bat-like ear.
 
     It hears best towards its axis, as a Gaussian of the angle from it whose width falls with the
@@ -110,13 +109,13 @@ class Ears:
         positions ((E, 3), m): Of the receivers, head frame.
     """
 
-    azimuth: NDArray[np.float64]
-    elevation: NDArray[np.float64]
-    frequency: NDArray[np.float64]
-    beam: NDArray[np.float32]
-    ears: NDArray[np.float32]
-    emitter: NDArray[np.float64]
-    positions: NDArray[np.float64]
+    azimuth: Floats
+    elevation: Floats
+    frequency: Floats
+    beam: Singles
+    ears: Singles
+    emitter: Floats
+    positions: Floats
 
     def __post_init__(self) -> None:
         grid = (len(self.frequency), len(self.elevation), len(self.azimuth))
@@ -127,7 +126,7 @@ class Ears:
             )
 
     @property
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Floats:
         """Unit vectors of the grid, (L, A, 3)."""
         return unit_vectors(self.azimuth, self.elevation[:, None])
 
@@ -147,7 +146,7 @@ class Ears:
         return float(deaf.max()) if len(deaf) else -1.0
 
     @cached_property
-    def _by_direction(self) -> NDArray[np.float32]:
+    def _by_direction(self) -> Singles:
         """Beam, then ears, with frequency last: (1 + E, L A, F); one look-up is one row."""
         tables = np.concatenate([self.beam[None], self.ears])
         flat = tables.reshape(*tables.shape[:2], -1).transpose(0, 2, 1)
@@ -188,7 +187,7 @@ def ear_tables(settings: EarSettings, frequency: ArrayLike) -> Ears:
     return Ears(azimuth, elevation, f, beam, tables, emitter, places)
 
 
-def receiver_places(settings: EarSettings) -> NDArray[np.float64]:
+def receiver_places(settings: EarSettings) -> Floats:
     """Return the places (E, 3) of the receivers, m, head frame; raises as :func:`ear_tables`."""
     return _places(settings, _measured(settings))[0]
 
@@ -199,7 +198,7 @@ def directivity_content(settings: EarSettings) -> str | None:
 
 
 @lru_cache(maxsize=1)
-def _grid() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def _grid() -> tuple[Floats, Floats, Floats]:
     """Return azimuths (A,), elevations (L,) and directions (L, A, 3) of the tables."""
     azimuth = np.radians(np.linspace(-180.0, 180.0, round(360.0 / GRID_DEG) + 1))
     elevation = np.radians(np.linspace(-90.0, 90.0, round(180.0 / GRID_DEG) + 1))
@@ -215,9 +214,7 @@ def _measured(settings: EarSettings) -> Directivity | None:
     return None if settings.file is None else read_directivity(settings.file)
 
 
-def _places(
-    settings: EarSettings, measured: Directivity | None
-) -> tuple[NDArray[np.float64], list[float]]:
+def _places(settings: EarSettings, measured: Directivity | None) -> tuple[Floats, list[float]]:
     """Return places (E, 3) of the receivers, and which way synthetic ears there look."""
     left = np.asarray(settings.left, dtype=np.float64)
     if settings.receivers is not None:
@@ -239,13 +236,11 @@ def _places(
     return np.stack([left * (1.0, side, 1.0) for side in sides]), sides
 
 
-def _measured_tables(
-    measured: Directivity, frequency: NDArray[np.float64]
-) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
+def _measured_tables(measured: Directivity, frequency: Floats) -> tuple[Singles, Singles | None]:
     """Return tables (E, F, L, A) and the beam (F, L, A) of a measured directivity."""
     weights, shape = _grid_weights(measured), (len(frequency), *_grid()[2].shape[:2])
 
-    def table(values: NDArray[np.float64]) -> NDArray[np.float32]:
+    def table(values: Floats) -> Singles:
         at_grid = weights @ measured.at(frequency, values)  # (L A, F)
         return np.ascontiguousarray(at_grid.T, dtype=np.float32).reshape(shape)
 
@@ -255,7 +250,7 @@ def _measured_tables(
 
 def analysed_ears(
     settings: EarSettings, call: CallSettings, analysis: SpectrogramSettings
-) -> tuple[Ears, NDArray[np.float32] | None]:
+) -> tuple[Ears, Singles | None]:
     r"""Tables of the same head as an analysis hears it: smeared over frequency by its window.
 
     A window of 64 µs cannot tell frequencies apart that lie closer than about 28 kHz. It fills a
@@ -289,20 +284,20 @@ def analysed_ears(
 @lru_cache(maxsize=4)  # a fit and its read-out ask nine times; no one may write to the arrays
 def _analysed(
     settings: EarSettings, call: CallSettings, analysis: SpectrogramSettings, content: str | None
-) -> tuple[Ears, NDArray[np.float32] | None]:
+) -> tuple[Ears, Singles | None]:
     del content  # a changed file is read again
     fine_frequency, rows, weight, later = smearing(call, analysis)
     fine = ear_tables(settings, fine_frequency)
 
-    def smeared(table: NDArray[np.float64], weight: NDArray[Any]) -> NDArray[Any]:
+    def smeared(table: Floats, weight: NDArray[Any]) -> NDArray[Any]:
         padded = np.moveaxis(table, -3, 0)
         parts = zip(weight.T[:, :, None, None], rows.T, strict=True)
         total = sum(np.moveaxis(padded[row], 0, -3) * part for part, row in parts)
         return np.asarray(total)
 
     beam = fine.beam.astype(np.float64)
-    lags: list[NDArray[np.float32]] = []
-    ears: list[NDArray[np.float32]] = []
+    lags: list[Singles] = []
+    ears: list[Singles] = []
     for single in fine.ears[:1] if fine.alike else fine.ears:  # one by one, for memory's sake
         ear = single.astype(np.float64)
         if later is None:
@@ -317,7 +312,7 @@ def _analysed(
     else:
         beam = np.sqrt(smeared(beam**2, weight))
 
-    def of_all(tables: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    def of_all(tables: list[Singles]) -> Singles:
         stacked = tables[0][None] if fine.alike else np.stack(tables)
         return np.broadcast_to(stacked, (len(fine.positions), *stacked.shape[1:]))
 
@@ -330,7 +325,7 @@ def _analysed(
     return analysed, of_all(lags) if lags else None
 
 
-def beam_gain(ears: Ears, directions_head: NDArray[np.float64]) -> NDArray[np.float32]:
+def beam_gain(ears: Ears, directions_head: Floats) -> Singles:
     """Gain of the emission towards directions, bilinear between the table's nodes.
 
     Args:
@@ -343,7 +338,7 @@ def beam_gain(ears: Ears, directions_head: NDArray[np.float64]) -> NDArray[np.fl
     return _look_up(ears, 0, directions_head)
 
 
-def ear_gain(ears: Ears, ear: int, directions_head: NDArray[np.float64]) -> NDArray[np.float32]:
+def ear_gain(ears: Ears, ear: int, directions_head: Floats) -> Singles:
     """Gain of one ear for sound from directions, bilinear between the table's nodes.
 
     Args:
@@ -357,7 +352,7 @@ def ear_gain(ears: Ears, ear: int, directions_head: NDArray[np.float64]) -> NDAr
     return _look_up(ears, 1 + ear, directions_head)
 
 
-def _look_up(ears: Ears, table: int, directions: NDArray[np.float64]) -> NDArray[np.float32]:
+def _look_up(ears: Ears, table: int, directions: Floats) -> Singles:
     x, y, z = np.ascontiguousarray(directions.T, dtype=np.float32)
     column, across = _place(ears.azimuth, np.arctan2(y, x))
     row, upward = _place(ears.elevation, np.arctan2(z, np.hypot(x, y)))
@@ -372,13 +367,11 @@ def _look_up(ears: Ears, table: int, directions: NDArray[np.float64]) -> NDArray
     ends = np.arange(0, 4 * len(directions) + 1, 4, dtype=np.int32)
     values = ears._by_direction[table]
     pick = csr_array((weights.ravel(), corners.ravel(), ends), shape=(len(directions), len(values)))
-    gain: NDArray[np.float32] = pick @ values
+    gain: Singles = pick @ values
     return gain
 
 
-def _place(
-    nodes: NDArray[np.float64], values: NDArray[np.float32]
-) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+def _place(nodes: Floats, values: Singles) -> tuple[NDArray[np.int32], Singles]:
     """Index of the node below, and the fraction of the way to the next."""
     per_step = np.float32((len(nodes) - 1) / (nodes[-1] - nodes[0]))
     steps = (values - np.float32(nodes[0])) * per_step

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.array_types import Floats, Singles
 from sononerf.errors import InputError, SettingsError
 from sononerf.head.air import absorption_in, speed_in
 from sononerf.head.call import call_waveform, covered, emit, sweep_delay
@@ -32,8 +33,6 @@ from sononerf.settings.schema import (
     SpectrogramSettings,
 )
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class PointEcho:
@@ -48,10 +47,10 @@ class PointEcho:
             does so too.
     """
 
-    window: Array
+    window: Floats
     spacing: float
     looks: float
-    rows: Array | None = None
+    rows: Floats | None = None
 
     @classmethod
     def of(
@@ -70,7 +69,7 @@ class PointEcho:
             looks=filters.looks,
         )
 
-    def of_spectrum(self, magnitude: NDArray[np.floating]) -> Array:
+    def of_spectrum(self, magnitude: NDArray[np.floating]) -> Floats:
         """Return the window (W,) of an echo whose rows have some magnitudes (F,)."""
         assert self.rows is not None
         return np.asarray(np.square(magnitude, dtype=np.float64) @ self.rows)
@@ -88,7 +87,7 @@ class PointEcho:
         return float(last - first + 1) * self.spacing
 
 
-def own_top(window: Array) -> int:
+def own_top(window: Floats) -> int:
     """Return where a point echo (W,) is greatest about its own range, which is in the middle.
 
     What lies apart from that, as another harmonic's echo does, may be greater.
@@ -147,16 +146,16 @@ class Head:
         )
 
     @cached_property
-    def emitter(self) -> Array:
+    def emitter(self) -> Floats:
         """Place of the emitter (3,), m, head frame."""
         return np.asarray(self.ears.emitter, dtype=np.float64)
 
     @cached_property
-    def receivers(self) -> Array:
+    def receivers(self) -> Floats:
         """Places of the receivers (E, 3), m, head frame."""
         return receiver_places(self.ears)
 
-    def places(self, positions: ArrayLike, rotations: ArrayLike) -> tuple[Array, Array]:
+    def places(self, positions: ArrayLike, rotations: ArrayLike) -> tuple[Floats, Floats]:
         """Return emitters (..., 3) and receivers (..., E, 3), m, world frame.
 
         Args:
@@ -171,12 +170,12 @@ class Head:
         """Speed of sound, m/s."""
         return speed_in(self.air)
 
-    def absorption(self, frequency: ArrayLike) -> Array:
+    def absorption(self, frequency: ArrayLike) -> Floats:
         """Return the absorption of the air (F,), dB/m, at frequencies (F,), Hz."""
         return absorption_in(self.air, frequency)
 
     @cached_property
-    def row_absorption(self) -> Array:
+    def row_absorption(self) -> Floats:
         """Amplitude loss of the air at the frequencies of the rows (F,), Np/m."""
         return self.absorption(self.frequency) * (math.log(10.0) / 20.0)
 
@@ -186,12 +185,12 @@ class Head:
         return self.analysis.sampling_rate
 
     @cached_property
-    def frequency(self) -> Array:
+    def frequency(self) -> Floats:
         """Frequencies of the spectrogram's rows (F,), Hz."""
         return frequency_axis(self.analysis)
 
     @cached_property
-    def range(self) -> Array:
+    def range(self) -> Floats:
         """Ranges of the spectrogram's slices (R,), m."""
         return range_axis(self.analysis, self.speed_of_sound)
 
@@ -216,7 +215,7 @@ class Head:
         return self.point_echo.resolution
 
     @cached_property
-    def window(self) -> Array:
+    def window(self) -> Floats:
         """Magnitude of a point echo in each row (F, W), one value per sample, 1 in the middle."""
         return effective_window(self.call, self.analysis)
 
@@ -230,7 +229,7 @@ class Head:
         return self.tables(self.frequency)
 
     @cached_property
-    def _smeared(self) -> tuple[Ears, NDArray[np.float32] | None]:
+    def _smeared(self) -> tuple[Ears, Singles | None]:
         return analysed_ears(self.ears, self.call, self.analysis)
 
     @property
@@ -239,7 +238,7 @@ class Head:
         return self._smeared[0]
 
     @property
-    def lag(self) -> NDArray[np.float32] | None:
+    def lag(self) -> Singles | None:
         """How much farther off (E, F, L, A), m, rows hear an echo, beam included; None: impulse."""
         lag = self._smeared[1]
         return None if lag is None else lag * np.float32(self.speed_of_sound / 2.0)
@@ -259,12 +258,12 @@ class Head:
         return float((power * self.lag).sum() / power.sum())
 
     @cached_property
-    def waveform(self) -> Array:
+    def waveform(self) -> Floats:
         """The call (N,), pressure at 1 m."""
         return call_waveform(self.call, self.sampling_rate)
 
     @cached_property
-    def delay(self) -> Array:
+    def delay(self) -> Floats:
         """Time (F,), s, at which the call emits the frequency of each row."""
         return sweep_delay(self.call, self.frequency)
 
@@ -273,7 +272,7 @@ class Head:
         """Number of samples from the emission to the end of the last frame."""
         return echo_samples(self.analysis, self.speed_of_sound, float(self.delay.max()))
 
-    def receive(self, impulse_responses: ArrayLike, *, seed: int) -> tuple[Array, Array]:
+    def receive(self, impulse_responses: ArrayLike, *, seed: int) -> tuple[Floats, Floats]:
         """Return the pressure at the receivers, noise included, and its spectrogram.
 
         Args:
@@ -296,7 +295,7 @@ class Head:
             waveform = waveform + draw_noise(level, waveform.shape[-1], seed=seed)
         return waveform, self.analyse(waveform)
 
-    def analyse(self, waveform: Array) -> Array:
+    def analyse(self, waveform: Floats) -> Floats:
         """Return the spectrogram (E, R, F) of a waveform (E, S) that starts at the emission."""
         return spectrogram(waveform, self.analysis, self.speed_of_sound, self.delay)
 
@@ -306,7 +305,7 @@ class Head:
         return max(self.row_filters.length, len(self.waveform))
 
     @cached_property
-    def _target_power(self) -> Array:
+    def _target_power(self) -> Floats:
         """Power (1,) of the target that the noise is relative to."""
         target = target_gain(self.noise.target_strength_db, self.noise.target_distance)
         return loudest_power(target * self.waveform[None], self.analysis, self._stretch)

@@ -19,8 +19,8 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.fft
-from numpy.typing import NDArray
 
+from sononerf.array_types import Floats
 from sononerf.settings.schema import NoiseSettings, SpectrogramSettings
 
 NOISE_STREAM = 1  # keeps a pose's noise apart from what else is drawn from its seed
@@ -47,9 +47,7 @@ def target_gain(target_strength_db: float, distance: float) -> float:
     return float(10.0 ** (target_strength_db / 20.0)) / distance**2
 
 
-def loudest_power(
-    echo: NDArray[np.float64], analysis: SpectrogramSettings, samples: int
-) -> NDArray[np.float64]:
+def loudest_power(echo: Floats, analysis: SpectrogramSettings, samples: int) -> Floats:
     """Mean power within the analysis band over an echo's loudest stretch.
 
     Args:
@@ -66,13 +64,11 @@ def loudest_power(
     band = (frequency >= analysis.frequency_min) & (frequency <= analysis.frequency_max)
     heard = np.fft.irfft(np.fft.rfft(padded, length) * band, length)
     total = np.cumsum(heard**2, axis=-1)
-    power: NDArray[np.float64] = (total[:, samples:] - total[:, :-samples]).max(axis=-1) / samples
+    power: Floats = (total[:, samples:] - total[:, :-samples]).max(axis=-1) / samples
     return power
 
 
-def noise_level(
-    settings: NoiseSettings, power: NDArray[np.float64], analysis: SpectrogramSettings
-) -> NDArray[np.float64]:
+def noise_level(settings: NoiseSettings, power: Floats, analysis: SpectrogramSettings) -> Floats:
     """Set each ear's noise: the standard deviation of its samples.
 
     Args:
@@ -86,11 +82,11 @@ def noise_level(
     """
     share = 2.0 * (analysis.frequency_max - analysis.frequency_min) / analysis.sampling_rate
     ratio = 10.0 ** (np.asarray(settings.snr_db, dtype=np.float64) / 10.0)
-    level: NDArray[np.float64] = np.sqrt(power / (ratio * share))
+    level: Floats = np.sqrt(power / (ratio * share))
     return level
 
 
-def draw_noise(level: NDArray[np.float64], samples: int, *, seed: int) -> NDArray[np.float64]:
+def draw_noise(level: Floats, samples: int, *, seed: int) -> Floats:
     """White Gaussian noise, each ear's its own.
 
     Args:

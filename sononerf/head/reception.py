@@ -7,8 +7,9 @@ import logging
 import math
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sononerf.array_types import Floats
 from sononerf.head.call import (
     call_waveform,
     covered,
@@ -34,9 +35,7 @@ MOST = 4.0
 """How much louder it may be at another time, where another harmonic is: 12 dB."""
 
 
-def row_duration(
-    call: CallSettings, analysis: SpectrogramSettings, frequency: ArrayLike
-) -> NDArray[np.float64]:
+def row_duration(call: CallSettings, analysis: SpectrogramSettings, frequency: ArrayLike) -> Floats:
     r"""How long a point echo lasts in a row of the dechirped spectrogram.
 
     .. math:: \sqrt{T_w^2 + (B_w / |\dot f|)^2}
@@ -55,7 +54,7 @@ def row_duration(
         duration ((F,), s): Two-way: times ``c / 2`` it is a width in range.
     """
     lasts, wide = row_widths(analysis, frequency)
-    duration: NDArray[np.float64] = np.hypot(lasts, wide / sweep_rate(call, frequency))
+    duration: Floats = np.hypot(lasts, wide / sweep_rate(call, frequency))
     return duration
 
 
@@ -85,19 +84,19 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
     return round(analysis.sampling_rate * math.sqrt(WINDOW_BANDWIDTH / WINDOW_DURATION * slowness))
 
 
-def within_band(analysis: SpectrogramSettings) -> NDArray[np.float64]:
+def within_band(analysis: SpectrogramSettings) -> Floats:
     """Return the rows' frequencies, the outermost drawn to the ends of the band asked for."""
     return np.clip(frequency_axis(analysis), analysis.frequency_min, analysis.frequency_max)
 
 
-def _heard(call: CallSettings, analysis: SpectrogramSettings) -> NDArray[np.float64]:
+def _heard(call: CallSettings, analysis: SpectrogramSettings) -> Floats:
     """Return those of the rows' frequencies that the call covers; all, where it covers none."""
     frequency = within_band(analysis)
     heard = covered(call, frequency)
     return frequency[heard] if heard.any() else frequency
 
 
-def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> NDArray[np.float64]:
+def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> Floats:
     """Point echo in each row of the dechirped spectrogram, as a window over the received time.
 
     Args:
@@ -124,13 +123,11 @@ def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> NDArr
     row = _point_echo(call, analysis, extra + (length - 1) / 2.0)
     power = row**2 + row[:, ::-1] ** 2
     middle = power[:, (power.shape[1] - 1) // 2]
-    window: NDArray[np.float64] = np.sqrt(power / middle[:, None])
+    window: Floats = np.sqrt(power / middle[:, None])
     return window
 
 
-def _point_echo(
-    call: CallSettings, analysis: SpectrogramSettings, side: float
-) -> NDArray[np.float64]:
+def _point_echo(call: CallSettings, analysis: SpectrogramSettings, side: float) -> Floats:
     """Return a point's echo in each row, (F, W), as far as ``side`` samples to both sides."""
     centre = row_filters(analysis).centre
     side = math.ceil(side - centre % 1.0) + centre % 1.0
@@ -147,9 +144,7 @@ def _point_echo(
     return spectrogram(echo, fine, 2.0, delay)[0].T[:, :count]
 
 
-def _cropped(
-    row: NDArray[np.float64], call: CallSettings, analysis: SpectrogramSettings
-) -> NDArray[np.float64]:
+def _cropped(row: Floats, call: CallSettings, analysis: SpectrogramSettings) -> Floats:
     """Return point echoes over their height at their own range, without what is faint all over."""
     width = row.shape[1]
     middle = row[:, [(width - 1) // 2, width // 2]].mean(axis=1)

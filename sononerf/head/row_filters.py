@@ -39,6 +39,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.array_types import Floats
 from sononerf.settings.schema import SpectrogramSettings
 
 WINDOW_DURATION = 0.528  # of a Hamming window's length, where it is above half its height
@@ -71,8 +72,8 @@ class RowFilters:
         looks: How many independent values of noise there are in a mean over the band.
     """
 
-    frequency: NDArray[np.float64]
-    envelope: NDArray[np.float64]
+    frequency: Floats
+    envelope: Floats
     origin: int
     centre: float
     length: int
@@ -84,7 +85,7 @@ class RowFilters:
         """How many samples from its start on a frame reads."""
         return self.origin + self.envelope.shape[1]
 
-    def point_echo(self) -> NDArray[np.float64]:
+    def point_echo(self) -> Floats:
         """Return how an impulse swells and fades in each row, (F, W') over samples.
 
         The frame's time is in the middle of the W' samples.
@@ -98,7 +99,7 @@ class RowFilters:
         return np.pad(self.envelope[:, ::-1], ((0, 0), (before, after)))
 
 
-def row_frequencies(settings: SpectrogramSettings) -> NDArray[np.float64]:
+def row_frequencies(settings: SpectrogramSettings) -> Floats:
     """Frequencies of the rows, (F,) Hz, ascending."""
     if settings.kind == "gammatone":
         return np.geomspace(settings.frequency_min, settings.frequency_max, settings.channels)
@@ -124,7 +125,7 @@ def band_mean(values: NDArray[Any], frequency: ArrayLike) -> NDArray[Any]:
     return np.asarray(values.mean(axis=-1) if part is None else values @ part)
 
 
-def band_parts(frequency: ArrayLike) -> NDArray[np.float64] | None:
+def band_parts(frequency: ArrayLike) -> Floats | None:
     """Return what part of the band each row (F,) stands for, together 1; None if all the same."""
     f = np.asarray(frequency, dtype=np.float64)
     steps = np.diff(f)
@@ -134,9 +135,7 @@ def band_parts(frequency: ArrayLike) -> NDArray[np.float64] | None:
     return np.asarray(part / part.sum())
 
 
-def row_widths(
-    settings: SpectrogramSettings, frequency: ArrayLike
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def row_widths(settings: SpectrogramSettings, frequency: ArrayLike) -> tuple[Floats, Floats]:
     """How long a row's envelope lasts and how wide its transform is, each above half its height.
 
     Args:
@@ -204,7 +203,7 @@ def _gammatone(settings: SpectrogramSettings) -> RowFilters:
     )
 
 
-def _looks(envelope: NDArray[np.float64], frequency: NDArray[np.float64], rate: float) -> float:
+def _looks(envelope: Floats, frequency: Floats, rate: float) -> float:
     """Return how many independent values white noise has in the mean power over the band.
 
     It is the squared mean over the variance: overlapping rows share noise.

@@ -9,14 +9,15 @@ from typing import NamedTuple
 import numpy as np
 import scipy.fft
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sononerf.array_types import Complexes, Floats, Ints
 from sononerf.head.call import call_waveform, sweep_delay
 from sononerf.head.row_filters import BANDWIDTH, SKIRT, fft_bins, row_filters, row_frequencies
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 
-def frequency_axis(settings: SpectrogramSettings) -> NDArray[np.float64]:
+def frequency_axis(settings: SpectrogramSettings) -> Floats:
     """Frequencies of the rows, see :mod:`sononerf.head.row_filters`.
 
     Of the kind ``stft`` the FFT's bins nearest to the two ends, and all between,
@@ -36,7 +37,7 @@ def frequency_axis(settings: SpectrogramSettings) -> NDArray[np.float64]:
     return row_frequencies(settings)
 
 
-def range_axis(settings: SpectrogramSettings, speed_of_sound: float) -> NDArray[np.float64]:
+def range_axis(settings: SpectrogramSettings, speed_of_sound: float) -> Floats:
     """Ranges of the analysis frames, ``c t / 2`` with t at the centre of the frame's envelopes.
 
     Args:
@@ -93,7 +94,7 @@ def spectrogram(
     settings: SpectrogramSettings,
     speed_of_sound: float,
     delay: ArrayLike | None = None,
-) -> NDArray[np.float64]:
+) -> Floats:
     r"""Magnitude in the rows' filters on the range and frequency axes, dechirped.
 
     Of the kind ``stft`` that is the short-time Fourier transform with a symmetric Hamming window,
@@ -138,16 +139,16 @@ def spectrogram(
     frames = sliding_window_view(signal, settings.window, axis=-1)[..., starts, :]
     low, high = fft_bins(settings)
     spectrum = np.fft.rfft(frames * np.hamming(settings.window), n=settings.fft, axis=-1)
-    magnitude: NDArray[np.float64] = np.abs(spectrum[..., low : high + 1])
+    magnitude: Floats = np.abs(spectrum[..., low : high + 1])
     return magnitude
 
 
 def _filtered(
-    signal: NDArray[np.float64],
+    signal: Floats,
     settings: SpectrogramSettings,
     starts: slice,
-    delay: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    delay: Floats,
+) -> Floats:
     """Each frequency's row as a filter, an envelope on that frequency; a delay is then a phase."""
     filters = row_filters(settings)
     delays = np.broadcast_to(delay, filters.frequency.shape)
@@ -182,10 +183,10 @@ class Smearing(NamedTuple):
             one is emitted; None for an impulse.
     """
 
-    frequency: NDArray[np.float64]
-    rows: NDArray[np.int64]
-    weight: NDArray[np.float64] | NDArray[np.complex128]
-    later: NDArray[np.float64] | None
+    frequency: Floats
+    rows: Ints
+    weight: Floats | Complexes
+    later: Floats | None
 
 
 def smearing(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.recordings import matlab as hdf5
 from sononerf.recordings.audio import Recording
@@ -85,7 +86,7 @@ def read_airsas(path: Path, settings: ImportSettings) -> Recording:
     )
 
 
-def _places(path: Path, position: NDArray[np.float64]) -> NDArray[np.float64]:
+def _places(path: Path, position: Floats) -> Floats:
     if not np.isfinite(position).all():
         raise InputError(f"{path}: /na/position holds values that are not finite")
     if position.ndim == 2 and 3 in position.shape and position.size > 3:

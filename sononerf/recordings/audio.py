@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.io import wavfile
 
+from sononerf.array_types import Floats
 from sononerf.echoes.layout import SPLITS
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses, euler_from_rotation
@@ -98,7 +99,7 @@ def _other(path: Path) -> tuple[float, NDArray[Any]]:
         raise InputError(f"{path}: cannot be read as sound ({said})") from None
 
 
-def as_float(samples: NDArray[Any]) -> NDArray[np.float64]:
+def as_float(samples: NDArray[Any]) -> Floats:
     """Return samples as floats; integers as fractions of the greatest that their type holds."""
     kind = samples.dtype
     if kind.kind == "u":
@@ -168,7 +169,7 @@ class Recording:
     path: Path
     sampling_rate: float
     labels: tuple[str, ...]
-    emission: NDArray[np.float64]
+    emission: Floats
     read: Callable[[int], NDArray[Any]]
     columns: Columns
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)

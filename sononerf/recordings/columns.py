@@ -25,12 +25,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.array_types import Floats
 from sononerf.echoes.layout import SPLITS
 from sononerf.errors import InputError
 from sononerf.settings.import_schema import LENGTHS, ImportSettings
 from sononerf.tables import number_in, read_rows
-
-Array = NDArray[np.float64]
 
 ANGLES = {"deg": math.pi / 180.0, "rad": 1.0}
 TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6}
@@ -58,9 +57,9 @@ class Columns:
     """
 
     where: str
-    values: dict[str, Array]
+    values: dict[str, Floats]
     texts: dict[str, list[str]]
-    rotation: Array | None
+    rotation: Floats | None
     units: dict[str, str]
 
     def __len__(self) -> int:
@@ -124,7 +123,7 @@ def columns_of(
         InputError: If a name is unknown or stands twice, a unit is missing, or a value is not
             finite.
     """
-    values: dict[str, Array] = {}
+    values: dict[str, Floats] = {}
     units: dict[str, str] = {}
     for full, column in given.items():
         name, unit = _parted(where, full)

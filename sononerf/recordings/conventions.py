@@ -19,14 +19,12 @@ enu and up in ned.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sononerf.array_types import Floats
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import Poses, look_at, rotation_from_euler
 from sononerf.recordings.columns import EULER, PLACE, QUATERNION, Columns
 from sononerf.settings.import_schema import ImportSettings, TurntableSettings
-
-Array = NDArray[np.float64]
 
 NED_TO_ENU = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 DOWN_TO_UP = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
@@ -35,7 +33,7 @@ SLACK = 1e-3
 """How far rotations and unit quaternions may be from exact ones, no unit: four printed digits."""
 
 
-def frame_matrices(settings: ImportSettings) -> tuple[Array, Array]:
+def frame_matrices(settings: ImportSettings) -> tuple[Floats, Floats]:
     """Return the matrices (3, 3) that take the world's and the head's axes to ours.
 
     Raises:
@@ -98,8 +96,8 @@ def to_poses(columns: Columns, settings: ImportSettings) -> Poses:
 
 
 def _rotations(
-    columns: Columns, settings: ImportSettings, world: Array, head: Array
-) -> Array | None:
+    columns: Columns, settings: ImportSettings, world: Floats, head: Floats
+) -> Floats | None:
     """Return rotations in the table's own frames, (P, 3, 3); None where it has none."""
     found = [
         name
@@ -129,13 +127,13 @@ def _rotations(
     return rotation_from_euler(yaw, pitch, roll)
 
 
-def _pitch(world: Array, head: Array) -> str:
+def _pitch(world: Floats, head: Floats) -> str:
     """Say where positive pitch looks by the formula."""
     own = rotation_from_euler(0.0, 0.1, 0.0)
     return "up" if (world @ own @ head.T)[2, 0] > 0.0 else "down"
 
 
-def _checked_rotation(columns: Columns, rotation: Array) -> Array:
+def _checked_rotation(columns: Columns, rotation: Floats) -> Floats:
     product = rotation @ rotation.transpose(0, 2, 1)
     wrong = ~np.isclose(product, np.eye(3), atol=SLACK).all(axis=(1, 2))
     if wrong.any():
@@ -150,7 +148,7 @@ def _checked_rotation(columns: Columns, rotation: Array) -> Array:
     return rotation
 
 
-def _from_quaternion(columns: Columns, quaternion: Array) -> Array:
+def _from_quaternion(columns: Columns, quaternion: Floats) -> Floats:
     length = np.linalg.norm(quaternion, axis=1)
     wrong = np.abs(length - 1.0) > 10.0 * SLACK
     if wrong.any():
@@ -178,7 +176,7 @@ def _turntable_of(columns: Columns, settings: TurntableSettings) -> Poses:
     )
 
 
-def turntable_poses(angle: Array, height: Array, *, radius: float, clockwise: bool) -> Poses:
+def turntable_poses(angle: Floats, height: Floats, *, radius: float, clockwise: bool) -> Poses:
     """Poses of a fixed sensor beside a turning object, seen from the object.
 
     Args:

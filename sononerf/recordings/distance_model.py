@@ -17,10 +17,9 @@ from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-Array = NDArray[np.float64]
+from sononerf.array_types import Floats
 
 DEGREE = 4
 """Greatest degree of the polynomials, no unit: parts of a body 45 degrees apart are separated."""
@@ -45,12 +44,12 @@ class Prediction:
             one another by so much.
     """
 
-    residual: Array
-    centre: Array
+    residual: Floats
+    centre: Floats
     size: float
 
 
-def predict(middle: Array, separation: Array, first: Array) -> Prediction:
+def predict(middle: Floats, separation: Floats, first: Floats) -> Prediction:
     """Predict each ping's first echoes from the other pings'.
 
     Args:
@@ -94,7 +93,7 @@ def _powers(degree: int) -> list[tuple[int, ...]]:
     ]
 
 
-def _basis(direction: Array, degree: int) -> Array:
+def _basis(direction: Floats, degree: int) -> Floats:
     columns = [
         np.prod(direction[..., list(powers)], axis=-1) if powers else np.ones(direction.shape[:-1])
         for powers in _powers(degree)
@@ -102,7 +101,7 @@ def _basis(direction: Array, degree: int) -> Array:
     return np.stack(columns, axis=-1)
 
 
-def _robust(basis: Array, target: Array) -> Array:
+def _robust(basis: Floats, target: Floats) -> Floats:
     """Fit coefficients by least squares whose weights fall with the residual."""
     weight = np.ones(len(target))
     middle = float(np.median(target))
@@ -120,7 +119,7 @@ def _robust(basis: Array, target: Array) -> Array:
     return fitted
 
 
-def _sphere(middle: Array, first: Array) -> tuple[Array, float]:
+def _sphere(middle: Floats, first: Floats) -> tuple[Floats, float]:
     """Return centre (3,) and radius of the sphere that explains first echoes best."""
     there = np.isfinite(first)
     places, ranges = middle[there], first[there]
@@ -128,7 +127,7 @@ def _sphere(middle: Array, first: Array) -> tuple[Array, float]:
     spread = float(np.linalg.norm(places - start, axis=1).mean())
     scale = max(float(np.median(ranges)), 1e-6)
 
-    def misfit(unknown: Array) -> Array:
+    def misfit(unknown: Floats) -> Floats:
         return (np.linalg.norm(places - unknown[:3], axis=1) - unknown[3] - ranges) / scale
 
     best = None
@@ -144,7 +143,7 @@ def _sphere(middle: Array, first: Array) -> tuple[Array, float]:
     return best.x[:3], float(best.x[3])
 
 
-def _sides(places: Array, start: Array, scale: float) -> list[Array]:
+def _sides(places: Floats, start: Floats, scale: float) -> list[Floats]:
     """Return guesses of a centre: amid the places, and beside them where they are flattest."""
     normal = np.linalg.svd(places - start, full_matrices=True)[2][-1]
     return [start, start + scale * normal, start - scale * normal]

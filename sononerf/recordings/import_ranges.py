@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf.array_types import Floats
 from sononerf.echoes.region import echo_extent
 from sononerf.errors import InputError
 from sononerf.head.call import call_waveform, covered, sweep_delay
@@ -23,8 +24,6 @@ from sononerf.recordings.folder import read_sound
 from sononerf.recordings.pings import Cutter, cut, mix
 from sononerf.settings.import_schema import ImportSettings, ReferenceSettings
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
-
-Array = NDArray[np.float64]
 
 SEARCH = 0.25
 """The sphere's echo is looked for within this fraction of its distance, nearer and farther."""
@@ -39,12 +38,12 @@ class Calibration:
         range_offset (m): To be added to every range.
     """
 
-    gain: Array
+    gain: Floats
     range_offset: float
 
 
 def calibrate(
-    echo: Array,
+    echo: Floats,
     reference: ReferenceSettings,
     head: Head,
 ) -> Calibration:
@@ -120,8 +119,8 @@ def calibrate(
 
 
 def _call_itself(
-    call: CallSettings, analysis: SpectrogramSettings, delay: Array
-) -> tuple[Array, Array]:
+    call: CallSettings, analysis: SpectrogramSettings, delay: Floats
+) -> tuple[Floats, Floats]:
     """Return the dechirped spectrogram (T, F) of the call, and its times (T,) s."""
     waveform, rate = call_waveform(call, analysis.sampling_rate), analysis.sampling_rate
     lead = len(waveform) + 2 * analysis.window
@@ -132,7 +131,7 @@ def _call_itself(
     return range_axis(own, 2.0) - lead / rate, spectrogram(echo, own, 2.0, delay)[0]
 
 
-def _peak(axis: Array, power: Array, top: NDArray[np.intp]) -> Array:
+def _peak(axis: Floats, power: Floats, top: NDArray[np.intp]) -> Floats:
     """Return the ranges of the tops, between slices, (E,) m."""
     rows = np.arange(len(top))
     before, at, after = (np.log(power[rows, top + step] + 1e-300) for step in (-1, 0, 1))
@@ -147,7 +146,7 @@ ASKED = 64
 
 def found_ranges(
     head: Head, cutter: Cutter, recording: Recording, given: Collection[str]
-) -> tuple[dict[str, float], Array]:
+) -> tuple[dict[str, float], Floats]:
     """Find range limits that are left out from the echoes.
 
     Args:

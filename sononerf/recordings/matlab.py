@@ -14,6 +14,7 @@ import numpy as np
 import scipy.io
 from numpy.typing import NDArray
 
+from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.recordings import matlab as hdf5
 
@@ -143,7 +144,7 @@ def as_list(value: Any) -> list[Any]:
     return value if isinstance(value, list) else [value]
 
 
-def vector(path: Path, where: dict[str, Any], name: str, size: int) -> NDArray[np.float64]:
+def vector(path: Path, where: dict[str, Any], name: str, size: int) -> Floats:
     """Return a field of some numbers, (size,).
 
     Raises:

@@ -14,11 +14,10 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.errors import InputError
 from sononerf.head.call import inverse_filter
 from sononerf.recordings.audio import Recording, as_float
-
-Array = NDArray[np.float64]
 
 GUARD = 64
 """Samples on both sides of a cut that take up what a shift by part of a sample leaks."""
@@ -29,7 +28,7 @@ STEPS = 1000
 stays at the same number for long anyway."""
 
 
-def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -> Array:
+def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -> Floats:
     """Return samples from the emission on; zeros where the recording had not begun or has ended.
 
     Args:
@@ -59,7 +58,7 @@ def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -
     return np.fft.irfft(spectrum, size)[:, guard : guard + count]
 
 
-def mix(samples: Array, channels: tuple[int | tuple[int, ...], ...] | None) -> Array:
+def mix(samples: Floats, channels: tuple[int | tuple[int, ...], ...] | None) -> Floats:
     """Return the chosen channels (E, S); those that stand together are averaged.
 
     Raises:
@@ -95,8 +94,8 @@ class Cutter:
     channels: tuple[int | tuple[int, ...], ...] | None = None
     delay: float = 0.0
     gain: ArrayLike = 1.0
-    background: Array | None = None
-    call: Array | None = None
+    background: Floats | None = None
+    call: Floats | None = None
 
     def samples(self, index: int) -> int:
         """Return how many samples a ping has from the emission on; less than one if none."""
@@ -111,7 +110,7 @@ class Cutter:
         time = float(self.recording.emission[index]) + self.delay
         return round(time * self.recording.sampling_rate, 6)
 
-    def echo(self, index: int, count: int, *, first: int = 0) -> Array:
+    def echo(self, index: int, count: int, *, first: int = 0) -> Floats:
         """Return what the receivers of a ping heard, (E, N), calibrated.
 
         Args:
@@ -167,12 +166,12 @@ class Clipping:
         step: Between two numbers of the recording; 0 of floats.
     """
 
-    peak: Array
-    stays: NDArray[np.int64]
+    peak: Floats
+    stays: Ints
     step: float
 
     @classmethod
-    def of(cls, samples: Array, step: float) -> Clipping:
+    def of(cls, samples: Floats, step: float) -> Clipping:
         """Look at samples (E, S)."""
         if not samples.shape[1]:
             return cls(np.zeros(2 * len(samples)), np.zeros(2 * len(samples), np.int64), step)
@@ -183,7 +182,7 @@ class Clipping:
         return cls(peak, beside.sum(axis=1), step)
 
 
-def clipped_pings(found: list[Clipping]) -> NDArray[np.bool_]:
+def clipped_pings(found: list[Clipping]) -> Bools:
     """Tell which pings are clipped, (P,).
 
     A ping is clipped if one of its channels has three samples or more that equal a neighbour, at a

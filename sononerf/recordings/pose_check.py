@@ -23,15 +23,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sononerf.array_types import Floats
 from sononerf.geometry.poses import Poses
 from sononerf.recordings.columns import EULER, PLACE, Columns
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.distance_model import Prediction, predict
 from sononerf.settings.import_schema import ImportSettings
-
-Array = NDArray[np.float64]
 
 FEWEST = 12
 """Fewer pings than this tell nothing."""
@@ -113,7 +111,7 @@ def mirrored(poses: Poses) -> Poses:
     return Poses(poses.positions @ mirror, mirror @ poses.rotations @ mirror)
 
 
-def _with(columns: Columns, values: dict[str, Array]) -> Columns:
+def _with(columns: Columns, values: dict[str, Floats]) -> Columns:
     return Columns(columns.where, values, columns.texts, columns.rotation, columns.units)
 
 
@@ -139,12 +137,12 @@ def _different(stated: Poses, found: dict[str, Poses]) -> dict[str, Poses]:
 
 
 def check_poses(
-    first: Array,
+    first: Floats,
     stated: Poses,
     others: Mapping[str, Poses],
     *,
-    emitter: Array,
-    receivers: Array,
+    emitter: Floats,
+    receivers: Floats,
     resolution: float,
 ) -> Verdict:
     """Name the convention that explains the first echoes, if it is not the stated one.
@@ -194,11 +192,11 @@ class _Misfit:
 
 @dataclass(frozen=True, eq=False)
 class _Head:
-    emitter: Array
-    receivers: Array
+    emitter: Floats
+    receivers: Floats
     resolution: float
 
-    def misfit(self, poses: Poses, first: Array) -> _Misfit:
+    def misfit(self, poses: Poses, first: Floats) -> _Misfit:
         """Return the sum of logarithms of error scales of pings (P, E)."""
         out = poses.positions + poses.rotations @ self.emitter
         back = poses.positions[:, None] + np.einsum("pij,ej->pei", poses.rotations, self.receivers)
@@ -224,12 +222,12 @@ class _Head:
         return bool(np.abs(self.receivers - self.emitter).max() > 0.0)
 
 
-def _scale(error: Array, floor: float) -> float:
+def _scale(error: Floats, floor: float) -> float:
     """Return a robust standard deviation, m."""
     return float(np.hypot(1.48 * np.median(np.abs(error)), floor))
 
 
-def _off_axis(poses: Poses, centre: Array, reach: float) -> Array:
+def _off_axis(poses: Poses, centre: Floats, reach: float) -> Floats:
     """Return the angles (P,) between where heads look and where the body is, rad."""
     to_body = centre - poses.positions
     distance = np.linalg.norm(to_body, axis=1)
@@ -237,7 +235,7 @@ def _off_axis(poses: Poses, centre: Array, reach: float) -> Array:
     return np.arccos(cosine.clip(-1.0, 1.0))
 
 
-def _unit(poses: Poses, ranges: Array) -> Verdict:
+def _unit(poses: Poses, ranges: Floats) -> Verdict:
     """Compare how far poses lie apart with how far their echoes come from."""
     spread = float(
         np.sqrt(np.square(poses.positions - poses.positions.mean(axis=0)).sum(axis=1).mean())

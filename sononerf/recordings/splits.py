@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf.array_types import Ints
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses
 
@@ -13,7 +14,7 @@ TRAIN, VALIDATION, TEST = 0, 1, 2
 SAME_PLACE, SAME_TURN = 1e-6, 1e-6  # m and no unit: of one pose, printed twice
 
 
-def pose_groups(poses: Poses) -> NDArray[np.int64]:
+def pose_groups(poses: Poses) -> Ints:
     """Return a number for each pose, (P,): the same for pings of the same pose."""
     table = np.concatenate(
         [

@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
 
 MeshFormat = Literal["ply", "stl", "glb"]
@@ -75,7 +76,7 @@ MANY_POSES = 100
 FEW_COLOUR, MANY_COLOUR = (0.34, 0.0, -0.01), (0.93, -0.02, 0.15)
 
 
-def confidence_colours(poses: ArrayLike) -> NDArray[np.float64]:
+def confidence_colours(poses: ArrayLike) -> Floats:
     """Colour numbers of poses: dark grey for none, bright yellow for a hundred and more.
 
     Steps are even to the eye (a straight line in OKLab [1]_) over the logarithm of one plus the
@@ -105,16 +106,14 @@ def confidence_colours(poses: ArrayLike) -> NDArray[np.float64]:
         ],
         axis=-1,
     ).clip(0, 1)
-    colours: NDArray[np.float64] = np.where(
+    colours: Floats = np.where(
         linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
     )
     return colours
 
 
-def linear_light(colours: ArrayLike) -> NDArray[np.float64]:
+def linear_light(colours: ArrayLike) -> Floats:
     """Turn sRGB colours (..., 3), 0 to 1, into linear light, as glTF has them."""
     given = np.asarray(colours, dtype=np.float64)
-    light: NDArray[np.float64] = np.where(
-        given <= 0.04045, given / 12.92, ((given + 0.055) / 1.055) ** 2.4
-    )
+    light: Floats = np.where(given <= 0.04045, given / 12.92, ((given + 0.055) / 1.055) ** 2.4)
     return light

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sononerf import storage
+from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore, seal
 from sononerf.errors import IncompatibleError, SettingsError
@@ -193,9 +194,7 @@ def _write(
     return EnsembleStore.open(output)
 
 
-def moved(
-    magnitude: NDArray[np.floating], axis: NDArray[np.floating], offset: float
-) -> NDArray[np.float64]:
+def moved(magnitude: NDArray[np.floating], axis: NDArray[np.floating], offset: float) -> Floats:
     """Return magnitudes (E, R, F) that are heard so much nearer (m), between slices linearly."""
     if offset == 0.0:
         return np.asarray(magnitude, dtype=np.float64)

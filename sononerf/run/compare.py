@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 
 from sononerf import storage
+from sononerf.array_types import Floats
 from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.evaluation.baseline import backprojection
 from sononerf.evaluation.prediction import added_part, compare
@@ -144,8 +144,8 @@ def _heard(
     run: Fitted,
     poses: Poses,
     reference: float,
-    lower: NDArray[np.float64],
-    upper: NDArray[np.float64],
+    lower: Floats,
+    upper: Floats,
     accelerator: str,
     progress: Progress,
 ) -> Volume:
@@ -165,9 +165,7 @@ def _heard(
     )
 
 
-def _added(
-    first: trimesh.Trimesh | None, second: trimesh.Trimesh | None
-) -> NDArray[np.float64] | None:
+def _added(first: trimesh.Trimesh | None, second: trimesh.Trimesh | None) -> Floats | None:
     """Return the middle of what the first true surface has and the second has not, (3,) m."""
     if first is None or second is None:
         return None

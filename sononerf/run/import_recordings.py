@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sononerf import __version__, storage
+from sononerf.array_types import Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore, seal
 from sononerf.errors import IncompatibleError
@@ -57,7 +57,7 @@ def echo_hash(understood: Understood) -> str:
     return digest.hexdigest()
 
 
-def spectrogram_of(understood: Understood, ping: int) -> NDArray[np.float32]:
+def spectrogram_of(understood: Understood, ping: int) -> Singles:
     """Return what the receivers heard of one ping of the recording, (E, R, F)."""
     head = understood.head
     return head.analyse(understood.cutter.echo(ping, head.samples)).astype(np.float32)

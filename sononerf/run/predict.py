@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from sononerf import storage
+from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.evaluation.prediction import predict as predict_poses
 from sononerf.evaluation.traced import Traced
@@ -152,9 +153,9 @@ def _save_npz(file: BinaryIO, arrays: dict[str, NDArray[np.generic]]) -> None:
 def _pictures(
     folder: Path,
     poses: WholePoses,
-    measured: NDArray[np.float64] | None,
-    predicted: NDArray[np.float64],
-    axes: dict[str, NDArray[np.float64]],
+    measured: Floats | None,
+    predicted: Floats,
+    axes: dict[str, Floats],
     progress: Progress,
 ) -> None:
     with progress.task("drawing", len(poses)) as task:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf.array_types import Ints
 from sononerf.echoes.detection import RANK
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import Poses
@@ -31,8 +32,6 @@ from sononerf.run.build import head_of
 from sononerf.settings.import_schema import ImportSettings, read_import_settings
 from sononerf.settings.loading import apply_override, read_yaml, validate_settings
 from sononerf.settings.schema import FILE_SECTIONS, HEAD_SECTIONS, CallSettings, Settings
-
-Array = NDArray[np.float64]
 
 READERS: dict[str, Callable[[Path, ImportSettings], Recording]] = {
     "recordings": read_folder,
@@ -71,7 +70,7 @@ class Understood:
     wanted: ImportSettings
     cutter: Cutter
     head: Head
-    pings: NDArray[np.int64]
+    pings: Ints
     poses: Poses
     split: NDArray[np.int8]
     clipped: int
@@ -231,7 +230,7 @@ def _mixed(known: dict[str, Any], wanted: ImportSettings) -> dict[str, Any]:
 
 def _without_clipped(
     recording: Recording, cutter: Cutter, head: Head, wanted: ImportSettings
-) -> tuple[NDArray[np.int64], int]:
+) -> tuple[Ints, int]:
     """Return the pings to keep, and how many are clipped where their echoes are."""
     if not wanted.reject_clipped:
         return np.arange(len(recording)), 0

@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.errors import SettingsError
 from sononerf.geometry.raycast import RayCaster
 from sononerf.scene.material import Material
@@ -116,14 +117,14 @@ def _placed(part: Part, where: str) -> trimesh.Trimesh:
     return trimesh.Trimesh(vertices + position, faces, process=False, validate=False)
 
 
-def _background(part: Part) -> NDArray[np.bool_]:
+def _background(part: Part) -> Bools:
     own = part.scene.background
     if part.background or own is None:
         return np.full(len(part.scene.mesh.faces), part.background)
     return own
 
 
-def _merged(parts: Sequence[Part]) -> tuple[tuple[Material, ...], NDArray[np.int64]]:
+def _merged(parts: Sequence[Part]) -> tuple[tuple[Material, ...], Ints]:
     """Return the materials of all parts, each once, and which one each triangle is of, (T,)."""
     numbers: dict[Material, int] = {}
     of = []
@@ -180,9 +181,7 @@ def surfaces_cross(one: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:
     return _pierces(near[0], near[1]) or _pierces(near[1], near[0])
 
 
-def _within(
-    mesh: trimesh.Trimesh, low: NDArray[np.float64], high: NDArray[np.float64]
-) -> trimesh.Trimesh:
+def _within(mesh: trimesh.Trimesh, low: Floats, high: Floats) -> trimesh.Trimesh:
     """Return the triangles whose bounding boxes reach into a box."""
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
     corners = vertices[faces]

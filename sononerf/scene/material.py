@@ -8,7 +8,8 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from sononerf.array_types import Floats
 
 Curve = tuple[float, ...]
 BOUNDS = {
@@ -124,7 +125,7 @@ def roughened(material: Material, height: float) -> Material:
     nodes = np.array([20e3, 40e3, 60e3, 80e3, 100e3, 150e3])
     in_step = np.exp(-2.0 * (2.0 * math.pi * nodes / 343.0 * height) ** 2)
 
-    def at_nodes(curve: Curve | None, factor: NDArray[np.float64] | float = 1.0) -> Any:
+    def at_nodes(curve: Curve | None, factor: Floats | float = 1.0) -> Any:
         if curve is None:
             return None
         values = np.interp(np.log(nodes), np.log(material.frequency), curve) * factor

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from sononerf.array_types import Bools, Ints
 from sononerf.errors import InputError, SettingsError, SonoNerfError
 from sononerf.geometry.faults import surface_faults
 from sononerf.scene.material import MATERIALS, RIGID, Material, MaterialName
@@ -69,8 +69,8 @@ class Scene:
 
     mesh: trimesh.Trimesh
     material: Material | tuple[Material, ...] = RIGID
-    part: NDArray[np.int64] | None = None
-    background: NDArray[np.bool_] | None = None
+    part: Ints | None = None
+    background: Bools | None = None
 
     def __post_init__(self) -> None:
         several = isinstance(self.material, tuple)
@@ -91,7 +91,7 @@ class Scene:
         check_surface(self.mesh)
         _warn_of_faults(self.mesh)
 
-    def _checked(self, background: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def _checked(self, background: Bools) -> Bools:
         background = np.asarray(background)
         if background.shape != (len(self.mesh.faces),) or background.dtype != np.bool_:
             raise ValueError(

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from sononerf.array_types import Bools, Floats
 from sononerf.scene.scene import Scene
 from sononerf.simulation.impulse_response import NODE_SPACING
 from sononerf.simulation.paths import Bounce
@@ -31,9 +31,9 @@ EARS_APART = 0.03
 """Distance between receivers, m, up to which the middle between them stands for each of them."""
 
 
-def row_dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def row_dot(a: Floats, b: Floats) -> Floats:
     """Return the dot products (N,) of rows (N, 3)."""
-    product: NDArray[np.float64] = np.einsum("nd,nd->n", a, b)
+    product: Floats = np.einsum("nd,nd->n", a, b)
     return product
 
 
@@ -53,9 +53,7 @@ class Audibility:
     radius: float
     bounces: int
 
-    def judge_all(
-        self, bounce: Bounce, listeners: NDArray[np.float64]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    def judge_all(self, bounce: Bounce, listeners: Floats) -> tuple[Bools, Floats]:
         """Which hits some listener can hear (H,), and by how much each (H,) may be wrong."""
         audible, doubt = self._judge(bounce, listeners[0])
         for place in listeners[1:]:
@@ -64,9 +62,7 @@ class Audibility:
             np.maximum(doubt, more, out=doubt)
         return audible, doubt
 
-    def _judge(
-        self, bounce: Bounce, listener: NDArray[np.float64]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+    def _judge(self, bounce: Bounce, listener: Floats) -> tuple[Bools, Floats]:
         """Which hits can be heard (H,), and by how much each (H,) may be wrong."""
         away = listener - bounce.points
         distance = np.sqrt(row_dot(away, away))
@@ -122,11 +118,9 @@ class Arrival:
             scene.mesh.vertices, scene.mesh.faces, FINE * self.radius, max_iter=20
         )
         used = np.asarray(vertices, dtype=np.float64)[np.unique(faces)]
-        self._points: NDArray[np.float64] = np.unique(used, axis=0) - self._middle
+        self._points: Floats = np.unique(used, axis=0) - self._middle
 
-    def shortest(
-        self, emitters: NDArray[np.float64], ears: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def shortest(self, emitters: Floats, ears: Floats) -> Floats:
         """Return the shortest way (P, E), m.
 
         Args:
@@ -145,9 +139,7 @@ class Arrival:
         return found
 
 
-def silence_before(
-    echo: NDArray[np.float64], first: NDArray[np.float64], *, sampling_rate: float
-) -> NDArray[np.float64]:
+def silence_before(echo: Floats, first: Floats, *, sampling_rate: float) -> Floats:
     """Cut off what comes before sound can arrive.
 
     Beam and ears are real gains, so their responses are even in time: half of them comes before

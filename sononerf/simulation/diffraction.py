@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.geometry.directions import GOLDEN_TURN
 from sononerf.geometry.normals import CREASE
 from sononerf.geometry.raycast import RayCaster
@@ -31,15 +31,15 @@ class Edges:
         triangle (K,): That face.
     """
 
-    ends: NDArray[np.float64]
-    away: NDArray[np.float64]
-    inward: NDArray[np.float64]
-    normal: NDArray[np.float64]
-    open_angle: NDArray[np.float64]
-    triangle: NDArray[np.int64]
+    ends: Floats
+    away: Floats
+    inward: Floats
+    normal: Floats
+    open_angle: Floats
+    triangle: Ints
 
     @property
-    def length(self) -> NDArray[np.float64]:
+    def length(self) -> Floats:
         """Of each edge (K,), m."""
         return np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1)
 
@@ -81,23 +81,23 @@ def diffracting_edges(mesh: trimesh.Trimesh) -> Edges:
     )
 
 
-def _thin(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _thin(corners: Floats) -> Bools:
     """Which triangles (T, 3, 3) are a millionth as high as long, or less."""
     sides = np.roll(corners, -1, axis=1) - corners
     longest = np.square(sides).sum(axis=2).max(axis=1)
     twice_area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    thin: NDArray[np.bool_] = twice_area <= 1e-6 * longest
+    thin: Bools = twice_area <= 1e-6 * longest
     return thin
 
 
 def wedge_directivity(
-    inward: NDArray[np.float64],
-    normal: NDArray[np.float64],
-    open_angle: NDArray[np.float64],
-    to_source: NDArray[np.float64],
-    to_receiver: NDArray[np.float64],
-    fade: NDArray[np.float64],
-) -> NDArray[np.float64]:
+    inward: Floats,
+    normal: Floats,
+    open_angle: Floats,
+    to_source: Floats,
+    to_receiver: Floats,
+    fade: Floats,
+) -> Floats:
     r"""Return what the edge of a rigid wedge sends on from a source to a receiver.
 
     .. math:: -\frac{\nu}{2} \sum_{\pm \pm}
@@ -198,8 +198,8 @@ class Diffraction:
     def sound(
         self,
         hearing: Hearing,
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
+        position: Floats,
+        rotation: Floats,
         *,
         points: int,
         offset: float,
@@ -258,7 +258,7 @@ class Diffraction:
 
     def _places(
         self, share: float, points: int, offset: float
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    ) -> tuple[Floats, Floats, Floats, Ints]:
         """Points (N, 3), off the surface (N, 3), the stretch each stands for (N, 3), what it is."""
         at = (np.arange(points) + offset) * share
         index = np.searchsorted(self._end, at, side="right")

@@ -6,9 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from sononerf.array_types import Floats
 from sononerf.geometry.raycast import RayCaster
 from sononerf.scene.scene import Scene
 from sononerf.simulation.audibility import Arrival
@@ -69,8 +67,8 @@ class Engine:
 
     def prepare(
         self,
-        positions: NDArray[np.float64],
-        rotations: NDArray[np.float64],
+        positions: Floats,
+        rotations: Floats,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
         """Do at once what can be done for all poses at once.
@@ -81,9 +79,7 @@ class Engine:
             progress: Takes how many parts are done and how many there are.
         """
 
-    def echo(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
-    ) -> NDArray[np.float64]:
+    def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
         """Pressure at both ears for a call that is one sample of height 1.
 
         Args:
@@ -96,9 +92,7 @@ class Engine:
         """
         raise NotImplementedError
 
-    def hits(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def hits(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
         """Places that send sound straight back, and how much.
 
         Position, rotation and seed are those of :meth:`echo`.

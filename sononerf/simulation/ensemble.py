@@ -13,8 +13,9 @@ from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from sononerf.array_types import Bools, Floats, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore, seal
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("sononerf")
 
-Write = Callable[[int, NDArray[np.float32]], None]
+Write = Callable[[int, Singles], None]
 
 MOST_WORKERS = 8
 WORTH_WORKERS = 64
@@ -49,7 +50,7 @@ def pose_seed(seed: int, index: int) -> int:
     return int(state[0])
 
 
-def check_poses(scene: Scene, poses: Poses, *, offsets: NDArray[np.float64] | None = None) -> None:
+def check_poses(scene: Scene, poses: Poses, *, offsets: Floats | None = None) -> None:
     """Refuse poses that are no numbers or lie inside the surface.
 
     Args:
@@ -73,7 +74,7 @@ def _refuse(bad: ArrayLike, what: str) -> None:
         raise InputError(f"{_named(bad)} {what}; move them, or raise poses.radius")
 
 
-def _named(bad: NDArray[np.bool_]) -> str:
+def _named(bad: Bools) -> str:
     """Say how many poses there are of a kind, and which are the first ten."""
     indices = np.flatnonzero(bad)
     listed = ", ".join(str(index) for index in indices[:10])
@@ -151,12 +152,12 @@ def simulate(
         alone = simulator.engine.prepares or len(missing) < WORTH_WORKERS
         workers = 1 if alone else cores
     test = store.indices("test")[: options.noise_floor_poses]
-    again: dict[int, NDArray[np.float32]] = {}
+    again: dict[int, Singles] = {}
     wanted = [*missing, *test]
     simulator.prepare(poses.positions[wanted], poses.rotations[wanted], progress)
     with progress.task("simulating", len(missing) + len(test)) as task:
         # The second simulation of the test poses goes first where it can share the processes.
-        def keep(index: int, spectrogram: NDArray[np.float32]) -> None:
+        def keep(index: int, spectrogram: Singles) -> None:
             if index < len(poses):
                 store.write_pose(index, spectrogram)
             else:
@@ -234,7 +235,7 @@ def _failed(index: int, error: BaseException) -> SonoNerfError:
 
 def _simulate_here(
     simulator: Simulator, poses: Poses, indices: list[int], seed: int
-) -> Iterator[tuple[int, NDArray[np.float32]]]:
+) -> Iterator[tuple[int, Singles]]:
     for index in indices:
         try:
             spectrogram = simulator.spectrogram(
@@ -249,9 +250,7 @@ def _receive(simulator: Simulator) -> Simulator:
     return simulator
 
 
-def _one(
-    simulator: Simulator, position: NDArray[np.float64], rotation: NDArray[np.float64], seed: int
-) -> NDArray[np.float32]:
+def _one(simulator: Simulator, position: Floats, rotation: Floats, seed: int) -> Singles:
     return simulator.spectrogram(position, rotation, seed=seed)
 
 
@@ -263,7 +262,7 @@ def _simulate_there(
     seed: int,
     *,
     ours: bool,
-) -> Iterator[tuple[int, NDArray[np.float32]]]:
+) -> Iterator[tuple[int, Singles]]:
     from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 
     from distributed import KilledWorker

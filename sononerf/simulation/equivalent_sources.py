@@ -11,6 +11,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from sononerf.array_types import Complexes, Floats
 from sononerf.errors import NumericalError
 from sononerf.geometry.directions import spread_points
 from sononerf.scene.scene import Scene
@@ -104,12 +105,10 @@ class Sources(Solved):
             fall=fall,
         )
         self.error: dict[float, float] = {}
-        self._surface: (
-            tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]] | None
-        ) = None
+        self._surface: tuple[Floats, Floats, Floats] | None = None
 
     @property
-    def surface(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def surface(self) -> tuple[Floats, Floats, Floats]:
         """Points (N, 3), m, of which any first ones are spread evenly; normals; thickness (N,)."""
         if self._surface is None:
             points, normals = spread_points(self.scene.mesh, round(POINTS * self.most) + CHECKS)
@@ -121,7 +120,7 @@ class Sources(Solved):
         return self._surface
 
     @cached_property
-    def _blend(self) -> NDArray[np.float64]:
+    def _blend(self) -> Floats:
         """Weights (N, C) by which the gains at control points make those at all points.
 
         A polynomial over the place is fitted to them. Tables have bends between their nodes, and
@@ -133,7 +132,7 @@ class Sources(Solved):
             power for power in itertools.product(range(ORDER + 1), repeat=3) if sum(power) <= ORDER
         ]
         terms = np.stack([np.prod(points**power, axis=1) for power in powers], axis=1)
-        blend: NDArray[np.float64] = terms @ np.linalg.pinv(terms[:CONTROL], rcond=1e-6)
+        blend: Floats = terms @ np.linalg.pinv(terms[:CONTROL], rcond=1e-6)
         return blend
 
     @property
@@ -158,7 +157,7 @@ class Sources(Solved):
         incident = _arriving(system.points, system.normals, emitters, complex(wavenumber))
         return system.error(incident, system.solve(incident))
 
-    def respond(self, wavenumber: complex, poses: Heads) -> NDArray[np.complex128]:
+    def respond(self, wavenumber: complex, poses: Heads) -> Complexes:
         """Scattered pressure at the ears at one frequency; see :meth:`Solved.respond`."""
         frequency = wavenumber.real * self.hearing.speed_of_sound / (2.0 * math.pi)
         system = _System(self, frequency, wavenumber)
@@ -245,9 +244,9 @@ def sources_worth(scene: Scene) -> int:
 
 
 def _slopes(
-    points: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    places: NDArray[np.float64],
+    points: Floats,
+    normals: Floats,
+    places: Floats,
     wavenumber: complex,
 ) -> NDArray[np.complex64]:
     r"""Return :math:`\partial_n e^{-j k r} / 4 \pi r` at points (N, 3) for sources (M, 3)."""
@@ -262,9 +261,7 @@ def _slopes(
     return slope
 
 
-def _waves(
-    points: NDArray[np.float64], places: NDArray[np.float64], wavenumber: complex
-) -> NDArray[np.complex64]:
+def _waves(points: Floats, places: Floats, wavenumber: complex) -> NDArray[np.complex64]:
     r"""Return :math:`e^{-j k r} / 4 \pi r` at points (N, 3) for sources (M, 3)."""
     distance = np.sqrt(_squares(points, places))
     wave = _turned(distance, wavenumber)
@@ -272,7 +269,7 @@ def _waves(
     return wave
 
 
-def _turned(distance: NDArray[np.float64], wavenumber: complex) -> NDArray[np.complex64]:
+def _turned(distance: Floats, wavenumber: complex) -> NDArray[np.complex64]:
     r"""Return :math:`e^{-j k r} / 4 \pi` at distances (N, M); phases keep their full precision."""
     turns = distance * (wavenumber.real / (2.0 * math.pi))
     turns -= np.rint(turns)
@@ -286,18 +283,18 @@ def _turned(distance: NDArray[np.float64], wavenumber: complex) -> NDArray[np.co
     return wave
 
 
-def _squares(points: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _squares(points: Floats, places: Floats) -> Floats:
     """Return squared distances (N, M), m²; products suffice, for coordinates are as small."""
     square = np.square(points).sum(axis=1)[:, None] + np.square(places).sum(axis=1)
     square -= 2.0 * points @ places.T
-    found: NDArray[np.float64] = square
+    found: Floats = square
     return found
 
 
 def _arriving(
-    points: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    emitters: NDArray[np.float64],
+    points: Floats,
+    normals: Floats,
+    emitters: Floats,
     wavenumber: complex,
 ) -> NDArray[np.complex64]:
     r"""Return :math:`\partial_n e^{-j k r} / r` at points (N, 3) for emitters (P, 3)."""

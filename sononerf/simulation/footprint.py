@@ -6,9 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Real = NDArray[np.float32]  # single precision suffices for differentials, and is twice as fast
+from sononerf.array_types import Floats, Ints, Singles
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,15 +31,15 @@ class Footprint:
         .. [1] H. Igehy, "Tracing ray differentials", SIGGRAPH 1999.
     """
 
-    shift: Real
-    square: Real
-    bend: Real
-    curving: Real
-    onward: Real
-    sink: Real
-    tube: Real
+    shift: Singles
+    square: Singles
+    bend: Singles
+    curving: Singles
+    onward: Singles
+    sink: Singles
+    tube: Singles
 
-    def __getitem__(self, chosen: NDArray[np.int64]) -> Footprint:
+    def __getitem__(self, chosen: Ints) -> Footprint:
         """Return those of the chosen hits."""
         parts = (
             self.shift, self.square, self.bend, self.curving, self.onward, self.sink, self.tube,
@@ -48,8 +47,8 @@ class Footprint:
         return Footprint(*(part.take(chosen, axis=-1) for part in parts))
 
     def detour(
-        self, towards: Real, rise: Real, distance: Real, solid_angle: float | NDArray[np.float64]
-    ) -> tuple[Real, Real, Real]:
+        self, towards: Singles, rise: Singles, distance: Singles, solid_angle: float | Floats
+    ) -> tuple[Singles, Singles, Singles]:
         r"""How much longer a path is than the mirror's nearby, and how it varies over a ray's cell.
 
         To second order, the path's length over u and v has the slope :math:`g` and the Hessian
@@ -93,18 +92,18 @@ class Footprint:
         return np.maximum(detour, 0.0), np.sqrt(variance), stiffness
 
 
-def dots(a: Real, b: Real) -> Real:
+def dots(a: Singles, b: Singles) -> Singles:
     """Scalar products (..., N) of vectors (..., 3, N) and (3, N)."""
-    found: Real = np.einsum("...dn,dn->...n", a, b)
+    found: Singles = np.einsum("...dn,dn->...n", a, b)
     return found
 
 
-def pairs(a: Real, b: Real) -> Real:
+def pairs(a: Singles, b: Singles) -> Singles:
     """Products (3, N) of two and two vectors (2, 3, N): first, second, first with second."""
     return np.stack([dots(a[0], b[0]), dots(a[1], b[1]), dots(a[0], b[1])])
 
 
-def across(directions: Real) -> Real:
+def across(directions: Singles) -> Singles:
     """Two unit vectors (2, 3, N) square to each direction (3, N) and to each other.
 
     Source: T. Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
@@ -122,14 +121,14 @@ def across(directions: Real) -> Real:
 
 
 def land(
-    shift: Real,
-    turn: Real,
+    shift: Singles,
+    turn: Singles,
     *,
-    incoming: Real,
-    flat: Real,
-    normals: Real,
-    gradients: Real,
-) -> tuple[Footprint, Real]:
+    incoming: Singles,
+    flat: Singles,
+    normals: Singles,
+    gradients: Singles,
+) -> tuple[Footprint, Singles]:
     """Let bundles fall on the surface.
 
     Args:
@@ -169,7 +168,7 @@ def land(
     )
 
 
-def _cross(a: Real, b: Real) -> Real:
+def _cross(a: Singles, b: Singles) -> Singles:
     return np.stack(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )

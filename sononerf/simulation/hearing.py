@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf.array_types import Complexes, Floats, Ints, Singles
 from sononerf.head.ears import beam_gain, ear_gain
 from sononerf.head.head import Head
 from sononerf.simulation.impulse_response import (
@@ -95,13 +96,11 @@ class Hearing:
         self.speed_of_sound = head.speed_of_sound
 
     @cached_property
-    def _air(self) -> NDArray[np.float32]:
+    def _air(self) -> Singles:
         decay = self.absorption * (math.log(10.0) / 20.0) * self.speed_of_sound
         return air_loss(self.synthesis, decay).astype(np.float32)
 
-    def places(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def places(self, position: Floats, rotation: Floats) -> tuple[Floats, Floats]:
         """Return the emitter (3,) and the ears (E, 3) of a pose, m, world frame."""
         return self.head.places(position, rotation)
 
@@ -109,15 +108,11 @@ class Hearing:
         """Return nothing heard yet."""
         return Sound(self.synthesis, len(self.ears.positions))
 
-    def beam(
-        self, emitted: NDArray[np.float64], rotation: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
+    def beam(self, emitted: Floats, rotation: Floats) -> Singles:
         """Return the beam's gain (N, F) towards directions (N, 3) of the world."""
         return beam_gain(self.ears, _into_head(emitted, rotation))
 
-    def gain(
-        self, ear: int, towards: NDArray[np.float64], rotation: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
+    def gain(self, ear: int, towards: Floats, rotation: Floats) -> Singles:
         """Return an ear's gain (N, F) for sound from directions (N, 3) of the world."""
         return ear_gain(self.ears, ear, _into_head(towards, rotation))
 
@@ -125,14 +120,14 @@ class Hearing:
         self,
         sound: Listener,
         ear: int,
-        points: NDArray[np.float64],
+        points: Floats,
         *,
-        length: NDArray[np.float64],
+        length: Floats,
         spread: NDArray[np.floating[Any]],
         level: NDArray[np.floating[Any]],
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
-        shaded: tuple[Listener, NDArray[np.int64], NDArray[np.complex64]] | None = None,
+        position: Floats,
+        rotation: Floats,
+        shaded: tuple[Listener, Ints, NDArray[np.complex64]] | None = None,
     ) -> None:
         r"""Add what one ear hears of points.
 
@@ -169,9 +164,7 @@ class Hearing:
             gain[dim] = part * passed.real
         sound.add(ear, delay, spread, gain)
 
-    def echo(
-        self, sound: Sound, basis: NDArray[np.complex128] | None = None
-    ) -> NDArray[np.float64]:
+    def echo(self, sound: Sound, basis: Complexes | None = None) -> Floats:
         """Return the pressure at the ears for a call that is one sample of height 1.
 
         Args:
@@ -197,6 +190,6 @@ def hearing_of(head: Head) -> Hearing:
     return Hearing(head, plan_synthesis(head.analysis, head.samples))
 
 
-def _into_head(vectors: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    turned: NDArray[np.float64] = vectors @ rotation
+def _into_head(vectors: Floats, rotation: Floats) -> Floats:
+    turned: Floats = vectors @ rotation
     return turned

@@ -6,9 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from sononerf.array_types import Floats
 from sononerf.scene.scene import Scene
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.equivalent_sources import THIN, Sources, resolved_frequency, sources_worth
@@ -48,24 +46,20 @@ class Hybrid(Engine):
 
     def prepare(
         self,
-        positions: NDArray[np.float64],
-        rotations: NDArray[np.float64],
+        positions: Floats,
+        rotations: Floats,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
         """Solve for the low band of all poses at once; see :meth:`Solved.prepare`."""
         self.low.prepare(positions, rotations, progress)
 
-    def echo(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
-    ) -> NDArray[np.float64]:
+    def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
         """Pressure at both ears; see :meth:`Engine.echo`."""
         echo = self.low.echo(position, rotation, seed=seed)
         echo += self.high.echo(position, rotation, seed=seed)
         return echo
 
-    def hits(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def hits(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
         """Places that send sound straight back, by the rays; see :meth:`Engine.hits`."""
         return self.high.hits(position, rotation, seed=seed)
 

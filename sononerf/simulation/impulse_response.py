@@ -29,6 +29,7 @@ import scipy.fft
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
+from sononerf.array_types import Complexes, Floats
 from sononerf.head.ears import NOTCH_WIDTH
 from sononerf.settings.schema import SpectrogramSettings
 
@@ -65,10 +66,10 @@ class Synthesis:
         length: Of the transform, at the sampling rate.
     """
 
-    nodes: NDArray[np.float64]
-    hats: NDArray[np.complex128]
-    basis: NDArray[np.complex128]
-    odd_hats: NDArray[np.complex128]
+    nodes: Floats
+    hats: Complexes
+    basis: Complexes
+    odd_hats: Complexes
     sampling_rate: float
     samples: int
     length: int
@@ -79,7 +80,7 @@ class Synthesis:
         return tuple(OVERSAMPLING * self.length >> level for level in range(LEVELS))
 
     @property
-    def frequency(self) -> NDArray[np.float64]:
+    def frequency(self) -> Floats:
         """Of the filters (K,), Hz."""
         return np.fft.rfftfreq(self.length, 1.0 / self.sampling_rate).astype(np.float64)
 
@@ -122,7 +123,7 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     rate = settings.sampling_rate
     top = min(max(HIGHEST, 1.2 * settings.frequency_max), 0.45 * rate)
     count = max(2, round(top / NODE_SPACING))
-    nodes: NDArray[np.float64] = (np.arange(count, dtype=np.float64) + 0.5) * (top / count)
+    nodes: Floats = (np.arange(count, dtype=np.float64) + 0.5) * (top / count)
     # The coarsest level must hold a whole number of bins.
     unit = 2 ** (LEVELS - 1)
     length = unit * int(scipy.fft.next_fast_len(math.ceil((samples + GUARD) / unit), real=True))
@@ -139,9 +140,7 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     return Synthesis(nodes, hats, basis, odd_hats, rate, samples, length)
 
 
-def between(
-    frequency: NDArray[np.float64], nodes: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def between(frequency: Floats, nodes: Floats) -> tuple[Floats, Floats]:
     r"""Return the weight (K, F) of each node in a value at each frequency.
 
     The interpolation is Nyquist's raised cosine, with :math:`x` the distance in node spacings and
@@ -181,8 +180,8 @@ def between(
 def deposit(
     synthesis: Synthesis,
     bins: Bins,
-    delay: NDArray[np.float64],
-    spread: NDArray[np.float64],
+    delay: Floats,
+    spread: Floats,
     strength: NDArray[np.floating[Any]],
 ) -> None:
     """Lay echoes into time bins, each between the two nearest of the two levels it lies between.
@@ -234,11 +233,11 @@ def deposit(
         bins.values[to + at_level : to + at_level + rows_of] += laid[begin : begin + rows_of]
 
 
-def air_loss(synthesis: Synthesis, decay: NDArray[np.float64]) -> NDArray[np.float64]:
+def air_loss(synthesis: Synthesis, decay: Floats) -> Floats:
     """Return what the air leaves of an echo in each bin (B, F), by its decay (F,) in 1/s."""
     rate = OVERSAMPLING * synthesis.sampling_rate
     times = [np.arange(size) * (2.0**level / rate) for level, size in enumerate(synthesis.sizes)]
-    loss: NDArray[np.float64] = np.exp(-np.multiply.outer(np.concatenate(times), decay))
+    loss: Floats = np.exp(-np.multiply.outer(np.concatenate(times), decay))
     return loss
 
 
@@ -246,8 +245,8 @@ def synthesise(
     synthesis: Synthesis,
     bins: Bins,
     air: NDArray[np.floating[Any]],
-    basis: NDArray[np.complex128],
-) -> NDArray[np.float64]:
+    basis: Complexes,
+) -> Floats:
     """Weaken each node's bins by the air, filter them with its part of the spectrum, add up.
 
     Args:

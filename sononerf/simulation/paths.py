@@ -12,16 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf.array_types import Bools, Floats, Ints, Singles
 from sononerf.geometry.directions import CapSpiral, Cells
 from sononerf.geometry.raycast import Hits, RayCaster
-from sononerf.simulation.footprint import Footprint, Real, across, dots, land
+from sononerf.simulation.footprint import Footprint, across, dots, land
 from sononerf.simulation.reflection import keep_outside, mirror
 
 SPLIT = 2  # along each side of a divided cell
 GATHERED = 8192  # hits; so many are taken together, for numpy's calls cost as much as some hundred
 CHUNK = 49_152  # rays; fewer and calls add up, more and they leave the processor's cache
 
-Beyond = Callable[[Hits, NDArray[np.float64]], tuple[Hits, NDArray[np.float64]]]
+Beyond = Callable[[Hits, Floats], tuple[Hits, Floats]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,21 +45,21 @@ class Bounce:
     """
 
     number: int
-    solid_angle: float | NDArray[np.float64]
-    ray: NDArray[np.int64]
-    emitted: NDArray[np.float64]
-    incoming: NDArray[np.float64]
-    points: NDArray[np.float64]
-    flat: NDArray[np.float64]
-    mirrored: NDArray[np.float64]
-    length: NDArray[np.float64]
+    solid_angle: float | Floats
+    ray: Ints
+    emitted: Floats
+    incoming: Floats
+    points: Floats
+    flat: Floats
+    mirrored: Floats
+    length: Floats
     footprint: Footprint
-    triangles: NDArray[np.int64]
+    triangles: Ints
     hidden: bool = False
 
     def detour(
-        self, towards: NDArray[np.float64], distance: NDArray[np.float64]
-    ) -> tuple[Real, Real, Real, Real]:
+        self, towards: Floats, distance: Floats
+    ) -> tuple[Singles, Singles, Singles, Singles]:
         """Compare paths to a listener with those of a mirror.
 
         Args:
@@ -75,7 +76,7 @@ class Bounce:
             there, rise, distance.astype(np.float32), self.solid_angle
         )
 
-    def __getitem__(self, chosen: NDArray[np.int64]) -> Bounce:
+    def __getitem__(self, chosen: Ints) -> Bounce:
         """Return the chosen hits."""
         return Bounce(
             self.number,
@@ -119,7 +120,7 @@ def _joined(bounces: list[Bounce]) -> Bounce:
     def of_hits(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(bounce, name) for bounce in bounces])
 
-    def of_footprints(name: str) -> Real:
+    def of_footprints(name: str) -> Singles:
         return np.concatenate([getattr(bounce.footprint, name) for bounce in bounces], axis=-1)
 
     angles = [np.broadcast_to(bounce.solid_angle, len(bounce.ray)) for bounce in bounces]
@@ -129,14 +130,12 @@ def _joined(bounces: list[Bounce]) -> Bounce:
     return replace(bounces[0], solid_angle=np.concatenate(angles), footprint=footprint, **joined)
 
 
-def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    product: NDArray[np.float64] = np.einsum("nd,nd->n", a, b)
+def _dot(a: Floats, b: Floats) -> Floats:
+    product: Floats = np.einsum("nd,nd->n", a, b)
     return product
 
 
-def aim(
-    emitter: NDArray[np.float64], centre: NDArray[np.float64], radius: float
-) -> tuple[NDArray[np.float64], float]:
+def aim(emitter: Floats, centre: Floats, radius: float) -> tuple[Floats, float]:
     """Axis and half angle of the cap under which a point sees a ball.
 
     Args:
@@ -156,8 +155,8 @@ def aim(
 
 def trace(
     caster: RayCaster,
-    emitter: NDArray[np.float64],
-    directions: NDArray[np.float64],
+    emitter: Floats,
+    directions: Floats,
     bounces: int,
     *,
     solid_angle: float,
@@ -227,21 +226,21 @@ def trace(
         )
 
 
-def _single(vectors: NDArray[np.float64]) -> Real:
+def _single(vectors: Floats) -> Singles:
     """Return vectors (N, 3) as (3, N) in single precision."""
     return vectors.astype(np.float32).T.copy()
 
 
 def echo_paths(
     caster: RayCaster,
-    emitter: NDArray[np.float64],
+    emitter: Floats,
     cap: CapSpiral,
     *,
     bounces: int,
     extra: int,
-    judge: Callable[[Bounce], tuple[NDArray[np.bool_], NDArray[np.float64]]],
+    judge: Callable[[Bounce], tuple[Bools, Floats]],
     beyond: Beyond | None = None,
-    index: NDArray[np.int64] | None = None,
+    index: Ints | None = None,
 ) -> Iterator[Bounce]:
     """Follow the rays of a cap, with more of them where a few would be noise.
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf.array_types import Bools, Floats, Ints, Singles
 from sononerf.geometry.directions import CapSpiral
 from sononerf.geometry.normals import bodies, enclosing_balls
 from sononerf.geometry.raycast import Hits
@@ -19,7 +20,6 @@ from sononerf.scene.scene import Scene
 from sononerf.simulation.audibility import EARS_APART, RESOLVED_FREQUENCY, Audibility, row_dot
 from sononerf.simulation.diffraction import Diffraction
 from sononerf.simulation.engine import Engine
-from sononerf.simulation.footprint import Real
 from sononerf.simulation.hearing import Hearing, Listener
 from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
 from sononerf.simulation.reflection import coarse_gain, unfaded
@@ -78,7 +78,7 @@ class Rays(Engine):
         rays: int,
         bounces: int,
         diffraction_points: int,
-        band: NDArray[np.float64] | None = None,
+        band: Floats | None = None,
     ) -> None:
         super().__init__(scene, hearing)
         self.rays = rays
@@ -115,9 +115,7 @@ class Rays(Engine):
         self._diffraction: Diffraction | None = None
         self._outlines: Outlines | None = None
 
-    def echo(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
-    ) -> NDArray[np.float64]:
+    def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
         """Pressure at both ears; the seed turns and shifts the pattern of rays as a whole."""
         first, second, third = np.random.default_rng(seed).random(3)
         sound, turned = self.hearing.silence(), self.hearing.silence()
@@ -141,8 +139,8 @@ class Rays(Engine):
     def later(
         self,
         sound: Listener,
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
+        position: Floats,
+        rotation: Floats,
         *,
         seed: int,
     ) -> None:
@@ -155,9 +153,7 @@ class Rays(Engine):
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_diffraction": None, "_outlines": None}
 
-    def _shadows(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64]
-    ) -> list[Shadow]:
+    def _shadows(self, position: Floats, rotation: Floats) -> list[Shadow]:
         """Shadows of the emitter and of each ear."""
         if self._outlines is None:
             self._outlines = Outlines(self.scene.mesh)
@@ -174,9 +170,7 @@ class Rays(Engine):
             for place in (emitter, *ears)
         ]
 
-    def hits(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def hits(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
         """Places that send sound straight back, and how much; see :meth:`Engine.hits`."""
         first, second, _ = np.random.default_rng(seed).random(3)
         points, strength = [np.zeros((0, 3))], [np.zeros(0)]
@@ -193,8 +187,8 @@ class Rays(Engine):
 
     def _paths(
         self,
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
+        position: Floats,
+        rotation: Floats,
         offset: tuple[float, float],
         bounces: int,
     ) -> Iterator[Bounce]:
@@ -206,7 +200,7 @@ class Rays(Engine):
 
         listeners = self._listeners(position, rotation)
 
-        def judge(bounce: Bounce) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        def judge(bounce: Bounce) -> tuple[Bools, Floats]:
             return self._audibility.judge_all(bounce, listeners)
 
         index = self._reaching(cap, emitter)
@@ -214,7 +208,7 @@ class Rays(Engine):
             self.caster, emitter, cap, bounces=bounces, extra=extra, judge=judge, index=index
         )
 
-    def _reaching(self, cap: CapSpiral, emitter: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _reaching(self, cap: CapSpiral, emitter: Floats) -> Ints:
         """Return which rays of a cap may hit the scene."""
         centres, radii = self._balls
         ways = centres - emitter
@@ -226,8 +220,8 @@ class Rays(Engine):
 
     def _hidden(
         self,
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
+        position: Floats,
+        rotation: Floats,
         offset: tuple[float, float],
         shadow: Shadow,
     ) -> Iterator[Bounce]:
@@ -242,7 +236,7 @@ class Rays(Engine):
         axis, half_angle = aim(emitter, self._centre, self._radius)
         cap = CapSpiral(max(rays - extra, 1), axis @ rotation, half_angle, offset, rotation)
 
-        def judge(bounce: Bounce) -> tuple[NDArray[np.bool_], NDArray[np.float64]]:
+        def judge(bounce: Bounce) -> tuple[Bools, Floats]:
             audible, doubt = self._audibility.judge_all(bounce, listeners)
             chosen = np.flatnonzero(audible)
             level = shadow.level(bounce.points[chosen], bounce.triangles[chosen, -1])
@@ -251,7 +245,7 @@ class Rays(Engine):
             passed[chosen] = level
             return audible, doubt * passed
 
-        def beyond(hits: Hits, directions: NDArray[np.float64]) -> tuple[Hits, NDArray[np.float64]]:
+        def beyond(hits: Hits, directions: Floats) -> tuple[Hits, Floats]:
             return behind(self.caster, outlines, hits, directions)
 
         index = self._reaching(cap, emitter)
@@ -261,15 +255,13 @@ class Rays(Engine):
         ):  # fmt: skip
             yield replace(bounce, hidden=True)
 
-    def _listeners(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _listeners(self, position: Floats, rotation: Floats) -> Floats:
         """Places (L, 3) that between them tell what any ear can hear, m, world frame."""
         _, ears = self.hearing.places(position, rotation)
         if np.ptp(ears, axis=0).max() < EARS_APART:
             return np.asarray(ears.mean(axis=0, keepdims=True))
         # One for all within a ball of that size about it.
-        chosen: list[NDArray[np.float64]] = []
+        chosen: list[Floats] = []
         for ear in ears:
             if all(np.linalg.norm(ear - other) >= EARS_APART / 2.0 for other in chosen):
                 chosen.append(ear)
@@ -280,8 +272,8 @@ class Rays(Engine):
         sound: Listener,
         turned: Listener,
         bounce: Bounce,
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
+        position: Floats,
+        rotation: Floats,
         shadows: list[Shadow],
     ) -> None:
         soft = bounce.number == 1
@@ -313,14 +305,14 @@ class Rays(Engine):
     def _heard(
         self,
         bounce: Bounce,
-        ear: NDArray[np.float64],
+        ear: Floats,
         lit: Shadow | None = None,
         shadow: Shadow | None = None,
     ) -> tuple[
-        NDArray[np.int64],
+        Ints,
         NDArray[np.floating[Any]],
-        Real,
-        tuple[NDArray[np.int64], NDArray[np.complex64]] | None,
+        Singles,
+        tuple[Ints, NDArray[np.complex64]] | None,
     ]:
         """Which hits an ear hears (N,), by what gain (N, F), and their paths' spread (N,), m.
 
@@ -349,11 +341,11 @@ class Rays(Engine):
     def _shaded(
         self,
         bounce: Bounce,
-        near: NDArray[np.int64],
-        seen: NDArray[np.bool_],
+        near: Ints,
+        seen: Bools,
         lit: Shadow | None,
         shadow: Shadow | None,
-    ) -> tuple[NDArray[np.bool_], tuple[NDArray[np.int64], NDArray[np.complex64]] | None]:
+    ) -> tuple[Bools, tuple[Ints, NDArray[np.complex64]] | None]:
         """Which hits pass obstacles, and what passes of those near an outline."""
         points, triangle = bounce.points.take(near, axis=0), bounce.triangles[near, -1]
         whole = np.broadcast_to(~np.bool_(bounce.hidden), near.shape)
@@ -383,7 +375,7 @@ class Rays(Engine):
         place_of = np.cumsum(passes) - 1
         return passes, (place_of[chosen[strong]], passed[strong])
 
-    def _level(self, bounce: Bounce) -> NDArray[np.float64]:
+    def _level(self, bounce: Bounce) -> Floats:
         """Level without lobe and beam, (H, 1) or (H, F) m."""
         level = (bounce.solid_angle * np.sqrt(bounce.footprint.tube))[:, None]
         for earlier in bounce.triangles[:, :-1].T:
@@ -395,9 +387,9 @@ class Rays(Engine):
     def _gain(
         self,
         bounce: Bounce,
-        heard: NDArray[np.int64],
-        towards: NDArray[np.float64],
-        detour: Real,
+        heard: Ints,
+        towards: Floats,
+        detour: Singles,
     ) -> NDArray[np.floating[Any]]:
         """Lobe times strength towards a listener (N, F)."""
         cosine = row_dot(bounce.mirrored.take(heard, axis=0), towards)
@@ -413,6 +405,6 @@ class Rays(Engine):
             gain[of_part] = found if self._smooth[index] else found * self._lobed_level
         return gain
 
-    def _part(self, triangle: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _part(self, triangle: Ints) -> Ints:
         part = self.scene.part
         return np.zeros(len(triangle), dtype=np.int64) if part is None else part[triangle]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.array_types import Complexes, Floats, Singles
 from sononerf.scene.material import Material
 
 COARSEST = 10.0  # rad
@@ -40,27 +41,27 @@ class Reflection:
         material: What these are the values of.
     """
 
-    fade: NDArray[np.float64]
-    lobe_width: NDArray[np.float64]
-    strength: NDArray[np.float64]
-    kept: NDArray[np.float64]
-    curved_lobe_width: NDArray[np.float64]
-    curved_strength: NDArray[np.float64]
-    diffraction: NDArray[np.float64]
+    fade: Floats
+    lobe_width: Floats
+    strength: Floats
+    kept: Floats
+    curved_lobe_width: Floats
+    curved_strength: Floats
+    diffraction: Floats
     material: Material
 
-    def curved_share(self, curvature: NDArray[np.float64]) -> NDArray[np.float64]:
+    def curved_share(self, curvature: Floats) -> Floats:
         """Return how curved places are, 0 to 1, by their total curvature (N,) in 1/m."""
         steepness = 8.0 * self.material.transition_slope
         away = steepness * (curvature - self.material.transition_curvature)
-        share: NDArray[np.float64] = 0.5 * (1.0 + np.tanh(0.5 * away))
+        share: Floats = 0.5 * (1.0 + np.tanh(0.5 * away))
         return share
 
     def heard(
         self,
-        cosine: NDArray[np.float64],
+        cosine: Floats,
         detour: NDArray[np.floating[Any]],
-        curvature: NDArray[np.float64],
+        curvature: Floats,
     ) -> NDArray[np.floating[Any]]:
         r"""Lobe times strength.
 
@@ -106,7 +107,7 @@ def reflection(material: Material, frequency: ArrayLike, *, speed_of_sound: floa
     """Return a material's values at frequencies (F,) in Hz, straight over their logarithm."""
     wanted, nodes = np.log(np.asarray(frequency)), np.log(material.frequency)
 
-    def at(*curves: tuple[float, ...] | None) -> NDArray[np.float64]:
+    def at(*curves: tuple[float, ...] | None) -> Floats:
         given = next((curve for curve in curves if curve is not None), (0.0,) * len(nodes))
         return np.interp(wanted, nodes, given)
 
@@ -123,9 +124,7 @@ def reflection(material: Material, frequency: ArrayLike, *, speed_of_sound: floa
     )
 
 
-def unfaded(
-    frequency: NDArray[np.float64], *, speed_of_sound: float
-) -> tuple[NDArray[np.float64], NDArray[np.complex128]]:
+def unfaded(frequency: Floats, *, speed_of_sound: float) -> tuple[Floats, Complexes]:
     r"""Return the fade of smooth surfaces, and what makes good for it.
 
     Faded, Kirchhoff's integral over the Fresnel zones is
@@ -145,7 +144,7 @@ def unfaded(
     return 2.0 * math.pi / speed_of_sound * faded, gain
 
 
-def coarse_gain(bend: NDArray[np.float32]) -> NDArray[np.float32]:
+def coarse_gain(bend: Singles) -> Singles:
     r"""Make good what a smooth surface loses, on average, to cells that are too coarse.
 
     A cell is laid into time bins as wide as its paths are spread, by the slope of the path over it
@@ -163,11 +162,11 @@ def coarse_gain(bend: NDArray[np.float32]) -> NDArray[np.float32]:
     b = np.minimum(bend, np.float32(COARSEST))
     fade = np.square(np.float32(FADE) + b / np.float32(12.0)) + np.float32(1.0)
     fade /= np.float32(FADE**2 + 1.0)
-    gain: NDArray[np.float32] = np.sqrt(fade) * np.exp(np.square(b) / np.float32(720.0))
+    gain: Singles = np.sqrt(fade) * np.exp(np.square(b) / np.float32(720.0))
     return gain
 
 
-def mirror(directions: NDArray[np.float64], normals: NDArray[np.float64]) -> NDArray[np.float64]:
+def mirror(directions: Floats, normals: Floats) -> Floats:
     """Mirror directions about planes.
 
     Args:
@@ -178,11 +177,11 @@ def mirror(directions: NDArray[np.float64], normals: NDArray[np.float64]) -> NDA
         mirrored (N, 3): Unit vectors.
     """
     along = np.einsum("nd,nd->n", directions, normals)
-    mirrored: NDArray[np.float64] = directions - (2.0 * along)[:, None] * normals
+    mirrored: Floats = directions - (2.0 * along)[:, None] * normals
     return mirrored
 
 
-def keep_outside(directions: NDArray[np.float64], flat: NDArray[np.float64]) -> NDArray[np.float64]:
+def keep_outside(directions: Floats, flat: Floats) -> Floats:
     """Turn directions that run into the surface so far that they graze it.
 
     A mirror direction about a smooth normal may point into the flat triangle that was hit.
@@ -202,9 +201,7 @@ def keep_outside(directions: NDArray[np.float64], flat: NDArray[np.float64]) -> 
     return turned
 
 
-def lobe_exponent(
-    cosine: NDArray[np.float64], lobe_width: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def lobe_exponent(cosine: Floats, lobe_width: Floats) -> Floats:
     """Logarithm of the lobe, ``-theta**2 / (2 w**2)``.
 
     Args:

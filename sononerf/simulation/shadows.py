@@ -12,6 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from sononerf.array_types import Bools, Complexes, Floats, Ints
 from sononerf.geometry.normals import CREASE, bodies, corner_normals, weight_gradients
 from sononerf.geometry.raycast import Hits, RayCaster
 from sononerf.simulation.audibility import RESOLVED_FREQUENCY
@@ -38,11 +39,11 @@ class Outlines:
         _, first, count = np.unique(used, axis=0, return_index=True, return_counts=True)
         rim = first[count == 1]
         owner = np.asarray(mesh.edges_face, dtype=np.int64)[rim]
-        self.body: NDArray[np.int64] = bodies(mesh)
+        self.body: Ints = bodies(mesh)
         parts = int(self.body.max()) + 1
         is_open = np.zeros(parts, dtype=bool)
         is_open[self.body[owner]] = True
-        self.closed: NDArray[np.bool_] = ~is_open[self.body]
+        self.closed: Bools = ~is_open[self.body]
         ends = np.concatenate([np.asarray(mesh.face_adjacency_edges).reshape(-1, 2), used[rim]])
         self._normals = np.asarray(mesh.face_normals, dtype=np.float64)
         self._height = np.einsum("td,td->t", self._normals, vertices[faces[:, 0]])
@@ -63,9 +64,7 @@ class Outlines:
         )
         self.several = parts > 1 or bool(is_open.any()) or not mesh.is_convex
 
-    def seen_from(
-        self, place: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+    def seen_from(self, place: Floats) -> tuple[Floats, Floats, Ints, Floats]:
         """Return outline edges as seen from a place.
 
         Returns:
@@ -97,9 +96,7 @@ class Outlines:
         radius[self._sharp[chosen]] = 0.0
         return ends, away / np.maximum(length, 1e-300), self.body[facing], radius
 
-    def _radius(
-        self, one: NDArray[np.int64], two: NDArray[np.int64], along: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _radius(self, one: Ints, two: Ints, along: Floats) -> Floats:
         """Radius of curvature along a direction, the mean of two triangles."""
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
         bend = np.zeros(len(one))
@@ -134,11 +131,11 @@ LIT, SHADED = 1.2, 1.8
 
 @dataclass(frozen=True, eq=False)
 class _Pieces:
-    middle: NDArray[np.float64]
-    along: NDArray[np.float64]
-    behind: NDArray[np.float64]
-    body: NDArray[np.int64]
-    curve: NDArray[np.float64]
+    middle: Floats
+    along: Floats
+    behind: Floats
+    body: Ints
+    curve: Floats
 
 
 class Shadow:
@@ -181,9 +178,9 @@ class Shadow:
         self,
         outlines: Outlines,
         caster: RayCaster,
-        place: NDArray[np.float64],
+        place: Floats,
         *,
-        wavenumber: NDArray[np.float64],
+        wavenumber: Floats,
         speed_of_sound: float,
         size: float,
     ) -> None:
@@ -249,7 +246,7 @@ class Shadow:
         count = group.max() + 1
         weight = np.maximum(np.bincount(group, length, count), 1e-300)
 
-        def total(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        def total(values: Floats) -> Floats:
             return np.stack([np.bincount(group, column, count) for column in values.T], axis=1)
 
         middle = total(middle * length[:, None]) / weight[:, None]
@@ -260,14 +257,14 @@ class Shadow:
         curve = np.bincount(group, curve * length, count) / weight
         return _Pieces(middle, total(along), least, of, curve)
 
-    def _key(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
+    def _key(self, points: Floats) -> Ints:
         at = ((points - self._low) * (1.0 / self._cell)).astype(np.int64)
         np.clip(at, 0, self._shape - 1, out=at)
-        key: NDArray[np.int64] = (at[:, 0] * self._shape[1] + at[:, 1]) * self._shape[2] + at[:, 2]
+        key: Ints = (at[:, 0] * self._shape[1] + at[:, 1]) * self._shape[2] + at[:, 2]
         return key
 
     def passed(
-        self, points: NDArray[np.float64], triangle: NDArray[np.int64]
+        self, points: Floats, triangle: Ints
     ) -> tuple[NDArray[np.int32], NDArray[np.complex64]]:
         """Return the row (N,) of each point in a table (C, F) of what passes; -1: no outline near.
 
@@ -282,7 +279,7 @@ class Shadow:
         new = np.flatnonzero(row == UNKNOWN)
         if len(new):
             count: NDArray[Any]
-            middle: NDArray[np.float64]
+            middle: Floats
             keys, first, of = np.unique(key[new], return_index=True, return_inverse=True)
             count = np.bincount(of)
             middle = np.stack([np.bincount(of, column) / count for column in points[new].T], axis=1)
@@ -296,16 +293,14 @@ class Shadow:
         """Whether nothing throws a shadow on anything."""
         return self._pieces is None
 
-    def level(
-        self, points: NDArray[np.float64], triangle: NDArray[np.int64]
-    ) -> NDArray[np.float64]:
+    def level(self, points: Floats, triangle: Ints) -> Floats:
         """Return the most that passes (N,) at any frequency to points in the shadow."""
         row, table = self.passed(points, triangle)
         most = np.append(np.abs(table).max(axis=1, initial=0.0), 0.0)
-        level: NDArray[np.float64] = most[row]
+        level: Floats = most[row]
         return level
 
-    def _solve(self, points: NDArray[np.float64], body: NDArray[np.int64]) -> NDArray[np.int32]:
+    def _solve(self, points: Floats, body: Ints) -> NDArray[np.int32]:
         pieces = self._pieces
         assert pieces is not None
         way = points - self._place
@@ -358,10 +353,10 @@ class Shadow:
         size = len(used) * len(self._turns)
         at = point * len(self._turns) + index
 
-        def lay(weight: NDArray[np.float64]) -> NDArray[np.float64]:
+        def lay(weight: Floats) -> Floats:
             laid: NDArray[Any] = np.bincount(at, weight * (1.0 - share), size)
             laid += np.bincount(at + 1, weight * share, size)
-            table: NDArray[np.float64] = laid.reshape(len(used), -1)
+            table: Floats = laid.reshape(len(used), -1)
             return table
 
         lit = self._caster.visible(points[used] - self._cell * way[used], self._place)
@@ -383,18 +378,18 @@ class Shadow:
         return rows
 
 
-def _product(real: NDArray[np.float64], factor: NDArray[np.complex128]) -> NDArray[np.complex128]:
+def _product(real: Floats, factor: Complexes) -> Complexes:
     """Multiply a real matrix by a complex one, without making the real one complex."""
-    product: NDArray[np.complex128] = (real @ factor.view(np.float64)).view(np.complex128)
+    product: Complexes = (real @ factor.view(np.float64)).view(np.complex128)
     return product
 
 
 def behind(
-    caster: RayCaster, outlines: Outlines, hits: Hits, directions: NDArray[np.float64]
-) -> tuple[Hits, NDArray[np.float64]]:
+    caster: RayCaster, outlines: Outlines, hits: Hits, directions: Floats
+) -> tuple[Hits, Floats]:
     """Return what rays would hit beyond the first obstacle, and the whole ways (M,) there, m."""
     ray, points, length = hits.ray, hits.points, hits.distance
-    found: list[tuple[Hits, NDArray[np.float64]]] = []
+    found: list[tuple[Hits, Floats]] = []
     for _ in range(LAYERS):
         along = directions.take(ray, axis=0)
         further = caster.first_hit(points + caster.lift * along, along)
@@ -423,7 +418,7 @@ def behind(
     return joined, np.concatenate([way for _, way in hidden])
 
 
-def _chosen(hits: Hits, kept: NDArray[np.int64], ray: NDArray[np.int64]) -> Hits:
+def _chosen(hits: Hits, kept: Ints, ray: Ints) -> Hits:
     return Hits(
         ray[kept],
         hits.points[kept],

@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from sononerf.array_types import Floats, Singles
 from sononerf.errors import InputError
 from sononerf.geometry.poses import (
     Poses,
@@ -112,8 +113,8 @@ class Simulator:
 
     def prepare(
         self,
-        positions: NDArray[np.float64],
-        rotations: NDArray[np.float64],
+        positions: Floats,
+        rotations: Floats,
         progress: Progress,
     ) -> None:
         """Let the engine do its work for all poses at once, and show how far it is.
@@ -127,17 +128,13 @@ class Simulator:
             with progress.task("solving", self.engine.parts) as task:
                 self.engine.prepare(positions, rotations, lambda *_: task.advance())
 
-    def hits(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def hits(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
         """Places (N, 3) that send sound straight back, m, and how much (N,), dB below the most."""
         points, strength = self.engine.hits(position, rotation, seed=seed)
         loudest = max(float(strength.max(initial=0.0)), 1e-300)
         return points, 20.0 * np.log10(np.maximum(strength / loudest, 1e-10))
 
-    def echo(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
-    ) -> NDArray[np.float64]:
+    def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
         """Pressure at both ears for an impulse; see :meth:`Engine.echo`.
 
         Engines that solve the wave equation hear with the head as it is; of the others nothing is
@@ -152,9 +149,7 @@ class Simulator:
         rate = engine.hearing.synthesis.sampling_rate
         return silence_before(echo, first, sampling_rate=rate)
 
-    def spectrogram(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
-    ) -> NDArray[np.float32]:
+    def spectrogram(self, position: Floats, rotation: Floats, *, seed: int) -> Singles:
         """Magnitude of what both ears hear, over range and frequency.
 
         Position, rotation and seed are those of :meth:`Engine.echo`.
@@ -164,9 +159,7 @@ class Simulator:
         """
         return self.receive(position, rotation, seed=seed)[1].astype(np.float32)
 
-    def receive(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def receive(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
         """Return what both ears hear of the call, noise included, and its spectrogram.
 
         Position, rotation and seed are those of :meth:`Engine.echo`.

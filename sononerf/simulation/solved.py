@@ -11,8 +11,8 @@ from typing import ClassVar
 
 import numpy as np
 import scipy.fft
-from numpy.typing import NDArray
 
+from sononerf.array_types import Complexes, Floats, Ints, Singles
 from sononerf.errors import ResourceError
 from sononerf.head.ears import Ears, beam_gain, ear_gain
 from sononerf.memory import available_memory
@@ -41,38 +41,36 @@ class Heads:
         gains: Tables of one frequency.
     """
 
-    emitters: NDArray[np.float64]
-    ears: NDArray[np.float64]
-    rotations: NDArray[np.float64]
+    emitters: Floats
+    ears: Floats
+    rotations: Floats
     gains: Ears
 
     def __len__(self) -> int:
         """How many poses there are, P."""
         return len(self.emitters)
 
-    def __getitem__(self, some: slice | NDArray[np.int64]) -> Heads:
+    def __getitem__(self, some: slice | Ints) -> Heads:
         """Return some of the poses."""
         return Heads(self.emitters[some], self.ears[some], self.rotations[some], self.gains)
 
-    def beam(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def beam(self, points: Floats) -> Floats:
         """Return the gains (P, N) of the emission towards points (N, 3) of the world, m."""
         towards = self._towards(points, self.emitters)
         return _by_pose(beam_gain(self.gains, towards), len(self))
 
-    def gain(self, ear: int, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    def gain(self, ear: int, points: Floats) -> Floats:
         """Return the gains (P, N) of an ear for sound from points (N, 3) of the world, m."""
         towards = self._towards(points, self.ears[:, ear])
         return _by_pose(ear_gain(self.gains, ear, towards), len(self))
 
-    def _towards(
-        self, points: NDArray[np.float64], places: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _towards(self, points: Floats, places: Floats) -> Floats:
         """Return the ways from places (P, 3) to points in the head frame (P N, 3), m."""
         ways = (points[None] - places[:, None]) @ self.rotations
         return ways.reshape(-1, 3)
 
 
-def _by_pose(gain: NDArray[np.float32], poses: int) -> NDArray[np.float64]:
+def _by_pose(gain: Singles, poses: int) -> Floats:
     return gain.reshape(poses, -1).astype(np.float64)
 
 
@@ -129,8 +127,8 @@ class Solved(Engine):
         step = rate / self.period
         # At the highest of them the taper is zero already; it is not solved for.
         count = math.ceil(self.frequency_max / step) - 1
-        self.frequency: NDArray[np.float64] = np.arange(1.0, count + 0.5) * step
-        self._known: dict[bytes, tuple[NDArray[np.int64], NDArray[np.float64]]] = {}
+        self.frequency: Floats = np.arange(1.0, count + 0.5) * step
+        self._known: dict[bytes, tuple[Ints, Floats]] = {}
 
     @property
     def parts(self) -> int:
@@ -145,7 +143,7 @@ class Solved(Engine):
         del poses
         return 0.0, 0.0
 
-    def respond(self, wavenumber: complex, poses: Heads) -> NDArray[np.complex128]:
+    def respond(self, wavenumber: complex, poses: Heads) -> Complexes:
         """Scattered pressure at the ears at one frequency.
 
         Args:
@@ -160,8 +158,8 @@ class Solved(Engine):
 
     def prepare(
         self,
-        positions: NDArray[np.float64],
-        rotations: NDArray[np.float64],
+        positions: Floats,
+        rotations: Floats,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
         """Solve for all poses that are not known yet, and keep their responses.
@@ -202,20 +200,20 @@ class Solved(Engine):
         for key, begins, pressure in zip(wanted, start, response, strict=True):
             self._known[key] = begins, pressure
 
-    def taper(self, frequency: NDArray[np.float64]) -> NDArray[np.float64]:
+    def taper(self, frequency: Floats) -> Floats:
         """Return what is left of the response (K,) at frequencies (K,) in Hz."""
         band = self.frequency_max - self.frequency_full
         fall = np.clip((frequency - self.frequency_full) / band, 0.0, 1.0)
-        left: NDArray[np.float64] = 0.5 * (1.0 + np.cos(np.pi * fall))
+        left: Floats = 0.5 * (1.0 + np.cos(np.pi * fall))
         return left
 
     def echo(
         self,
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
+        position: Floats,
+        rotation: Floats,
         *,
         seed: int,  # noqa: ARG002  (nothing is random)
-    ) -> NDArray[np.float64]:
+    ) -> Floats:
         """Pressure at both ears; see :meth:`Engine.echo`. A pose not prepared is solved alone."""
         if not (np.isfinite(position).all() and np.isfinite(rotation).all()):
             raise ValueError("the pose is no finite number")
@@ -227,9 +225,7 @@ class Solved(Engine):
             row[low:high] = pressure[low - begins : high - begins]
         return record
 
-    def hits(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64], *, seed: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def hits(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
         """Places that send sound straight back by physical optics; see :meth:`Kirchhoff.hits`."""
         optics = Kirchhoff(self.scene, self.hearing, frequency_max=self.frequency_full)
         return optics.hits(position, rotation, seed=seed)
@@ -249,6 +245,6 @@ class Solved(Engine):
             raise ResourceError(f"{asked}{seconds / 86_400.0:.2g} days of computation; {less}")
 
 
-def _key(position: NDArray[np.float64], rotation: NDArray[np.float64]) -> bytes:
+def _key(position: Floats, rotation: Floats) -> bytes:
     parts = (np.ascontiguousarray(part, dtype=np.float64) for part in (position, rotation))
     return b"".join(part.tobytes() for part in parts)

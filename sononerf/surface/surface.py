@@ -12,6 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from sononerf.array_types import Bools, Floats
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.region import ENOUGH
 from sononerf.geometry.raycast import RayCaster
@@ -95,7 +96,6 @@ def finished_surface(
     )
 
 
-Array = NDArray[np.float64]
 FACING = 0.1
 """Least cosine between a triangle's normal and the way to a pose that it faces."""
 UNSEEN_SHARE = 0.25
@@ -118,7 +118,7 @@ class Openness:
             close behind it.
     """
 
-    unseen: NDArray[np.bool_]
+    unseen: Bools
     unseen_share: float
     thin_share: float
 
@@ -130,7 +130,7 @@ class Openness:
         return "sheet" if self.thin_share > THIN_SHARE else "closed"
 
 
-def judge_openness(mesh: trimesh.Trimesh, sources: Array, *, resolution: float) -> Openness:
+def judge_openness(mesh: trimesh.Trimesh, sources: Floats, *, resolution: float) -> Openness:
     """Tell a body's skin from an open surface.
 
     Args:
@@ -150,7 +150,7 @@ def judge_openness(mesh: trimesh.Trimesh, sources: Array, *, resolution: float) 
     return Openness(unseen, float(areas[unseen].sum() / total), float(areas[thin].sum() / total))
 
 
-def _seen(caster: RayCaster, middles: Array, normals: Array, sources: Array) -> NDArray[np.bool_]:
+def _seen(caster: RayCaster, middles: Floats, normals: Floats, sources: Floats) -> Bools:
     seen = np.zeros(len(middles), dtype=bool)
     for start in range(0, len(middles), _CHUNK):
         some = slice(start, start + _CHUNK)
@@ -173,7 +173,7 @@ def _seen(caster: RayCaster, middles: Array, normals: Array, sources: Array) -> 
 
 def known_part(
     mesh: trimesh.Trimesh, heard: NDArray[np.int32], hull: EchoHull, *, resolution: float
-) -> NDArray[np.bool_]:
+) -> Bools:
     """Tell which part of a surface that was heard from one side is known.
 
     That is what two poses heard. Between such places a triangle is also known if it lies where the
@@ -206,7 +206,7 @@ def known_part(
     return np.asarray(enough[mesh.faces].any(axis=1) | (between & bounded))
 
 
-def leaving_out(openness: Openness, unknown: NDArray[np.bool_], areas: Array) -> Openness:
+def leaving_out(openness: Openness, unknown: Bools, areas: Floats) -> Openness:
     """Return the openness with triangles (T,) of these areas among the unseen ones."""
     unseen = openness.unseen | unknown
     share = float(areas[unseen].sum() / areas.sum())

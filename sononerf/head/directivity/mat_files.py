@@ -24,6 +24,7 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.head.directivity.record import Directivity, unit_vectors
 
@@ -33,7 +34,6 @@ NUMERIC_CLASSES = {
     *(f"{sign}int{bits}".encode() for sign in ("", "u") for bits in (8, 16, 32, 64)),
 }  # fmt: skip
 
-Array = NDArray[np.float64]
 Field = Callable[[str], NDArray[Any] | None]
 """Takes a dotted name inside the file; returns numbers as MATLAB has them, or None."""
 
@@ -136,7 +136,7 @@ def _layout(path: Path, field: Field, structs: list[str]) -> Directivity:
     sizes = (len(azimuth), len(elevation))
     shape = (*(sizes if order.startswith("azimuth") else sizes[::-1]), len(frequency))
 
-    def gain(name: str, values: NDArray[Any]) -> Array:
+    def gain(name: str, values: NDArray[Any]) -> Floats:
         if [size for size in values.shape if size > 1] != [size for size in shape if size > 1]:
             raise InputError(
                 f"{path}: {struct}.{name} has the shape {values.shape}, expected {shape} "

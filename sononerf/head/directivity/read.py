@@ -10,16 +10,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.head.directivity.record import MOST_RECEIVERS, Directivity, unit_vectors
 
 MOST_BYTES = 500_000_000
 ANGLES = ("azimuth_deg", "elevation_deg")
 EMITTER = -1
-
-Array = NDArray[np.float64]
 
 
 def read_csv(path: Path) -> Directivity:
@@ -43,7 +41,7 @@ def read_csv(path: Path) -> Directivity:
         ) from None
 
 
-def _rows(path: Path, lines: Any) -> Array:
+def _rows(path: Path, lines: Any) -> Floats:
     """Return receiver, azimuth, elevation, frequency, linear gain (N, 5)."""
     names = [name.strip().lower() for name in next(lines, [])]
     missing = [name for name in (*ANGLES, "frequency_hz") if name not in names]
@@ -86,7 +84,7 @@ def _receiver(text: str) -> int:
     return int(text)
 
 
-def _table(path: Path, rows: NDArray[np.float64]) -> Directivity:
+def _table(path: Path, rows: Floats) -> Directivity:
     if not len(rows):
         raise InputError(f"{path}: holds no gains")
     receivers, which = np.unique(rows[:, 0], return_inverse=True)

@@ -7,10 +7,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_sphere
 
@@ -30,10 +30,8 @@ EDGE = 1e-9  # weight of a corner; below minus this a direction lies beyond the 
 NEAR = 24  # triangles that are tried for a direction before all are
 CHUNK = 512
 
-Array = NDArray[np.float64]
 
-
-def interpolation(known: Array, wanted: Array) -> csr_array:
+def interpolation(known: Floats, wanted: Floats) -> csr_array:
     """Return weights that bring values from known directions to wanted ones.
 
     Directions are triangulated on the sphere. Within a triangle values are linear, so that measured
@@ -74,13 +72,13 @@ def interpolation(known: Array, wanted: Array) -> csr_array:
     return csr_array((values, (rows, columns)), shape=(len(wanted), len(points))) @ merge
 
 
-def _hull(points: Array) -> NDArray[np.int64]:
+def _hull(points: Floats) -> Ints:
     x, y, z = points.T
     radius = 1.0 + BULGE * (x * y + 0.7 * y * z + 0.4 * z * x + 0.3 * x * x + 0.1 * y * y)
     return np.asarray(ConvexHull(points * radius[:, None]).simplices, dtype=np.int64)
 
 
-def _radius(points: Array, triangles: NDArray[np.int64]) -> Array:
+def _radius(points: Floats, triangles: Ints) -> Floats:
     """Return the angle from the centre of each circumscribed circle to its corners, rad."""
     a, b, c = (points[triangles[:, corner]] for corner in range(3))
     normal = np.cross(b - a, c - a)
@@ -88,7 +86,7 @@ def _radius(points: Array, triangles: NDArray[np.int64]) -> Array:
     return np.asarray(np.arccos(np.clip(np.abs((normal * a).sum(axis=1)), 0.0, 1.0)))
 
 
-def _spacing(points: Array) -> float:
+def _spacing(points: Floats) -> float:
     """Return the usual radius of the circles that hold no measured direction, rad."""
     try:
         radius = float(np.median(_radius(points, _hull(points))))
@@ -100,15 +98,13 @@ def _spacing(points: Array) -> float:
     return min(max(radius, LEAST_SPACING), MOST_SPACING)
 
 
-def _locate(
-    points: Array, triangles: NDArray[np.int64], first: NDArray[np.bool_], wanted: Array
-) -> tuple[NDArray[np.int64], Array]:
+def _locate(points: Floats, triangles: Ints, first: Bools, wanted: Floats) -> tuple[Ints, Floats]:
     """Return the triangle that each direction runs through, and the weights (N, 3) of its corners.
 
     The triangles enclose the origin. On the edge of two of them, those that come ``first`` count.
     """
 
-    def best(inside: Array, of: NDArray[np.int64]) -> NDArray[np.int64]:
+    def best(inside: Floats, of: Ints) -> Ints:
         least = inside.min(axis=2)
         return np.asarray(np.where(least > -EDGE, 1.0 + first[of], least).argmax(axis=1))
 
@@ -133,7 +129,7 @@ def _locate(
     return found, weights / weights.sum(axis=1, keepdims=True)
 
 
-def _portions(missed: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+def _portions(missed: Ints) -> tuple[Ints, int]:
     return missed, max(1, math.ceil(len(missed) / 64))
 
 
@@ -158,15 +154,15 @@ class Directivity:
     """
 
     source: str
-    directions: Array
-    frequency: Array
-    gains: Array
-    beam: Array | None = None
-    places: Array | None = None
+    directions: Floats
+    frequency: Floats
+    gains: Floats
+    beam: Floats | None = None
+    places: Floats | None = None
 
     def __post_init__(self) -> None:
         self._check_shapes()
-        named: dict[str, Array] = {
+        named: dict[str, Floats] = {
             "frequencies": self.frequency,
             "directions": self.directions,
             "gains": self.gains,
@@ -216,7 +212,7 @@ class Directivity:
                 f"{self.source}: states {len(self.places)} places of {receivers} receivers"
             )
 
-    def weights(self, directions: Array) -> csr_array:
+    def weights(self, directions: Floats) -> csr_array:
         """Return the weights (N, M) that bring gains to directions (N, 3); rows sum to 1 or less.
 
         Linear between measured directions; outside the measured area the nearest measured gain
@@ -224,7 +220,7 @@ class Directivity:
         """
         return interpolation(self.directions, directions)
 
-    def at(self, frequency: Array, values: Array) -> Array:
+    def at(self, frequency: Floats, values: Floats) -> Floats:
         """Return gains (..., M, F) at other frequencies (K,), (..., M, K).
 
         Linear between measured frequencies; outside of them the nearest measured one counts.
@@ -235,11 +231,11 @@ class Directivity:
             return np.repeat(values, len(frequency), axis=-1)
         left = right - 1
         part = ((frequency - known[left]) / (known[right] - known[left])).clip(0.0, 1.0)
-        found: Array = values[..., left] * (1.0 - part) + values[..., right] * part
+        found: Floats = values[..., left] * (1.0 - part) + values[..., right] * part
         return found
 
 
-def unit_vectors(azimuth: Array, elevation: Array) -> Array:
+def unit_vectors(azimuth: Floats, elevation: Floats) -> Floats:
     """Return unit vectors (..., 3) of azimuths (to the left) and elevations (up), rad.
 
     The two are broadcast against each other.

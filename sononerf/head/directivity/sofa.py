@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf import __version__, storage
+from sononerf.array_types import Floats, Singles
 from sononerf.errors import InputError
 from sononerf.head.directivity.mat_files import find, numbers, opened, text
 from sononerf.head.directivity.record import Directivity, unit_vectors
@@ -28,8 +29,6 @@ EMITTER = "emitter"
 """A receiver of this description in a file of ours holds the gain of the emitter."""
 METRES = ("", "m", "metre", "meter", "metres", "meters")
 DEGREES = ("", "degree", "degrees", "deg")
-
-Array = NDArray[np.float64]
 
 
 def read_sofa(path: Path) -> Directivity:
@@ -62,7 +61,7 @@ def read_sofa(path: Path) -> Directivity:
         return _receivers(file, path, frequency, gains)
 
 
-def _spectrum(file: h5py.File, path: Path) -> tuple[Array, Array]:
+def _spectrum(file: h5py.File, path: Path) -> tuple[Floats, Floats]:
     """Return frequencies (F,) and magnitudes (M, R, F)."""
     if find(file, "Data.IR") is None:
         real, imaginary = numbers(file, "Data.Real"), numbers(file, "Data.Imag")
@@ -71,7 +70,7 @@ def _spectrum(file: h5py.File, path: Path) -> tuple[Array, Array]:
                 f"{path}: Data.Real and Data.Imag differ in shape: {real.shape}, {imaginary.shape}"
             )
         pressure = real + 1j * imaginary
-        frequency: Array = numbers(file, "N").astype(np.float64).reshape(-1)
+        frequency: Floats = numbers(file, "N").astype(np.float64).reshape(-1)
     else:
         response = numbers(file, "Data.IR").astype(np.float64)
         rate = float(numbers(file, "Data.SamplingRate").reshape(-1)[0])
@@ -89,13 +88,13 @@ def _spectrum(file: h5py.File, path: Path) -> tuple[Array, Array]:
     return frequency, np.abs(pressure)
 
 
-def _receivers(file: h5py.File, path: Path, frequency: Array, gains: Array) -> Directivity:
+def _receivers(file: h5py.File, path: Path, frequency: Floats, gains: Floats) -> Directivity:
     measurements, receivers = gains.shape[:2]
     source = _position(file, "SourcePosition", path, rows=measurements)
     listener = _position(file, "ListenerPosition", path, rows=measurements)
     frame = _frame(file, "Listener", path, rows=measurements)
     directions = _units(np.einsum("mij,mj->mi", frame, source - listener), path)
-    places: Array | None = _position(file, "ReceiverPosition", path, rows=receivers)
+    places: Floats | None = _position(file, "ReceiverPosition", path, rows=receivers)
     emitting = [n for n, name in enumerate(_names(file, receivers)) if name == EMITTER]
     hearing = [number for number in range(receivers) if number not in emitting]
     assert places is not None
@@ -112,7 +111,7 @@ def _receivers(file: h5py.File, path: Path, frequency: Array, gains: Array) -> D
     )
 
 
-def _transducer(file: h5py.File, path: Path, frequency: Array, gains: Array) -> Directivity:
+def _transducer(file: h5py.File, path: Path, frequency: Floats, gains: Floats) -> Directivity:
     if len(gains) != 1:
         raise InputError(f"{path}: holds {len(gains)} measurements of a transducer, expected 1")
     receivers = _position(file, "ReceiverPosition", path, rows=gains.shape[1])
@@ -123,7 +122,7 @@ def _transducer(file: h5py.File, path: Path, frequency: Array, gains: Array) -> 
     return Directivity(str(path), directions, frequency, gains, beam=gains[0])
 
 
-def _position(file: h5py.File, name: str, path: Path, *, rows: int) -> Array:
+def _position(file: h5py.File, name: str, path: Path, *, rows: int) -> Floats:
     """Return a position or direction (rows, 3) in metres; one row in the file stands for all."""
     values = numbers(file, name).astype(np.float64)
     if values.ndim == 3 and values.shape[2] == 1:
@@ -144,7 +143,7 @@ def _position(file: h5py.File, name: str, path: Path, *, rows: int) -> Array:
     return np.repeat(values, rows, axis=0) if len(values) == 1 else values
 
 
-def _frame(file: h5py.File, whose: str, path: Path, *, rows: int) -> Array:
+def _frame(file: h5py.File, whose: str, path: Path, *, rows: int) -> Floats:
     """Return matrices (rows, 3, 3) from the world to where a listener or source looks."""
     if find(file, f"{whose}View") is None or find(file, f"{whose}Up") is None:
         return np.tile(np.eye(3), (rows, 1, 1))
@@ -154,7 +153,7 @@ def _frame(file: h5py.File, whose: str, path: Path, *, rows: int) -> Array:
     return np.stack([view, side, np.cross(view, side)], axis=1)
 
 
-def _units(vectors: Array, path: Path) -> Array:
+def _units(vectors: Floats, path: Path) -> Floats:
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     if not np.isfinite(vectors).all() or not (length > 1e-9).all():
         raise InputError(f"{path}: a position or view gives no direction (zero, NaN or infinite)")
@@ -186,7 +185,7 @@ def directivity_of(ears: Ears, *, source: str = "settings") -> Directivity:
     """
     directions = ears.directions[:, :-1].reshape(-1, 3)
 
-    def rows(table: NDArray[np.float32]) -> NDArray[np.float64]:
+    def rows(table: Singles) -> Floats:
         part = table[..., :-1].astype(np.float64)
         return np.moveaxis(part.reshape(*part.shape[:-2], -1), -1, -2)
 

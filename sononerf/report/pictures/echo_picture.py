@@ -10,6 +10,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
 from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
 from sononerf.report.pictures.mesh_picture import INK, draw_scale_bar, oversampled
@@ -137,9 +138,7 @@ def _draw_view(part: Any, view: NDArray[np.uint8], count: int, drawn: int, unhit
     bar.set_label("strength of a hit (dB below the loudest)")
 
 
-def _draw_waves(
-    axes: Any, distance: NDArray[np.float64], waves: NDArray[np.float64], names: list[str]
-) -> None:
+def _draw_waves(axes: Any, distance: Floats, waves: Floats, names: list[str]) -> None:
     # A number that is easy to read, and its power of ten in the label.
     top = float(np.abs(waves).max())
     power = int(np.floor(np.log10(top))) if top > 0.0 else 0
@@ -154,9 +153,9 @@ def _draw_waves(
 def _draw_spectrograms(
     part: Any,
     axes: Any,
-    sounds: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-    frequencies: NDArray[np.float64],
+    sounds: Floats,
+    ranges: Floats,
+    frequencies: Floats,
     names: list[str],
 ) -> None:
     top = max(5.0, float(np.ceil(sounds.max() / 5.0)) * 5.0)
@@ -185,10 +184,10 @@ def _add_time_axis(panel: Any, speed_of_sound: float) -> None:
 
 def hits_image(
     mesh: trimesh.Trimesh,
-    points: NDArray[np.float64],
-    relative_db: NDArray[np.float64],
-    position: NDArray[np.float64],
-    rotation: NDArray[np.float64],
+    points: Floats,
+    relative_db: Floats,
+    position: Floats,
+    rotation: Floats,
     *,
     receivers: int = 2,
     size: tuple[int, int] = SIZE,
@@ -229,7 +228,7 @@ def hits_image(
     return np.asarray(done)
 
 
-def _over_shoulder(away: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
+def _over_shoulder(away: Floats, radius: float) -> Floats:
     """Return a view along which a head stands beside the scene that it looks at."""
     level, distance = float(np.hypot(away[0], away[1])), float(np.linalg.norm(away))
     aside = np.arcsin(np.clip(1.2 * radius / max(distance, 1e-9), LEAST_ASIDE, MOST_ASIDE))
@@ -241,11 +240,11 @@ def _over_shoulder(away: NDArray[np.float64], radius: float) -> NDArray[np.float
 
 
 def _draw_hits(
-    pixels: NDArray[np.float64],
-    nearness: NDArray[np.float64],
+    pixels: Floats,
+    nearness: Floats,
     camera: Camera,
-    points: NDArray[np.float64],
-    relative_db: NDArray[np.float64],
+    points: Floats,
+    relative_db: Floats,
     scale: float,
 ) -> None:
     from matplotlib import colormaps
@@ -276,8 +275,8 @@ def _draw_hits(
 def _draw_head(
     picture: Image.Image,
     camera: Camera,
-    position: NDArray[np.float64],
-    rotation: NDArray[np.float64],
+    position: Floats,
+    rotation: Floats,
     *,
     ears: bool,
 ) -> None:
@@ -315,7 +314,7 @@ def _draw_head(
 
 
 def _disc(
-    draw: ImageDraw.ImageDraw, centre: NDArray[np.float64], radius: float, colour: tuple[int, ...]
+    draw: ImageDraw.ImageDraw, centre: Floats, radius: float, colour: tuple[int, ...]
 ) -> None:
     (x, y), r = centre, radius
     draw.ellipse([x - r, y - r, x + r, y + r], fill=colour)

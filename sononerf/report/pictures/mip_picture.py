@@ -9,6 +9,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
 from sononerf.evaluation.prediction import Comparison
 from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
@@ -25,7 +26,7 @@ Scale = Literal["db", "linear"]
 Extents = tuple[tuple[float, float], tuple[float, float]]
 
 
-def _scaled(projection: ArrayLike, scale: Scale) -> NDArray[np.float64]:
+def _scaled(projection: ArrayLike, scale: Scale) -> Floats:
     """Return decibels below the greatest value, or the values themselves from zero."""
     values = np.asarray(projection, dtype=np.float64)
     if values.ndim != 2 or not values.size:
@@ -37,11 +38,11 @@ def _scaled(projection: ArrayLike, scale: Scale) -> NDArray[np.float64]:
     top = float(values.max())
     if not top > 0:
         return np.full(values.shape, -RANGE_DB)
-    decibels: NDArray[np.float64] = 10 * np.log10(np.maximum(values / top, 10 ** (-RANGE_DB / 10)))
+    decibels: Floats = 10 * np.log10(np.maximum(values / top, 10 ** (-RANGE_DB / 10)))
     return decibels
 
 
-def _limits(values: NDArray[np.float64], scale: Scale) -> tuple[float, float]:
+def _limits(values: Floats, scale: Scale) -> tuple[float, float]:
     if scale == "db":
         return -RANGE_DB, 0.0
     top = float(values.max())

@@ -7,9 +7,10 @@ from itertools import combinations
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw, ImageFont
 
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.errors import NumericalError
 from sononerf.report.pictures.figure import png_from_pixels
 from sononerf.report.pictures.mesh_picture import INK, STEEL, draw_scale_bar, oversampled
@@ -90,7 +91,7 @@ def scene_png(
     return png_from_pixels(np.asarray(done))
 
 
-def _corners(lower: ArrayLike, upper: ArrayLike) -> NDArray[np.float64]:
+def _corners(lower: ArrayLike, upper: ArrayLike) -> Floats:
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     return np.array([np.where(choice, high, low) for choice in np.ndindex(2, 2, 2)])
 
@@ -98,11 +99,11 @@ def _corners(lower: ArrayLike, upper: ArrayLike) -> NDArray[np.float64]:
 def _draw_poses(
     picture: Image.Image,
     camera: Camera,
-    heads: NDArray[np.float64],
-    looks: NDArray[np.float64],
-    kinds: NDArray[np.int64],
-    nearness: NDArray[np.float64],
-    chosen: NDArray[np.bool_],
+    heads: Floats,
+    looks: Floats,
+    kinds: Ints,
+    nearness: Floats,
+    chosen: Bools,
 ) -> None:
     if not chosen.any():
         return
@@ -120,7 +121,7 @@ def _draw_poses(
         draw.ellipse([x - radius, y - radius, x + radius, y + radius], fill=colour)
 
 
-def _draw_box(picture: Image.Image, camera: Camera, corners: NDArray[np.float64]) -> None:
+def _draw_box(picture: Image.Image, camera: Camera, corners: Floats) -> None:
     if not len(corners):
         return
     draw = ImageDraw.Draw(picture)
@@ -146,9 +147,7 @@ def draw_axes(picture: Image.Image, camera: Camera) -> None:
         draw.text(tuple(label), "xyz"[axis], fill=colours[axis], font=font, anchor="mm")
 
 
-def _draw_caption(
-    picture: Image.Image, camera: Camera, count: int, kinds: NDArray[np.int64] | None
-) -> None:
+def _draw_caption(picture: Image.Image, camera: Camera, count: int, kinds: Ints | None) -> None:
     draw = ImageDraw.Draw(picture)
     size = max(12, camera.height // 36)
     font = ImageFont.load_default(size)

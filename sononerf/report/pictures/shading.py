@@ -10,6 +10,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
+from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
 from sononerf.geometry.raycast import RayCaster
 
@@ -33,13 +34,13 @@ class Camera:
         scale: Pixels per metre.
     """
 
-    axes: NDArray[np.float64]
-    centre: NDArray[np.float64]
+    axes: Floats
+    centre: Floats
     width: int
     height: int
     scale: float
 
-    def project(self, points: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def project(self, points: ArrayLike) -> tuple[Floats, Floats]:
         """Return pixels (..., 2), x to the right and y down, and nearness (...,) m."""
         local = (np.asarray(points, dtype=np.float64) - self.centre) @ self.axes.T
         x = self.width / 2 + self.scale * local[..., 1]
@@ -83,14 +84,14 @@ def camera_for(
     return Camera(axes, (low + high) / 2 @ axes, size[0], size[1], float(scale))
 
 
-def background(width: int, height: int) -> NDArray[np.float64]:
+def background(width: int, height: int) -> Floats:
     """Return a soft vertical gradient, (H, W, 3) in 0 to 1."""
     fall = np.linspace(0, 1, height)[:, None, None]
     top, bottom = np.array([0.985, 0.988, 0.992]), np.array([0.86, 0.875, 0.89])
     return np.broadcast_to(top + (bottom - top) * fall**1.5, (height, width, 3)).copy()
 
 
-def _lit(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+def _lit(normals: Floats) -> Floats:
     """Return the brightness of unit normals (N, 3) in the camera's frame."""
     brightness = AMBIENT + 0.10 * normals[:, 2]  # more light from the sky than from the ground
     for direction, strength in LIGHTS:
@@ -100,11 +101,11 @@ def _lit(normals: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def draw_mesh(
-    pixels: NDArray[np.float64],
+    pixels: Floats,
     mesh: trimesh.Trimesh,
     camera: Camera,
     colour: ArrayLike,
-) -> NDArray[np.float64]:
+) -> Floats:
     """Draw a mesh over pixels, in place.
 
     Args:
@@ -145,7 +146,7 @@ def draw_mesh(
     return image
 
 
-def _crevices(nearness: NDArray[np.float64]) -> NDArray[np.float64]:
+def _crevices(nearness: Floats) -> Floats:
     """Return how much light reaches each pixel: less where the surroundings stand nearer."""
     there = np.isfinite(nearness)
     if not there.any():
@@ -162,11 +163,11 @@ def _crevices(nearness: NDArray[np.float64]) -> NDArray[np.float64]:
         blurred, np.meshgrid(rows, columns, indexing="ij"), order=1, mode="nearest"
     )
     rise = (around - filled) / max(high - low, 1e-9)
-    light: NDArray[np.float64] = 1 - np.clip(1.6 * rise, -0.06, 0.30)
+    light: Floats = 1 - np.clip(1.6 * rise, -0.06, 0.30)
     return light
 
 
-def averaged(pixels: NDArray[np.float64], factor: int = OVERSAMPLING) -> NDArray[np.uint8]:
+def averaged(pixels: Floats, factor: int = OVERSAMPLING) -> NDArray[np.uint8]:
     """Average blocks of pixels (H, W, 3) in 0 to 1 into bytes."""
     height, width = pixels.shape[0] // factor, pixels.shape[1] // factor
     blocks = pixels[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)

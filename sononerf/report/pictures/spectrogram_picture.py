@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sononerf.array_types import Floats, Ints
 from sononerf.errors import NumericalError
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import ACTIVE_DB
@@ -56,7 +57,7 @@ def spectrogram_image(
     return _pixels(measured_db, predicted_db, range_m, frequency_hz, title, 90)
 
 
-def sounding_slice(spectrograms: NDArray[np.floating], range_m: NDArray[np.float64]) -> slice:
+def sounding_slice(spectrograms: NDArray[np.floating], range_m: Floats) -> slice:
     """Return the part of the range axis that sounds in any of (..., R, F), with a margin.
 
     All of it where nothing sounds.
@@ -76,7 +77,7 @@ def _checked(
     predicted_db: ArrayLike,
     range_m: ArrayLike,
     frequency_hz: ArrayLike,
-) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[dict[str, Floats], Floats, Floats]:
     ranges, frequencies = (np.asarray(a, dtype=np.float64) for a in (range_m, frequency_hz))
     given = {} if measured_db is None else {"measured": measured_db}
     levels = {
@@ -95,7 +96,7 @@ def _checked(
     return levels, ranges, frequencies
 
 
-def drawn_receivers(count: int, most: int = MOST_ROWS) -> tuple[NDArray[np.int64], list[str]]:
+def drawn_receivers(count: int, most: int = MOST_ROWS) -> tuple[Ints, list[str]]:
     """Return which receivers are drawn, evenly chosen, and their names.
 
     Args:
@@ -108,7 +109,7 @@ def drawn_receivers(count: int, most: int = MOST_ROWS) -> tuple[NDArray[np.int64
     return chosen, ["receiver" if count == 1 else f"receiver {number}" for number in chosen]
 
 
-def axis_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
+def axis_edges(axis: Floats) -> tuple[float, float]:
     """Return the outer edges of an axis' first and last cell, so that ticks stand at centres."""
     half = (axis[1] - axis[0]) / 2 if len(axis) > 1 else 0.5
     return float(axis[0] - half), float(axis[-1] + half)
@@ -116,9 +117,9 @@ def axis_edges(axis: NDArray[np.float64]) -> tuple[float, float]:
 
 def draw_cells(
     panel: Any,
-    values: NDArray[np.float64],
-    ranges: NDArray[np.float64],
-    frequencies: NDArray[np.float64],
+    values: Floats,
+    ranges: Floats,
+    frequencies: Floats,
     **options: Any,
 ) -> Any:
     """Draw cells (R, F) over range (m) and frequency (Hz, drawn in kHz) and return the picture.
@@ -217,8 +218,6 @@ def _axes(
     return axes, bars
 
 
-Array = NDArray[np.float64]
-
 SHOWN_DB = 50.0
 MOST_ARROWS = 400
 
@@ -229,8 +228,8 @@ def pings_png(
     labels: Sequence[str],
     *,
     sampling_rate: float,
-    range_m: Array,
-    frequency_hz: Array,
+    range_m: Floats,
+    frequency_hz: Floats,
     poses: Poses,
 ) -> bytes:
     """Draw the first pings of an import, so that a wrong convention can be seen.
@@ -283,7 +282,7 @@ def _poses(axes: Any, poses: Poses, shown: tuple[int, int], marked: int) -> None
     axes.set_title("poses from above" if shown[1] == 1 else "poses from the side")
 
 
-def _waveform(axes: Any, waveform: Array, sampling_rate: float, label: str) -> None:
+def _waveform(axes: Any, waveform: Floats, sampling_rate: float, label: str) -> None:
     time = 1e3 * np.arange(waveform.shape[1]) / sampling_rate
     for number, wave in enumerate(waveform):
         axes.plot(time, wave, linewidth=0.5, label=str(number))

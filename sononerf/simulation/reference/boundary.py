@@ -8,9 +8,9 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lu_factor, lu_solve
 
+from sononerf.array_types import Complexes, Floats
 from sononerf.errors import NumericalError, ResourceError
 from sononerf.memory import available_memory
 from sononerf.scene.scene import Scene
@@ -117,7 +117,7 @@ class Boundary(Solved):
         seconds = FILLING * thousands**2 + FACTORISING * thousands**3
         return COPIES * 8.0 * self._unknowns**2, float(seconds.sum())
 
-    def respond(self, wavenumber: complex, poses: Heads) -> NDArray[np.complex128]:
+    def respond(self, wavenumber: complex, poses: Heads) -> Complexes:
         """Scattered pressure at the ears; see :meth:`Solved.respond`."""
         k = complex(wavenumber)
         operators = self._operators(k)
@@ -182,9 +182,9 @@ class Boundary(Solved):
 def excitation(
     panels: Panels,
     wavenumber: complex,
-    emitters: NDArray[np.float64],
-    beam: NDArray[np.float64],
-) -> NDArray[np.complex128]:
+    emitters: Floats,
+    beam: Floats,
+) -> Complexes:
     """Return the right-hand sides (V, P), m: the incident waves and their normal derivatives.
 
     Args:
@@ -196,16 +196,16 @@ def excitation(
     distance, cosine = _ways(panels, emitters)
     slope = coupling(wavenumber) * (1j * wavenumber + 1.0 / distance) * cosine
     incident = beam * np.exp(-1j * wavenumber * distance) / distance
-    load: NDArray[np.complex128] = panels.halves.T @ (incident * (panels.weights + slope)).T
+    load: Complexes = panels.halves.T @ (incident * (panels.weights + slope)).T
     return load
 
 
 def radiated(
     panels: Panels,
     wavenumber: complex,
-    pressure: NDArray[np.complex128],
-    ears: NDArray[np.float64],
-) -> NDArray[np.complex128]:
+    pressure: Complexes,
+    ears: Floats,
+) -> Complexes:
     """Return the scattered pressure at ears.
 
     Args:
@@ -220,13 +220,11 @@ def radiated(
     """
     distance, cosine = _ways(panels, ears)
     kernel = (1j * wavenumber + 1.0 / distance) * np.exp(-1j * wavenumber * distance) / distance
-    heard: NDArray[np.complex128] = (kernel * cosine * pressure).sum(axis=1) / (4.0 * np.pi)
+    heard: Complexes = (kernel * cosine * pressure).sum(axis=1) / (4.0 * np.pi)
     return heard
 
 
-def _ways(
-    panels: Panels, places: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _ways(panels: Panels, places: Floats) -> tuple[Floats, Floats]:
     """Distances (P, Q), m, and cosines from the normals towards places, times areas (P, Q), m2."""
     away = places[:, None] - panels.points
     distance = np.sqrt(np.einsum("pqd,pqd->pq", away, away))

@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pyvista as pv
 import trimesh
-from numpy.typing import NDArray
 
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.errors import InputError
 from sononerf.geometry.raycast import winding_numbers
 
@@ -177,7 +177,7 @@ class _Edges:
         pair (Q, 2): Its two triangles; -1 where there are not just two.
     """
 
-    def __init__(self, vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> None:
+    def __init__(self, vertices: Floats, faces: Ints) -> None:
         pairs = np.sort(faces[:, [[1, 2], [2, 0], [0, 1]]], axis=2).reshape(-1, 2)
         self.ends, sides, uses = np.unique(pairs, axis=0, return_inverse=True, return_counts=True)
         self.sides = sides.reshape(-1, 3)
@@ -192,7 +192,7 @@ class _Edges:
             self.pair[two, side] = corner // 3
             self.opposite[two, side] = faces.ravel()[corner]
 
-    def lift(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    def lift(self, vertices: Floats) -> Floats:
         """Return how far apart both diagonals about an edge are (Q,), m; endless if there are none.
 
         So much the surface changes where a diagonal is turned.
@@ -205,15 +205,15 @@ class _Edges:
         apart /= np.where(length > 0.0, length, 1.0)
         return np.where((length > 0.0) & (self.pair[:, 0] >= 0), apart, np.inf)
 
-    def first(self, key: NDArray[np.float64]) -> NDArray[np.int64]:
+    def first(self, key: Floats) -> Ints:
         """Return the corner (T,) opposite to the side with the greatest key (Q,)."""
         # Of equal ones the number decides.
         self._rank = np.zeros(len(key), dtype=np.int64)
         self._rank[np.argsort(key, kind="stable")] = np.arange(len(key))
-        found: NDArray[np.int64] = self._rank[self.sides].argmax(axis=1)
+        found: Ints = self._rank[self.sides].argmax(axis=1)
         return found
 
-    def won(self, first: NDArray[np.int64]) -> NDArray[np.bool_]:
+    def won(self, first: Ints) -> Bools:
         """Return the edges (Q,) that are first in all their triangles."""
         beaten = np.ones(self.sides.shape, dtype=bool)
         beaten[np.arange(len(first)), first] = False
@@ -222,9 +222,7 @@ class _Edges:
         return won
 
 
-def _turned(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], flat: float
-) -> NDArray[np.int64]:
+def _turned(vertices: Floats, faces: Ints, flat: float) -> Ints:
     """Turn diagonals of quadrilaterals that are flat within a length (m), by Delaunay's rule."""
     for _ in range(TURNS):
         edges = _Edges(vertices, faces)
@@ -258,7 +256,7 @@ def _turned(
     return faces
 
 
-def _angle(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _angle(a: Floats, b: Floats) -> Floats:
     cross = np.linalg.norm(np.cross(a, b), axis=1)
-    found: NDArray[np.float64] = np.arctan2(cross, np.einsum("qd,qd->q", a, b))
+    found: Floats = np.arctan2(cross, np.einsum("qd,qd->q", a, b))
     return found

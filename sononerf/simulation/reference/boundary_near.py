@@ -24,6 +24,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 
+from sononerf.array_types import Floats, Ints
+
 NEAR = 2.0  # distance of middles over the sum of both radii, below which a pair is near
 PAIRS = 1 << 13  # near pairs at a time
 # Seven points, exact to degree five (J. Radon 1948): barycentric coordinates and weights.
@@ -41,7 +43,7 @@ WEIGHTS = np.array(
 MIDDLES = 0.5 * (1.0 - np.eye(3))
 
 
-def potentials(corners: Reals, normals: Reals, slopes: Reals, points: Reals) -> Reals:
+def potentials(corners: Floats, normals: Floats, slopes: Floats, points: Floats) -> Floats:
     r"""Integrate linear functions over triangles, times what is not smooth in the kernel.
 
     With :math:`R` the distance of a point to a place on the triangle and :math:`z` its height
@@ -90,8 +92,8 @@ def potentials(corners: Reals, normals: Reals, slopes: Reals, points: Reals) -> 
     # The corners' functions below the point, and what their slopes add.
     foot = 1.0 / 3.0 + _dot(slopes[:, None], -away.mean(axis=2)[:, :, None])
 
-    def slope(over: Reals) -> Reals:
-        added: Reals = np.einsum("nkd,ncd->nkc", np.einsum("nke,ned->nkd", over, out), slopes)
+    def slope(over: Floats) -> Floats:
+        added: Floats = np.einsum("nkd,ncd->nkc", np.einsum("nke,ned->nkd", over, out), slopes)
         return added
 
     inverse = foot * whole[..., None] + slope(first)
@@ -105,12 +107,12 @@ def potentials(corners: Reals, normals: Reals, slopes: Reals, points: Reals) -> 
     )
 
 
-def _dot(a: Reals, b: Reals) -> Reals:
-    product: Reals = np.einsum("...d,...d->...", a, b)
+def _dot(a: Floats, b: Floats) -> Floats:
+    product: Floats = np.einsum("...d,...d->...", a, b)
     return product
 
 
-def near_pairs(panels: Panels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def near_pairs(panels: Panels) -> tuple[Ints, Ints]:
     """Return the pairs (N,), (N,) of triangles that are near each other, themselves included."""
     corners = panels.vertices[panels.faces]
     middles = corners.mean(axis=1)
@@ -169,7 +171,7 @@ def corrections(panels: Panels) -> tuple[csr_array, ...]:
     )
 
 
-def _missing(panels: Panels, one: NDArray[np.int64], other: NDArray[np.int64]) -> Reals:
+def _missing(panels: Panels, one: Ints, other: Ints) -> Floats:
     """Integrals over pairs of triangles, less those by the middles of edges (4, N, 3, 3)."""
     corners = panels.vertices[panels.faces[one]]
     theirs = panels.vertices[panels.faces[other]]
@@ -187,11 +189,8 @@ def _missing(panels: Panels, one: NDArray[np.int64], other: NDArray[np.int64]) -
     kernels = np.stack([inverse, distance, height * inverse**3, height * inverse])
     both = (panels.area[one] * panels.area[other] / 9.0)[:, None, None]
     rough = np.einsum("ka,jnkl,lb->jnab", MIDDLES, kernels, MIDDLES, optimize=True) * both
-    found: Reals = exact - rough
+    found: Floats = exact - rough
     return found
-
-
-Reals = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,16 +210,16 @@ class Panels:
         vectors ((Q, 3), m2): The same, times their normals.
     """
 
-    vertices: Reals
-    faces: NDArray[np.int64]
-    area: Reals
-    normals: Reals
-    slopes: Reals
-    ends: NDArray[np.int64]
-    sides: NDArray[np.int64]
-    points: Reals
-    weights: Reals
-    vectors: Reals
+    vertices: Floats
+    faces: Ints
+    area: Floats
+    normals: Floats
+    slopes: Floats
+    ends: Ints
+    sides: Ints
+    points: Floats
+    weights: Floats
+    vectors: Floats
 
     @classmethod
     def of(cls, vertices: NDArray[Any], faces: NDArray[Any]) -> Panels:
@@ -240,7 +239,7 @@ class Panels:
             (np.ones(sides.size), (sides.ravel(), np.arange(sides.size) // 3)),
             shape=(len(ends), len(faces)),
         )
-        sums: Reals = onto @ laid
+        sums: Floats = onto @ laid
         weights, vectors = sums[:, 0], sums[:, 1:]
         points = vertices[ends].mean(axis=1)
         area = double / 2.0

@@ -8,8 +8,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sononerf.array_types import Complexes, Floats
 from sononerf.simulation.reference.partial_waves import (
     into_axis,
     legendre,
@@ -21,8 +21,6 @@ from sononerf.simulation.reference.partial_waves import (
     slopes,
 )
 
-Array = NDArray[np.complex128]
-
 
 @dataclass(frozen=True, eq=False)
 class Ball:
@@ -33,7 +31,7 @@ class Ball:
         radius (m): Of its surface.
     """
 
-    centre: NDArray[np.float64]
+    centre: Floats
     radius: float
 
 
@@ -75,7 +73,7 @@ class Coupling:
         degrees: list[int],
         wavenumber: complex,
         links: list[Link],
-        turns: list[list[NDArray[np.float64]]],
+        turns: list[list[Floats]],
     ) -> None:
         self.balls, self.degrees, self.wavenumber = balls, degrees, wavenumber
         self.links, self.turns = links, turns
@@ -85,8 +83,8 @@ class Coupling:
             log_outgoing(degree, np.array([wavenumber * ball.radius]))
             for ball, degree in zip(balls, degrees, strict=True)
         ]
-        known: dict[tuple[float, ...], list[Array]] = {}
-        self._moves: list[tuple[list[Array], list[Array]]] = []
+        known: dict[tuple[float, ...], list[Complexes]] = {}
+        self._moves: list[tuple[list[Complexes], list[Complexes]]] = []
         for link in links:
             both = []
             for source, target in ((link.one, link.two), (link.two, link.one)):
@@ -99,7 +97,7 @@ class Coupling:
                 both.append(known[key])
             self._moves.append((both[0], both[1]))
 
-    def emitted(self, emitters: NDArray[np.float64]) -> Array:
+    def emitted(self, emitters: Floats) -> Complexes:
         """Return what the emission alone causes on the spheres (K, P), from (P, 3) m."""
         waves = np.zeros((self.rows[-1].stop, len(emitters)), dtype=np.complex128)
         for index, (ball, degree) in enumerate(zip(self.balls, self.degrees, strict=True)):
@@ -115,7 +113,7 @@ class Coupling:
             waves[self.rows[index]] = around.conj() * np.repeat(radial, order, axis=0)
         return waves
 
-    def heard(self, index: int, waves: Array, ears: NDArray[np.float64]) -> Array:
+    def heard(self, index: int, waves: Complexes, ears: Floats) -> Complexes:
         """Return the pressure (P,) that a sphere scatters, at a place (P, 3) m for each pose."""
         degree = self.degrees[index]
         distance, around = seen_from(ears - self.balls[index].centre, degree)
@@ -126,10 +124,10 @@ class Coupling:
         order = 2 * np.arange(degree + 1) + 1
         around = around * waves[self.rows[index]]
         around *= np.repeat(ratio, order, axis=0)
-        pressure: Array = around.sum(axis=0)
+        pressure: Complexes = around.sum(axis=0)
         return pressure
 
-    def apply(self, waves: Array) -> Array:
+    def apply(self, waves: Complexes) -> Complexes:
         """Return what waves (K, P) of each sphere cause on all others."""
         caused = np.zeros_like(waves)
         for link, turns, moves in zip(self.links, self.turns, self._moves, strict=True):
@@ -144,13 +142,13 @@ class Coupling:
             caused[one] += out_of_axis(moved, link.azimuth, turns)
         return caused
 
-    def _answer(self, index: int) -> Array:
+    def _answer(self, index: int) -> Complexes:
         """Return the waves (N,) that a slope of pressure on a sphere causes, m."""
         slope = self.wavenumber * self.on_ball[index][1][:, 0]
-        answer: Array = -1.0 / slope
+        answer: Complexes = -1.0 / slope
         return answer
 
-    def _along(self, source: int, target: int, length: float) -> list[Array]:
+    def _along(self, source: int, target: int, length: float) -> list[Complexes]:
         """Return the matrices (L - m + 1, N - m + 1) that translate along +z, by order m."""
         given, wanted = self.degrees[source], self.degrees[target]
         radius = self.balls[target].radius

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from sononerf.array_types import Bools, Floats, Ints, Singles
 from sononerf.geometry.normals import corner_normals
 from sononerf.scene.scene import Scene
 from sononerf.simulation.engine import Engine
@@ -32,12 +32,12 @@ class Elements:
         heard (N, E): Whether emitter and ear see them.
     """
 
-    points: NDArray[np.float64]
-    corners: NDArray[np.float64]
-    triangle: NDArray[np.int64]
-    area: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    heard: NDArray[np.bool_]
+    points: Floats
+    corners: Floats
+    triangle: Ints
+    area: Floats
+    normals: Floats
+    heard: Bools
 
 
 class Kirchhoff(Engine):
@@ -90,13 +90,13 @@ class Kirchhoff(Engine):
         self.wavelength = hearing.speed_of_sound / frequency_max
         self.elements_per_wavelength = elements_per_wavelength
         self._strength = np.stack([reflection.strength for reflection in self.reflections])
-        self._corners: NDArray[np.float64] | None = None
+        self._corners: Floats | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_corners": None}
 
     @property
-    def corners(self) -> NDArray[np.float64]:
+    def corners(self) -> Floats:
         """Positions (m) and smooth normals of the triangles' corners (T, 3, 6)."""
         if self._corners is None:
             mesh = self.scene.mesh
@@ -106,11 +106,11 @@ class Kirchhoff(Engine):
 
     def echo(
         self,
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
+        position: Floats,
+        rotation: Floats,
         *,
         seed: int,  # noqa: ARG002  (nothing is random)
-    ) -> NDArray[np.float64]:
+    ) -> Floats:
         """Pressure at both ears; see :meth:`Engine.echo`."""
         emitter, ears = self.hearing.places(position, rotation)
         sound = self.hearing.silence()
@@ -137,11 +137,11 @@ class Kirchhoff(Engine):
 
     def hits(
         self,
-        position: NDArray[np.float64],
-        rotation: NDArray[np.float64],
+        position: Floats,
+        rotation: Floats,
         *,
         seed: int,  # noqa: ARG002  (nothing is random)
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[Floats, Floats]:
         """Places that send sound straight back, and how much; see :meth:`Engine.hits`.
 
         The patch is one wavelength long: if it is not seen straight on, it extinguishes itself.
@@ -171,10 +171,10 @@ class Kirchhoff(Engine):
     def _lit(
         self,
         elements: Elements,
-        length: NDArray[np.float64],
-        away: NDArray[np.float64],
-        rotation: NDArray[np.float64],
-    ) -> NDArray[np.float32]:
+        length: Floats,
+        away: Floats,
+        rotation: Floats,
+    ) -> Singles:
         """Sound that arrives, times the material's strength (N, F), 1/m."""
         lit = self.hearing.beam(-away, rotation)
         part = self.scene.part
@@ -182,16 +182,14 @@ class Kirchhoff(Engine):
         lit /= length[:, None]
         return lit
 
-    def _elements(
-        self, emitter: NDArray[np.float64], ears: NDArray[np.float64]
-    ) -> Iterator[Elements]:
+    def _elements(self, emitter: Floats, ears: Floats) -> Iterator[Elements]:
         """Give all that is heard, some at a time."""
         flat = self.caster.face_normals
         first = self.corners[:, 0, :3]
         side = np.sign(_dot(emitter - first, flat))
         facing = side * np.stack([_dot(place - first, flat) for place in ears]) > 0.0  # (E, T)
 
-        def heard(points: NDArray[np.float64], of: NDArray[np.int64]) -> NDArray[np.bool_]:
+        def heard(points: Floats, of: Ints) -> Bools:
             normals = flat[of] * side[of, None]
             lit = np.flatnonzero(self.caster.visible(points, emitter, normals=normals))
             found = np.zeros((len(points), len(ears)), dtype=np.bool_)
@@ -205,7 +203,7 @@ class Kirchhoff(Engine):
             # Halfway to the corners.
             probes = ((corners[:, :, :3] + points[:, None]) / 2.0).reshape(-1, 3)
             seen = heard(probes, np.repeat(of, 3)).reshape(len(of), 3, -1)
-            whole: NDArray[np.bool_] = np.all(seen, axis=1)
+            whole: Bools = np.all(seen, axis=1)
             border = np.any(np.any(seen, axis=1) & ~whole, axis=1)
             kept = np.any(whole, axis=1) & ~border
             yield _elements(corners[kept], of[kept], side, whole[kept])
@@ -218,9 +216,7 @@ class Kirchhoff(Engine):
                 kept = found.any(axis=1)
                 yield _elements(corners[kept], of[kept], side, found[kept])
 
-    def _cut(
-        self, triangle: NDArray[np.int64], emitter: NDArray[np.float64], ears: NDArray[np.float64]
-    ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
+    def _cut(self, triangle: Ints, emitter: Floats, ears: Floats) -> Iterator[tuple[Floats, Ints]]:
         """Halve triangles across their worst edge until all are fine, some at a time."""
         for start in range(0, len(triangle), CHUNK):
             some = triangle[start : start + CHUNK]
@@ -238,9 +234,7 @@ class Kirchhoff(Engine):
                     halves = _halve(corners[coarse], size[coarse].argmax(axis=1))
                     waiting.append((halves, np.tile(of[coarse], 2)))
 
-    def _size(
-        self, corners: NDArray[np.float64], emitter: NDArray[np.float64], ears: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _size(self, corners: Floats, emitter: Floats, ears: Floats) -> Floats:
         """Return what must not exceed the wavelength, per edge (N, 3): longer side or path, m."""
         size = _edges(corners)
         out = _away(corners, emitter)[0]
@@ -252,10 +246,10 @@ class Kirchhoff(Engine):
 
 
 def _elements(
-    corners: NDArray[np.float64],
-    of: NDArray[np.int64],
-    side: NDArray[np.float64],
-    heard: NDArray[np.bool_],
+    corners: Floats,
+    of: Ints,
+    side: Floats,
+    heard: Bools,
 ) -> Elements:
     middle = corners.mean(axis=1)
     around = corners[:, :, :3] - middle[:, None, :3]
@@ -267,7 +261,7 @@ def _elements(
     return Elements(middle[:, :3], around, of, area, normals, heard)
 
 
-def _halve(corners: NDArray[np.float64], edge: NDArray[np.int64]) -> NDArray[np.float64]:
+def _halve(corners: Floats, edge: Ints) -> Floats:
     """Cut triangles (N, 3, D) through the middle of an edge, named by the corner opposite."""
     order = (edge[:, None] + np.arange(3)) % 3
     turned = np.take_along_axis(corners, order[:, :, None], axis=1)
@@ -276,29 +270,25 @@ def _halve(corners: NDArray[np.float64], edge: NDArray[np.int64]) -> NDArray[np.
     return halves.reshape(-1, *corners.shape[1:])
 
 
-def _edges(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+def _edges(corners: Floats) -> Floats:
     """Length of the edges opposite to each corner, (N, 3)."""
     edges = corners[:, [1, 2, 0]] - corners[:, [2, 0, 1]]
     return np.sqrt(_dot(edges, edges))
 
 
-def _away(
-    points: NDArray[np.float64], place: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _away(points: Floats, place: Floats) -> tuple[Floats, Floats]:
     """Distance (...,) of points from a place, and unit vectors (..., 3) towards it."""
     away = place - points
     distance = np.sqrt(_dot(away, away))
     return distance, away / distance[..., None]
 
 
-def _cosine(
-    normals: NDArray[np.float64], away: NDArray[np.float64], back: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _cosine(normals: Floats, away: Floats, back: Floats) -> Floats:
     """Mean cosine of both angles (N, 1); nothing comes from below the smooth surface."""
     both = np.maximum(_dot(normals, away), 0.0) + np.maximum(_dot(normals, back), 0.0)
     return both[:, None] / 2.0
 
 
-def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    product: NDArray[np.float64] = np.einsum("...d,...d->...", a, b)
+def _dot(a: Floats, b: Floats) -> Floats:
+    product: Floats = np.einsum("...d,...d->...", a, b)
     return product

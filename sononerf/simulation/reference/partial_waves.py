@@ -6,14 +6,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import eigh_tridiagonal
 from scipy.special import spherical_jn
 
-Array = NDArray[np.complex128]
+from sononerf.array_types import Complexes, Floats, Ints
 
 
-def log_outgoing(degree: int, argument: Array) -> tuple[Array, Array]:
+def log_outgoing(degree: int, argument: Complexes) -> tuple[Complexes, Complexes]:
     """Spherical Hankel functions of the second kind, as logarithms.
 
     The ratio of neighbours follows by the recurrence upwards, which is stable for them
@@ -39,7 +38,7 @@ def log_outgoing(degree: int, argument: Array) -> tuple[Array, Array]:
     return logarithm, slope
 
 
-def legendre(degree: int, cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+def legendre(degree: int, cosine: Floats) -> Floats:
     """Associated Legendre functions, normalised for spherical harmonics, with (-1)^m in them.
 
     Args:
@@ -65,7 +64,7 @@ def legendre(degree: int, cosine: NDArray[np.float64]) -> NDArray[np.float64]:
     return values
 
 
-def harmonics(degree: int, directions: NDArray[np.float64]) -> Array:
+def harmonics(degree: int, directions: Floats) -> Complexes:
     """Orthonormal spherical harmonics.
 
     Args:
@@ -88,7 +87,7 @@ def harmonics(degree: int, directions: NDArray[np.float64]) -> Array:
     return values
 
 
-def wigner(degree: int, angles: list[float]) -> list[NDArray[np.float64]]:
+def wigner(degree: int, angles: list[float]) -> list[Floats]:
     """Matrices of one degree n that turn spherical harmonics about y.
 
     Args:
@@ -110,44 +109,44 @@ def wigner(degree: int, angles: list[float]) -> list[NDArray[np.float64]]:
     ]
 
 
-def slopes(size: complex, log_h: Array) -> Array:
+def slopes(size: complex, log_h: Complexes) -> Complexes:
     """Return derivatives of Bessel functions times Hankel functions (N + 1,) at one argument."""
     n = np.arange(len(log_h))
-    product: Array = 1j * n / ((2 * n + 1) * size**2)  # their limit far above the argument
+    product: Complexes = 1j * n / ((2 * n + 1) * size**2)  # their limit far above the argument
     plain = log_h[:, 0].real < 600.0
     product[plain] = spherical_jn(n[plain], size, derivative=True) * np.exp(log_h[plain, 0])
     return product
 
 
-def seen_from(away: NDArray[np.float64], degree: int) -> tuple[NDArray[np.float64], Array]:
+def seen_from(away: Floats, degree: int) -> tuple[Floats, Complexes]:
     """Distance (P,) of places from a centre, and the harmonics ((N + 1)^2, P) towards them."""
     distance = np.linalg.norm(away, axis=1)
     return distance, harmonics(degree, away / distance[:, None])
 
 
-def _orders(degree: int) -> NDArray[np.int64]:
+def _orders(degree: int) -> Ints:
     """Order m of each row of waves."""
     return np.concatenate([np.arange(-n, n + 1) for n in range(degree + 1)])
 
 
-def _degree(waves: Array) -> int:
+def _degree(waves: Complexes) -> int:
     return math.isqrt(len(waves)) - 1
 
 
-def into_axis(waves: Array, azimuth: float, turns: list[NDArray[np.float64]]) -> Array:
+def into_axis(waves: Complexes, azimuth: float, turns: list[Floats]) -> Complexes:
     """Turn waves into the frame whose z is the axis."""
     turned = np.exp(1j * azimuth * _orders(_degree(waves)))[:, None] * waves
     return _turned(turned, turns, back=False)
 
 
-def out_of_axis(waves: Array, azimuth: float, turns: list[NDArray[np.float64]]) -> Array:
+def out_of_axis(waves: Complexes, azimuth: float, turns: list[Floats]) -> Complexes:
     """Turn waves back from the frame of an axis; see :func:`into_axis`."""
     turned = _turned(waves, turns, back=True)
     turned *= np.exp(-1j * azimuth * _orders(_degree(waves)))[:, None]
     return turned
 
 
-def _turned(waves: Array, turns: list[NDArray[np.float64]], *, back: bool) -> Array:
+def _turned(waves: Complexes, turns: list[Floats], *, back: bool) -> Complexes:
     turned = np.zeros_like(waves)
     for n in range(_degree(waves) + 1):
         rows = slice(n**2, (n + 1) ** 2)
@@ -157,13 +156,13 @@ def _turned(waves: Array, turns: list[NDArray[np.float64]], *, back: bool) -> Ar
     return turned
 
 
-def mirror(waves: Array) -> None:
+def mirror(waves: Complexes) -> None:
     """Turn z round, up to the sign of the order, which translations along z leave alone."""
     for n in range(1, _degree(waves) + 1, 2):
         waves[n**2 : (n + 1) ** 2] *= -1.0
 
 
-def move(moves: list[Array], waves: Array, wanted: int) -> Array:
+def move(moves: list[Complexes], waves: Complexes, wanted: int) -> Complexes:
     """Translate waves of one sphere along the axis to those that they cause on another."""
     given = _degree(waves)
     moved = np.zeros(((wanted + 1) ** 2, waves.shape[1]), dtype=np.complex128)
@@ -174,7 +173,7 @@ def move(moves: list[Array], waves: Array, wanted: int) -> Array:
     return moved
 
 
-def inner_product(one: Array, two: Array) -> Array:
+def inner_product(one: Complexes, two: Complexes) -> Complexes:
     """Scalar product (P,) of the columns of two arrays (K, P)."""
-    product: Array = np.einsum("kp,kp->p", one.conj(), two)
+    product: Complexes = np.einsum("kp,kp->p", one.conj(), two)
     return product

@@ -8,10 +8,10 @@ import math
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from sononerf.array_types import Complexes, Floats, Ints
 from sononerf.errors import InputError, NumericalError
 from sononerf.scene.material import Material
 from sononerf.scene.scene import Scene
@@ -31,8 +31,6 @@ MOST_WAVES = 300_000  # partial waves of all spheres together
 BATCH_BYTES = 500e6  # for the waves of all poses of a batch
 KEPT = 30  # arrays of the waves' size, while a batch is solved
 SPEED = 6e9  # operations per second of one core
-
-Array = NDArray[np.complex128]
 
 
 class Spheres(Solved):
@@ -107,7 +105,7 @@ class Spheres(Solved):
         self._links = list(_links(self.balls))
         highest = 2.0 * math.pi * self.frequency[-1] / hearing.speed_of_sound
         _refuse_many(self.degrees(highest, math.inf), self.frequency[-1])
-        self._turns: list[list[NDArray[np.float64]]] = []
+        self._turns: list[list[Floats]] = []
 
     def degrees(self, wavenumber: float, nearest: float) -> list[int]:
         """Highest degree of each sphere's partial waves.
@@ -141,7 +139,7 @@ class Spheres(Solved):
         moves = 2 * len(self._links) * 16.0 / 3.0 * (max(degrees) + 1.0) ** 3
         return turns + moves + BATCH_BYTES, seconds * max(1, len(wavenumbers) // 20)
 
-    def respond(self, wavenumber: complex, poses: Heads) -> Array:
+    def respond(self, wavenumber: complex, poses: Heads) -> Complexes:
         """Scattered pressure at the ears; see :meth:`Solved.respond`."""
         coupling = self._coupling(
             wavenumber, np.vstack([poses.emitters, poses.ears.reshape(-1, 3)])
@@ -154,9 +152,7 @@ class Spheres(Solved):
         ]
         return np.concatenate(parts)
 
-    def field(
-        self, wavenumber: complex, emitter: NDArray[np.float64], points: NDArray[np.float64]
-    ) -> Array:
+    def field(self, wavenumber: complex, emitter: Floats, points: Floats) -> Complexes:
         """Scattered pressure at points, of an emitter that sends alike in all directions.
 
         Args:
@@ -172,7 +168,7 @@ class Spheres(Solved):
         parts = [coupling.heard(index, waves, points) for index in range(len(self.balls))]
         return np.sum(parts, axis=0)
 
-    def _coupling(self, wavenumber: complex, places: NDArray[np.float64]) -> Coupling:
+    def _coupling(self, wavenumber: complex, places: Floats) -> Coupling:
         """Return what the spheres send to one another, in degrees that suit heads at places."""
         nearest = min(
             float(np.linalg.norm(places - ball.centre, axis=1).min()) / ball.radius
@@ -184,7 +180,7 @@ class Spheres(Solved):
         _refuse_many(degrees, wavenumber.real * self.hearing.speed_of_sound / (2.0 * math.pi))
         return Coupling(self.balls, degrees, wavenumber, self._links, self._all_turns(degrees))
 
-    def _all_turns(self, degrees: list[int]) -> list[list[NDArray[np.float64]]]:
+    def _all_turns(self, degrees: list[int]) -> list[list[Floats]]:
         """Return Wigner's matrices of each link, by degree."""
         wanted = max(degrees)
         if not self._turns and self._links:
@@ -196,7 +192,7 @@ class Spheres(Solved):
                     known.append(matrix)
         return self._turns
 
-    def _respond(self, coupling: Coupling, poses: Heads) -> Array:
+    def _respond(self, coupling: Coupling, poses: Heads) -> Complexes:
         waves = coupling.emitted(poses.emitters)
         for ball, rows in zip(self.balls, coupling.rows, strict=True):
             waves[rows] *= poses.beam(ball.centre[None]).T
@@ -209,7 +205,7 @@ class Spheres(Solved):
                 heard[:, ear] += gain * coupling.heard(index, waves, poses.ears[:, ear])
         return heard
 
-    def _scattered(self, coupling: Coupling, first: Array) -> Array:
+    def _scattered(self, coupling: Coupling, first: Complexes) -> Complexes:
         if self.orders is None:
             return self._solved(coupling, first)
         waves = first
@@ -217,11 +213,11 @@ class Spheres(Solved):
             waves = first + coupling.apply(waves)
         return waves
 
-    def _solved(self, coupling: Coupling, first: Array) -> Array:
+    def _solved(self, coupling: Coupling, first: Complexes) -> Complexes:
         """Solve ``waves - coupling(waves) = first`` for each column by GCR."""
         residual, waves = first.copy(), np.zeros_like(first)
         scale = np.maximum(np.sqrt(inner_product(first, first).real), 1e-300)
-        basis: list[tuple[Array, Array]] = []
+        basis: list[tuple[Complexes, Complexes]] = []
         for _ in range(MOST_ITERATIONS):
             if (np.sqrt(inner_product(residual, residual).real) <= TOLERANCE * scale).all():
                 return waves
@@ -273,7 +269,7 @@ def find_balls(scene: Scene) -> list[Ball]:
     ]
 
 
-def _ball(places: NDArray[np.float64], faces: NDArray[np.int64], name: int) -> Ball:
+def _ball(places: Floats, faces: Ints, name: int) -> Ball:
     points = places[np.unique(faces)]
     middle = points.mean(axis=0)
     # |x|^2 = 2 c x + (r^2 - c^2) is linear in the centre.

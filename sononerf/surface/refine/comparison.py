@@ -8,8 +8,8 @@ import math
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 
+from sononerf.array_types import Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.surface.refine.descent import ONSETS
@@ -78,14 +78,14 @@ class Comparison:
         return float(np.average(errors, weights=weights)) + ONSETS * misfit
 
 
-def _common_gain(heard: list[NDArray[np.float32]], rendered: list[NDArray[np.float32]]) -> float:
+def _common_gain(heard: list[Singles], rendered: list[Singles]) -> float:
     """Median over poses and ears of the loudest heard over the loudest rendered magnitude."""
     a, b = (np.stack(part).max(axis=(2, 3)) for part in (heard, rendered))
     both = (a > 0) & (b > 0)
     return float(np.median(a[both] / b[both])) if both.any() else 1.0
 
 
-def _difference(heard: NDArray[np.float32], rendered: NDArray[np.float32]) -> float:
+def _difference(heard: Singles, rendered: Singles) -> float:
     """Mean difference of spectrograms (E, R, F) over the active cells, compressed decibels."""
     reference = max(float(heard.max()) * 10.0 ** (-FLOOR_DB / 20.0), 1e-30)
     a, b = (_DB * np.log1p(part / reference) for part in (heard, rendered))

@@ -19,9 +19,9 @@ from __future__ import annotations
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from torch import Tensor
 
+from sononerf.array_types import Ints
 from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.raycast import Occlusion
 from sononerf.simulation.simulator import Simulator
@@ -49,7 +49,7 @@ class Correction:
         mesh: trimesh.Trimesh,
         simulator: Simulator,
         echoes: Echoes,
-        numbers: NDArray[np.int64],
+        numbers: Ints,
         *,
         seed: int,
     ) -> None:
@@ -69,7 +69,7 @@ class Correction:
         turns = np.asarray(echoes.rotations[numbers], dtype=np.float64)
         simulator.engine.prepare(places, turns)
 
-    def batch(self, seed: int, step: int, size: int) -> NDArray[np.int64]:
+    def batch(self, seed: int, step: int, size: int) -> Ints:
         """Return the poses of a step, drawn from the seed and the step's number."""
         rng = np.random.default_rng([seed, step])
         return rng.choice(self.numbers, min(size, len(self.numbers)), replace=False)

@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import scipy.fft
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from sononerf.array_types import Floats, Ints
 from sononerf.head.head import Head
 from sononerf.simulation.impulse_response import between
 
@@ -40,7 +40,7 @@ class FilterBank:
         spacing (Hz): Of the nodes.
     """
 
-    def __init__(self, head: Head, nodes: NDArray[np.float64], soft: float) -> None:
+    def __init__(self, head: Head, nodes: Floats, soft: float) -> None:
         self.head, self.analysis, self.nodes, self.soft = head, head.analysis, nodes, soft
         self.filters = head.row_filters
         rate = self.analysis.sampling_rate
@@ -48,7 +48,7 @@ class FilterBank:
         self.spacing = 2.0 * float(nodes[0])
         self._top = self.spacing * len(nodes)
         # Interpolation uses nodes on both sides; the ones beyond the band hardly count.
-        self.kept_nodes: NDArray[np.int64] = np.flatnonzero(nodes <= self._band[1] + self.spacing)
+        self.kept_nodes: Ints = np.flatnonzero(nodes <= self._band[1] + self.spacing)
         self.finer = max(1, math.ceil(FINE * self._band[1] / rate))
         self._filters: dict[tuple[int, str], tuple[Tensor, Tensor]] = {}
 

@@ -12,6 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
+from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.rays import Rays
@@ -37,9 +38,9 @@ class Later:
             absorption.
     """
 
-    ear: NDArray[np.int64]
-    delay: NDArray[np.float64]
-    weight: NDArray[np.float32]
+    ear: Ints
+    delay: Floats
+    weight: Singles
 
 
 class Tracer:
@@ -62,13 +63,11 @@ class Tracer:
         self._simulator = Simulator.of(quiet_scene(mesh), optics.head, wanted)
         self._optics, self._seed = optics, seed
 
-    def spectrogram(
-        self, position: NDArray[np.float64], rotation: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
+    def spectrogram(self, position: Floats, rotation: Floats) -> Singles:
         """Magnitude that a pose hears, (E, R, F)."""
         return self._simulator.spectrogram(position, rotation, seed=self._seed)
 
-    def later(self, position: NDArray[np.float64], rotation: NDArray[np.float64]) -> Later:
+    def later(self, position: Floats, rotation: Floats) -> Later:
         """Return what a pose hears after the first bounce."""
         found = _Collected(self._optics)
         engine = self._simulator.engine

@@ -7,9 +7,10 @@ import warnings
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from torch import Tensor
+
+from sononerf.array_types import Ints
 
 BENDING = 0.5
 """Length over which curvature is averaged, shortest wavelengths."""
@@ -35,7 +36,7 @@ class MeshOperators:
 
     def __init__(self, faces: Tensor, count: int) -> None:
         self.faces, self.count = faces, count
-        table: NDArray[np.int64] = faces.detach().cpu().numpy()
+        table: Ints = faces.detach().cpu().numpy()
         pairs = np.concatenate([table[:, [0, 1]], table[:, [1, 2]], table[:, [2, 0]]])
         pairs = np.unique(np.sort(pairs, axis=1), axis=0)
         both = np.concatenate([pairs, pairs[:, ::-1]])

@@ -12,9 +12,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from torch import Tensor
 
+from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import SonoNerfError
 from sononerf.simulation.simulator import Simulator
@@ -62,8 +62,8 @@ class Refined:
     """
 
     mesh: trimesh.Trimesh
-    gain: NDArray[np.float64]
-    support: NDArray[np.float64]
+    gain: Floats
+    support: Floats
     start: StartMethod
     kept: bool
     error_db: float

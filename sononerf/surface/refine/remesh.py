@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from sononerf.array_types import Floats, Singles
 from sononerf.geometry.lattice import level_surface, signed_volume
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
 
@@ -32,8 +32,6 @@ is thinner than a voxel would be lost."""
 CHORD = 0.005
 """Depth of the middles of edges below the smooth surface, shortest wavelengths, above which
 triangles are divided."""
-
-Array = NDArray[np.float64]
 
 
 def remesh(mesh: trimesh.Trimesh, edge: float, blur: float = 0.0) -> trimesh.Trimesh | None:
@@ -83,7 +81,9 @@ def relaxed(mesh: trimesh.Trimesh, steps: int = RELAXING) -> trimesh.Trimesh:
     return trimesh.Trimesh(places.numpy(), faces, process=False)
 
 
-def finer(mesh: trimesh.Trimesh, values: Array, wavelength: float) -> tuple[trimesh.Trimesh, Array]:
+def finer(
+    mesh: trimesh.Trimesh, values: Floats, wavelength: float
+) -> tuple[trimesh.Trimesh, Floats]:
     """Return a finer mesh of the same smooth surface where triangles cut too deep below it.
 
     Each triangle becomes four. The middle of an edge is put where a curve runs that is square to
@@ -127,7 +127,7 @@ def finer(mesh: trimesh.Trimesh, values: Array, wavelength: float) -> tuple[trim
 
 def signed_distance(
     mesh: trimesh.Trimesh, spacing: float, *, margin: int
-) -> tuple[Array, NDArray[np.float32]]:
+) -> tuple[Floats, Singles]:
     """Signed distance near closed bodies on a lattice, positive outside of all of them.
 
     Args:
@@ -156,8 +156,8 @@ def signed_distance(
 
 
 def _of_body(
-    body: trimesh.Trimesh, lower: Array, shape: tuple[int, ...], spacing: float
-) -> NDArray[np.float32]:
+    body: trimesh.Trimesh, lower: Floats, shape: tuple[int, ...], spacing: float
+) -> Singles:
     """Signed distance of one closed body on a lattice around it."""
     points, normals = _samples(body, 0.5 * spacing)
     near = np.zeros(shape, dtype=bool)
@@ -179,7 +179,7 @@ def _of_body(
     return distance
 
 
-def _samples(mesh: trimesh.Trimesh, spacing: float) -> tuple[Array, Array]:
+def _samples(mesh: trimesh.Trimesh, spacing: float) -> tuple[Floats, Floats]:
     """Points on a mesh about a spacing apart, and smooth normals there."""
     corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
     normals = np.asarray(mesh.vertex_normals)[np.asarray(mesh.faces)]

@@ -24,9 +24,9 @@ from typing import Literal
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sononerf.array_types import Floats, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.raycast import Occlusion
 from sononerf.head.decibels import ACTIVE_DB
@@ -35,7 +35,6 @@ from sononerf.surface.refine.objective import FLOOR_DB, TRUST
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.visibility import listen
 
-Array = NDArray[np.float64]
 Kind = Literal["gain", "range_offset", "speed_of_sound", "position", "aim"]
 KINDS: tuple[Kind, ...] = ("gain", "range_offset", "speed_of_sound", "position", "aim")
 STEP = 0.02
@@ -60,11 +59,11 @@ class Calibration:
         aim ((P, 3), rad): Rotation vectors, world frame, to be applied to the stated rotations.
     """
 
-    gain: Array
+    gain: Floats
     range_offset: float
     speed_of_sound: float
-    position: Array
-    aim: Array
+    position: Floats
+    aim: Floats
 
     @classmethod
     def none(cls, receivers: int, poses: int) -> Calibration:
@@ -108,8 +107,8 @@ class Body:
         self.sight = Occlusion(self.vertices.cpu().numpy(), faces)
 
     def render(
-        self, positions: Array, rotations: Array, stretch: Array, late: Array
-    ) -> NDArray[np.float32]:
+        self, positions: Floats, rotations: Floats, stretch: Floats, late: Floats
+    ) -> Singles:
         """Return magnitudes (P, E, R, F) on the whole axis.
 
         Args:
@@ -248,9 +247,9 @@ class Calibrator:
 
     def _solve(
         self,
-        kept: list[tuple[int, Array, Array]],
-        total: Array,
-        towards: Array,
+        kept: list[tuple[int, Floats, Floats]],
+        total: Floats,
+        towards: Floats,
         noise: float,
     ) -> None:
         """Solve the normal equations, move all unknowns, and learn spreads and uncertainties."""
@@ -297,12 +296,12 @@ class Calibrator:
             deviation = math.sqrt(max(noise * float(variance), 0.0))
             self.deviation[column.name] = max(self.deviation.get(column.name, 0.0), deviation)
 
-    def _local_values(self, number: int) -> Array:
+    def _local_values(self, number: int) -> Floats:
         return np.array(
             [getattr(self.found, column.name)[number, column.axis] for column in self.local]
         )
 
-    def _move(self, number: int, step: Array) -> None:
+    def _move(self, number: int, step: Floats) -> None:
         limits = {"position": 0.5 * self.optics.head.resolution, "aim": 5.0 * TURN}
         turn = np.zeros(3)
         for column, value in zip(self.local, step, strict=True):
@@ -314,7 +313,7 @@ class Calibrator:
         before = Rotation.from_rotvec(self.found.aim[number])
         self.found.aim[number] = (Rotation.from_rotvec(turn) * before).as_rotvec()
 
-    def _move_all(self, step: Array) -> None:
+    def _move_all(self, step: Floats) -> None:
         gain = self.found.gain
         offset, speed = self.found.range_offset, self.found.speed_of_sound
         for column, value in zip(self.shared, step.tolist(), strict=True):
@@ -347,7 +346,7 @@ class Calibrator:
                 found["scale"] = changed(self.layer, self.scale + column.step)
         return found
 
-    def _linear(self, bodies: dict[str, Body], number: int) -> tuple[Array, Array, Array]:
+    def _linear(self, bodies: dict[str, Body], number: int) -> tuple[Floats, Floats, Floats]:
         """Return residual (E, R, F) dB, derivatives (U, E, R, F) and active cells of a pose."""
         found = self.found
         position = self.echoes.positions[number] + found.position[number]
@@ -371,7 +370,7 @@ class Calibrator:
         measured = self.echoes.magnitude(number).numpy().astype(np.float64)
         reference = max(float(measured.max()) * 10.0 ** (-FLOOR_DB / 20.0), 1e-30)
 
-        def compressed(magnitude: NDArray[np.float32]) -> Array:
+        def compressed(magnitude: Singles) -> Floats:
             return np.asarray(_DB * np.log1p(gain * magnitude / reference), dtype=np.float64)
 
         a, b = _DB * np.log1p(measured / reference), compressed(rendered[0])

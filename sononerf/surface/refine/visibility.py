@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from sononerf.array_types import Bools, Floats
 from sononerf.geometry.raycast import Occlusion
 from sononerf.surface.refine.mesh_operators import MeshOperators
 from sononerf.surface.refine.optics import SILENT, Optics, Pieces
@@ -17,9 +17,7 @@ FREE = 0.25
 shadow, and the other side of a thin sheet that was pushed through must not."""
 
 
-def seen(
-    sight: Occlusion, points: NDArray[np.float64], target: NDArray[np.float64], *, free: float
-) -> NDArray[np.bool_]:
+def seen(sight: Occlusion, points: Floats, target: Floats, *, free: float) -> Bools:
     """Which points (N, 3) on the surface are seen from targets (N, 3), m.
 
     Args:

@@ -20,11 +20,10 @@ from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from sononerf.array_types import Bools, Floats, Singles
 from sononerf.echoes.free_space import EchoHull
 from sononerf.field.field import Field
-from sononerf.geometry.lattice import Grid
 
-Array = NDArray[np.float64]
 SHARED = 1.6
 """Standard deviation, in range resolutions, of the Gaussian over which the sound is averaged. With
 1.3 the points of nineteen touching spheres lie 0.9 mm too far out, with 2.0 0.3 mm; but with 2.0
@@ -48,12 +47,12 @@ class Evidence:
         pose (G,): Which pose hears it.
     """
 
-    points: Array
-    normals: Array
-    weight: Array
+    points: Floats
+    normals: Floats
+    weight: Floats
     pose: NDArray[np.intp]
 
-    def where(self, kept: NDArray[np.bool_]) -> Evidence:
+    def where(self, kept: Bools) -> Evidence:
         """Return those for which (G,) is true."""
         return Evidence(self.points[kept], self.normals[kept], self.weight[kept], self.pose[kept])
 
@@ -62,7 +61,7 @@ class Evidence:
 def locate_sound(
     field: Field,
     places: Tensor,
-    sources: Array,
+    sources: Floats,
     *,
     resolution: float,
     progress: Callable[[int, int], None] | None = None,
@@ -82,7 +81,7 @@ def locate_sound(
     bands = torch.arange(_BANDS, device=places.device) * (len(field.frequency) - 1) // (_BANDS - 1)
     where = places.cpu().double().numpy()
     kernel = _neighbours(where, SHARED * resolution)
-    found: list[tuple[Array, Array, Array, NDArray[np.intp]]] = []
+    found: list[tuple[Floats, Floats, Floats, NDArray[np.intp]]] = []
     for pose, source in enumerate(sources):
         emitter = torch.as_tensor(source, dtype=places.dtype, device=places.device)
         ray = emitter - places
@@ -113,7 +112,7 @@ def locate_sound(
     return Evidence(points, normals, weight, pose_)
 
 
-def _neighbours(places: Array, deviation: float) -> sparse.csr_matrix:
+def _neighbours(places: Floats, deviation: float) -> sparse.csr_matrix:
     """Return the Gaussian weights of places close to each other, (N, N)."""
     tree = cKDTree(places)
     pairs = tree.sparse_distance_matrix(tree, _CUTOFF * deviation, output_type="ndarray")
@@ -122,13 +121,13 @@ def _neighbours(places: Array, deviation: float) -> sparse.csr_matrix:
 
 
 def _moved(
-    places: Array,
-    ranges: Array,
-    power: Array,
+    places: Floats,
+    ranges: Floats,
+    power: Floats,
     near: sparse.csr_matrix,
-    source: Array,
+    source: Floats,
     side: float,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats]:
     """Return points, normals and power of one pose's sound, one per cube."""
     summed = near @ np.column_stack((power, power[:, None] * places, power * ranges))
     middle = summed[:, 1:4] / summed[:, :1]
@@ -143,7 +142,7 @@ def _moved(
     total = np.bincount(member, power)
     points = np.column_stack([np.bincount(member, power * p) for p in points.T]) / total[:, None]
     towards = source - points
-    normals: Array = towards / np.linalg.norm(towards, axis=1, keepdims=True)
+    normals: Floats = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     return points, normals, np.asarray(total, dtype=np.float64)
 
 
@@ -154,8 +153,8 @@ _ACCURACY = 1e-3  # of the residual's norm, where conjugate gradients stop
 
 
 def signed_distance(
-    weight: Grid, target: Grid, bound: Grid, pull: float, empty: Grid, bending: float
-) -> Grid:
+    weight: Singles, target: Singles, bound: Singles, pull: float, empty: Singles, bending: float
+) -> Singles:
     """Return the signed distance, positive outside.
 
     Args:
@@ -172,7 +171,7 @@ def signed_distance(
     if min(weight.shape) >= 2 * _COARSEST:
         coarse = _halved(weight)
         moment = _halved(np.asarray(weight * target, dtype=np.float32))
-        aim: Grid = (moment / np.maximum(coarse, 1e-9)).astype(np.float32)
+        aim: Singles = (moment / np.maximum(coarse, 1e-9)).astype(np.float32)
         # Values stay in fine voxels, so a Laplacian on twice the spacing is four times as small.
         first = signed_distance(coarse, aim, _halved(bound), pull, _halved(empty), bending / 16)
         distance = ndimage.zoom(first, 2, order=1, mode="nearest", grid_mode=True)
@@ -194,14 +193,14 @@ def signed_distance(
     return distance
 
 
-def _halved(grid: Grid) -> Grid:
+def _halved(grid: Singles) -> Singles:
     """Average blocks of eight; an odd last layer counts twice."""
     padded = np.pad(grid, [(0, n % 2) for n in grid.shape], mode="edge")
     x, y, z = (n // 2 for n in padded.shape)
     return np.asarray(padded.reshape(x, 2, y, 2, z, 2).mean(axis=(1, 3, 5)), dtype=np.float32)
 
 
-def _laplacian(values: Grid) -> Grid:
+def _laplacian(values: Singles) -> Singles:
     result = np.zeros_like(values)
     for axis in range(3):
         step = np.diff(values, axis=axis)
@@ -212,10 +211,12 @@ def _laplacian(values: Grid) -> Grid:
     return result
 
 
-def _conjugate_gradients(x: Grid, diagonal: Grid, right: Grid, bending: float, steps: int) -> Grid:
+def _conjugate_gradients(
+    x: Singles, diagonal: Singles, right: Singles, bending: float, steps: int
+) -> Singles:
     """Solve (diagonal + bending Laplacian²) x = right, from x on."""
 
-    def product(v: Grid) -> Grid:
+    def product(v: Singles) -> Singles:
         return np.asarray(diagonal * v + bending * _laplacian(_laplacian(v)), dtype=np.float32)
 
     scale = 1 / (diagonal + np.float32(42 * bending))  # 42: on the diagonal of Laplacian²
@@ -249,7 +250,7 @@ _WITNESSES = 4000  # points that are asked at most, a bound of time
 _CHUNK = 4000  # points at a time, a bound of memory
 
 
-def reliability(evidence: Evidence, hull: EchoHull, resolution: float) -> Array:
+def reliability(evidence: Evidence, hull: EchoHull, resolution: float) -> Floats:
     """Return how far each point is believed, (G,) from 0 to 1.
 
     Sound that a pose hears from a surface is heard by other poses from the same smooth surface, and
@@ -276,7 +277,7 @@ def reliability(evidence: Evidence, hull: EchoHull, resolution: float) -> Array:
     return np.maximum(by_others, at_onset)
 
 
-def _agreement(evidence: Evidence, resolution: float) -> Array:
+def _agreement(evidence: Evidence, resolution: float) -> Floats:
     """Return the fraction of the power around that lies on one smooth surface, if it is enough."""
     points, normals = evidence.points, evidence.normals
     count = len(points)
@@ -298,7 +299,7 @@ def _agreement(evidence: Evidence, resolution: float) -> Array:
     usual = float(np.average(support, weights=power))
     if not usual > 0:
         return np.zeros(count)
-    found: Array = support / around * support / (support + FEW * usual)
+    found: Floats = support / around * support / (support + FEW * usual)
     return found
 
 

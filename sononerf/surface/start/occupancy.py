@@ -24,23 +24,22 @@ from typing import Literal
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy import fft, ndimage
 
+from sononerf.array_types import Floats, Singles
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError
 from sononerf.field.field import Field
-from sononerf.geometry.lattice import MARGIN, Grid, Lattice, level_surface
+from sononerf.geometry.lattice import MARGIN, Lattice, level_surface
 from sononerf.surface.start.evidence import Evidence, locate_sound, reliability, signed_distance
 
-Array = NDArray[np.float64]
 _DENSE = 0.2  # density, over the median at the points, at which a plane has half of its full weight
 _PLANE = 1.0  # voxels, standard deviation of the Gaussian over which a point's plane counts
 _LOCAL = 3.0  # voxels over which the density of points is measured
 _BLUR = 1.5  # voxels over which normals are averaged to find out where opposite ones cancel
 
 
-def thinness(lattice: Lattice, points: Array, normals: Array, weight: Array) -> Grid:
+def thinness(lattice: Lattice, points: Floats, normals: Floats, weight: Floats) -> Singles:
     """Return where the other side of the body is so close that both would cancel, from 0 to 1.
 
     There the blurred normals are short beside the blurred weights, or point the other way behind a
@@ -59,7 +58,7 @@ def thinness(lattice: Lattice, points: Array, normals: Array, weight: Array) -> 
     total = lattice.spread(points, weight, _BLUR)
     blurred = [lattice.spread(points, weight * along, _BLUR) for along in normals.T]
 
-    def agreement(shift: float) -> Array:
+    def agreement(shift: float) -> Floats:
         where = points + shift * lattice.spacing * normals
         along = sum(
             n * lattice.read(grid, where) for n, grid in zip(normals.T, blurred, strict=True)
@@ -75,7 +74,9 @@ def thinness(lattice: Lattice, points: Array, normals: Array, weight: Array) -> 
     return np.asarray(thin / np.maximum(wide, 1e-3 * wide.max() + 1e-30), dtype=np.float32)
 
 
-def planes(lattice: Lattice, points: Array, normals: Array, weight: Array) -> tuple[Grid, Grid]:
+def planes(
+    lattice: Lattice, points: Floats, normals: Floats, weight: Floats
+) -> tuple[Singles, Singles]:
     """Return how far voxels near points are known, and their distance to the planes.
 
     Args:
@@ -107,7 +108,7 @@ def planes(lattice: Lattice, points: Array, normals: Array, weight: Array) -> tu
     return known.astype(np.float32), target
 
 
-def winding_of(lattice: Lattice, points: Array, normals: Array, weight: Array) -> Grid:
+def winding_of(lattice: Lattice, points: Floats, normals: Floats, weight: Floats) -> Singles:
     """Return the winding number of oriented points, each place of the surface counted once.
 
     Args:
@@ -134,7 +135,7 @@ def winding_of(lattice: Lattice, points: Array, normals: Array, weight: Array) -
 _AIR = 0.25  # fraction of the longest side, empty on each side: periodic images must stay apart
 
 
-def winding_number(flux: Sequence[Grid]) -> Grid:
+def winding_number(flux: Sequence[Singles]) -> Singles:
     """Return the winding number of a density of surface.
 
     Args:
@@ -210,11 +211,11 @@ class Gathered:
     """
 
     evidence: Evidence
-    weight: Array
-    points: Array
+    weight: Floats
+    points: Floats
     lattice: Lattice
-    thin: Grid
-    bound: Grid
+    thin: Singles
+    bound: Singles
     hull: EchoHull
     resolution: float
 
@@ -223,8 +224,8 @@ def gather_evidence(
     field: Field,
     places: torch.Tensor,
     hull: EchoHull,
-    lower: Array,
-    upper: Array,
+    lower: Floats,
+    upper: Floats,
     spacing: float,
     resolution: float,
 ) -> Gathered:
@@ -292,7 +293,7 @@ def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> trimesh.Tr
     return mesh
 
 
-def _by_all_evidence(known: Gathered, belief: Literal["open", "filled"]) -> Grid:
+def _by_all_evidence(known: Gathered, belief: Literal["open", "filled"]) -> Singles:
     """Return the signed distance, voxels, with thin parts too thick."""
     lattice, normals = known.lattice, known.evidence.normals
     bound = _walled(known.bound - np.float32(_THICKER) * known.thin)
@@ -307,7 +308,7 @@ def _by_all_evidence(known: Gathered, belief: Literal["open", "filled"]) -> Grid
     return signed_distance(weight, target, bound, span**-4, empty, _BENDING)
 
 
-def _walled(distance: Grid) -> Grid:
+def _walled(distance: Singles) -> Singles:
     """Return it with air all around the region."""
     walled = np.maximum(distance, 1.0)
     inner = (slice(MARGIN - 1, 1 - MARGIN),) * 3
@@ -315,14 +316,14 @@ def _walled(distance: Grid) -> Grid:
     return walled
 
 
-def _without_hollows(distance: Grid) -> Grid:
+def _without_hollows(distance: Singles) -> Singles:
     """Fill hollows: no sound comes out of them."""
     labels, _ = ndimage.label(distance > 0)
     hollow = (labels != labels[0, 0, 0]) & (distance > 0)
     return np.where(hollow, -distance, distance).astype(np.float32)
 
 
-def _without_parts(distance: Grid, known: Gathered | None) -> Grid:
+def _without_parts(distance: Singles, known: Gathered | None) -> Singles:
     """Leave out parts that the lattice does not resolve and, by the evidence, unheard ones."""
     labels, count = ndimage.label(distance < 0)
     if not count:
@@ -344,7 +345,7 @@ def _without_parts(distance: Grid, known: Gathered | None) -> Grid:
     return np.where(dropped, np.float32(1.0), distance).astype(np.float32)
 
 
-def _surface(distance: Grid, lattice: Lattice) -> trimesh.Trimesh:
+def _surface(distance: Singles, lattice: Lattice) -> trimesh.Trimesh:
     # A voxel on the surface itself would be wrapped in triangles without area.
     near = np.abs(distance) < 1e-3
     off = np.where(near, np.where(distance < 0, -1e-3, 1e-3), distance)
@@ -354,7 +355,7 @@ def _surface(distance: Grid, lattice: Lattice) -> trimesh.Trimesh:
 _COARSER = 4  # voxels between the places of the first look; only saves time
 
 
-def clearance_grid(hull: EchoHull, lattice: Lattice) -> NDArray[np.float64]:
+def clearance_grid(hull: EchoHull, lattice: Lattice) -> Floats:
     """Return how far each voxel lies behind the onsets, (X, Y, Z) m; exact near zero.
 
     Args:

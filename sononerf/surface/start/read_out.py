@@ -10,10 +10,10 @@ from typing import Literal
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
+from sononerf.array_types import Floats
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
@@ -27,7 +27,6 @@ from sononerf.surface.start.volume import (
     volume_from_function,
 )
 
-Array = NDArray[np.float64]
 _FAINTEST = (
     1e-7  # fraction of the loudest place's energy; quieter places are left out, to save time
 )
@@ -144,7 +143,7 @@ def read_isosurface(
     return isosurface(volume, found), volume, found
 
 
-def _grid_of(field: Field, spacing: float | None) -> tuple[Array, Array, float]:
+def _grid_of(field: Field, spacing: float | None) -> tuple[Floats, Floats, float]:
     """Return lower and upper corner (3,) of a field's region, and the voxel size, m."""
     lower, upper = (corner.cpu().double().numpy() for corner in field.region)
     step = spacing or field.resolution / 2
@@ -169,18 +168,18 @@ def energy_volume(field: Field, spacing: float, directions: int) -> Volume:
     return volume_from_function(_energy(field, directions), lower, upper, spacing, chunk=_CHUNK)
 
 
-def _energy(field: Field, directions: int) -> Callable[[Array], Array]:
+def _energy(field: Field, directions: int) -> Callable[[Floats], Floats]:
     return _inside(field, lambda places: field.oriented(places, directions)[0])
 
 
-def _loudness(field: Field, directions: int) -> Callable[[Array], Array]:
+def _loudness(field: Field, directions: int) -> Callable[[Floats], Floats]:
     return _inside(field, lambda places: field.loudness(places, directions))
 
 
-def _inside(field: Field, function: Callable[[Tensor], Tensor]) -> Callable[[Array], Array]:
+def _inside(field: Field, function: Callable[[Tensor], Tensor]) -> Callable[[Floats], Floats]:
     """Return a function of points that is zero where the field has no places."""
 
-    def values_at(points: Array) -> Array:
+    def values_at(points: Floats) -> Floats:
         places = torch.as_tensor(points, dtype=field.region.dtype, device=field.region.device)
         inside = field.inside(places)
         values = places.new_zeros(len(places))
@@ -191,7 +190,7 @@ def _inside(field: Field, function: Callable[[Tensor], Tensor]) -> Callable[[Arr
     return values_at
 
 
-def _places(field: Field, lower: Array, upper: Array, directions: int) -> Tensor:
+def _places(field: Field, lower: Floats, upper: Floats, directions: int) -> Tensor:
     """Return the field's own vertices that are not silent, (N, 3) m."""
     points = grid_over(lower, upper, field.resolution).points()
     # From the region's corner, where the field's own vertices lie.

@@ -24,16 +24,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 
+from sononerf.array_types import Bools, Floats
 from sononerf.errors import NumericalError
 from sononerf.geometry.lattice import level_surface
 from sononerf.surface.start.evidence import ALIGNED
 from sononerf.surface.start.occupancy import Gathered
 
-Array = NDArray[np.float64]
 THIN = 0.7
 """Range resolutions: a place is thin if its other side is nearer than this. The sides of a sheet
 share one echo, so neither is known to better than a fraction of the resolution."""
@@ -64,12 +63,12 @@ class _Frame:
         heights (Z,): m.
     """
 
-    centre: Array
-    axes: Array
-    lower: Array
+    centre: Floats
+    axes: Floats
+    lower: Floats
     step: float
-    depth: Array
-    heights: Array
+    depth: Floats
+    heights: Floats
 
 
 def fit_sheet(known: Gathered) -> trimesh.Trimesh:
@@ -153,7 +152,7 @@ def _framed(known: Gathered) -> _Frame:
     return _Frame(centre, axes, lower[:2], step, depth.reshape(grid.shape[:3]), heights)
 
 
-def _hull_heights(frame: _Frame) -> tuple[NDArray[np.bool_], Array, Array]:
+def _hull_heights(frame: _Frame) -> tuple[Bools, Floats, Floats]:
     """Return which columns the hull fills, and from where to where, (U V,) each, m."""
     inside = frame.depth > 0
     first = frame.heights[inside.argmax(axis=2)]
@@ -161,7 +160,7 @@ def _hull_heights(frame: _Frame) -> tuple[NDArray[np.bool_], Array, Array]:
     return inside.any(axis=2).ravel(), first.ravel(), last.ravel()
 
 
-def _linear(at: Array, shape: tuple[int, ...]) -> sparse.csr_array:
+def _linear(at: Floats, shape: tuple[int, ...]) -> sparse.csr_array:
     """Return the matrix that reads a grid at places (N, 2), linearly between columns."""
     base = np.floor(at).astype(np.intp).clip(0, np.asarray(shape) - 2)
     fraction = at - base
@@ -186,7 +185,7 @@ def _bending(shape: tuple[int, ...]) -> sparse.csr_array:
     return sparse.csr_array(along.T @ along + across.T @ across + 2.0 * twist.T @ twist)
 
 
-def _slab(frame: _Frame, z: Array, half: float) -> trimesh.Trimesh:
+def _slab(frame: _Frame, z: Floats, half: float) -> trimesh.Trimesh:
     """Return the body between two heights, as far as the hull reaches."""
     # Made as a flat slab of two layers, then put at its heights: the sides cannot touch.
     layers = np.abs(np.arange(-3, 4)) - 1.0

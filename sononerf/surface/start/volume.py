@@ -11,6 +11,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from skimage.filters import threshold_otsu
 
+from sononerf.array_types import Floats
 from sononerf.errors import NumericalError, ResourceError
 from sononerf.geometry.lattice import level_surface
 from sononerf.memory import available_memory
@@ -33,7 +34,7 @@ class Volume:
     """
 
     values: NDArray[np.floating]
-    origin: NDArray[np.float64]
+    origin: Floats
     spacing: float
 
     def __post_init__(self) -> None:
@@ -56,11 +57,11 @@ class Volume:
         return x, y, z
 
     @property
-    def upper(self) -> NDArray[np.float64]:
+    def upper(self) -> Floats:
         """Centre of the last voxel, (3,) m."""
         return self.origin + self.spacing * (np.asarray(self.shape) - 1)
 
-    def axes(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def axes(self) -> tuple[Floats, Floats, Floats]:
         """Return the voxels' centres along each axis: (X,), (Y,), (Z,) m."""
         x, y, z = (
             start + self.spacing * np.arange(count)
@@ -68,7 +69,7 @@ class Volume:
         )
         return x, y, z
 
-    def points(self) -> NDArray[np.float64]:
+    def points(self) -> Floats:
         """Return the voxels' centres, (X*Y*Z, 3) m, in the order of ``values.ravel()``."""
         return _centres(self.axes(), 0, self.values.size)
 
@@ -79,13 +80,13 @@ class Volume:
         return Volume(values, self.origin, self.spacing)
 
 
-def _centres(axes: tuple[NDArray[np.float64], ...], start: int, stop: int) -> NDArray[np.float64]:
+def _centres(axes: tuple[Floats, ...], start: int, stop: int) -> Floats:
     shape = tuple(len(axis) for axis in axes)
     indices = np.unravel_index(np.arange(start, stop), shape)
     return np.stack([axis[index] for axis, index in zip(axes, indices, strict=True)], axis=1)
 
 
-def _box(lower: ArrayLike, upper: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _box(lower: ArrayLike, upper: ArrayLike) -> tuple[Floats, Floats]:
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     if low.shape != (3,) or high.shape != (3,) or not np.isfinite([low, high]).all():
         raise ValueError(f"box {lower!r} to {upper!r}: expected three finite numbers each, in m")
@@ -157,7 +158,7 @@ def grid_over(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Volume:
 
 
 def volume_from_function(
-    function: Callable[[NDArray[np.float64]], ArrayLike],
+    function: Callable[[Floats], ArrayLike],
     lower: ArrayLike,
     upper: ArrayLike,
     spacing: float,
@@ -292,7 +293,7 @@ def isosurface(volume: Volume, level: float) -> trimesh.Trimesh:
     return level_surface(scaled, float(threshold), origin, volume.spacing)
 
 
-def _kept_off(values: NDArray[np.float64], level: float) -> NDArray[np.float64]:
+def _kept_off(values: Floats, level: float) -> Floats:
     """Move values off the level, as far as moves the surface by a thousandth of a voxel.
 
     A voxel on the level, or all but, is wrapped in triangles too small to have a normal.
