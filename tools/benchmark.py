@@ -81,8 +81,7 @@ def main() -> None:
         command.add_argument("--scene", default="ua")
         command.add_argument("--poses", type=int, default=default)
         command.add_argument("--bounces", type=int, default=3)
-        if run is simulate:
-            command.add_argument("--rays", type=int, default=300_000)
+        command.add_argument("--rays", type=int, default=300_000)
     added(physics)
     added(dechirp)
     command = added(cost)

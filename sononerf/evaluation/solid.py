@@ -15,9 +15,14 @@ from scipy.spatial import cKDTree
 
 from sononerf.array_types import Bools, Floats
 from sononerf.errors import NumericalError
+from sononerf.geometry.raycast import RayCaster
 
 Samples = tuple[Floats, Floats]
 
+WAYS_OUT = np.array([[0.62, 0.33, 0.71], [-0.45, 0.83, -0.33], [0.21, -0.56, -0.80]])
+WAYS_OUT /= np.linalg.norm(WAYS_OUT, axis=1, keepdims=True)
+"""Directions of the rays that tell inside from outside; the majority counts, as a ray may pass
+between two triangles. They are parallel to no axis, and so to few faces."""
 SMALLEST_PART = 0.01
 """Parts with less than this fraction of the largest part's area are not counted."""
 ROUNDING = 1e-9
@@ -95,14 +100,15 @@ class Solid:
 
     def contains(self, points: Floats) -> Bools:
         """Return whether points (N, 3), in m, lie inside the union, (N,)."""
-        import pyvista  # its test is five times as quick as winding numbers
-
         if self.union.is_empty() or not len(points):
             return np.zeros(len(points), bool)
-        body = _trimesh(self.union)
-        surface = pyvista.PolyData.from_regular_faces(body.vertices, body.faces)
-        found = pyvista.PolyData(np.asarray(points)).compute_implicit_distance(surface)
-        return np.asarray(found["implicit_distance"]) < 0
+        caster = RayCaster(_trimesh(self.union))
+        origins, votes = np.asarray(points, dtype=np.float64), np.zeros(len(points), int)
+        for direction in WAYS_OUT:
+            hits = caster.first_hit(origins, np.broadcast_to(direction, origins.shape))
+            # From inside, a ray leaves through the first surface that it meets.
+            votes[hits.ray] += (hits.flat @ direction) > 0
+        return votes * 2 > len(WAYS_OUT)
 
     @cached_property
     def surface(self) -> trimesh.Trimesh:

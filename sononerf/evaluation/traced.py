@@ -37,12 +37,14 @@ class Traced:
         gain_db ((E, F), dB): Level that is added to the traced echoes.
         weight (F,): Weight of the traced echoes in the mean with the rendered ones, 0 to 1.
         fault: Why no echoes can be traced off the surface; empty where they can.
+        simulator: Of the surface, with what it has solved for; made anew where None.
     """
 
     mesh: trimesh.Trimesh
     gain_db: Floats
     weight: Floats
     fault: str = ""
+    simulator: Simulator | None = None
 
     @classmethod
     def none(cls, mesh: trimesh.Trimesh, head: Head, fault: str = "") -> Traced:
@@ -91,7 +93,9 @@ def learn_traced(
     some = training.only(torch.as_tensor(numbers))
     try:
         simulator = Simulator.of_surface(mesh, fitted.head, simulation, rays=RAYS)
-        both = zip(_places(some), _places(validation), strict=True)
+        # The low band of the test poses is solved with the others: the surface is known by now.
+        all_places = (_places(of) for of in (some, validation, poses_of(echoes, "test", renderer)))
+        both = zip(*all_places, strict=True)
         positions, rotations = (np.concatenate(parts) for parts in both)
         simulator.prepare(positions, rotations, progress)
         traced = compress(_trace(simulator, some, seed, progress), reference)
@@ -105,7 +109,8 @@ def learn_traced(
     traced = compress(traced * 10 ** (gain[:, None] / 20), reference)
     rendered = render_poses(fitted, validation, accelerator=accelerator, progress=progress)
     measured = compress(_measured(validation), reference)
-    return Traced(mesh, gain, regress_weight(measured, compress(rendered, reference), traced))
+    weight = regress_weight(measured, compress(rendered, reference), traced)
+    return Traced(mesh, gain, weight, simulator=simulator)
 
 
 def trace_poses(
@@ -118,7 +123,7 @@ def trace_poses(
     progress: Progress,
 ) -> Floats:
     """Trace echoes off the surface, (P, E, R, F) linear magnitude, without noise."""
-    simulator = Simulator.of_surface(traced.mesh, head, simulation, rays=RAYS)
+    simulator = traced.simulator or Simulator.of_surface(traced.mesh, head, simulation, rays=RAYS)
     simulator.prepare(*_places(poses), progress)
     found = _trace(simulator, poses, seed, progress)
     return found * 10 ** (traced.gain_db[:, None] / 20)

@@ -9,6 +9,7 @@ import platform
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -95,6 +96,7 @@ class RunFolder:
         self.checkpoint = path / "checkpoints" / "last.ckpt"
         self.reconstruction = path / "reconstruction"
         self._locks = 0
+        self._kept: Traced | None = None
 
     @classmethod
     def of(cls, run: Path | RunFolder) -> RunFolder:
@@ -162,11 +164,15 @@ class RunFolder:
 
     def traced(self) -> Traced | None:
         """Return the surface that echoes are traced off, and their weight; None without them."""
-        return load_traced(self.path)
+        found, kept = load_traced(self.path), self._kept
+        if found is None or kept is None or not _same(found.mesh, kept.mesh):
+            return found
+        return replace(found, simulator=kept.simulator)
 
     def keep_traced(self, traced: Traced) -> None:
         """Write what was learned of the reconstructed surface."""
         save_traced(self.path, traced)
+        self._kept = traced
 
     def _traces_its_mesh(self) -> bool:
         """Tell whether the traced surface is that of the reconstruction."""
@@ -174,11 +180,7 @@ class RunFolder:
             traced, mesh = self.traced(), self.mesh()
         except InputError:
             return False
-        return (
-            traced is not None
-            and np.array_equal(traced.mesh.vertices, mesh.vertices)
-            and np.array_equal(traced.mesh.faces, mesh.faces)
-        )
+        return traced is not None and _same(traced.mesh, mesh)
 
     def is_done(self, stage: Stage) -> bool:
         """Tell whether a stage came to its end, with the results of the stages before it."""
@@ -323,6 +325,11 @@ class RunFolder:
     def clear_previews(self) -> None:
         """Remove the previews of a fit that starts anew."""
         shutil.rmtree(self.path / "epochs", ignore_errors=True)
+
+
+def _same(one: trimesh.Trimesh, two: trimesh.Trimesh) -> bool:
+    """Tell whether two meshes have the same vertices and triangles."""
+    return np.array_equal(one.vertices, two.vertices) and np.array_equal(one.faces, two.faces)
 
 
 def _has(name: str) -> bool:

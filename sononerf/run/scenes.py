@@ -24,7 +24,7 @@ from sononerf.run.simulate import scene_of
 from sononerf.scene.scene import list_scenes, load_scene
 from sononerf.settings import plugins
 from sononerf.settings.schema import Settings
-from sononerf.simulation.ensemble import pose_seed
+from sononerf.simulation.simulator import pose_seed
 
 
 def describe_scenes() -> list[dict[str, Any]]:

@@ -24,9 +24,10 @@ from sononerf.run.build import attach, complete_store, head_of, simulator_of
 from sononerf.run.understand import OWN_SETTINGS
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
-from sononerf.simulation.ensemble import check_poses, check_reach, pose_seed
+from sononerf.simulation.accuracy import settle_rays
+from sononerf.simulation.ensemble import check_poses, check_reach
 from sononerf.simulation.ensemble import simulate as simulate_poses
-from sononerf.simulation.simulator import VERSION, Simulator, ensemble_poses
+from sononerf.simulation.simulator import VERSION, Simulator, ensemble_poses, pose_seed
 
 HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")
 
@@ -60,6 +61,8 @@ def _heard_settings(settings: Settings) -> dict[str, Any]:
     if analysis["kind"] == "stft":
         for key in ("kind", "channels", "q"):
             del analysis[key]
+    if plain["simulation"]["rays"] is not None:
+        del plain["simulation"]["accuracy_db"]
     if ears["directivity"] != "piston":
         del ears["piston_radius"]
     for section, key, default in (
@@ -290,6 +293,7 @@ def write_waveforms(
     simulator = simulator_of(scene, settings)
     poses, split = ensemble_poses(settings.poses)
     simulator.prepare(poses.positions, poses.rotations, progress)
+    settle_rays(simulator, poses, settings.simulation, progress)
     digits = max(4, len(str(len(poses) - 1)))
     names = [f"ping_{index:0{digits}d}.wav" for index in range(len(poses))]
     with progress.task("recording", len(poses)) as task:

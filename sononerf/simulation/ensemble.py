@@ -4,13 +4,8 @@
 from __future__ import annotations
 
 import logging
-import signal
-import warnings
-from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import ExitStack, contextmanager
-from multiprocessing import resource_tracker
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from contextlib import closing
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,17 +13,16 @@ from numpy.typing import ArrayLike
 from sononerf.array_types import Bools, Floats, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore, seal
-from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
+from sononerf.errors import InputError, NumericalError
 from sononerf.geometry.poses import Poses
 from sononerf.geometry.raycast import winding_numbers
 from sononerf.memory import available_cores
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SimulationSettings
+from sononerf.simulation.accuracy import settle_rays
 from sononerf.simulation.simulator import Simulator
-
-if TYPE_CHECKING:
-    from distributed import Client
+from sononerf.simulation.workers import in_processes, in_this_process, on_cluster
 
 logger = logging.getLogger("sononerf")
 
@@ -37,17 +31,6 @@ Write = Callable[[int, Singles], None]
 MOST_WORKERS = 8
 WORTH_WORKERS = 64
 """Number of poses from which other processes save time: fewer are done before these start."""
-CONNECT_SECONDS = 30  # a scheduler across a network answers in one
-QUEUED_PER_WORKER = 4  # results wait in memory; more than this would only fill it
-PATIENCE_SECONDS = 10  # without a result, before workers are looked for
-GIVEN_UP_AFTER = 6  # such times on end without any worker of our own: none will come again
-SENT_AGAIN = 3  # times, and each time Dask itself tries four workers
-
-
-def pose_seed(seed: int, index: int) -> int:
-    """Seed of one pose of an ensemble; who simulates it, and when, does not matter."""
-    state = np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)
-    return int(state[0])
 
 
 def check_poses(scene: Scene, poses: Poses, *, offsets: Floats | None = None) -> None:
@@ -155,6 +138,10 @@ def simulate(
     again: dict[int, Singles] = {}
     wanted = [*missing, *test]
     simulator.prepare(poses.positions[wanted], poses.rotations[wanted], progress)
+    known = store.attributes.get("rays")
+    if known is not None:  # an interrupted simulation goes on with the same rays
+        options = options.model_copy(update={"rays": known})
+    store.update_attributes(rays=settle_rays(simulator, poses, options, progress))
     with progress.task("simulating", len(missing) + len(test)) as task:
         # The second simulation of the test poses goes first where it can share the processes.
         def keep(index: int, spectrogram: Singles) -> None:
@@ -217,171 +204,13 @@ def simulate_ensemble(
         )
         workers, scheduler = 1, None
     engine.prepare(poses.positions[wanted], poses.rotations[wanted])
-    if scheduler is None and workers <= 1:
-        for index, spectrogram in _simulate_here(simulator, poses, wanted, seed):
+    if scheduler is not None:
+        results = on_cluster(simulator, poses, wanted, seed, scheduler)
+    elif workers > 1:
+        results = in_processes(simulator, poses, wanted, seed, workers)
+    else:
+        results = in_this_process(simulator, poses, wanted, seed)
+    # Closed at once where a write fails: what runs elsewhere ends before the error is seen.
+    with closing(results):
+        for index, spectrogram in results:
             write(index, spectrogram)
-    elif wanted:
-        with _workers(workers, scheduler) as client:
-            ours = scheduler is None
-            results = _simulate_there(client, simulator, poses, wanted, seed, ours=ours)
-            for index, spectrogram in results:
-                write(index, spectrogram)
-
-
-def _failed(index: int, error: BaseException) -> SonoNerfError:
-    text = " ".join(str(error).split())
-    return SonoNerfError(f"pose {index} cannot be simulated: {type(error).__name__}: {text}")
-
-
-def _simulate_here(
-    simulator: Simulator, poses: Poses, indices: list[int], seed: int
-) -> Iterator[tuple[int, Singles]]:
-    for index in indices:
-        try:
-            spectrogram = simulator.spectrogram(
-                poses.positions[index], poses.rotations[index], seed=pose_seed(seed, index)
-            )
-        except Exception as error:
-            raise _failed(index, error) from error
-        yield index, spectrogram
-
-
-def _receive(simulator: Simulator) -> Simulator:
-    return simulator
-
-
-def _one(simulator: Simulator, position: Floats, rotation: Floats, seed: int) -> Singles:
-    return simulator.spectrogram(position, rotation, seed=seed)
-
-
-def _simulate_there(
-    client: Client,
-    simulator: Simulator,
-    poses: Poses,
-    indices: list[int],
-    seed: int,
-    *,
-    ours: bool,
-) -> Iterator[tuple[int, Singles]]:
-    from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
-
-    from distributed import KilledWorker
-
-    executor, sent = client.get_executor(pure=False), _send(client, simulator)
-    left, running, lost = deque(indices), dict[Future[Any], int](), Counter[int]()
-    idle = 0
-    while left or running:
-        # Workers come and go.
-        threads = _threads(client)
-        while left and len(running) < QUEUED_PER_WORKER * max(1, threads):
-            index = left.popleft()
-            pose = poses.positions[index], poses.rotations[index]
-            running[executor.submit(_one, sent, *pose, pose_seed(seed, index))] = index
-        done = wait(running, PATIENCE_SECONDS, return_when=FIRST_COMPLETED).done
-        idle = idle + 1 if not done and not threads else 0
-        if idle == 1:
-            logger.warning("the Dask scheduler has no workers; waiting for some")
-        if ours and idle >= GIVEN_UP_AFTER:  # on a cluster others may start some tomorrow
-            raise ResourceError(
-                "all workers on this machine were killed, and none came back; give them more "
-                "memory, or start fewer; the same command goes on with what is missing"
-            )
-        for future in done:
-            index = running.pop(future)
-            try:
-                spectrogram = future.result()
-            except KilledWorker as error:
-                # Whose workers died is not to blame, until it has happened again and again.
-                lost[index] += 1
-                if lost[index] > SENT_AGAIN:
-                    raise ResourceError(
-                        f"pose {index}: every worker that took it was killed; give workers more "
-                        "memory, or start fewer on a machine"
-                    ) from error
-                left.appendleft(index)
-                if sent.status == "error":
-                    sent = _send(client, simulator)
-                continue
-            except CancelledError as error:
-                raise _unreachable(error) from error
-            except Exception as error:
-                raise _failed(index, error) from error
-            yield index, spectrogram
-
-
-def _send(client: Client, simulator: Simulator) -> Any:
-    """Send the simulator once, as a task: what dies with a worker can be made again."""
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", message="Sending large graph", category=UserWarning)
-        return client.submit(_receive, simulator, pure=False)
-
-
-def _threads(client: Client) -> int:
-    try:
-        return sum(client.nthreads().values())
-    except OSError as error:
-        raise _unreachable(error) from error
-
-
-def _unreachable(error: BaseException) -> ResourceError:
-    return ResourceError(
-        f"the Dask scheduler is gone ({type(error).__name__}); the same command goes on with what "
-        "is missing"
-    )
-
-
-@contextmanager
-def _workers(workers: int, scheduler: str | None) -> Iterator[Client]:
-    """Connect to a scheduler, or start processes here that end with the block."""
-    import dask
-    from distributed import Client, LocalCluster
-
-    with ExitStack() as stack:
-        # Its workers run numerical libraries on one thread each; that is Dask's own default.
-        stack.enter_context(dask.config.set({"distributed.admin.log-level": "error"}))
-        stack.enter_context(_quiet("distributed"))
-        try:
-            if scheduler is None:
-                with _deaf_to_interrupts():
-                    cluster = LocalCluster(
-                        n_workers=workers,
-                        threads_per_worker=1,
-                        processes=True,
-                        dashboard_address="127.0.0.1:0",  # none would still take port 8787
-                        silence_logs=logging.CRITICAL,
-                    )
-                scheduler = stack.enter_context(cluster)
-            client = stack.enter_context(Client(scheduler, timeout=CONNECT_SECONDS))
-        except (OSError, ValueError, RuntimeError) as error:
-            where = scheduler if isinstance(scheduler, str) else f"{workers} local workers"
-            raise ResourceError(f"{where} cannot be reached: {error}") from error
-        yield client
-
-
-@contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """Keep Ctrl-C from threads and processes that are started in the block, and those of theirs.
-
-    A terminal sends it to all of them; we alone end them, and without a traceback of each.
-    """
-    # Where it is not running yet, its start would let the signal through again.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def _quiet(name: str) -> Iterator[None]:
-    """Silence a package's loggers; it has given some of them levels of their own."""
-    names = [known for known in logging.root.manager.loggerDict if known.split(".")[0] == name]
-    levels = {known: logging.getLogger(known).level for known in names}
-    for known in names:
-        logging.getLogger(known).setLevel(logging.CRITICAL)
-    try:
-        yield
-    finally:
-        for known, level in levels.items():
-            logging.getLogger(known).setLevel(level)

@@ -34,15 +34,15 @@ from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import hearing_of
 from sononerf.simulation.hybrid import hybrid
 from sononerf.simulation.rays import Rays
-from sononerf.simulation.reference.boundary import Boundary
 from sononerf.simulation.reference.kirchhoff import Kirchhoff
-from sononerf.simulation.reference.spheres import Spheres
 from sononerf.simulation.solved import TAPER, Solved
 
 logger = logging.getLogger("sononerf")
 
 COARSE = 1.25
 """Times ``RESOLVED_FREQUENCY``: bands that end above are warned of. The default band ends there."""
+UNSETTLED = 100_000
+"""Rays per pose where neither a number is set nor an accuracy was measured, as in a preview."""
 VERSION = 4  # to be raised when the same settings give other echoes: stores are told apart by it
 
 
@@ -71,8 +71,11 @@ class Simulator:
         """
         hearing, analysis = hearing_of(head), head.analysis
         if options.engine in ("spheres", "bem"):
-            solver = Spheres if options.engine == "spheres" else Boundary
-            return cls(solver(scene, hearing, frequency_max=solved_frequency(options, analysis)))
+            return cls(
+                _solver(options.engine)(
+                    scene, hearing, frequency_max=solved_frequency(options, analysis)
+                )
+            )
         if options.engine == "kirchhoff":
             if any(material.lobe_width is not None for material in scene.materials):
                 logger.warning(
@@ -87,7 +90,7 @@ class Simulator:
                 *(analysis.frequency_max, options.engine, RESOLVED_FREQUENCY),
             )
         rays: dict[str, Any] = {
-            "rays": options.rays,
+            "rays": options.rays or UNSETTLED,
             "bounces": options.bounces,
             "diffraction_points": options.diffraction_points,
         }
@@ -170,6 +173,22 @@ class Simulator:
         """
         echo = self.echo(position, rotation, seed=seed)
         return self.head.receive(echo, seed=seed)
+
+
+def pose_seed(seed: int, index: int) -> int:
+    """Seed of one pose of an ensemble; who simulates it, and when, does not matter."""
+    state = np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)
+    return int(state[0])
+
+
+def _solver(engine: str) -> type[Solved]:
+    if engine == "spheres":
+        from sononerf.simulation.reference.spheres import Spheres
+
+        return Spheres
+    from sononerf.simulation.reference.boundary import Boundary  # imports torch: seconds
+
+    return Boundary
 
 
 def quiet_scene(mesh: trimesh.Trimesh) -> Scene:

@@ -33,8 +33,7 @@ def _heard(scene: str, engine: str, poses: int) -> dict[str, Any]:
     from sononerf.run.build import simulator_of
     from sononerf.scene.scene import load_scene
     from sononerf.settings.loading import validate_settings
-    from sononerf.simulation.ensemble import pose_seed
-    from sononerf.simulation.simulator import ensemble_poses
+    from sononerf.simulation.simulator import ensemble_poses, pose_seed
 
     data = SETTINGS | {"scene": {"name": scene}, "simulation": {"engine": engine}}
     settings = validate_settings(data, "benchmark exact")

@@ -18,8 +18,7 @@ from sononerf.run.build import simulator_of
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings, validate_settings
 from sononerf.settings.schema import Settings
-from sononerf.simulation.ensemble import pose_seed
-from sononerf.simulation.simulator import ensemble_poses
+from sononerf.simulation.simulator import ensemble_poses, pose_seed
 
 REFERENCE_RATIO = 1e-3  # the reported decibels start 60 dB below the greatest magnitude
 
@@ -112,8 +111,8 @@ def simulate(arguments: argparse.Namespace) -> dict[str, Any]:
 def noise(arguments: argparse.Namespace) -> dict[str, Any]:
     """Compare simulations of the test poses that differ in their rays alone."""
     scene = load_scene(arguments.scene)
-    default = settings_for(arguments)
-    rays = default.simulation.rays
+    rays = arguments.rays
+    default = settings_for(arguments, rays=rays)
     poses, split = ensemble_poses(default.poses)
     chosen = np.flatnonzero(split == 2)[: arguments.poses]
 

@@ -1,0 +1,277 @@
+# SPDX-License-Identifier: MIT
+"""Who simulates the poses: this process, others on this machine, or a Dask cluster."""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import warnings
+from collections import Counter, deque
+from collections.abc import Generator, Iterator
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
+from multiprocessing import resource_tracker
+from typing import TYPE_CHECKING, Any
+
+from sononerf.array_types import Floats, Singles
+from sononerf.errors import ResourceError, SettingsError, SonoNerfError
+from sononerf.geometry.poses import Poses
+from sononerf.simulation.simulator import Simulator, pose_seed
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+logger = logging.getLogger("sononerf")
+
+QUEUED_PER_WORKER = 4
+"""Poses that wait for each worker. Results wait in memory, so more would only fill it."""
+SENT_AGAIN = 3
+"""Times that a pose is sent again after its worker died; Dask itself tries four workers a time."""
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+"""Variables by which numerical libraries take one thread in each worker."""
+CONNECT_SECONDS = 30
+"""Time to wait for a Dask scheduler, s; across a network it answers in one."""
+PATIENCE_SECONDS = 10
+"""Time without a result after which the workers of a cluster are counted, s."""
+
+Results = Generator[tuple[int, Singles], None, None]
+
+
+def in_this_process(simulator: Simulator, poses: Poses, indices: list[int], seed: int) -> Results:
+    """Simulate poses one after the other."""
+    for index in indices:
+        try:
+            spectrogram = _one(simulator, *_pose(poses, index), pose_seed(seed, index))
+        except Exception as error:
+            raise _failed(index, error) from error
+        yield index, spectrogram
+
+
+def in_processes(
+    simulator: Simulator, poses: Poses, indices: list[int], seed: int, workers: int
+) -> Results:
+    """Simulate poses in other processes of this machine; they come in any order.
+
+    A killed worker costs what it was working on, which is sent again.
+
+    Raises:
+        ResourceError: If the workers of a pose die again and again.
+    """
+    left, lost = deque(indices), Counter[int]()
+    while left:
+        running: dict[Future[Singles], int] = {}
+        # Who is suspected of killing workers shares none with poses that wait.
+        most = workers if lost else QUEUED_PER_WORKER * workers
+        with _pool(simulator, workers) as pool:
+            try:
+                while left or running:
+                    while left and len(running) < most:
+                        task = _pose(poses, left[0]), pose_seed(seed, left[0])
+                        with _deaf_single_threads():
+                            running[pool.submit(_mine, *task)] = left[0]
+                        left.popleft()
+                    for future in wait(running, return_when=FIRST_COMPLETED).done:
+                        try:
+                            spectrogram = future.result()
+                        except BrokenProcessPool:
+                            raise
+                        except Exception as error:
+                            raise _failed(running[future], error) from error
+                        yield running.pop(future), spectrogram
+            except BrokenProcessPool as error:
+                again = sorted(running.values())
+                lost.update(again)
+                if lost and max(lost.values()) > SENT_AGAIN:
+                    named = ", ".join(str(i) for i in again if lost[i] > SENT_AGAIN)
+                    raise ResourceError(
+                        f"pose {named}: every worker that took it was killed; give workers more "
+                        "memory, or start fewer; the same command goes on with what is missing"
+                    ) from error
+                left.extendleft(reversed(again))
+
+
+_simulator: Simulator | None = None
+
+
+def _become(simulator: Simulator) -> None:
+    """Make this process a worker, which ends with the one that started it."""
+    global _simulator
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _simulator = simulator
+    parent = multiprocessing.parent_process()
+
+    def follow() -> None:
+        if parent is not None:
+            parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+def _mine(pose: tuple[Floats, Floats], seed: int) -> Singles:
+    assert _simulator is not None
+    return _one(_simulator, *pose, seed)
+
+
+def _one(simulator: Simulator, position: Floats, rotation: Floats, seed: int) -> Singles:
+    return simulator.spectrogram(position, rotation, seed=seed)
+
+
+def _pose(poses: Poses, index: int) -> tuple[Floats, Floats]:
+    return poses.positions[index], poses.rotations[index]
+
+
+def _failed(index: int, error: BaseException) -> SonoNerfError:
+    text = " ".join(str(error).split())
+    return SonoNerfError(f"pose {index} cannot be simulated: {type(error).__name__}: {text}")
+
+
+@contextmanager
+def _pool(simulator: Simulator, workers: int) -> Iterator[ProcessPoolExecutor]:
+    """Start processes that end with the block, at once where it fails."""
+    # A server that has imported the simulator forks them; other systems start each from nothing.
+    context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
+    if sys.platform == "linux":
+        context.set_forkserver_preload([__name__])
+    others = set(multiprocessing.active_children())
+    pool = ProcessPoolExecutor(workers, context, _become, (simulator,))
+    try:
+        yield pool
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(multiprocessing.active_children()) - others:
+            child.terminate()
+        raise
+    pool.shutdown()
+
+
+@contextmanager
+def _deaf_single_threads() -> Iterator[None]:
+    """Start processes on one thread each, and keep Ctrl-C from them.
+
+    A terminal sends it to all of them; we alone end them, and without a traceback of each.
+    """
+    before = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    # Where it is not running yet, its start would let the signal through again.
+    resource_tracker.ensure_running()
+    heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, heard)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def on_cluster(
+    simulator: Simulator, poses: Poses, indices: list[int], seed: int, scheduler: str
+) -> Results:
+    """Simulate poses on the workers of a Dask scheduler; they come in any order.
+
+    Raises:
+        SettingsError: If Dask is not installed.
+        ResourceError: If the scheduler is gone, or the workers of a pose die again and again.
+    """
+    with _client(scheduler) as client:
+        executor, sent = client.get_executor(pure=False), _send(client, simulator)
+        left, running, lost = deque(indices), dict[Future[Any], int](), Counter[int]()
+        told = False
+        while left or running:
+            # Workers come and go.
+            threads = _threads(client)
+            while left and len(running) < QUEUED_PER_WORKER * max(1, threads):
+                index = left.popleft()
+                task = *_pose(poses, index), pose_seed(seed, index)
+                running[executor.submit(_one, sent, *task)] = index
+            done = wait(running, PATIENCE_SECONDS, return_when=FIRST_COMPLETED).done
+            if not (done or threads or told):  # others may start some tomorrow
+                logger.warning("the Dask scheduler has no workers; waiting for some")
+            told = not (done or threads)
+            for future in done:
+                index = running.pop(future)
+                try:
+                    spectrogram = future.result()
+                except CancelledError as error:
+                    raise _unreachable(error) from error
+                except Exception as error:
+                    if type(error).__name__ != "KilledWorker":
+                        raise _failed(index, error) from error
+                    # A pose is blamed only after repeated deaths of its workers.
+                    lost[index] += 1
+                    if lost[index] > SENT_AGAIN:
+                        raise ResourceError(
+                            f"pose {index}: every worker that took it was killed; give workers "
+                            "more memory, or start fewer on a machine"
+                        ) from error
+                    left.appendleft(index)
+                    if sent.status == "error":
+                        sent = _send(client, simulator)
+                    continue
+                yield index, spectrogram
+
+
+def _receive(simulator: Simulator) -> Simulator:
+    return simulator
+
+
+def _send(client: Client, simulator: Simulator) -> Any:
+    """Send the simulator once, as a task: what dies with a worker can be made again."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Sending large graph", category=UserWarning)
+        return client.submit(_receive, simulator, pure=False)
+
+
+def _threads(client: Client) -> int:
+    try:
+        return sum(client.nthreads().values())
+    except OSError as error:
+        raise _unreachable(error) from error
+
+
+def _unreachable(error: BaseException) -> ResourceError:
+    return ResourceError(
+        f"the Dask scheduler is gone ({type(error).__name__}); the same command goes on with what "
+        "is missing"
+    )
+
+
+@contextmanager
+def _client(scheduler: str) -> Iterator[Client]:
+    try:
+        import dask
+        from distributed import Client
+    except ImportError as error:
+        raise SettingsError(
+            "--scheduler: Dask is not installed; pip install 'sononerf[cluster]'"
+        ) from error
+    with ExitStack() as stack:
+        stack.enter_context(dask.config.set({"distributed.admin.log-level": "error"}))
+        stack.enter_context(_quiet("distributed"))
+        try:
+            client = stack.enter_context(Client(scheduler, timeout=CONNECT_SECONDS))
+        except (OSError, ValueError, RuntimeError) as error:
+            raise ResourceError(f"{scheduler} cannot be reached: {error}") from error
+        yield client
+
+
+@contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Silence a package's loggers; it has given some of them levels of their own."""
+    names = [known for known in logging.root.manager.loggerDict if known.split(".")[0] == name]
+    levels = {known: logging.getLogger(known).level for known in names}
+    for known in names:
+        logging.getLogger(known).setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        for known, level in levels.items():
+            logging.getLogger(known).setLevel(level)

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import pytest
+
+from sononerf.echoes.layout import chunk_path
+from sononerf.echoes.store import EnsembleStore
+from sononerf.progress import Progress
+from sononerf.run.build import simulator_of
+from sononerf.run.simulate import simulate
+from sononerf.scene.scene import load_scene
+from sononerf.settings.loading import validate_settings
+from sononerf.simulation import accuracy
+from sononerf.simulation.accuracy import settle_rays
+from sononerf.simulation.simulator import ensemble_poses
+
+QUIET = Progress(quiet=True)
+
+
+def settings(**simulation):
+    return validate_settings(
+        {
+            "scene": {"name": "torus"},
+            "simulation": {"engine": "rays", "noise_floor_poses": 4, **simulation},
+            "poses": {"count": 8, "validation": 0, "heldout": 4},
+            "noise": {"snr_db": 20},
+        },
+        "test",
+    )
+
+
+def settled(wanted):
+    scene = load_scene(wanted.scene.name, wanted.scene.options)
+    simulator, poses = simulator_of(scene, wanted), ensemble_poses(wanted.poses)[0]
+    return settle_rays(simulator, poses, wanted.simulation, QUIET), simulator, poses
+
+
+@pytest.fixture
+def few(monkeypatch):
+    monkeypatch.setattr(accuracy, "FIRST", 500)
+
+
+def test_the_accuracy_is_reached_and_costs_rays(few):
+    loose, tight = (settled(settings(accuracy_db=wanted)) for wanted in (2.0, 1.0))
+    assert 500 <= loose[0] < tight[0] < accuracy.MOST
+    for (rays, simulator, poses), wanted in ((loose, 2.0), (tight, 1.0)):
+        assert simulator.engine.rays == rays
+        assert accuracy._difference(simulator, poses) < 1.3 * wanted
+
+
+def test_a_number_of_rays_is_taken_as_it_is():
+    rays, simulator, _ = settled(settings(rays=777))
+    assert rays == simulator.engine.rays == 777
+
+
+def test_an_engine_without_rays_has_no_number():
+    wanted = settings(engine="kirchhoff")
+    assert settled(wanted)[0] is None
+
+
+def test_no_more_rays_are_taken_than_the_most(few, monkeypatch):
+    monkeypatch.setattr(accuracy, "MOST", 900)
+    assert settled(settings(accuracy_db=0.01))[0] == 900
+
+
+def test_a_store_records_the_number_and_goes_on_with_it(few, tmp_path, monkeypatch):
+    wanted = settings(accuracy_db=3.0)
+    store = simulate(wanted, output=tmp_path / "store", workers=1)
+    rays = store.attributes["rays"]
+    assert rays >= 500
+    whole = [store.read_pose(index).tobytes() for index in range(len(store))]
+    chunk_path(store.path, "spectrogram", (3, 0, 0, 0)).unlink()
+    assert EnsembleStore.open(store.path).missing() == [3]
+    monkeypatch.setattr(accuracy, "FIRST", 10 * rays)
+    again = simulate(wanted, output=tmp_path / "store", workers=1)
+    assert again.attributes["rays"] == rays
+    assert [again.read_pose(index).tobytes() for index in range(len(again))] == whole
