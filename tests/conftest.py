@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -26,6 +27,10 @@ def pytest_addoption(parser):
 def pytest_configure():
     # Bits depend on the number of threads, and other test processes may run beside this one.
     torch.set_num_threads(1)
+    # `nohup` and batch systems ignore these, and the program then goes on ignoring them.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    if hasattr(signal, "SIGHUP"):
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(scope="session")
