@@ -222,6 +222,25 @@ def global_randomness(tree):
             yield node.lineno
 
 
+def undescribed_arguments(tree):
+    """Find functions with a list of arguments that leaves one out; one entry may name several."""
+    for node in ast.walk(tree):
+        if not isinstance(node, ast.FunctionDef) or node.name.startswith("_"):
+            continue
+        section = re.search(r"\nArgs:\n(.*?)(\n\n|$)", ast.get_docstring(node) or "", re.DOTALL)
+        if section is None:
+            continue
+        entries = re.findall(
+            r"^    (\*{0,2}\w+(?:, \*{0,2}\w+)*)(?= \(|:)", section[1], re.MULTILINE
+        )
+        described = {name.lstrip("*") for entry in entries for name in entry.split(", ")}
+        taken = [*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]
+        taken += [one for one in (node.args.vararg, node.args.kwarg) if one]
+        names = {one.arg for one in taken if not one.arg.startswith("_")} - {"self", "cls"}
+        if not names <= described:
+            yield node.lineno
+
+
 def faults(path):
     """Return every broken rule of one source file as `file:line: rule`."""
     tree = parse(path)
@@ -239,6 +258,7 @@ def faults(path):
         "writes past storage": writing(tree, file),
         "draws outside report": drawing(tree, room),
         "global random numbers": global_randomness(tree),
+        "an argument that Args leaves out": undescribed_arguments(tree),
     }
     return [f"{name_of(path)}:{line}: {rule}" for rule, lines in found.items() for line in lines]
 
@@ -289,6 +309,12 @@ def test_every_source_keeps_the_rules():
         (drawing, ("geometry",), "pv.Plotter()", "pv.PolyData()"),
         (global_randomness, (), "np.random.rand(3)", "np.random.default_rng(0)"),
         (global_randomness, (), "import random", "import math"),
+        (
+            undescribed_arguments,
+            (),
+            'def f(a, b):\n    """F.\n\n    Args:\n        a: One.\n    """',
+            'def f(a, b):\n    """F.\n\n    Args:\n        a, b ((3,), m): Two.\n    """',
+        ),
     ],
 )
 def test_each_rule_sees_a_source_that_breaks_it(rule, arguments, bad, good):
@@ -303,6 +329,11 @@ def test_scenes_use_the_public_door():
             first, _, rest = module.partition(".")
             if first == "sononerf":
                 assert rest.partition(".")[0] in allowed, f"{name_of(path)}:{line}: {module}"
+
+
+def test_scenes_and_tools_describe_their_arguments():
+    for path in [*sources(ROOT / "scenes"), *sources(ROOT / "tools")]:
+        assert list(undescribed_arguments(parse(path))) == [], name_of(path)
 
 
 def test_no_server_listens_on_every_address():

@@ -19,10 +19,10 @@ from sononerf.geometry.raycast import RayCaster
 
 Samples = tuple[Floats, Floats]
 
-WAYS_OUT = np.array([[0.62, 0.33, 0.71], [-0.45, 0.83, -0.33], [0.21, -0.56, -0.80]])
-WAYS_OUT /= np.linalg.norm(WAYS_OUT, axis=1, keepdims=True)
-"""Directions of the rays that tell inside from outside; the majority counts, as a ray may pass
-between two triangles. They are parallel to no axis, and so to few faces."""
+DIRECTIONS = np.array([[0.62, 0.33, 0.71], [-0.45, 0.83, -0.33], [0.21, -0.56, -0.80]])
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+"""Directions of the rays that tell inside from outside. The majority counts, because a ray may
+slip between two triangles. None is parallel to an axis, because many faces are."""
 SMALLEST_PART = 0.01
 """Parts with less than this fraction of the largest part's area are not counted."""
 ROUNDING = 1e-9
@@ -104,11 +104,11 @@ class Solid:
             return np.zeros(len(points), bool)
         caster = RayCaster(_trimesh(self.union))
         origins, votes = np.asarray(points, dtype=np.float64), np.zeros(len(points), int)
-        for direction in WAYS_OUT:
+        for direction in DIRECTIONS:
             hits = caster.first_hit(origins, np.broadcast_to(direction, origins.shape))
             # From inside, a ray leaves through the first surface that it meets.
             votes[hits.ray] += (hits.flat @ direction) > 0
-        return votes * 2 > len(WAYS_OUT)
+        return votes * 2 > len(DIRECTIONS)
 
     @cached_property
     def surface(self) -> trimesh.Trimesh:

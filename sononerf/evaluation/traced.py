@@ -93,10 +93,10 @@ def learn_traced(
     some = training.only(torch.as_tensor(numbers))
     try:
         simulator = Simulator.of_surface(mesh, fitted.head, simulation, rays=RAYS)
-        # The low band of the test poses is solved with the others: the surface is known by now.
-        all_places = (_places(of) for of in (some, validation, poses_of(echoes, "test", renderer)))
-        both = zip(*all_places, strict=True)
-        positions, rotations = (np.concatenate(parts) for parts in both)
+        # The prediction will need the test poses. Their echoes are not read here.
+        sets = (some, validation, poses_of(echoes, "test", renderer))
+        places = zip(*(_places(poses) for poses in sets if len(poses)), strict=True)
+        positions, rotations = (np.concatenate(parts) for parts in places)
         simulator.prepare(positions, rotations, progress)
         traced = compress(_trace(simulator, some, seed, progress), reference)
         gain = gain_db(compress(_measured(some), reference), traced)

@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from sononerf.array_types import Floats
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import RANGE_DB, compress, mae_db
-from sononerf.progress import Progress
+from sononerf.progress import Progress, Task
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hybrid import Hybrid
@@ -44,7 +42,7 @@ def settle_rays(
         simulator: Its engine gets the number.
         poses: Those of the ensemble.
         options: A number of rays, or the accuracy to be reached.
-        progress: Where the number is said.
+        progress: Shows the trials and the number.
 
     Returns:
         rays: Per pose; None if the engine traces none.
@@ -57,17 +55,18 @@ def settle_rays(
         return tracer.rays
     chosen = np.unique(np.linspace(0, len(poses) - 1, POSES).round().astype(int))
     some = Poses(poses.positions[chosen], poses.rotations[chosen])
-    tracer.rays, error = FIRST, math.inf
+    tracer.rays = FIRST
     while tracer.rays < MOST:
-        error = _difference(simulator, some)
+        with progress.task(f"trying {tracer.rays} rays per pose", 2 * len(chosen)) as task:
+            error = _difference(simulator, some, task)
         if error <= options.accuracy_db:
             progress.say(f"echoes: {tracer.rays} rays per pose, {error:.2g} dB between two seeds")
             return tracer.rays
         factor = (error / options.accuracy_db) ** (1.0 / CONVERGENCE)
         tracer.rays = min(MOST, _rounded(tracer.rays * float(np.clip(factor, *STEP))))
     progress.say(
-        f"echoes: {MOST} rays per pose, which is less accurate than simulation.accuracy_db; more "
-        "rays by simulation.rays"
+        f"echoes: {MOST} rays per pose, the most that are chosen; they are less accurate than "
+        f"simulation.accuracy_db ({options.accuracy_db:g} dB); simulation.rays=NUMBER takes more"
     )
     return tracer.rays
 
@@ -78,16 +77,17 @@ def _tracer(engine: Engine) -> Rays | None:
     return engine if isinstance(engine, Rays) else None
 
 
-def _difference(simulator: Simulator, poses: Poses) -> float:
+def _difference(simulator: Simulator, poses: Poses, task: Task) -> float:
     """Return the mean difference between two seeds over active cells, dB."""
     head = simulator.head.without_noise()
 
     def heard(seed: int) -> Floats:
-        echoes = (
-            simulator.echo(*pose, seed=2 * index + seed)
-            for index, pose in enumerate(zip(poses.positions, poses.rotations, strict=True))
-        )
-        return np.stack([head.receive(echo, seed=seed)[1] for echo in echoes])
+        spectrograms = []
+        for index, pose in enumerate(zip(poses.positions, poses.rotations, strict=True)):
+            echo = simulator.echo(*pose, seed=2 * index + seed)
+            spectrograms.append(head.receive(echo, seed=seed)[1])
+            task.advance()
+        return np.stack(spectrograms)
 
     first, second = heard(0), heard(1)
     loudest = float(max(first.max(), second.max()))

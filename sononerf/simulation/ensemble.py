@@ -20,7 +20,7 @@ from sononerf.memory import available_cores
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SimulationSettings
-from sononerf.simulation.accuracy import settle_rays
+from sononerf.simulation.accuracy import MOST, settle_rays
 from sononerf.simulation.simulator import Simulator
 from sononerf.simulation.workers import in_processes, in_this_process, on_cluster
 
@@ -139,7 +139,8 @@ def simulate(
     wanted = [*missing, *test]
     simulator.prepare(poses.positions[wanted], poses.rotations[wanted], progress)
     known = store.attributes.get("rays")
-    if known is not None:  # an interrupted simulation goes on with the same rays
+    if options.rays is None and isinstance(known, int) and 0 < known <= MOST:
+        # An interrupted simulation goes on with the number that it began with.
         options = options.model_copy(update={"rays": known})
     store.update_attributes(rays=settle_rays(simulator, poses, options, progress))
     with progress.task("simulating", len(missing) + len(test)) as task:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Who simulates the poses: this process, others on this machine, or a Dask cluster."""
+"""Simulate poses in this process, in other processes of this machine, or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ if TYPE_CHECKING:
 logger = logging.getLogger("sononerf")
 
 QUEUED_PER_WORKER = 4
-"""Poses that wait for each worker. Results wait in memory, so more would only fill it."""
+"""Poses that are sent per worker before results are taken. More would only fill the memory."""
 SENT_AGAIN = 3
-"""Times that a pose is sent again after its worker died; Dask itself tries four workers a time."""
+"""Times that a pose is sent again after its worker died. Dask tries four workers each time."""
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Variables by which numerical libraries take one thread in each worker."""
+"""Environment variables that limit numerical libraries to one thread in each worker."""
 CONNECT_SECONDS = 30
 """Time to wait for a Dask scheduler, s; across a network it answers in one."""
 PATIENCE_SECONDS = 10
-"""Time without a result after which the workers of a cluster are counted, s."""
+"""Time without a result after which a cluster without workers is warned of, s."""
 
 Results = Generator[tuple[int, Singles], None, None]
 
@@ -57,7 +57,7 @@ def in_processes(
 ) -> Results:
     """Simulate poses in other processes of this machine; they come in any order.
 
-    A killed worker costs what it was working on, which is sent again.
+    If a worker is killed, the poses that were being simulated are sent again.
 
     Raises:
         ResourceError: If the workers of a pose die again and again.
@@ -65,14 +65,14 @@ def in_processes(
     left, lost = deque(indices), Counter[int]()
     while left:
         running: dict[Future[Singles], int] = {}
-        # Who is suspected of killing workers shares none with poses that wait.
+        # After a death no pose waits at a worker, so that few are blamed for the next one.
         most = workers if lost else QUEUED_PER_WORKER * workers
         with _pool(simulator, workers) as pool:
             try:
                 while left or running:
                     while left and len(running) < most:
                         task = _pose(poses, left[0]), pose_seed(seed, left[0])
-                        with _deaf_single_threads():
+                        with _starting_workers():
                             running[pool.submit(_mine, *task)] = left[0]
                         left.popleft()
                     for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -86,7 +86,7 @@ def in_processes(
             except BrokenProcessPool as error:
                 again = sorted(running.values())
                 lost.update(again)
-                if lost and max(lost.values()) > SENT_AGAIN:
+                if max(lost.values()) > SENT_AGAIN:
                     named = ", ".join(str(i) for i in again if lost[i] > SENT_AGAIN)
                     raise ResourceError(
                         f"pose {named}: every worker that took it was killed; give workers more "
@@ -99,15 +99,14 @@ _simulator: Simulator | None = None
 
 
 def _become(simulator: Simulator) -> None:
-    """Make this process a worker, which ends with the one that started it."""
+    """Make this process a worker; it ends if the process that started it ends."""
     global _simulator
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     _simulator = simulator
     parent = multiprocessing.parent_process()
+    assert parent is not None
 
     def follow() -> None:
-        if parent is not None:
-            parent.join()
+        parent.join()
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()
@@ -133,8 +132,8 @@ def _failed(index: int, error: BaseException) -> SonoNerfError:
 
 @contextmanager
 def _pool(simulator: Simulator, workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Start processes that end with the block, at once where it fails."""
-    # A server that has imported the simulator forks them; other systems start each from nothing.
+    """Open a pool of processes. If the block fails, they are terminated."""
+    # On Linux a server imports the simulator once and forks; elsewhere each process imports it.
     context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
     if sys.platform == "linux":
         context.set_forkserver_preload([__name__])
@@ -151,10 +150,11 @@ def _pool(simulator: Simulator, workers: int) -> Iterator[ProcessPoolExecutor]:
 
 
 @contextmanager
-def _deaf_single_threads() -> Iterator[None]:
-    """Start processes on one thread each, and keep Ctrl-C from them.
+def _starting_workers() -> Iterator[None]:
+    """Give processes that start in the block one thread each, and block SIGINT in them.
 
-    A terminal sends it to all of them; we alone end them, and without a traceback of each.
+    A terminal sends Ctrl-C to all processes. This one ends the workers, so that none of them
+    prints a traceback.
     """
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))

@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -233,13 +234,56 @@ def test_the_same_run_gives_the_same_bits(run):
     assert (run / NAME).read_bytes() == first
 
 
-def no_validation(path, patch):
+def without(split, patch):
     indices = EnsembleStore.indices
     patch.setattr(
         EnsembleStore,
         "indices",
-        lambda self, split: indices(self, split)[: 0 if split == "val" else None],
+        lambda self, asked: indices(self, asked)[: 0 if asked == split else None],
     )
+
+
+def no_validation(path, patch):
+    without("val", patch)
+
+
+def test_no_test_poses_are_needed_to_learn(run, monkeypatch):
+    expected = learn(run)
+    without("test", monkeypatch)
+    np.testing.assert_array_equal(learn(run), expected)
+
+
+class Counted(Progress):
+    """Counts the frequencies that are solved for."""
+
+    def __init__(self):
+        super().__init__(quiet=True)
+        self.tasks = []
+
+    @contextmanager
+    def task(self, what, total):
+        with super().task(what, total) as task:
+            self.tasks.append(task)
+            yield task
+
+    @property
+    def solved(self):
+        return sum(task.done for task in self.tasks if task.what == "solving")
+
+
+def test_the_low_band_is_solved_once_for_learning_and_predicting(run):
+    description = json.loads((run / "model.json").read_text())
+    description["settings"]["simulation"]["sources"] = 300
+    (run / "model.json").write_text(json.dumps(description))
+    progress, opened = Counted(), RunFolder(run)
+    finish_module._learn_traced(opened, "cpu", progress)
+    solved = progress.solved
+    assert solved > 0
+    shared, _ = arrays_and_numbers(opened, progress=progress)
+    assert progress.solved == solved
+    alone, _ = arrays_and_numbers(run, progress=progress)
+    assert progress.solved > solved
+    np.testing.assert_array_equal(shared["predicted"], alone["predicted"])
 
 
 def switched_off(path, patch):
@@ -445,9 +489,10 @@ def arrays_and_numbers(path, **options):
     folder = predict(path, accelerator="cpu", **options)
     with np.load(folder / "spectrograms.npz", allow_pickle=False) as file:
         arrays = dict(file)
-    if not (path / "metrics.json").exists():
+    metrics = folder.parent / "metrics.json"
+    if not metrics.exists():
         return arrays, None
-    return arrays, json.loads((path / "metrics.json").read_text())["prediction"]
+    return arrays, json.loads(metrics.read_text())["prediction"]
 
 
 def parts(path, poses):
