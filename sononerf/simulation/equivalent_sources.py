@@ -86,7 +86,7 @@ class Sources(Solved):
            based on the principle of wave superposition", JASA 86, 1989.
     """
 
-    path, lead = PATH, LEAD
+    path, lead, side_by_side = PATH, LEAD, True
 
     def __init__(
         self,

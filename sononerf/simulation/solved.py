@@ -5,17 +5,20 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import scipy.fft
+from threadpoolctl import threadpool_limits
 
 from sononerf.array_types import Complexes, Floats, Ints, Singles
 from sononerf.errors import ResourceError
 from sononerf.head.ears import Ears, beam_gain, ear_gain
-from sononerf.memory import available_memory
+from sononerf.memory import available_cores, available_memory
 from sononerf.scene.scene import Scene
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import Hearing
@@ -28,6 +31,7 @@ PATH = 12.0  # radii of the bounding sphere; what comes later is more than 80 dB
 LEAD = 5.0  # over the taper's width; it puts less than -80 dB farther before an arrival
 TAIL = 1.0  # over the taper's width, behind the last arrival
 LONGEST = 7.0 * 86_400.0  # s; a longer computation is refused
+MOST_THREADS = 8  # frequencies side by side; each has its own equations in memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,11 +106,14 @@ class Solved(Engine):
         frequency ((K,), Hz): Those that are solved for.
         frequency_full (Hz): Up to which the response is whole.
         period: Samples of a response.
+        side_by_side: Whether frequencies are solved for in several threads. It pays where the
+            equations of one are small: the threads of BLAS itself then double the time.
     """
 
     prepares = True
     path: ClassVar[float] = PATH
     lead: ClassVar[float] = LEAD
+    side_by_side: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -188,17 +195,39 @@ class Solved(Engine):
         spectrum = np.zeros((*start.shape, self.period // 2 + 1), dtype=np.complex128)
         absorbed = self.hearing.head.absorption(self.frequency) * (math.log(10.0) / 20.0)
         fall = self.taper(self.frequency)
-        for index, frequency in enumerate(self.frequency.tolist()):
-            turn = 2.0 * math.pi * frequency
+
+        def respond(index: int) -> Complexes:
+            turn = 2.0 * math.pi * float(self.frequency[index])
             wavenumber = complex(turn / self.hearing.speed_of_sound, -absorbed[index])
             gains = self.hearing.head.tables(self.frequency[index : index + 1])
             found = self.respond(wavenumber, Heads(emitters, ears, turns, gains))
-            spectrum[:, :, index + 1] = fall[index] * found * np.exp(1j * turn / rate * start)
-            if progress is not None:
-                progress(index + 1, len(self.frequency))
+            return fall[index] * found * np.exp(1j * turn / rate * start)
+
+        with self._in_threads(respond, len(self.frequency)) as found:
+            for index, pressure in enumerate(found):
+                spectrum[:, :, index + 1] = pressure
+                if progress is not None:
+                    progress(index + 1, len(self.frequency))
         response = scipy.fft.irfft(spectrum, n=self.period, axis=-1)
         for key, begins, pressure in zip(wanted, start, response, strict=True):
             self._known[key] = begins, pressure
+
+    @contextmanager
+    def _in_threads(
+        self, respond: Callable[[int], Complexes], count: int
+    ) -> Generator[Iterator[Complexes], None, None]:
+        """Give the responses at all frequencies in order; what waits is dropped on an error."""
+        if not self.side_by_side:
+            yield map(respond, range(count))
+            return
+        workers = min(available_cores(), MOST_THREADS)
+        workers = min(available_cores(), MOST_THREADS)
+        with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(workers) as pool:
+            waiting = [pool.submit(respond, index) for index in range(count)]
+            try:
+                yield (future.result() for future in waiting)
+            finally:
+                pool.shutdown(cancel_futures=True)
 
     def taper(self, frequency: Floats) -> Floats:
         """Return what is left of the response (K,) at frequencies (K,) in Hz."""
