@@ -12,8 +12,9 @@ import pytest
 import torch
 
 from sononerf.field.module import EchoModule
-from sononerf.run.build import check_plugins, field_and_renderer, head_of
+from sononerf.run.build import head_of
 from sononerf.run.fit import fit
+from sononerf.run.model import check_plugins, field_and_renderer
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import dump_yaml, load_settings, read_yaml, validate_settings
 

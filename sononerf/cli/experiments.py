@@ -52,7 +52,7 @@ def simulate(
 
     settings = load_settings(config, overrides or ())
     from sononerf.progress import Progress
-    from sononerf.run.run_folder import results_folder
+    from sononerf.run.build import results_folder
     from sononerf.run.scenes import draw_ensemble
     from sononerf.run.simulate import simulate as run
 

@@ -40,8 +40,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import gammaincinv
-from scipy.stats import poisson
+from scipy.special import gammainc, gammaincinv
 
 from sononerf.array_types import Bools, Floats, Ints
 from sononerf.echoes.store import EnsembleStore
@@ -216,7 +215,8 @@ class Onsets:
         """
         extent = len(self.range) * float(self.range[1] - self.range[0])
         tries = self.first.size * extent / resolution
-        return float(poisson.sf(np.isfinite(self.first).sum() - 1, FALSE_ALARMS * tries))
+        # As many or more of a Poisson distribution.
+        return float(gammainc(np.isfinite(self.first).sum(), FALSE_ALARMS * tries))
 
 
 def asked_poses(store: EnsembleStore) -> Ints:

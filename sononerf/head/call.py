@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import scipy.fft
-import scipy.signal
 from numpy.typing import ArrayLike
 
 from sononerf.array_types import Bools, Complexes, Floats
@@ -236,6 +235,8 @@ def emit(impulse_responses: ArrayLike, waveform: Floats) -> Floats:
     responses = np.asarray(impulse_responses, dtype=np.float64)
     if len(waveform) == 1:
         return responses * waveform[0]  # no rounding by transforms
+    import scipy.signal  # takes half a second
+
     echo: Floats = scipy.signal.fftconvolve(responses, waveform[None], axes=-1)
     return echo
 

@@ -23,7 +23,6 @@ import numpy as np
 import scipy.fft
 import scipy.io.wavfile
 import scipy.ndimage
-import scipy.signal
 from numpy.typing import NDArray
 
 from sononerf.array_types import Bools, Floats
@@ -76,6 +75,8 @@ class CallFile:
         if ratio == 1:
             return self.waveform.copy()
         up, down = ratio.numerator, ratio.denominator
+        import scipy.signal  # takes half a second
+
         return np.asarray(scipy.signal.resample_poly(self.waveform, up, down), dtype=np.float64)
 
     def covers(self, frequency: Floats) -> Bools:

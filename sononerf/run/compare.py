@@ -20,9 +20,9 @@ from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.mip_picture import difference_pngs, overlay_png
-from sononerf.run.build import true_mesh
+from sononerf.run.build import results_folder, true_mesh
 from sononerf.run.fitted import Fitted, all_poses
-from sononerf.run.run_folder import RunFolder, differing_keys, results_folder
+from sononerf.run.run_folder import RunFolder, differing_keys
 from sononerf.simulation.simulator import TRAIN
 from sononerf.surface.start.volume import Volume, vti_bytes
 

@@ -27,16 +27,9 @@ from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import FittedField, require_accelerator
 from sononerf.field.fitting import fit as fit_field
 from sononerf.progress import Progress
-from sononerf.run.build import (
-    check_plugins,
-    data_for,
-    field_and_renderer,
-    head_of,
-    module_for,
-    region_of,
-    with_store,
-)
+from sononerf.run.build import head_of, with_store
 from sononerf.run.evaluate import evaluate
+from sononerf.run.model import check_plugins, data_for, field_and_renderer, module_for, region_of
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder

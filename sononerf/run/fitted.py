@@ -23,7 +23,8 @@ from sononerf.evaluation.traced import Traced
 from sononerf.field.checkpoint_io import DESCRIPTION_NAME, load_weights, model_checksum
 from sononerf.field.fitting import FittedField
 from sononerf.geometry.poses import Poses
-from sononerf.run.build import field_and_renderer, head_of, module_for, with_attached
+from sononerf.run.build import head_of, with_attached
+from sononerf.run.model import field_and_renderer, module_for
 from sononerf.run.simulate import default_store, open_ensemble
 from sononerf.settings.loading import validate_settings
 from sononerf.settings.schema import Settings

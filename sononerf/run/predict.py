@@ -22,9 +22,10 @@ from sononerf.geometry.poses import Poses, read_pose_csv
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.spectrogram_picture import spectrogram_png
+from sononerf.run.build import results_folder
 from sononerf.run.fitted import NAME as TRACED_NAME
 from sononerf.run.fitted import Fitted
-from sononerf.run.run_folder import RunFolder, results_folder
+from sononerf.run.run_folder import RunFolder
 
 
 def predict(

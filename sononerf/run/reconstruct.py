@@ -27,8 +27,8 @@ from sononerf.progress import Progress
 from sononerf.report.mesh_files import MeshFormat, mesh_bytes
 from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png, side_by_side_png
 from sononerf.report.pictures.mip_picture import mip_pngs
-from sononerf.run.build import true_mesh
-from sononerf.run.run_folder import RunFolder, results_folder
+from sononerf.run.build import results_folder, true_mesh
+from sononerf.run.run_folder import RunFolder
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine import descent as stages
 from sononerf.surface.refine.optics import Optics

@@ -19,9 +19,9 @@ from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.mesh_picture import mesh_png
 from sononerf.report.pictures.scene_picture import scene_png
-from sononerf.run.build import true_mesh
+from sononerf.run.build import results_folder, true_mesh
 from sononerf.run.fitted import Fitted, all_poses
-from sononerf.run.run_folder import RunFolder, results_folder
+from sononerf.run.run_folder import RunFolder
 from sononerf.settings.loading import dump_yaml
 from sononerf.surface.start.read_out import read_isosurface
 

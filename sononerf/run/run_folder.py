@@ -54,23 +54,6 @@ def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-@contextmanager
-def results_folder(folder: Path) -> Iterator[None]:
-    """Make a folder for results; remove it afterwards if it is empty.
-
-    Raises:
-        InputError: If it is a run's own, in which results would lie among its files.
-        StorageError: If it cannot be created or written.
-    """
-    if any((folder / name).exists() for name in ("config.yaml", DESCRIPTION_NAME)):
-        raise InputError(f"{folder}: is the folder of a run; give --output a folder of its own")
-    created = storage.probe_writable(folder)
-    try:
-        yield
-    finally:
-        storage.remove_if_empty(created)
-
-
 def differing_keys(old: Settings, new: Settings) -> list[str]:
     """Return the dotted keys in which two experiments differ, without those that move nothing."""
     first, second = _flat(old.plain()), _flat(new.plain())

@@ -14,7 +14,8 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import quiet_lightning
-from sononerf.run.build import field_and_renderer, head_of, module_for, region_of
+from sononerf.run.build import head_of
+from sononerf.run.model import field_and_renderer, module_for, region_of
 from sononerf.run.simulate import simulate
 from sononerf.settings.loading import validate_settings
 

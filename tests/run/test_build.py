@@ -29,18 +29,9 @@ from sononerf.field.profile import ProfileRenderer
 from sononerf.field.renderer import ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.reception import effective_window
-from sononerf.run.build import (
-    check_plugins,
-    data_for,
-    field_and_renderer,
-    head_of,
-    module_for,
-    read_truth,
-    region_of,
-    true_mesh,
-    with_store,
-)
+from sononerf.run.build import head_of, read_truth, true_mesh, with_store
 from sononerf.run.fit import finish, fit
+from sononerf.run.model import check_plugins, data_for, field_and_renderer, module_for, region_of
 from sononerf.run.simulate import simulate
 from sononerf.settings import plugins
 from sononerf.settings.loading import load_settings, validate_settings

@@ -35,13 +35,8 @@ from sononerf.field.fourier import FourierField
 from sononerf.field.module import EchoModule
 from sononerf.field.renderer import ShellRenderer
 from sononerf.progress import Progress
-from sononerf.run.build import (
-    data_for,
-    field_and_renderer,
-    head_of,
-    module_for,
-    region_of,
-)
+from sononerf.run.build import head_of
+from sononerf.run.model import data_for, field_and_renderer, module_for, region_of
 from sononerf.run.simulate import default_store, echo_hash, ensemble
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
