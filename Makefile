@@ -1,6 +1,6 @@
 PY ?= python3
 
-.PHONY: demo test check
+.PHONY: demo test test-all check
 
-demo test check:
+demo test test-all check:
 	$(PY) tools/bootstrap.py $@

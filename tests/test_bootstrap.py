@@ -68,6 +68,22 @@ def test_other_dependencies_install_again(bootstrap, checkout, installs, monkeyp
     assert installs == ["create", "install", "install", "install"]
 
 
+def test_the_demo_leaves_out_what_only_the_tests_need(bootstrap, checkout, installs):
+    bootstrap.prepare(checkout, ".")
+    bootstrap.prepare(checkout)
+    assert installs == ["create", "install", "install"]
+    bootstrap.prepare(checkout, ".")
+    assert installs == ["create", "install", "install"]
+
+
+def test_the_usual_tests_leave_out_the_thorough_ones(bootstrap):
+    usual, whole = (
+        bootstrap.command_line(name, Path("python"), ROOT, ["-x"]) for name in ("test", "test-all")
+    )
+    assert "not slow" not in usual
+    assert whole[-3:] == ["-m", "not slow", "-x"]
+
+
 def test_another_python_or_place_starts_afresh(bootstrap, checkout, installs, monkeypatch):
     bootstrap.prepare(checkout)
     monkeypatch.setattr(sys, "version", "3.99")
@@ -100,11 +116,11 @@ def test_torch_alone_comes_from_the_named_index(bootstrap, checkout, monkeypatch
     commands = []
     monkeypatch.setattr(subprocess, "call", lambda command, **_: commands.append(command) or 0)
     monkeypatch.delenv("TORCH_INDEX", raising=False)
-    bootstrap.install(checkout, checkout / ".venv")
+    bootstrap.install(checkout, checkout / ".venv", ".[test]")
     assert not any("--index-url" in command for command in commands)
     commands.clear()
     monkeypatch.setenv("TORCH_INDEX", "https://host/cpu")
-    bootstrap.install(checkout, checkout / ".venv")
+    bootstrap.install(checkout, checkout / ".venv", ".[test]")
     first, second = commands
     assert first[-3:] == ["--index-url", "https://host/cpu", bootstrap.TORCH]
     assert second[-2:] == ["--editable", ".[test]"]
@@ -114,7 +130,7 @@ def test_torch_alone_comes_from_the_named_index(bootstrap, checkout, monkeypatch
 def test_a_failed_install_keeps_its_exit_code(bootstrap, checkout, monkeypatch, capsys):
     monkeypatch.setattr(subprocess, "call", lambda *_, **__: 7)
     with pytest.raises(SystemExit, match="7"):
-        bootstrap.install(checkout, checkout / ".venv")
+        bootstrap.install(checkout, checkout / ".venv", ".[test]")
     assert "give the same command again" in capsys.readouterr().err
 
 
@@ -142,7 +158,7 @@ def test_an_old_python_is_told_in_one_line(bootstrap, monkeypatch, capsys):
 def test_wrong_usage(bootstrap, arguments, capsys):
     with pytest.raises(SystemExit, match="2"):
         bootstrap.main(arguments)
-    assert "usage: bootstrap.py {demo|test|check}" in capsys.readouterr().err
+    assert "usage: bootstrap.py {demo|test|test-all|check}" in capsys.readouterr().err
 
 
 def test_each_demo_gets_a_folder_of_its_own(bootstrap, checkout):
@@ -166,7 +182,7 @@ def test_exit_codes_and_arguments_pass_through(bootstrap, checkout, code):
     python.parent.mkdir(parents=True)
     python.symlink_to(sys.executable)
     stamp = checkout / ".venv" / ".sononerf-stamp"
-    stamp.write_text(bootstrap.fingerprint(checkout))
+    stamp.write_text(f"{bootstrap.fingerprint(checkout)}.[test]\n")
     (checkout / "pytest.py").write_text(
         "import sys\nprint(sys.argv[-2:])\nsys.exit(int(sys.argv[-2]))"
     )

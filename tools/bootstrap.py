@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Make a virtual environment in `.venv` once, then run the demo, the tests or the checks in it.
 
-    python3 tools/bootstrap.py {demo|test|check} [ARGUMENT]...
+    python3 tools/bootstrap.py {demo|test|test-all|check} [ARGUMENT]...
 
 Standard library only. Nothing is written outside this checkout. Further arguments go to the
 command: KEY=VALUE and options for the demo, pytest's for tests and checks. `TORCH_INDEX=URL`
@@ -23,10 +23,12 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 OLDEST_PYTHON = (3, 11)
 TORCH = "torch==2.13.0"
-COMMANDS = ("demo", "test", "check")
+COMMANDS = ("demo", "test", "test-all", "check")
 PYTEST = ("-m", "pytest", "-n", "auto", "--maxprocesses", "4", "--dist", "loadfile")
 """The tests run one file per process, on at most four cores: each process takes 0.7 GiB."""
 DEMO_CONFIG = "configs/three_spheres.yaml"
+TESTS = ".[test]"
+"""What the tests need; the demo does without."""
 UNFINISHED = "unfinished"
 
 
@@ -75,14 +77,16 @@ def create(environment: Path) -> None:
         raise fail(f"cannot create {environment}: {error.strerror}") from None
 
 
-def install(root: Path, environment: Path) -> None:
-    """Install torch, then this checkout with what its tests need."""
-    say("installing (about 2 minutes the first time)")
+def install(root: Path, environment: Path, what: str) -> None:
+    """Install torch, then this checkout, alone or with what its tests need."""
+    say("installing (about a minute the first time)")
     index = os.environ.get("TORCH_INDEX")
     pip = [str(interpreter(environment)), "-m", "pip", "install", "--disable-pip-version-check"]
+    # Python compiles what it imports at the first import, a tenth of what is installed.
+    pip.append("--no-compile")
     for arguments in (
         [*(["--index-url", index] if index else []), TORCH],
-        ["--editable", ".[test]"],
+        ["--editable", what],
     ):
         code = subprocess.call([*pip, "--quiet", *arguments], cwd=root)
         if code:
@@ -99,21 +103,21 @@ def has_pip(python: Path) -> bool:
         return False
 
 
-def prepare(root: Path) -> Path:
+def prepare(root: Path, what: str = TESTS) -> Path:
     """Bring the environment up to date where it is not, and return its Python."""
     environment = root / ".venv"
     stamp = environment / ".sononerf-stamp"
-    wanted = fingerprint(root)
+    wanted = f"{fingerprint(root)}{what}\n"
     python = interpreter(environment)
     found = stamp.read_text(encoding="utf-8") if stamp.is_file() else ""
-    if found == wanted and python.exists():
+    if found in (wanted, f"{fingerprint(root)}{TESTS}\n") and python.exists():
         return python
     # An interrupted install may have left half a package, which pip would take for a whole one.
     is_other = bool(found) and found.partition("\n")[0] != wanted.partition("\n")[0]
     if is_other or not has_pip(python):
         create(environment)
     stamp.write_text(UNFINISHED, encoding="utf-8")
-    install(root, environment)
+    install(root, environment, what)
     stamp.write_text(wanted, encoding="utf-8")
     say("ready")
     return python
@@ -134,6 +138,8 @@ def command_line(command: str, python: Path, root: Path, arguments: list[str]) -
         return [str(python), "-m", "sononerf.cli", "fit", DEMO_CONFIG, *output, *arguments]
     if command == "test":
         return [str(python), *PYTEST, *arguments]
+    if command == "test-all":
+        return [str(python), *PYTEST, "-m", "not slow", *arguments]
     return ["bash", str(root / "tools" / "check"), *arguments]
 
 
@@ -147,7 +153,7 @@ def main(arguments: list[str], root: Path = ROOT) -> int:
         )
     if not arguments or arguments[0] not in COMMANDS:
         raise fail(f"usage: bootstrap.py {{{'|'.join(COMMANDS)}}} [ARGUMENT]...")
-    python = prepare(root)
+    python = prepare(root, "." if arguments[0] == "demo" else TESTS)
     os.environ["PY"] = str(python)
     command = command_line(arguments[0], python, root, arguments[1:])
     if os.name == "nt":

@@ -60,16 +60,16 @@ def backprojection(
     emitters, receivers = head.places(poses.positions, poses.rotations)
     axis = head.range
     volume = grid_over(lower, upper, spacing)
-    points = volume.points().astype(np.float32)
+    axes = [along.astype(np.float32) for along in volume.axes()]
     step = float(np.diff(axis).mean())
-    total = np.zeros(len(points))
+    total = np.zeros(volume.values.shape)
     profiles = range_profiles(spectrograms, (*receivers.shape[:2], len(axis)))
     for energy, emitter, ears in zip(profiles, emitters, receivers, strict=True):
-        outward = _distance(points, emitter)
+        outward = _distances(axes, emitter)
         for profile, receiver in zip(energy, ears, strict=True):
-            half = (outward + _distance(points, receiver)) * np.float32(0.5)
+            half = (outward + _distances(axes, receiver)) * np.float32(0.5)
             total += _interpolated(profile, half, axis[0], step)
-    return volume.with_values((total / max(len(emitters), 1)).reshape(volume.shape))
+    return volume.with_values(total / max(len(emitters), 1))
 
 
 def coherent_backprojection(
@@ -109,8 +109,8 @@ def coherent_backprojection(
     step = head.speed_of_sound / (2.0 * head.sampling_rate * finer)
     emitters, receivers = head.places(poses.positions, poses.rotations)
     volume = grid_over(lower, upper, spacing)
-    points = volume.points().astype(np.float32)
-    total = np.zeros(len(points), dtype=np.complex64)
+    axes = [along.astype(np.float32) for along in volume.axes()]
+    total = np.zeros(volume.values.shape, dtype=np.complex64)
     count = 0
     for count, recording in enumerate(waveforms, start=1):
         heard = np.asarray(recording, dtype=np.float64)
@@ -121,15 +121,15 @@ def coherent_backprojection(
             )
         if not np.isfinite(heard).all():
             raise NumericalError(f"the recording of pose {count - 1} is not finite")
-        outward = _distance(points, emitters[count - 1])
+        outward = _distances(axes, emitters[count - 1])
         compressed = matched_filter(heard, emitted, oversampling=finer).astype(np.complex64)
         for echo, receiver in zip(compressed, receivers[count - 1], strict=True):
-            half = (outward + _distance(points, receiver)) * np.float32(0.5)
+            half = (outward + _distances(axes, receiver)) * np.float32(0.5)
             total += _interpolated(echo, half, 0.0, step)
     if count != len(emitters):
         raise ValueError(f"recordings: {count}, expected one for each of {len(emitters)} poses")
     summed = np.abs(total).astype(np.float64) / max(receivers.shape[0] * receivers.shape[1], 1)
-    return volume.with_values(summed.reshape(volume.shape))
+    return volume.with_values(summed)
 
 
 def _oversampling(call: Floats) -> int:
@@ -169,12 +169,6 @@ def range_profiles(
         yield energy
     if count != poses:
         raise ValueError(f"spectrograms: {count}, expected one for each of {poses} poses")
-
-
-def _distance(points: Singles, place: Floats) -> Singles:
-    offset = points - place.astype(np.float32)
-    distance: Singles = np.sqrt(np.einsum("ni,ni->n", offset, offset))
-    return distance
 
 
 def _interpolated(

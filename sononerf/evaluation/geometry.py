@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,6 +23,9 @@ from sononerf.evaluation.solid import Solid
 from sononerf.geometry.poses import Poses
 from sononerf.scene.scene import Scene
 from sononerf.surface.start.volume import Volume
+
+BASELINES = {"backprojection": backprojection, "voxels": voxel_fit}
+"""Baselines of a surface, by their names in ``metrics.json``."""
 
 Kind = Literal["none", "rigid", "similarity"]
 
@@ -209,6 +213,10 @@ def baselines(echoes: Echoes, lower: Floats, upper: Floats) -> Iterator[tuple[st
     train = store.indices("train")
     poses = Poses(echoes.positions[train], echoes.rotations[train])
     spacing = float((upper - lower).max()) / BASELINE_VOXELS
-    for name, baseline in (("backprojection", backprojection), ("voxels", voxel_fit)):
+
+    def volume(baseline: Callable[..., Volume]) -> Volume:
         heard = (store.read_pose(int(index)) for index in train)
-        yield name, baseline(heard, poses, echoes.head, lower, upper, spacing)
+        return baseline(heard, poses, echoes.head, lower, upper, spacing)
+
+    with ThreadPoolExecutor(len(BASELINES)) as pool:
+        yield from zip(BASELINES, pool.map(volume, BASELINES.values()), strict=True)
