@@ -33,6 +33,8 @@ from sononerf.evaluation import geometry as geometry_module
 from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.run import fit as fit_module
 
+pytestmark = pytest.mark.thorough
+
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 SMOKE = str(CONFIGS / "smoke.yaml")
 COMMANDS = (

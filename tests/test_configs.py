@@ -59,6 +59,7 @@ def test_it_says_only_what_differs_from_the_defaults(path):
     assert [key for key, value in leaves(settings) if key in same and same[key] == value] == []
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("path", FILES, ids=named)
 def test_its_scene_field_and_renderer_build(path):
     settings = load_settings(path)
@@ -106,6 +107,7 @@ def test_the_papers_scenes_differ_in_scene_and_poses_alone():
     assert all(data == settings["three_spheres"] for data in settings.values())
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(
     "slices",
     [16, pytest.param(512, marks=pytest.mark.slow)],  # its full batch: half a minute

@@ -4,8 +4,11 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 
 from tools.benchmarks import simulator as module
+
+pytestmark = pytest.mark.thorough
 
 
 class Some(NamedTuple):

@@ -6,6 +6,8 @@ import pytest
 
 from tools.benchmarks import exact as module
 
+pytestmark = pytest.mark.thorough
+
 RANGE = np.arange(0.3, 0.5, 0.001)
 FREQUENCY = np.array([15e3, 30e3, 60e3])
 

@@ -13,6 +13,8 @@ from sononerf.settings.loading import dump_yaml, load_settings
 from tools.benchmarks import experiment
 from tools.benchmarks.experiment import CONFIG, run_experiment
 
+pytestmark = pytest.mark.thorough
+
 METRICS = {
     "schema": 1,
     "cost": {"simulate_s": 60.0, "fit_s": 41.0, "reconstruct_s": 9.0},

@@ -11,6 +11,8 @@ import pytest
 from tools.benchmarks import fit as module
 from tools.benchmarks.fit import EPOCHS
 
+pytestmark = pytest.mark.thorough
+
 ERRORS = {1: 0.9, 2: 0.6, 3: 0.45}
 
 

@@ -14,6 +14,8 @@ import pytest
 from sononerf.settings.loading import validate_settings
 from tools.benchmarks import reconstruct as module
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.fixture
 def asked(monkeypatch):

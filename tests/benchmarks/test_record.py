@@ -3,8 +3,12 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from sononerf import __version__
 from tools.benchmarks.experiment import keep, ratios
+
+pytestmark = pytest.mark.thorough
 
 FOUND = {"copy": 2.0, "rows": [{"name": "a", "step_s": 0.5}, {"name": "b", "step_s": 3.0}]}
 

@@ -18,6 +18,8 @@ from sononerf.simulation.simulator import ensemble_poses
 from tools.benchmarks.experiment import CONFIG
 from tools.benchmarks.scaled import UNSCALED, scaled_settings, scaled_store
 
+pytestmark = pytest.mark.thorough
+
 PLAIN = [*UNSCALED, "poses.count=3", "poses.validation=0", "poses.heldout=1"]
 PLAIN += ["spectrogram.range_min=0.3", "spectrogram.range_max=0.35", "simulation.engine=rays"]
 

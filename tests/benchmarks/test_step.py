@@ -10,6 +10,8 @@ import pytest
 from tools.benchmarks import step as module
 from tools.benchmarks.step import CONFIG, PAIRS, PAPER, Pair
 
+pytestmark = pytest.mark.thorough
+
 ECHOES = [
     "scene.options.radius=0.02",
     "poses.count=8",

@@ -16,6 +16,8 @@ from tools.benchmarks import surfaces as module
 from tools.benchmarks.experiment import CONFIG
 from tools.benchmarks.surfaces import CASES, NEW, PROCEDURAL, chosen_cases, measured, table
 
+pytestmark = pytest.mark.thorough
+
 METRICS = {
     "cost": {"simulate_s": 60.0, "fit_s": 41.0, "reconstruct_s": 9.0, "steps": 1340},
     "prediction": {"mae_db": 0.4, "mae_db_active": 1.4, "rendered_mae_db_active": 3.4},

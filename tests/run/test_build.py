@@ -281,6 +281,7 @@ def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):
     torch.testing.assert_close(chosen[1], torch.tensor([0.1, 0.2, 0.3]))
 
 
+@pytest.mark.thorough
 def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
     """The noise of all lies above the zero of the reported decibels, 3, 23 and 33 dB."""
     poses = {"count": 24, "validation": 0, "heldout": 0}
@@ -301,6 +302,7 @@ def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
         assert np.abs(late).max() < error
 
 
+@pytest.mark.thorough
 def test_of_many_poses_hull_and_region_ask_the_same_ones(tiny, echoes, monkeypatch):
     store = EnsembleStore.open(echoes)
     whole = region_of(tiny(), Echoes(store, head_of(tiny())))[0]
@@ -440,6 +442,7 @@ def test_what_contradicts_the_store_is_refused_and_what_agrees_is_not(alone):
     assert wider.spectrogram.dynamic_range_db == 50.0
 
 
+@pytest.mark.thorough
 def test_a_fit_of_a_store_needs_no_scene(alone, tmp_path):
     run = tmp_path / "run"
     fit(alone(), run, accelerator="cpu")

@@ -41,6 +41,7 @@ def test_it_goes_where_it_is_told_to(home):
     assert new_scene("tin-drum", home / "a" / "b")[1].is_file()
 
 
+@pytest.mark.thorough
 def test_what_is_written_installs_and_passes_its_own_test(tmp_path):
     source, target = tmp_path / "tin-drum", tmp_path / "installed"
     new_scene("tin-drum", source)

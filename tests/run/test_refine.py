@@ -118,6 +118,7 @@ def test_an_interrupted_refinement_goes_on_to_the_same_surface(interrupted, monk
     np.testing.assert_array_equal(again.mesh.vertices, whole.mesh.vertices)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("what", ["another start", "damaged"])
 def test_a_state_that_does_not_fit_is_ignored(interrupted, what):
     if what == "damaged":

@@ -215,6 +215,7 @@ def test_stops_and_other_numbers_of_workers_change_no_byte(tiny, echoes, tmp_pat
     assert content(store) == content(alone)
 
 
+@pytest.mark.thorough
 def test_a_killed_worker_costs_nothing(tiny, tmp_path, monkeypatch):
     settings = tiny(poses={"count": 20}, simulation={"rays": 4000})
     alone = simulate(settings, output=tmp_path / "alone", workers=1)
@@ -272,6 +273,7 @@ def before_a_wall(settings):
     return Scene(both, (RIGID, LEAF), marked.astype(int), background=marked)
 
 
+@pytest.mark.thorough
 def test_the_scenes_own_background_is_simulated_alone_and_taken_off(tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     settings = tiny(data={"store": None, "background": "scene"})

@@ -9,6 +9,7 @@ from sononerf.scene.scene import MATERIALS, load_scene
 LEAF = {"seed": 3, "curl": 40.0, "bend": 50.0, "length": 0.16, "yaw": 25.0, "roll": 10.0}
 
 
+@pytest.mark.thorough
 def test_the_leaf_is_the_same_with_and_without_prey(caplog):
     alone = load_scene("leaf", LEAF)
     both = load_scene("leaf_dragonfly", {**LEAF, "along": 0.01, "heading": 30.0})
@@ -24,6 +25,7 @@ def test_the_leaf_is_the_same_with_and_without_prey(caplog):
     assert not caplog.records
 
 
+@pytest.mark.thorough
 def test_materials_are_options_and_one_alone_is_one():
     scene = load_scene("leaf_dragonfly", {"material": "rigid", "dragonfly": "leaf"})
     assert scene.materials == (MATERIALS["rigid"], MATERIALS["leaf"])
@@ -37,12 +39,14 @@ def prey(**options):
     return np.asarray(mesh.vertices)[count:]
 
 
+@pytest.mark.thorough
 def test_it_is_turned_with_the_leaf():
     np.testing.assert_allclose(
         prey(yaw=90.0), prey() @ np.array([[0, 1, 0], [-1, 0, 0], [0, 0, 1]]), atol=2e-9
     )
 
 
+@pytest.mark.thorough
 def test_a_placement_seed_draws_where_it_sits():
     first, again, other = prey(placement_seed=1), prey(placement_seed=1), prey(placement_seed=2)
     np.testing.assert_array_equal(first, again)

@@ -14,6 +14,8 @@ from sononerf.simulation import accuracy
 from sononerf.simulation.accuracy import settle_rays
 from sononerf.simulation.simulator import ensemble_poses
 
+pytestmark = pytest.mark.thorough
+
 QUIET = Progress(quiet=True)
 NOISE = {"snr_db": 10}
 

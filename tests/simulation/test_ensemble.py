@@ -148,6 +148,7 @@ def test_poses_out_of_reach_are_told_of(caplog):
         reach(far, near)
 
 
+@pytest.mark.thorough
 def test_poses_are_checked_fast_in_a_million_triangles():
     scene = Scene(trimesh.creation.icosphere(subdivisions=8, radius=1.0))
     assert len(scene.mesh.faces) > 1_300_000
@@ -243,6 +244,7 @@ class Deadly:
         return np.full((1, 1, 1), position[0], dtype=np.float32)
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("times", [3, 99])
 def test_a_pose_is_not_blamed_for_its_workers(tmp_path, caplog, times):
     found, poses = {}, poses_at([1.0, 0.0, 0.0], [-2.0, 0.0, 0.0], [3.0, 0.0, 0.0])
@@ -266,6 +268,7 @@ class Slow:
         return np.ones((1, 1, 1), dtype=np.float32)
 
 
+@pytest.mark.thorough
 def test_a_fault_of_the_writer_ends_the_workers_at_once():
     def full(index, spectrogram):
         raise OSError("disk full")
@@ -289,6 +292,7 @@ class Deaf:
         return np.ones((1, 1, 1), dtype=np.float32)
 
 
+@pytest.mark.thorough
 def test_ctrl_c_is_for_us_and_not_for_our_workers():
     resource_tracker._resource_tracker._stop()  # as in a process that has started no other yet
     found, poses = {}, poses_at([1.0, 0.0, 0.0], [-2.0, 0.0, 0.0])

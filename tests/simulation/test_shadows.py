@@ -9,6 +9,8 @@ from sononerf.scene.scene import Scene
 from sononerf.settings.loading import validate_settings
 from tests.simulation.listening import ball, echoes, hearing, level_db, rays, spectrum, wall
 
+pytestmark = pytest.mark.thorough
+
 BAND = np.linspace(40e3, 80e3, 41)
 
 

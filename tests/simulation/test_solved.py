@@ -160,6 +160,7 @@ def test_the_head_is_that_of_the_settings():
     np.testing.assert_allclose(heads[1:].beam(points), heads.beam(points)[1:])
 
 
+@pytest.mark.thorough
 def test_poses_are_solved_once_and_kept_by_what_they_are():
     found, said = glint(), []
     engine = found.engine

@@ -24,6 +24,8 @@ from sononerf.simulation.solved import Heads
 from tests.simulation.exact import SPEED, disc_on_axis, rigid_sphere
 from tests.simulation.listening import ball, box, echoes, hearing, level_db, spectrum, wall
 
+pytestmark = pytest.mark.thorough
+
 RADIUS = 0.02
 
 

@@ -13,6 +13,8 @@ from sononerf.simulation.reference.boundary_mesh import (
 )
 from tests.simulation.listening import ball, wall
 
+pytestmark = pytest.mark.thorough
+
 PLATE = trimesh.creation.box((0.04, 0.03, 0.0003))
 
 

@@ -11,6 +11,8 @@ from sononerf.simulation.reference.boundary_near import (
     potentials,
 )
 
+pytestmark = pytest.mark.thorough
+
 TRIANGLE = np.array([[0.0, 0.0, 0.0], [1.2, 0.1, 0.0], [0.3, 0.9, 0.0]])
 PLACES = {
     "above": (0.5, 0.3, 0.4),

@@ -9,6 +9,8 @@ from sononerf.simulation.reference.boundary_near import Panels
 from sononerf.simulation.reference.boundary_operators import Operators, coupling
 from tests.simulation.listening import ball
 
+pytestmark = pytest.mark.thorough
+
 SHAPES = {
     "ball": ball(0.02, subdivisions=3),
     "thin plate": halved(trimesh.creation.box((0.02, 0.015, 0.0003)), 0.002),

@@ -5,6 +5,8 @@ import trimesh
 
 from sononerf.simulation.reference.boundary_near import Panels
 
+pytestmark = pytest.mark.thorough
+
 
 @pytest.fixture(scope="module")
 def panels():

@@ -20,6 +20,8 @@ from sononerf.simulation.reference.kirchhoff import Kirchhoff
 from tests.simulation.exact import SPEED, disc_on_axis, image_source, rigid_sphere
 from tests.simulation.listening import TableHead
 
+pytestmark = pytest.mark.thorough
+
 ANALYSIS = SpectrogramSettings()
 SYNTHESIS = plan_synthesis(ANALYSIS, echo_samples(ANALYSIS, SPEED))
 NODES = SYNTHESIS.nodes

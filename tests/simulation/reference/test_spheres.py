@@ -16,6 +16,8 @@ from sononerf.simulation.solved import Heads
 from tests.simulation.exact import SPEED, rigid_sphere
 from tests.simulation.listening import ball, level_db
 
+pytestmark = pytest.mark.thorough
+
 POINT_HEAD = {
     "emitter": [0, 0, 0], "left": [0, 0, 0], "beam_radius": 0, "azimuth_deg": 0,
     "elevation_deg": 0, "width_deg": 180, "notch_depth": 0,

@@ -170,6 +170,7 @@ def test_a_start_that_cannot_be_traced_is_told_and_counts_as_the_worst(
     assert fault in caplog.text
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("corrected", [False, True])
 def test_going_on_from_any_step_ends_the_same(bumpy, echoes, optics, simulated_stage, corrected):
     given = simulated_stage if corrected else {}
@@ -273,6 +274,7 @@ def slab(height):
     return plate.subdivide().subdivide().subdivide().subdivide()
 
 
+@pytest.mark.thorough
 def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
     bumpy, echoes, optics, monkeypatch
 ):
