@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "sononerf"
 
 FLOORS = (
-    ("errors", "array_types", "progress", "memory"),
+    ("errors", "array_types", "compiled", "progress", "memory"),
     ("storage", "tables", "settings", "geometry"),
     ("scene", "head"),
     ("echoes",),

@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Floats, Ints
+from sononerf.array_types import Bools, Floats, Ints
+from sononerf.compiled import compiled
 from sononerf.geometry.normals import corner_normals
 
 # Turning by the golden section of a circle never lets two neighbouring rings line up.
@@ -137,7 +139,7 @@ class CapSpiral:
         rows, columns = PATCHES
         edge, turn = np.arange(rows + 1) / rows, (np.arange(columns) + 0.5) / columns
         share = 0.5 * (edge[:-1] + edge[1:])
-        middle = self._at(*(part.ravel() for part in np.meshgrid(share, turn, indexing="ij")))
+        middle = self._at(np.repeat(share, columns), np.tile(turn, rows))
         # From the middle of a patch its corners are farthest; those of one row are alike.
         aside = 0.5 / columns
         radius = np.zeros(rows)
@@ -147,11 +149,8 @@ class CapSpiral:
             radius = np.maximum(radius, 2.0 * np.arcsin(np.minimum(0.5 * apart, 1.0)))
         reach = np.cos(np.minimum(half_angle + 1.1 * radius[:, None], math.pi)) - 1e-9
         near = (middle @ towards.T).reshape(rows, columns, -1) >= reach[:, None]
-        index = np.arange(self.count, dtype=np.float64)
-        at_share, at_turn = self._lattice(index)
-        row = np.minimum((at_share * rows).astype(np.int64), rows - 1)
-        column = np.minimum((np.mod(at_turn, 1.0) * columns).astype(np.int64), columns - 1)
-        return np.flatnonzero(near.any(axis=2).ravel()[row * columns + column])
+        chosen: Bools = np.asarray(near.any(axis=2))
+        return _in_patches(chosen, self.count, *self.offset)
 
     def neighbourhood(self, index: Ints) -> Ints:
         """Return directions' indices together with those of their four neighbours, sorted."""
@@ -184,16 +183,46 @@ class CapSpiral:
         return np.sqrt(drop * (2.0 - drop))
 
     def _at(self, share: Floats, turn: Floats) -> Floats:
-        drop = self._depth * share  # 1 - cos(angle from the axis)
+        return _on_sphere(share, turn, self._depth, self._axes)
+
+    @cached_property
+    def _axes(self) -> Floats:
+        """The frame of the pattern, its axis first."""
+        axes = _frame(self.axis)
+        return axes if self.rotation is None else axes @ self.rotation.T
+
+
+@compiled
+def _on_sphere(share: Floats, turn: Floats, depth: float, axes: Floats) -> Floats:
+    """Return unit vectors (N, 3) at shares of a cap's area (N,) and turns about its axis (N,)."""
+    directions = np.zeros((len(share), 3))
+    for i in range(len(share)):
+        drop, angle = depth * share[i], turn[i]  # 1 - cos(angle from the axis)
         # A cell may reach over the axis, or over the far pole, to the other side.
-        over = (drop < 0.0) | (drop > 2.0)
-        drop = np.where(drop > 2.0, 4.0 - drop, np.abs(drop))
-        turn = 2.0 * math.pi * np.mod(turn + 0.5 * over, 1.0)
-        ring = np.sqrt(drop * (2.0 - drop))
-        frame = _frame(self.axis)
-        if self.rotation is not None:
-            frame = frame @ self.rotation.T
-        return np.stack([1.0 - drop, ring * np.cos(turn), ring * np.sin(turn)]).T @ frame
+        if drop < 0.0 or drop > 2.0:
+            drop = -drop if drop < 0.0 else 4.0 - drop
+            angle += 0.5
+        angle = 2.0 * math.pi * (angle - math.floor(angle))
+        ring = math.sqrt(drop * (2.0 - drop))
+        x, y, z = 1.0 - drop, ring * math.cos(angle), ring * math.sin(angle)
+        for k in range(3):
+            directions[i, k] = x * axes[0, k] + y * axes[1, k] + z * axes[2, k]
+    return directions
+
+
+@compiled
+def _in_patches(chosen: Bools, count: int, shift: float, turn: float) -> Ints:
+    """Return which directions of a spiral lie in chosen patches (rows, columns), ascending."""
+    rows, columns = chosen.shape
+    index, found = np.zeros(count, np.int64), 0
+    for i in range(count):
+        around = i * GOLDEN_TURN + turn
+        around -= math.floor(around)
+        row = min(int((i + shift) / count * rows), rows - 1)
+        if chosen[row, min(int(around * columns), columns - 1)]:
+            index[found] = i
+            found += 1
+    return index[:found].copy()
 
 
 def _cell_steps(ring: Floats, depth: float) -> tuple[Ints, Ints]:

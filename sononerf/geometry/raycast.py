@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeAlias
 
 import numpy as np
 import trimesh
 
 from sononerf.array_types import Bools, Floats, Ints, Singles
+from sononerf.compiled import compiled
 from sononerf.geometry.normals import corner_normals, total_curvature, weight_gradients
 
 try:
@@ -26,6 +28,7 @@ from sononerf.geometry.poses import rotation_from_euler
 # Of the mesh's size. Single precision puts a point up to 1e-7 sizes off its triangle, on either
 # side; without a lift half of all reflected rays hit the triangle they start from.
 LIFT = 4e-6
+Reals: TypeAlias = Floats | Singles
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +42,7 @@ class Hits:
         triangle (H,): Index of the triangle.
         distance ((H,), m): Along the ray.
         flat (H, 3): Unit normals of the flat triangles.
-        gradients ((4, 3, H) float32): How the smooth normal changes along the triangle: gradients
+        gradients ((H, 4, 3) float32): How the smooth normal changes along the triangle: gradients
             of the second and third corner's weight (1/m), and by how much the normals there differ
             from that at the first.
     """
@@ -58,7 +61,7 @@ class _Engine(Protocol):
 
     def first(self, origins: Floats, directions: Floats) -> Ints: ...
 
-    def blocked(self, origins: Floats, spans: Floats) -> Bools: ...
+    def blocked(self, origins: Reals, spans: Reals) -> Bools: ...
 
 
 class _EmbreeEngine:
@@ -74,12 +77,12 @@ class _EmbreeEngine:
         )
         return np.asarray(found, dtype=np.int64)
 
-    def blocked(self, origins: Floats, spans: Floats) -> Bools:
+    def blocked(self, origins: Reals, spans: Reals) -> Bools:
         # Distances count in lengths of the direction, so 1 is the target. Asked for more output
         # than this, the occlusion query returns uninitialised memory.
         found = self._scene.run(
-            origins.astype(np.float32),
-            spans.astype(np.float32),
+            origins.astype(np.float32, copy=False),
+            spans.astype(np.float32, copy=False),
             dists=np.ones(len(origins), np.float32),
             query="OCCLUDED",
         )
@@ -117,14 +120,111 @@ class _VtkEngine:
         ends = origins + reach * directions
         return np.array([self._search(a, b) for a, b in zip(origins, ends, strict=True)], np.int64)
 
-    def blocked(self, origins: Floats, spans: Floats) -> Bools:
+    def blocked(self, origins: Reals, spans: Reals) -> Bools:
         ends = origins + spans
         return np.array([self._search(a, b) >= 0 for a, b in zip(origins, ends, strict=True)], bool)
 
 
-def _dot(a: Floats, b: Floats) -> Floats:
-    product: Floats = np.einsum("nd,nd->n", a, b)
-    return product
+@compiled
+def _hits_of(
+    found: Ints,
+    origins: Floats,
+    directions: Floats,
+    planes: Floats,
+    smooth: Singles,
+    corners: Floats,
+) -> tuple[Ints, Floats, Floats, Ints, Floats, Floats, Singles]:
+    """Return the attributes of :class:`Hits`.
+
+    Args:
+        found (N,): The triangle that each ray hits first, below zero where it hits none.
+        origins ((N, 3) or (1, 3), m), directions (N, 3): Of the rays.
+        planes (T, 6): First corner (m) and unit normal of each triangle.
+        smooth ((T, 5, 3) float32): Gradients, and the smooth normal at the first corner.
+        corners ((T, 3, 3), m): Of the triangles.
+    """
+    ray, count = np.zeros(len(found), np.int64), 0
+    for i in range(len(found)):
+        if found[i] >= 0:
+            ray[count] = i
+            count += 1
+    ray = ray[:count].copy()
+    triangle, distance = np.zeros(count, np.int64), np.zeros(count)
+    points, normals, flat = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 3))
+    gradients = np.zeros((count, 4, 3), np.float32)
+    weight = np.zeros(3)
+    for i in range(count):
+        at = found[ray[i]]
+        start = origins[ray[i] if len(origins) > 1 else 0]
+        along, plane, of = directions[ray[i]], planes[at], smooth[at]
+        slope = along[0] * plane[3] + along[1] * plane[4] + along[2] * plane[5]
+        height = 0.0
+        for k in range(3):
+            height += (plane[k] - start[k]) * plane[3 + k]
+        # A ray along the plane meets it nowhere; it is then moved onto the triangle below.
+        far = height / slope if abs(slope) > 1e-12 else 0.0
+        weight[1], weight[2] = 0.0, 0.0
+        for k in range(3):
+            points[i, k] = start[k] + far * along[k]
+            offset = points[i, k] - plane[k]
+            weight[1] += of[0, k] * offset
+            weight[2] += of[1, k] * offset
+        weight[0] = 1.0 - weight[1] - weight[2]
+        if min(weight[0], weight[1], weight[2]) < -1e-4:
+            total = 0.0
+            for k in range(3):
+                weight[k] = max(weight[k], 0.0)
+                total += weight[k]
+            far = 0.0
+            for k in range(3):
+                weight[k] /= total
+            for k in range(3):
+                points[i, k] = 0.0
+                for corner in range(3):
+                    points[i, k] += weight[corner] * corners[at, corner, k]
+                far += (points[i, k] - start[k]) * along[k]
+        length = 0.0
+        for k in range(3):
+            normals[i, k] = of[4, k] + weight[1] * of[2, k] + weight[2] * of[3, k]
+            length += normals[i, k] * normals[i, k]
+        length = math.sqrt(length) if length > 0.0 else 1.0
+        for k in range(3):
+            normals[i, k] /= length
+            flat[i, k] = plane[3 + k]
+            for row in range(4):
+                gradients[i, row, k] = of[row, k]
+        triangle[i], distance[i] = at, far
+    return ray, points, normals, triangle, distance, flat, gradients
+
+
+@compiled
+def _sight(
+    points: Floats, normals: Floats, targets: Floats, middle: Floats, scale: float, lift: float
+) -> tuple[Singles, Singles]:
+    """Return origins and spans (N, 3), in the engine's coordinates, from lifted points to targets.
+
+    Args:
+        points, normals ((N, 3), m): Where sight begins, and which way it is lifted; no normals
+            (0, 3) lift it towards the targets.
+        targets ((N, 3) or (1, 3), m): Where it ends.
+        middle ((3,), m), scale (1/m), lift (m): Of the caster.
+    """
+    origins = np.zeros((len(points), 3), np.float32)
+    spans = np.zeros((len(points), 3), np.float32)
+    for i in range(len(points)):
+        target = targets[i if len(targets) > 1 else 0]
+        by = lift
+        if len(normals) == 0:
+            length = 0.0
+            for k in range(3):
+                length += (target[k] - points[i, k]) ** 2
+            by = lift / math.sqrt(length) if length > 0.0 else 0.0
+        for k in range(3):
+            way = target[k] - points[i, k] if len(normals) == 0 else normals[i, k]
+            lifted = points[i, k] + by * way
+            origins[i, k] = (lifted - middle[k]) * scale
+            spans[i, k] = (target[k] - lifted) * scale
+    return origins, spans
 
 
 class RayCaster:
@@ -159,9 +259,11 @@ class RayCaster:
         # Side by side, so that a hit reads one stretch of memory.
         self._planes = np.concatenate([self._corners[:, 0], self.face_normals], axis=1)
         differs = smooth[:, 1:] - smooth[:, :1]
-        self._gradients = np.concatenate(
-            [second, third, differs[:, 0], differs[:, 1], smooth[:, 0]], axis=1
-        ).astype(np.float32)
+        self._gradients = (
+            np.concatenate([second, third, differs[:, 0], differs[:, 1], smooth[:, 0]], axis=1)
+            .astype(np.float32)
+            .reshape(-1, 5, 3)
+        )
         # Single precision counts from the origin: far from it, millimetres would be lost.
         scaled = (vertices - self._middle) / self._size
         self._engine: _Engine = (
@@ -179,31 +281,10 @@ class RayCaster:
             hits: Points and distances in double precision, from the triangles' planes.
         """
         found = self._engine.first(self._scaled(origins), directions)
-        ray = np.flatnonzero(found >= 0)
-        triangle = found.take(ray)
-        start, along = origins.take(ray, axis=0), directions.take(ray, axis=0)
-        plane = self._planes.take(triangle, axis=0)
-        anchor, flat = plane[:, :3], np.ascontiguousarray(plane[:, 3:])
-        slope = _dot(along, flat)
-        # A ray along the plane meets it nowhere; it is then moved onto the triangle below.
-        slope = np.where(np.abs(slope) > 1e-12, slope, np.inf)
-        distance = _dot(anchor - start, flat) / slope
-        points = start + distance[:, None] * along
-        offset = points - anchor
-        smooth = np.ascontiguousarray(self._gradients.take(triangle, axis=0).T).reshape(5, 3, -1)
-        second, third = np.einsum("kdn,nd->kn", smooth[:2], offset.astype(np.float32))
-        off = np.flatnonzero(np.minimum(np.minimum(second, third), 1.0 - second - third) < -1e-4)
-        if len(off):
-            weights = np.stack([1.0 - second[off] - third[off], second[off], third[off]], axis=1)
-            weights = np.clip(weights, 0.0, None)
-            weights /= weights.sum(axis=1, keepdims=True)
-            _, second[off], third[off] = weights.T
-            points[off] = np.einsum("nc,ncd->nd", weights, self._corners[triangle[off]])
-            distance[off] = _dot(points[off] - start[off], along[off])
-        normals = smooth[4] + second * smooth[2] + third * smooth[3]
-        length = np.sqrt(np.einsum("dn,dn->n", normals, normals))
-        normals /= np.where(length > 0.0, length, np.float32(1.0))
-        return Hits(ray, points, normals.T.astype(np.float64), triangle, distance, flat, smooth[:4])
+        one = len(origins) > 1 and origins.strides[0] == 0
+        start = origins[:1].copy() if one else np.ascontiguousarray(origins)
+        along = np.ascontiguousarray(directions)
+        return Hits(*_hits_of(found, start, along, self._planes, self._gradients, self._corners))
 
     def visible(
         self,
@@ -224,13 +305,16 @@ class RayCaster:
         Returns:
             visible (N,): True where the line is free.
         """
-        spans = np.broadcast_to(targets, points.shape) - points
-        if normals is None:
-            length = np.linalg.norm(spans, axis=1, keepdims=True)
-            normals = spans / np.where(length > 0.0, length, 1.0)
-        lifted = points + self.lift * normals
-        spans = np.broadcast_to(targets, points.shape) - lifted
-        return ~self._engine.blocked(self._scaled(lifted), spans * (1.0 / self._size))
+        none = np.zeros((0, 3))
+        origins, spans = _sight(
+            np.ascontiguousarray(points),
+            none if normals is None else np.ascontiguousarray(normals),
+            np.ascontiguousarray(np.atleast_2d(targets)),
+            self._middle,
+            1.0 / self._size,
+            self.lift,
+        )
+        return ~self._engine.blocked(origins, spans)
 
     def _scaled(self, points: Floats) -> Floats:
         """Return points in the engine's coordinates."""

@@ -8,6 +8,7 @@ elevation is positive up. Of two ears, ear 0 is the left one.
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any
@@ -18,6 +19,7 @@ from scipy.sparse import csr_array
 from scipy.special import j1
 
 from sononerf.array_types import Floats, Singles
+from sononerf.compiled import compiled
 from sononerf.errors import SettingsError
 from sononerf.head.directivity.read import content_hash, read_directivity
 from sononerf.head.directivity.record import Directivity, unit_vectors
@@ -353,28 +355,45 @@ def ear_gain(ears: Ears, ear: int, directions_head: Floats) -> Singles:
 
 
 def _look_up(ears: Ears, table: int, directions: Floats) -> Singles:
-    x, y, z = np.ascontiguousarray(directions.T, dtype=np.float32)
-    column, across = _place(ears.azimuth, np.arctan2(y, x))
-    row, upward = _place(ears.elevation, np.arctan2(z, np.hypot(x, y)))
-    width = len(ears.azimuth)
-    corner = row * width + column
-    corners = corner[:, None] + np.array([0, 1, width, width + 1], dtype=np.int32)
-    low = 1 - upward
-    weights = np.zeros(corners.shape, dtype=np.float32)
-    weights[:, 0], weights[:, 1] = low * (1 - across), low * across
-    weights[:, 2], weights[:, 3] = upward * (1 - across), upward * across
-    # One pass over the rows, where four gathers would write four tables first.
-    ends = np.arange(0, 4 * len(directions) + 1, 4, dtype=np.int32)
-    values = ears._by_direction[table]
-    pick = csr_array((weights.ravel(), corners.ravel(), ends), shape=(len(directions), len(values)))
-    gain: Singles = pick @ values
+    upward, across = ears.elevation, ears.azimuth
+    gain: Singles = _bilinear(
+        np.ascontiguousarray(ears._by_direction[table]),
+        np.ascontiguousarray(directions, dtype=np.float64),
+        (float(upward[0]), (len(upward) - 1) / float(upward[-1] - upward[0]), len(upward)),
+        (float(across[0]), (len(across) - 1) / float(across[-1] - across[0]), len(across)),
+    )
     return gain
 
 
-def _place(nodes: Floats, values: Singles) -> tuple[NDArray[np.int32], Singles]:
-    """Index of the node below, and the fraction of the way to the next."""
-    per_step = np.float32((len(nodes) - 1) / (nodes[-1] - nodes[0]))
-    steps = (values - np.float32(nodes[0])) * per_step
-    steps = np.clip(steps, np.float32(0.0), np.float32(len(nodes) - 1))
-    index = np.minimum(steps.astype(np.int32), np.int32(len(nodes) - 2))
-    return index, steps - index.astype(np.float32)
+@compiled
+def _bilinear(
+    values: Singles,
+    directions: Floats,
+    elevation: tuple[float, float, int],
+    azimuth: tuple[float, float, int],
+) -> Singles:
+    """Read a table (D, F) of directions on a grid towards others (N, 3).
+
+    Args:
+        values (D, F): All azimuths of the first elevation, and so on.
+        directions (N, 3): Unit vectors.
+        elevation, azimuth: Of the grid: the first node (rad), nodes per radian, their number.
+    """
+    width, frequencies = azimuth[2], values.shape[1]
+    gain = np.zeros((len(directions), frequencies), np.float32)
+    for i in range(len(directions)):
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        up = (math.atan2(z, math.sqrt(x * x + y * y)) - elevation[0]) * elevation[1]
+        along = (math.atan2(y, x) - azimuth[0]) * azimuth[1]
+        up, along = min(max(up, 0.0), elevation[2] - 1.0), min(max(along, 0.0), width - 1.0)
+        row, column = min(int(up), elevation[2] - 2), min(int(along), width - 2)
+        up, along = up - row, along - column
+        a, b = np.float32((1.0 - up) * (1.0 - along)), np.float32((1.0 - up) * along)
+        c, d = np.float32(up * (1.0 - along)), np.float32(up * along)
+        one = values[row * width + column]
+        two = values[row * width + column + 1]
+        three = values[(row + 1) * width + column]
+        four = values[(row + 1) * width + column + 1]
+        for k in range(frequencies):
+            gain[i, k] = a * one[k] + b * two[k] + c * three[k] + d * four[k]
+    return gain

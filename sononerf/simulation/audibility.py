@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import trimesh
 
-from sononerf.array_types import Bools, Floats
+from sononerf.array_types import Bools, Floats, Singles
+from sononerf.compiled import compiled
 from sononerf.scene.scene import Scene
 from sononerf.simulation.impulse_response import NODE_SPACING
 from sononerf.simulation.paths import Bounce
@@ -31,12 +33,6 @@ EARS_APART = 0.03
 """Distance between receivers, m, up to which the middle between them stands for each of them."""
 
 
-def row_dot(a: Floats, b: Floats) -> Floats:
-    """Return the dot products (N,) of rows (N, 3)."""
-    product: Floats = np.einsum("nd,nd->n", a, b)
-    return product
-
-
 @dataclass(frozen=True)
 class Audibility:
     """Judges the hits of a bounce.
@@ -53,42 +49,64 @@ class Audibility:
     radius: float
     bounces: int
 
-    def judge_all(self, bounce: Bounce, listeners: Floats) -> tuple[Bools, Floats]:
+    def judge(self, bounce: Bounce, listeners: Floats) -> tuple[Bools, Floats]:
         """Which hits some listener can hear (H,), and by how much each (H,) may be wrong."""
-        audible, doubt = self._judge(bounce, listeners[0])
-        for place in listeners[1:]:
-            also, more = self._judge(bounce, place)
-            audible |= also
-            np.maximum(doubt, more, out=doubt)
+        count = len(bounce.ray)
+        audible, doubt = np.zeros(count, dtype=np.bool_), np.zeros(count)
+        # What goes on from here may be heard, however it looks from the head.
+        explore = EXPLORE / self.radius if 1 < bounce.number < self.bounces else 0.0
+        angle = np.atleast_1d(np.asarray(bounce.solid_angle, dtype=np.float64))
+        tube = np.ascontiguousarray(bounce.footprint.tube)
+        for place in listeners:
+            ways = bounce.ways_to(place)
+            _judge(
+                audible, doubt, ways.distance, ways.rise, ways.detour, ways.stiffness, tube, angle,
+                self.wavenumber, self.farthest, explore,
+            )  # fmt: skip
         return audible, doubt
 
-    def _judge(self, bounce: Bounce, listener: Floats) -> tuple[Bools, Floats]:
-        """Which hits can be heard (H,), and by how much each (H,) may be wrong."""
-        away = listener - bounce.points
-        distance = np.sqrt(row_dot(away, away))
-        away /= distance[:, None]
-        rise, detour, _, stiffness = bounce.detour(away, distance)
+
+@compiled
+def _judge(
+    audible: Bools,
+    doubt: Floats,
+    distance: Floats,
+    rise: Singles,
+    detour: Singles,
+    stiffness: Singles,
+    tube: Singles,
+    solid_angle: Floats,
+    k: float,
+    farthest: float,
+    explore: float,
+) -> None:
+    """Add one listener to what is audible (H,) and in doubt (H,).
+
+    Args:
+        audible, doubt (H,): Changed in place.
+        distance, rise, detour, stiffness (H,): Of :class:`Ways` to the listener.
+        tube ((H,), m²/sr): Of the footprint.
+        solid_angle ((H,) or (1,), sr): Of the cells.
+        k (rad/m), farthest (m): Of :class:`Audibility`.
+        explore (1/m): What a wide bundle may bring, over its level.
+    """
+    for i in range(len(distance)):
+        angle = solid_angle[i if len(solid_angle) > 1 else 0]
+        side, width = math.sqrt(angle), math.sqrt(tube[i])
+        level = angle * width
         # Seen from an ear either may be somewhat different from the middle between the ears.
-        facing = rise * distance > -EARS_APART
-        audible = facing & (detour < 1.25 * self.farthest)
-        k = np.float32(self.wavenumber)
-        side = np.sqrt(bounce.solid_angle)
+        facing = rise[i] * distance[i] > -EARS_APART
+        if facing and detour[i] < 1.25 * farthest:
+            audible[i] = True
         # Counted in turns of the ray at the emitter, the mirror point is this far from the cell.
-        off = np.sqrt(2.0 * detour / np.maximum(stiffness, np.float32(1e-12))) - REACHED * side
-        least = 0.5 * stiffness * np.square(np.maximum(off, 0.0))
-        turns = k * stiffness * side**2
-        coarse = facing & (turns > RESOLVED) & (k * least < NEAR)
-        width = np.sqrt(bounce.footprint.tube)
-        level = np.float32(bounce.solid_angle) * width
-        doubt = np.zeros(len(level))
-        chosen = np.flatnonzero(coarse)
-        doubt[chosen] = level[chosen] / distance[chosen] * np.exp(-k * least[chosen])
-        doubt[chosen] *= np.minimum(turns[chosen], 10.0)
-        if 1 < bounce.number < self.bounces:
-            # What goes on from here may be heard, however it looks from the head.
-            wide = side * width > WIDE
-            np.maximum(doubt, np.where(wide, EXPLORE / self.radius * level, 0.0), out=doubt)
-        return audible, doubt
+        off = math.sqrt(2.0 * detour[i] / max(stiffness[i], 1e-12)) - REACHED * side
+        least = 0.5 * stiffness[i] * max(off, 0.0) ** 2
+        turns = k * stiffness[i] * angle
+        if facing and turns > RESOLVED and k * least < NEAR:
+            found = level / distance[i] * math.exp(-k * least) * min(turns, 10.0)
+            doubt[i] = max(doubt[i], found)
+        if side * width > WIDE:
+            doubt[i] = max(doubt[i], explore * level)
 
 
 FINE = 0.05

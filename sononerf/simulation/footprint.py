@@ -3,18 +3,23 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 from sononerf.array_types import Floats, Ints, Singles
+from sononerf.compiled import compiled
 
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """Of rays that hit a surface, by ray differentials [1]_; components first, rays last.
+    """Of rays that hit a surface, by ray differentials [1]_.
 
     Directions at the emitter are turned by u and v (rad) about two axes square to the ray.
+
+    Args:
+        rows ((H, 19) float32): All of the attributes, hit by hit.
 
     Attributes:
         shift ((2, 3, H) float32, m/rad): How the hit moves on the surface over u and over v.
@@ -31,144 +36,246 @@ class Footprint:
         .. [1] H. Igehy, "Tracing ray differentials", SIGGRAPH 1999.
     """
 
-    shift: Singles
-    square: Singles
-    bend: Singles
-    curving: Singles
-    onward: Singles
-    sink: Singles
-    tube: Singles
+    rows: Singles
 
-    def __getitem__(self, chosen: Ints) -> Footprint:
-        """Return those of the chosen hits."""
-        parts = (
-            self.shift, self.square, self.bend, self.curving, self.onward, self.sink, self.tube,
-        )  # fmt: skip
-        return Footprint(*(part.take(chosen, axis=-1) for part in parts))
+    @property
+    def shift(self) -> Singles:  # noqa: D102 - see the class
+        return self.rows[:, :6].T.reshape(2, 3, -1)
 
-    def detour(
-        self, towards: Singles, rise: Singles, distance: Singles, solid_angle: float | Floats
-    ) -> tuple[Singles, Singles, Singles]:
-        r"""How much longer a path is than the mirror's nearby, and how it varies over a ray's cell.
+    @property
+    def square(self) -> Singles:  # noqa: D102
+        return self.rows[:, 6:9].T
 
-        To second order, the path's length over u and v has the slope :math:`g` and the Hessian
-        :math:`H`; the path by which a mirror would send the sound is shorter (or longer) by
-        :math:`g^T |H|^{-1} g / 2`.
+    @property
+    def bend(self) -> Singles:  # noqa: D102
+        return self.rows[:, 9:12].T
 
-        Args:
-            towards ((3, H) float32): Unit vectors from the hits to the listener.
-            rise ((H,) float32): Their cosine to the outward normal.
-            distance ((H,) float32, m): From the hits to the listener.
-            solid_angle (float or (H,) float64, sr): Of the cell, taken as a square.
+    @property
+    def curving(self) -> Singles:  # noqa: D102
+        return self.rows[:, 12:15].T
 
-        Returns:
-            detour ((H,) float32, m): Zero or more.
-            spread ((H,) float32, m): Standard deviation of the path's length over the cell.
-            stiffness ((H,) float32, m/rad²): The greater eigenvalue of :math:`|H|`.
-        """
-        off = np.einsum("kdn,dn->kn", self.shift, towards)
+    @property
+    def onward(self) -> Singles:  # noqa: D102
+        return self.rows[:, 15:17].T
+
+    @property
+    def sink(self) -> Singles:  # noqa: D102
+        return self.rows[:, 17]
+
+    @property
+    def tube(self) -> Singles:  # noqa: D102
+        return self.rows[:, 18]
+
+
+@dataclass(frozen=True, eq=False)
+class Ways:
+    r"""From hits to a listener, beside the ways that a mirror nearby would send the sound.
+
+    To second order, the path's length over u and v has the slope :math:`g` and the Hessian
+    :math:`H`; the path by which a mirror would send the sound is shorter (or longer) by
+    :math:`g^T |H|^{-1} g / 2`.
+
+    Attributes:
+        distance ((H,), m): From the hits to the listener.
+        cosine (H,): Of the angle between the mirrored ray and the way to the listener.
+        rise ((H,) float32): Cosine between that way and the outward normal.
+        detour ((H,) float32, m): By how much the path is longer than the mirror's; zero or more.
+        spread ((H,) float32, m): Standard deviation of the path's length over the cell.
+        stiffness ((H,) float32, m/rad²): The greater eigenvalue of :math:`|H|`.
+    """
+
+    distance: Floats
+    cosine: Floats
+    rise: Singles
+    detour: Singles
+    spread: Singles
+    stiffness: Singles
+
+
+@compiled
+def ways_to(
+    rows: Singles,
+    points: Floats,
+    flat: Floats,
+    mirrored: Floats,
+    listener: Floats,
+    solid_angle: Floats,
+) -> tuple[Floats, Floats, Singles]:
+    """Return what :class:`Ways` is made of: distance, cosine, and the rest as (4, H).
+
+    Args:
+        rows ((H, 19) float32): Of a footprint.
+        points, flat, mirrored (H, 3): See :class:`Bounce`.
+        listener ((3,), m): Where the hits are heard.
+        solid_angle ((H,) or (1,), sr): Of the cells, taken as squares.
+    """
+    count = len(rows)
+    distance, cosine = np.zeros(count), np.zeros(count)
+    found = np.zeros((4, count), np.float32)
+    for i in range(count):
+        row = rows[i]
+        x = listener[0] - points[i, 0]
+        y = listener[1] - points[i, 1]
+        z = listener[2] - points[i, 2]
+        far = math.sqrt(x * x + y * y + z * z)
+        near = 1.0 / far
+        x, y, z = x * near, y * near, z * near
+        rise = x * flat[i, 0] + y * flat[i, 1] + z * flat[i, 2]
+        cosine[i] = x * mirrored[i, 0] + y * mirrored[i, 1] + z * mirrored[i, 2]
+        off1 = row[0] * x + row[1] * y + row[2] * z
+        off2 = row[3] * x + row[4] * y + row[5] * z
         # From the mirror direction and not from the incoming one: the same on the smooth surface
         # that the triangles stand for, without their facets.
-        g1, g2 = self.onward - off
-        curve = self.bend + (rise - self.sink) * self.curving
-        near = np.float32(1.0) / distance
-        h11 = curve[0] + (self.square[0] - off[0] * off[0]) * near
-        h22 = curve[1] + (self.square[1] - off[1] * off[1]) * near
-        h12 = curve[2] + (self.square[2] - off[0] * off[1]) * near
-        middle, half = 0.5 * (h11 + h22), np.hypot(0.5 * (h11 - h22), h12)
+        g1, g2 = row[15] - off1, row[16] - off2
+        lean = rise - row[17]
+        h11 = row[9] + lean * row[12] + (row[6] - off1 * off1) * near
+        h22 = row[10] + lean * row[13] + (row[7] - off2 * off2) * near
+        h12 = row[11] + lean * row[14] + (row[8] - off1 * off2) * near
+        middle, apart = 0.5 * (h11 + h22), 0.5 * (h11 - h22)
+        half = math.sqrt(apart * apart + h12 * h12)
         # |H|^-1 is a I + b H, with a and b such that both eigenvalues fit.
-        high, low = np.abs(middle + half), np.abs(middle - half)
-        stiffness = np.maximum(high, low)
-        tiny = np.float32(1e-6) * stiffness + np.float32(1e-12)
-        f_high, f_low = 1.0 / np.maximum(high, tiny), 1.0 / np.maximum(low, tiny)
-        b = (f_high - f_low) / np.maximum(2.0 * half, tiny)
+        high, low = abs(middle + half), abs(middle - half)
+        stiffness = max(high, low)
+        tiny = 1e-6 * stiffness + 1e-12
+        f_high, f_low = 1.0 / max(high, tiny), 1.0 / max(low, tiny)
+        b = (f_high - f_low) / max(2.0 * half, tiny)
         a = f_high - b * (middle + half)
         slope = g1 * g1 + g2 * g2
         detour = 0.5 * (a * slope + b * (h11 * g1 * g1 + h22 * g2 * g2 + 2.0 * h12 * g1 * g2))
         # Over a square of side 1, u has the variance 1/12, u²/2 1/720 and u v 1/144.
-        angle = np.asarray(solid_angle, dtype=np.float32)
+        angle = solid_angle[i if len(solid_angle) > 1 else 0]
         variance = slope * (angle / 12.0) + (h11 * h11 + h22 * h22) * (angle * angle / 720.0)
         variance += h12 * h12 * (angle * angle / 144.0)
-        return np.maximum(detour, 0.0), np.sqrt(variance), stiffness
+        distance[i] = far
+        found[0, i] = rise
+        found[1, i] = max(detour, 0.0)
+        found[2, i] = math.sqrt(variance)
+        found[3, i] = stiffness
+    return distance, cosine, found
 
 
-def dots(a: Singles, b: Singles) -> Singles:
-    """Scalar products (..., N) of vectors (..., 3, N) and (3, N)."""
-    found: Singles = np.einsum("...dn,dn->...n", a, b)
-    return found
+@compiled
+def emit(directions: Floats, length: Floats) -> Singles:
+    """Return bundles (N, 12) that an emitter sends over a way, see :func:`land`.
 
-
-def pairs(a: Singles, b: Singles) -> Singles:
-    """Products (3, N) of two and two vectors (2, 3, N): first, second, first with second."""
-    return np.stack([dots(a[0], b[0]), dots(a[1], b[1]), dots(a[0], b[1])])
-
-
-def across(directions: Singles) -> Singles:
-    """Two unit vectors (2, 3, N) square to each direction (3, N) and to each other.
-
-    Source: T. Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
-    """
-    x, y, z = directions
-    sign = np.where(z >= 0.0, np.float32(1.0), np.float32(-1.0))
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return np.stack(
-        [
-            np.stack([1.0 + sign * x * x * a, sign * b, -sign * x]),
-            np.stack([b, sign + y * y * a, -y]),
-        ]
-    )
-
-
-def land(
-    shift: Singles,
-    turn: Singles,
-    *,
-    incoming: Singles,
-    flat: Singles,
-    normals: Singles,
-    gradients: Singles,
-) -> tuple[Footprint, Singles]:
-    """Let bundles fall on the surface.
+    They are turned at the emitter, not moved there, about two unit vectors that are square to each
+    direction and to each other [1]_.
 
     Args:
-        shift ((2, 3, H) float32, m/rad): How the rays move square to themselves over u and v;
-            overwritten.
-        turn ((2, 3, H) float32): How their directions turn.
-        incoming ((3, H) float32): Their directions.
-        flat, normals ((3, H) float32): Of the triangle and of the smooth surface, unit vectors on
-            the side of the ray.
-        gradients ((4, 3, H) float32): Of the weights of the second and third corner, and by how
-            much the smooth normals there differ from that at the first, on the side of the ray.
+        directions (N, 3): Unit vectors.
+        length ((N,), m): From the emitter.
+
+    References:
+        .. [1] T. Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
+    """
+    bundles = np.zeros((len(directions), 12), np.float32)
+    for i in range(len(directions)):
+        x, y, z = directions[i, 0], directions[i, 1], directions[i, 2]
+        sign = 1.0 if z >= 0.0 else -1.0
+        a = -1.0 / (sign + z)
+        b = x * y * a
+        turn = bundles[i, 6:]
+        turn[0], turn[1], turn[2] = 1.0 + sign * x * x * a, sign * b, -sign * x
+        turn[3], turn[4], turn[5] = b, sign + y * y * a, -y
+        for k in range(6):
+            bundles[i, k] = length[i] * turn[k]
+    return bundles
+
+
+@compiled
+def onto(rows: Singles, turned: Singles, further: Ints, distance: Floats) -> Singles:
+    """Return mirrored bundles (N, 12) where they are hit next, see :func:`land`.
+
+    Args:
+        rows, turned: From :func:`land`.
+        further (N,): Which of them hit anything.
+        distance ((N,), m): How far on.
+    """
+    bundles = np.zeros((len(further), 12), np.float32)
+    for i in range(len(further)):
+        before = further[i]
+        for k in range(6):
+            # What of it goes along the ray is lost where the bundle lands.
+            bundles[i, k] = rows[before, k] + distance[i] * turned[before, k]
+            bundles[i, 6 + k] = turned[before, k]
+    return bundles
+
+
+@compiled
+def land(
+    bundles: Singles,
+    incoming: Floats,
+    normals: Floats,
+    flat: Floats,
+    gradients: Singles,
+) -> tuple[Singles, Singles, Floats, Floats]:
+    """Let bundles fall on the surface, and mirror them.
+
+    Args:
+        bundles ((H, 12) float32): How the rays move square to themselves over u and v (m/rad), and
+            how their directions turn; three components each.
+        incoming (H, 3): Directions of the rays.
+        normals, flat (H, 3): Of the smooth surface and of the triangle, unit vectors on any side.
+        gradients ((H, 4, 3) float32): As of :class:`Hits`.
 
     Returns:
-        footprint: On the surface.
-        turned ((2, 3, H) float32): How the mirrored directions turn.
+        rows ((H, 19) float32): The :class:`Footprint`.
+        turned ((H, 6) float32): How the mirrored directions turn.
+        flat (H, 3): The triangles' normals on the side of the ray.
+        mirrored (H, 3): Unit vectors.
     """
-    sink = np.minimum(dots(incoming, flat), np.float32(-1e-6))
-    tube = np.abs(dots(_cross(shift[0], shift[1]), incoming))
-    along = dots(incoming, normals)
-    turned = np.zeros_like(turn)
-    tilts = np.zeros_like(turn)
-    to_second, to_third, second, third = gradients
-    for k in range(2):
-        shift[k] -= (dots(shift[k], flat) / sink) * incoming
-        tilt = dots(shift[k], to_second) * second
-        tilt += dots(shift[k], to_third) * third
-        tilt -= dots(tilt, normals) * normals
-        tilts[k] = tilt
-        change = dots(turn[k], normals) + dots(tilt, incoming)
-        turned[k] = turn[k] - 2.0 * (change * normals + along * tilt)
-    onward = dots(shift, incoming) - 2.0 * along * dots(shift, normals)
-    return (
-        Footprint(
-            shift, pairs(shift, shift), pairs(shift, turn), pairs(shift, tilts), onward, sink, tube
-        ),
-        turned,
-    )
-
-
-def _cross(a: Singles, b: Singles) -> Singles:
-    return np.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )
+    count = len(bundles)
+    rows, turned = np.zeros((count, 19), np.float32), np.zeros((count, 6), np.float32)
+    outward, mirrored = np.zeros((count, 3)), np.zeros((count, 3))
+    tilts = np.zeros(6)
+    for i in range(count):
+        x, y, z = incoming[i, 0], incoming[i, 1], incoming[i, 2]
+        fx, fy, fz = flat[i, 0], flat[i, 1], flat[i, 2]
+        sink = x * fx + y * fy + z * fz
+        if sink > 0.0:
+            fx, fy, fz, sink = -fx, -fy, -fz, -sink
+        nx, ny, nz = normals[i, 0], normals[i, 1], normals[i, 2]
+        # The smooth normals may point either way.
+        side = -1.0 if fx * nx + fy * ny + fz * nz < 0.0 else 1.0
+        nx, ny, nz = side * nx, side * ny, side * nz
+        sink = min(sink, -1e-6)
+        along = x * nx + y * ny + z * nz
+        outward[i, 0], outward[i, 1], outward[i, 2] = fx, fy, fz
+        mirrored[i, 0] = x - 2.0 * along * nx
+        mirrored[i, 1] = y - 2.0 * along * ny
+        mirrored[i, 2] = z - 2.0 * along * nz
+        shift, turn, row, grads = bundles[i, :6], bundles[i, 6:], rows[i], gradients[i]
+        cross = x * (shift[1] * shift[5] - shift[2] * shift[4])
+        cross += y * (shift[2] * shift[3] - shift[0] * shift[5])
+        cross += z * (shift[0] * shift[4] - shift[1] * shift[3])
+        for k in range(2):
+            sx, sy, sz = shift[3 * k], shift[3 * k + 1], shift[3 * k + 2]
+            tx, ty, tz = turn[3 * k], turn[3 * k + 1], turn[3 * k + 2]
+            down = (sx * fx + sy * fy + sz * fz) / sink
+            sx, sy, sz = sx - down * x, sy - down * y, sz - down * z
+            second = side * (sx * grads[0, 0] + sy * grads[0, 1] + sz * grads[0, 2])
+            third = side * (sx * grads[1, 0] + sy * grads[1, 1] + sz * grads[1, 2])
+            wx = second * grads[2, 0] + third * grads[3, 0]
+            wy = second * grads[2, 1] + third * grads[3, 1]
+            wz = second * grads[2, 2] + third * grads[3, 2]
+            out = wx * nx + wy * ny + wz * nz
+            wx, wy, wz = wx - out * nx, wy - out * ny, wz - out * nz
+            change = tx * nx + ty * ny + tz * nz + wx * x + wy * y + wz * z
+            turned[i, 3 * k] = tx - 2.0 * (change * nx + along * wx)
+            turned[i, 3 * k + 1] = ty - 2.0 * (change * ny + along * wy)
+            turned[i, 3 * k + 2] = tz - 2.0 * (change * nz + along * wz)
+            row[3 * k], row[3 * k + 1], row[3 * k + 2] = sx, sy, sz
+            tilts[3 * k], tilts[3 * k + 1], tilts[3 * k + 2] = wx, wy, wz
+            off = sx * nx + sy * ny + sz * nz
+            row[15 + k] = sx * x + sy * y + sz * z - 2.0 * along * off
+        row[6] = row[0] * row[0] + row[1] * row[1] + row[2] * row[2]
+        row[7] = row[3] * row[3] + row[4] * row[4] + row[5] * row[5]
+        row[8] = row[0] * row[3] + row[1] * row[4] + row[2] * row[5]
+        row[9] = row[0] * turn[0] + row[1] * turn[1] + row[2] * turn[2]
+        row[10] = row[3] * turn[3] + row[4] * turn[4] + row[5] * turn[5]
+        row[11] = row[0] * turn[3] + row[1] * turn[4] + row[2] * turn[5]
+        row[12] = row[0] * tilts[0] + row[1] * tilts[1] + row[2] * tilts[2]
+        row[13] = row[3] * tilts[3] + row[4] * tilts[4] + row[5] * tilts[5]
+        row[14] = row[0] * tilts[3] + row[1] * tilts[4] + row[2] * tilts[5]
+        row[17], row[18] = sink, abs(cross)
+    return rows, turned, outward, mirrored

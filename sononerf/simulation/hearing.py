@@ -14,15 +14,12 @@ from sononerf.array_types import Complexes, Floats, Ints, Singles
 from sononerf.head.ears import beam_gain, ear_gain
 from sononerf.head.head import Head
 from sononerf.simulation.impulse_response import (
-    Bins,
     Synthesis,
     air_loss,
     deposit,
     plan_synthesis,
     synthesise,
 )
-
-MOST_WAITING = 300_000  # echoes; laying them into bins goes over all bins, so it is done seldom
 
 
 class Listener(Protocol):
@@ -42,38 +39,21 @@ class Sound:
         ears: How many, E.
 
     Attributes:
-        bins: Of each ear, filled by :meth:`settle`.
+        bins: Of each ear.
+        heard: Whether any echo was added.
     """
 
     def __init__(self, synthesis: Synthesis, ears: int) -> None:
         self._synthesis = synthesis
         self.bins = [synthesis.silence() for _ in range(ears)]
-        self._waiting: list[list[tuple[NDArray[Any], ...]]] = [[] for _ in range(ears)]
-        self._heard = False
+        self.heard = False
 
     def add(
         self, ear: int, delay: NDArray[Any], spread: NDArray[Any], strength: NDArray[Any]
     ) -> None:
         """Add echoes: delay (N,) s, spread (N,) s, strength (N, F)."""
-        self._heard = True
-        self._waiting[ear].append((delay, spread, strength))
-        if sum(len(echoes[0]) for echoes in self._waiting[ear]) > MOST_WAITING:
-            self.settle(ear)
-
-    @property
-    def heard(self) -> bool:
-        """Whether any echo was added."""
-        return self._heard
-
-    def settle(self, ear: int) -> Bins:
-        """Lay what waits into an ear's bins, and return them."""
-        if self._waiting[ear]:
-            delay, spread, strength = (
-                np.concatenate(parts) for parts in zip(*self._waiting[ear], strict=True)
-            )
-            self._waiting[ear].clear()
-            deposit(self._synthesis, self.bins[ear], delay, spread, strength)
-        return self.bins[ear]
+        self.heard = True
+        deposit(self._synthesis, self.bins[ear], delay, spread, strength)
 
 
 class Hearing:
@@ -177,10 +157,7 @@ class Hearing:
         """
         filters = self.synthesis.basis if basis is None else basis
         return np.stack(
-            [
-                synthesise(self.synthesis, sound.settle(ear), self._air, filters)
-                for ear in range(len(sound.bins))
-            ]
+            [synthesise(self.synthesis, bins, self._air, filters) for bins in sound.bins]
         )
 
 

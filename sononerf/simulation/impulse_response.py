@@ -21,15 +21,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from itertools import accumulate
 from typing import Any
 
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
-from scipy.sparse import csc_array
 
-from sononerf.array_types import Complexes, Floats
+from sononerf.array_types import Complexes, Floats, Ints
+from sononerf.compiled import compiled
 from sononerf.head.ears import NOTCH_WIDTH
 from sononerf.settings.schema import SpectrogramSettings
 
@@ -193,44 +192,62 @@ def deposit(
         spread ((N,), s): Standard deviation of the arrival times of what an echo stands for.
         strength (N, F): Per node.
     """
-    rate = synthesis.sampling_rate * OVERSAMPLING
-    last = OVERSAMPLING * (synthesis.samples + GUARD // 2)
-    place = delay * rate
-    heard = place < last
-    if not heard.all():
-        place, spread, strength = place[heard], spread[heard], strength[heard]
-    if len(place) == 0:
-        return
-    earliest, latest = float(place.min()), float(place.max())
+    kind = bins.values.dtype
+    earliest, latest = _lay(
+        bins.values,
+        np.cumsum([0, *synthesis.sizes]),
+        np.array(delay, dtype=np.float64),
+        np.array(spread, dtype=np.float64),
+        np.array(strength, dtype=kind, order="C"),
+        synthesis.sampling_rate * OVERSAMPLING,
+        float(OVERSAMPLING * (synthesis.samples + GUARD // 2)),
+    )
     bins.first = min(bins.first, earliest / OVERSAMPLING)
     bins.last = max(bins.last, latest / OVERSAMPLING)
-    # In units of the finest bin; level l spreads by LEVEL_VARIANCE * 4**l, level 0 not at all.
-    variance = np.square(spread * rate) / LEVEL_VARIANCE
-    level = np.clip((np.frexp(variance)[1] - 1) // 2, 0, LEVELS - 2)
-    floor = np.ldexp(1.0, 2 * level)
-    below = np.where(level > 0, floor, 0.0)
-    share = np.clip((variance - below) / (4.0 * floor - below), 0.0, 1.0)
-    # Of each level, the bins from the earliest to behind the latest echo, one after the other.
-    low = np.array([int(math.ldexp(earliest, -step)) for step in range(LEVELS)])
-    count = [int(math.ldexp(latest, -step)) + 2 - low[step] for step in range(LEVELS)]
-    start = np.array([0, *accumulate(count)])
-    rows = np.zeros((len(place), 4), dtype=np.int32)
-    weights = np.zeros((len(place), 4), dtype=bins.values.dtype)
-    for step, part in ((0, 1.0 - share), (1, share)):
-        at = np.ldexp(place, -(level + step))
-        index = at.astype(np.int32)
-        rows[:, 2 * step] = (start[:-1] - low)[level + step] + index
-        rows[:, 2 * step + 1] = rows[:, 2 * step] + 1
-        late = (at - index) * part
-        weights[:, 2 * step] = part - late
-        weights[:, 2 * step + 1] = late
-    ends = np.arange(0, 4 * len(place) + 1, 4, dtype=np.int32)
-    lay = csc_array((weights.ravel(), rows.ravel(), ends), shape=(start[-1], len(place)))
-    laid = lay @ strength.astype(bins.values.dtype, copy=False)
-    for to, at_level, rows_of, begin in zip(
-        accumulate(synthesis.sizes, initial=0), low, count, start, strict=False
-    ):
-        bins.values[to + at_level : to + at_level + rows_of] += laid[begin : begin + rows_of]
+
+
+@compiled
+def _lay(
+    values: NDArray[Any],
+    start: Ints,
+    delay: Floats,
+    spread: Floats,
+    strength: NDArray[Any],
+    rate: float,
+    last: float,
+) -> tuple[float, float]:
+    """Add echoes to bins in place; return the first and the last place, in bins.
+
+    Args:
+        values (B, F): Of the bins.
+        start (L + 1,): First row of each level.
+        delay, spread, strength: See :func:`deposit`.
+        rate (Hz): Of the finest bins.
+        last (bins): What comes no sooner is left out.
+    """
+    earliest, latest = math.inf, -math.inf
+    for i in range(len(delay)):
+        place = delay[i] * rate
+        if not place < last:
+            continue
+        earliest, latest = min(earliest, place), max(latest, place)
+        # In units of the finest bin; level l spreads by LEVEL_VARIANCE * 4**l, level 0 not at all.
+        variance = (spread[i] * rate) ** 2 / LEVEL_VARIANCE
+        level = min(max((math.frexp(variance)[1] - 1) // 2, 0), LEVELS - 2)
+        floor = 4.0**level
+        below = floor if level > 0 else 0.0
+        share = min(max((variance - below) / (4.0 * floor - below), 0.0), 1.0)
+        for step in range(2):
+            part = share if step else 1.0 - share
+            at = math.ldexp(place, -(level + step))
+            row = start[level + step] + int(at)
+            late = (at - int(at)) * part
+            soon = values.dtype.type(part - late)
+            then = values.dtype.type(late)
+            for k in range(values.shape[1]):
+                values[row, k] += soon * strength[i, k]
+                values[row + 1, k] += then * strength[i, k]
+    return earliest, latest
 
 
 def air_loss(synthesis: Synthesis, decay: Floats) -> Floats:
@@ -262,11 +279,8 @@ def synthesise(
     if bins.last < bins.first:
         return echo
     begin, part = _stretch(synthesis, bins)
-    length, basis = synthesis.length // part, basis[::part]
-    kept = int(np.flatnonzero(basis.any(axis=1)).max(initial=0)) + 1
-    basis = basis[:kept]
-    spectrum = np.zeros(basis.shape, dtype=np.complex128)
-    frequency = np.arange(kept) * (synthesis.sampling_rate / length)
+    length = synthesis.length // part
+    spectrum = np.zeros(length // 2 + 1, dtype=np.complex128)
     first = 0
     for level, whole_size in enumerate(synthesis.sizes):
         size = whole_size // part
@@ -276,24 +290,51 @@ def synthesise(
         if not laid.any():
             continue
         half = scipy.fft.rfft(laid * air[start : start + size], axis=0, overwrite_x=True)
-        if level == 0:
-            spectrum += half[:kept]
-            continue
-        # Beyond half their own rate the bins' spectrum repeats; the triangle fades that out.
-        index = np.arange(kept) % size
-        mirrored = index > size // 2
-        index[mirrored] = size - index[mirrored]
-        whole = half[index]
-        whole[mirrored] = whole[mirrored].conj()
-        width = 2.0**level / (OVERSAMPLING * synthesis.sampling_rate)
-        triangle = np.sinc(frequency * width) ** 2
-        # What the filters make up for happens in the finest bins alone.
-        triangle *= np.sinc(frequency / (OVERSAMPLING * synthesis.sampling_rate)) ** 2
-        spectrum += whole * triangle[:, None]
-    sound = scipy.fft.irfft(np.einsum("kf,kf->k", spectrum, basis), n=length)
+        _filter(spectrum, half, basis, size, part, 2.0**level)
+    sound = scipy.fft.irfft(spectrum, n=length)
     end = min(begin + length, synthesis.samples)
     echo[begin:end] = sound[: end - begin]
     return echo
+
+
+@compiled
+def _filter(
+    spectrum: Complexes,
+    half: NDArray[Any],
+    basis: Complexes,
+    size: int,
+    part: int,
+    width: float,
+) -> None:
+    """Add what the filters make of one level of bins to a spectrum (K / part,), in place.
+
+    Args:
+        spectrum (K / part,): Of the echo.
+        half (size // 2 + 1, F): Spectra of the bins.
+        basis (K, F): The filters.
+        size: Number of bins.
+        part: One over the part of the record that is filtered.
+        width: Of these bins, in finest ones.
+    """
+    finest = OVERSAMPLING * 2.0 * (len(spectrum) - 1)  # bins at the level of the finest
+    for k in range(len(spectrum)):
+        # Beyond half their own rate the bins' spectrum repeats; the triangle fades that out.
+        index = k % size
+        mirrored = index > size // 2
+        if mirrored:
+            index = size - index
+        real, imag = 0.0, 0.0
+        for f in range(half.shape[1]):
+            one, other = half[index, f], basis[k * part, f]
+            along = -one.imag if mirrored else one.imag
+            real += one.real * other.real - along * other.imag
+            imag += one.real * other.imag + along * other.real
+        if width > 1.0 and k > 0:
+            # What the filters make up for happens in the finest bins alone.
+            wide, fine = math.pi * k / finest * width, math.pi * k / finest
+            fade = (math.sin(wide) / wide * math.sin(fine) / fine) ** 2
+            real, imag = fade * real, fade * imag
+        spectrum[k] += complex(real, imag)
 
 
 def _stretch(synthesis: Synthesis, bins: Bins) -> tuple[int, int]:

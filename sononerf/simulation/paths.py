@@ -6,17 +6,17 @@ from __future__ import annotations
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.array_types import Bools, Floats, Ints, Singles
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.geometry.directions import CapSpiral, Cells
 from sononerf.geometry.raycast import Hits, RayCaster
-from sononerf.simulation.footprint import Footprint, across, dots, land
-from sononerf.simulation.reflection import keep_outside, mirror
+from sononerf.simulation.footprint import Footprint, Ways, emit, land, onto, ways_to
+from sononerf.simulation.reflection import leave
 
 SPLIT = 2  # along each side of a divided cell
 GATHERED = 8192  # hits; so many are taken together, for numpy's calls cost as much as some hundred
@@ -34,7 +34,6 @@ class Bounce:
         solid_angle (float or (H,) float64, sr): What each ray stands for.
         ray (H,): Which of the emitted rays.
         emitted (H, 3): Their directions from the emitter.
-        incoming (H, 3): Their directions before the hit.
         points ((H, 3), m): Where they hit.
         flat (H, 3): Normals of the triangles, on the side of the ray.
         mirrored (H, 3): Where a mirror would send them.
@@ -48,7 +47,6 @@ class Bounce:
     solid_angle: float | Floats
     ray: Ints
     emitted: Floats
-    incoming: Floats
     points: Floats
     flat: Floats
     mirrored: Floats
@@ -57,24 +55,14 @@ class Bounce:
     triangles: Ints
     hidden: bool = False
 
-    def detour(
-        self, towards: Floats, distance: Floats
-    ) -> tuple[Singles, Singles, Singles, Singles]:
-        """Compare paths to a listener with those of a mirror.
-
-        Args:
-            towards (H, 3): Unit vectors from the hits to the listener.
-            distance ((H,), m): From the hits to the listener.
-
-        Returns:
-            rise ((H,) float32): Cosine between the way to the listener and the outward normal.
-            detour, spread, stiffness ((H,) float32): See :meth:`Footprint.detour`.
-        """
-        there = _single(towards)
-        rise = dots(there, _single(self.flat))
-        return rise, *self.footprint.detour(
-            there, rise, distance.astype(np.float32), self.solid_angle
+    def ways_to(self, listener: Floats) -> Ways:
+        """Compare the ways of all hits to a listener (3,), m, with those of a mirror."""
+        angle = np.atleast_1d(np.asarray(self.solid_angle, dtype=np.float64))
+        rows = self.footprint.rows
+        distance, cosine, found = ways_to(
+            rows, self.points, self.flat, self.mirrored, listener, angle
         )
+        return Ways(distance, cosine, *found)
 
     def __getitem__(self, chosen: Ints) -> Bounce:
         """Return the chosen hits."""
@@ -83,12 +71,11 @@ class Bounce:
             angle if isinstance(angle := self.solid_angle, float) else angle.take(chosen),
             self.ray.take(chosen),
             self.emitted.take(chosen, axis=0),
-            self.incoming.take(chosen, axis=0),
             self.points.take(chosen, axis=0),
             self.flat.take(chosen, axis=0),
             self.mirrored.take(chosen, axis=0),
             self.length.take(chosen),
-            self.footprint[chosen],
+            Footprint(self.footprint.rows.take(chosen, axis=0)),
             self.triangles.take(chosen, axis=0),
             self.hidden,
         )
@@ -120,19 +107,11 @@ def _joined(bounces: list[Bounce]) -> Bounce:
     def of_hits(name: str) -> NDArray[Any]:
         return np.concatenate([getattr(bounce, name) for bounce in bounces])
 
-    def of_footprints(name: str) -> Singles:
-        return np.concatenate([getattr(bounce.footprint, name) for bounce in bounces], axis=-1)
-
     angles = [np.broadcast_to(bounce.solid_angle, len(bounce.ray)) for bounce in bounces]
-    names = ("ray", "emitted", "incoming", "points", "flat", "mirrored", "length", "triangles")
+    names = ("ray", "emitted", "points", "flat", "mirrored", "length", "triangles")
     joined: dict[str, Any] = {name: of_hits(name) for name in names}
-    footprint = Footprint(**{of.name: of_footprints(of.name) for of in fields(Footprint)})
+    footprint = Footprint(np.concatenate([bounce.footprint.rows for bounce in bounces]))
     return replace(bounces[0], solid_angle=np.concatenate(angles), footprint=footprint, **joined)
-
-
-def _dot(a: Floats, b: Floats) -> Floats:
-    product: Floats = np.einsum("nd,nd->n", a, b)
-    return product
 
 
 def aim(emitter: Floats, centre: Floats, radius: float) -> tuple[Floats, float]:
@@ -184,51 +163,30 @@ def trace(
     if beyond is not None:
         hits, length = beyond(hits, directions)
     ray, emitted = hits.ray, directions.take(hits.ray, axis=0)
-    incoming = emitted
-    # Turned at the emitter, not moved there.
-    turn = across(_single(incoming))
-    shift = length.astype(np.float32) * turn
+    incoming, bundles = emitted, emit(emitted, length)
     triangles = hits.triangle[:, None]
     for number in range(1, bounces + 1):
         if len(ray) == 0:
             return
-        flat = hits.flat.copy()
-        flat[_dot(incoming, flat) > 0.0] *= -1.0
-        mirrored = mirror(incoming, hits.normals)
-        outward, normals, gradients = _single(flat), _single(hits.normals), hits.gradients
-        # The smooth normals may point either way.
-        side = np.where(dots(outward, normals) < 0.0, np.float32(-1.0), np.float32(1.0))
-        gradients[2:] *= side
-        footprint, turned = land(
-            shift,
-            turn,
-            incoming=_single(incoming),
-            flat=outward,
-            normals=side * normals,
-            gradients=gradients,
+        rows, turned, flat, mirrored = land(
+            bundles, incoming, hits.normals, hits.flat, hits.gradients
         )
         yield Bounce(
-            number, solid_angle, ray, emitted, incoming, hits.points, flat, mirrored, length,
-            footprint, triangles,
+            number, solid_angle, ray, emitted, hits.points, flat, mirrored, length,
+            Footprint(rows), triangles,
         )  # fmt: skip
         if number == bounces:
             return
-        onward = keep_outside(mirrored, flat)
-        hits = caster.first_hit(hits.points + caster.lift * flat, onward)
+        origins, onward = leave(mirrored, flat, hits.points, caster.lift)
+        hits = caster.first_hit(origins, onward)
         further = hits.ray
-        incoming, turn = onward.take(further, axis=0), turned.take(further, axis=2)
-        # What of it goes along the ray is lost where the bundle lands.
-        shift = footprint.shift.take(further, axis=2) + hits.distance.astype(np.float32) * turn
+        incoming = onward.take(further, axis=0)
+        bundles = onto(rows, turned, further, hits.distance)
         ray, emitted = ray.take(further), emitted.take(further, axis=0)
         length = length.take(further) + hits.distance
         triangles = np.concatenate(
             [triangles.take(further, axis=0), hits.triangle[:, None]], axis=1
         )
-
-
-def _single(vectors: Floats) -> Singles:
-    """Return vectors (N, 3) as (3, N) in single precision."""
-    return vectors.astype(np.float32).T.copy()
 
 
 def echo_paths(

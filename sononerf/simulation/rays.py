@@ -17,13 +17,14 @@ from sononerf.geometry.directions import CapSpiral
 from sononerf.geometry.normals import bodies, enclosing_balls
 from sononerf.geometry.raycast import Hits
 from sononerf.scene.scene import Scene
-from sononerf.simulation.audibility import EARS_APART, RESOLVED_FREQUENCY, Audibility, row_dot
+from sononerf.simulation.audibility import EARS_APART, RESOLVED_FREQUENCY, Audibility
 from sononerf.simulation.diffraction import Diffraction
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import Hearing, Listener
+from sononerf.simulation.outlines import Outlines
 from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
 from sononerf.simulation.reflection import coarse_gain, unfaded
-from sononerf.simulation.shadows import LEAST, Outlines, Shadow, behind
+from sononerf.simulation.shadows import LEAST, Shadow, behind
 
 HIDDEN_SHARE = 0.15  # as many rays again, for what lies behind obstacles
 HIDDEN_DIVIDED = 0.4  # of these, kept as above
@@ -201,7 +202,7 @@ class Rays(Engine):
         listeners = self._listeners(position, rotation)
 
         def judge(bounce: Bounce) -> tuple[Bools, Floats]:
-            return self._audibility.judge_all(bounce, listeners)
+            return self._audibility.judge(bounce, listeners)
 
         index = self._reaching(cap, emitter)
         return echo_paths(
@@ -237,7 +238,7 @@ class Rays(Engine):
         cap = CapSpiral(max(rays - extra, 1), axis @ rotation, half_angle, offset, rotation)
 
         def judge(bounce: Bounce) -> tuple[Bools, Floats]:
-            audible, doubt = self._audibility.judge_all(bounce, listeners)
+            audible, doubt = self._audibility.judge(bounce, listeners)
             chosen = np.flatnonzero(audible)
             level = shadow.level(bounce.points[chosen], bounce.triangles[chosen, -1])
             audible[chosen] = level > LEAST
@@ -318,25 +319,23 @@ class Rays(Engine):
 
         At last which of these are shaded (M,), and what passes of them (M, F), or None.
         """
-        away = ear - bounce.points
-        distance = np.sqrt(row_dot(away, away))
-        towards = away / distance[:, None]
-        rise, detour, spread, stiffness = bounce.detour(towards, distance)
-        heard = (rise > 0.0) & (detour < self._farthest)
+        ways = bounce.ways_to(ear)
+        heard = (ways.rise > 0.0) & (ways.detour < self._farthest)
         if self._reach < math.pi:
-            heard &= row_dot(bounce.mirrored, towards) > math.cos(self._reach)
+            heard &= ways.cosine > math.cos(self._reach)
         near = np.flatnonzero(heard)
         seen = self.caster.visible(
             bounce.points.take(near, axis=0), ear, normals=bounce.flat.take(near, axis=0)
         )
         seen, shaded = self._shaded(bounce, near, seen, lit, shadow)
         near = near[np.flatnonzero(seen)]
-        gain = self._gain(bounce, near, towards.take(near, axis=0), detour.take(near))
-        bend = (stiffness * np.asarray(bounce.solid_angle, dtype=np.float32)).take(near)
+        triangle = bounce.triangles[near, -1]
+        gain = self._gain(triangle, ways.cosine.take(near), ways.detour.take(near))
+        bend = (ways.stiffness * np.asarray(bounce.solid_angle, dtype=np.float32)).take(near)
         coarse = bend * self._wavenumber[-1] > FINE
-        coarse = np.flatnonzero(coarse & self._smooth[self._part(bounce.triangles[near, -1])])
+        coarse = np.flatnonzero(coarse & self._smooth[self._part(triangle)])
         gain[coarse] *= coarse_gain(np.multiply.outer(bend.take(coarse), self._wavenumber))
-        return near, gain, spread.take(near), shaded
+        return near, gain, ways.spread.take(near), shaded
 
     def _shaded(
         self,
@@ -384,21 +383,13 @@ class Rays(Engine):
                 level = level * kept[self._part(earlier)]
         return level
 
-    def _gain(
-        self,
-        bounce: Bounce,
-        heard: Ints,
-        towards: Floats,
-        detour: Singles,
-    ) -> NDArray[np.floating[Any]]:
-        """Lobe times strength towards a listener (N, F)."""
-        cosine = row_dot(bounce.mirrored.take(heard, axis=0), towards)
-        triangle = bounce.triangles[heard, -1]
+    def _gain(self, triangle: Ints, cosine: Floats, detour: Singles) -> NDArray[np.floating[Any]]:
+        """Lobe times strength of hits towards a listener (N, F)."""
         curvature = self.caster.curvature[triangle]
         if len(self.reflections) == 1:
             return self.reflections[0].heard(cosine, detour, curvature)
         part = self._part(triangle)
-        gain = np.zeros((len(heard), len(self.hearing.synthesis.nodes)), dtype=np.float32)
+        gain = np.zeros((len(triangle), len(self.hearing.synthesis.nodes)), dtype=np.float32)
         for index, reflection in enumerate(self.reflections):
             of_part = part == index
             found = reflection.heard(cosine[of_part], detour[of_part], curvature[of_part])

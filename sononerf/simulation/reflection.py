@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.array_types import Complexes, Floats, Singles
+from sononerf.compiled import compiled
 from sononerf.scene.material import Material
 
 COARSEST = 10.0  # rad
@@ -166,39 +167,38 @@ def coarse_gain(bend: Singles) -> Singles:
     return gain
 
 
-def mirror(directions: Floats, normals: Floats) -> Floats:
-    """Mirror directions about planes.
-
-    Args:
-        directions (N, 3): Unit vectors towards the surface.
-        normals (N, 3): Unit normals; their sign does not matter.
-
-    Returns:
-        mirrored (N, 3): Unit vectors.
-    """
-    along = np.einsum("nd,nd->n", directions, normals)
-    mirrored: Floats = directions - (2.0 * along)[:, None] * normals
-    return mirrored
-
-
-def keep_outside(directions: Floats, flat: Floats) -> Floats:
-    """Turn directions that run into the surface so far that they graze it.
+@compiled
+def leave(directions: Floats, flat: Floats, points: Floats, lift: float) -> tuple[Floats, Floats]:
+    """Start rays off the surface, turned so far that those which run into it graze it.
 
     A mirror direction about a smooth normal may point into the flat triangle that was hit.
 
     Args:
         directions (N, 3): Unit vectors.
         flat (N, 3): Unit normals of the triangles, on the side of the ray.
+        points ((N, 3), m): On the triangles.
+        lift (m): How far above them the rays start.
 
     Returns:
+        origins ((N, 3), m): Of the rays.
         directions (N, 3): Unit vectors.
     """
-    rise = np.einsum("nd,nd->n", directions, flat)
-    low = np.flatnonzero(rise < LEAST_RISE)
-    turned = directions.copy()
-    lifted = directions[low] + (LEAST_RISE - rise[low])[:, None] * flat[low]
-    turned[low] = lifted / np.linalg.norm(lifted, axis=1, keepdims=True)
-    return turned
+    origins, onward = np.zeros((len(points), 3)), np.zeros((len(points), 3))
+    for i in range(len(points)):
+        rise = 0.0
+        for k in range(3):
+            rise += directions[i, k] * flat[i, k]
+        more = max(LEAST_RISE - rise, 0.0)
+        length = 0.0
+        for k in range(3):
+            origins[i, k] = points[i, k] + lift * flat[i, k]
+            onward[i, k] = directions[i, k] + more * flat[i, k]
+            length += onward[i, k] * onward[i, k]
+        if more > 0.0:
+            length = math.sqrt(length)
+            for k in range(3):
+                onward[i, k] /= length
+    return origins, onward
 
 
 def lobe_exponent(cosine: Floats, lobe_width: Floats) -> Floats:

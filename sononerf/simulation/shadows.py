@@ -1,113 +1,22 @@
 # SPDX-License-Identifier: MIT
-"""Outlines of bodies, and the sound that passes them: shadows that fade with the Fresnel zone."""
+"""The sound that passes obstacles: shadows that fade with the Fresnel zone."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sononerf.array_types import Bools, Complexes, Floats, Ints
-from sononerf.geometry.normals import CREASE, bodies, corner_normals, weight_gradients
+from sononerf.array_types import Complexes, Floats, Ints
+from sononerf.compiled import compiled
 from sononerf.geometry.raycast import Hits, RayCaster
 from sononerf.simulation.audibility import RESOLVED_FREQUENCY
 from sononerf.simulation.impulse_response import NODE_SPACING
-
-
-class Outlines:
-    """The edges of a mesh that may be the outline of an obstacle, seen from somewhere.
-
-    Args:
-        mesh: The scene.
-
-    Attributes:
-        body (T,): Which connected part a triangle belongs to.
-        closed (T,): Whether that part has no rim.
-        several: Whether there is more than one part, or any that is not convex.
-    """
-
-    def __init__(self, mesh: trimesh.Trimesh) -> None:
-        vertices = np.asarray(mesh.vertices, dtype=np.float64)
-        faces = np.asarray(mesh.faces, dtype=np.int64)
-        pairs = np.asarray(mesh.face_adjacency, dtype=np.int64).reshape(-1, 2)
-        used = np.asarray(mesh.edges_sorted)
-        _, first, count = np.unique(used, axis=0, return_index=True, return_counts=True)
-        rim = first[count == 1]
-        owner = np.asarray(mesh.edges_face, dtype=np.int64)[rim]
-        self.body: Ints = bodies(mesh)
-        parts = int(self.body.max()) + 1
-        is_open = np.zeros(parts, dtype=bool)
-        is_open[self.body[owner]] = True
-        self.closed: Bools = ~is_open[self.body]
-        ends = np.concatenate([np.asarray(mesh.face_adjacency_edges).reshape(-1, 2), used[rim]])
-        self._normals = np.asarray(mesh.face_normals, dtype=np.float64)
-        self._height = np.einsum("td,td->t", self._normals, vertices[faces[:, 0]])
-        self._pairs = np.concatenate([pairs, np.stack([owner, owner], axis=1)])
-        self._rim = np.arange(len(self._pairs)) >= len(pairs)
-        self._ends, self._vertices = ends, vertices
-        self._middles = vertices[faces].mean(axis=1)
-        convex = np.asarray(mesh.face_adjacency_convex, dtype=bool)
-        normals = corner_normals(mesh)
-        self._second, self._third = weight_gradients(vertices[faces])
-        self._bend = normals[:, 1:] - normals[:, :1]
-        sharp = np.asarray(mesh.face_adjacency_angles) >= CREASE
-        self._sharp = np.concatenate([sharp, np.ones(len(rim), dtype=bool)])
-        self._size = float(np.linalg.norm(vertices.max(axis=0) - vertices.min(axis=0)))
-        self.bounds = vertices.min(axis=0), vertices.max(axis=0)
-        self._outward = np.concatenate(
-            [convex | ~self.closed[pairs[:, 0]], np.ones(len(rim), dtype=bool)]
-        )
-        self.several = parts > 1 or bool(is_open.any()) or not mesh.is_convex
-
-    def seen_from(self, place: Floats) -> tuple[Floats, Floats, Ints, Floats]:
-        """Return outline edges as seen from a place.
-
-        Returns:
-            ends ((K, 2, 3), m): The obstacle lies on the left as one goes from the first to the
-                second.
-            away (K, 3): Unit vectors off the surface.
-            body (K,): Of each edge.
-            radius ((K,), m): Of the surface's curvature along the way from the place; zero where it
-                is sharp.
-        """
-        front = self._normals @ place > self._height
-        one, two = self._pairs.T
-        chosen = np.flatnonzero(((front[one] != front[two]) | self._rim) & self._outward)
-        one, two = one[chosen], two[chosen]
-        facing = np.where(front[one], one, two)
-        ends = self._vertices[self._ends[chosen]]
-        inward = self._middles[facing] - ends[:, 0]
-        left = np.cross(ends[:, 1] - ends[:, 0], inward)
-        turned = np.einsum("kd,kd->k", left, place - ends[:, 0]) < 0.0
-        ends[turned] = ends[turned, ::-1]
-        away = self._normals[one] + self._normals[two]
-        rim = self._rim[chosen]
-        along = ends[rim, 1] - ends[rim, 0]
-        square = np.einsum("kd,kd->k", along, along)
-        square = np.einsum("kd,kd->k", along, inward[rim]) / np.maximum(square, 1e-300)
-        away[rim] = square[:, None] * along - inward[rim]
-        length = np.linalg.norm(away, axis=1, keepdims=True)
-        radius = self._radius(one, two, ends.mean(axis=1) - place)
-        radius[self._sharp[chosen]] = 0.0
-        return ends, away / np.maximum(length, 1e-300), self.body[facing], radius
-
-    def _radius(self, one: Ints, two: Ints, along: Floats) -> Floats:
-        """Radius of curvature along a direction, the mean of two triangles."""
-        along = along / np.linalg.norm(along, axis=1, keepdims=True)
-        bend = np.zeros(len(one))
-        for triangle in (one, two):
-            turn = np.zeros_like(along)
-            for corner, gradient in enumerate((self._second, self._third)):
-                share = np.einsum("kd,kd->k", gradient[triangle], along)
-                turn += share[:, None] * self._bend[triangle, corner]
-            bend += 0.5 * np.einsum("kd,kd->k", turn, along)
-        return 1.0 / np.maximum(bend, 1.0 / self._size)
-
+from sononerf.simulation.outlines import Outlines
 
 CELL = 0.25
 """Size of a piece of surface with one obstacle factor, over the root of wavelength times the radius
@@ -316,66 +225,137 @@ class Shadow:
         rows = np.full(len(points), -1, dtype=np.int32)
         if not count.any():
             return rows
-        point = np.repeat(np.arange(len(points)), count)
-        piece = np.concatenate([np.asarray(found, dtype=np.int64) for found in reached])
-        towards = pieces.middle[piece] - self._place
-        ahead = way[point]
-        far = distance[point]
-        before = np.einsum("nd,nd->n", towards, ahead)
-        after = far - before
-        behind = pieces.behind[piece]
-        own = pieces.body[piece] == body[point]
-        counts = (after > self._cell) & (before > 0.0)
-        counts &= np.where(
-            own, np.abs(far - behind) < 0.5 * (behind - before), behind > before + 0.5 * after
-        )
-        across = towards - before[:, None] * ahead
-        square = np.einsum("nd,nd->n", across, across)
-        detour = np.sqrt(before**2 + square) + np.sqrt(after**2 + square) - far
-        chosen = np.flatnonzero(counts & (detour < self._longest))
-        if len(chosen) == 0:
+        laid, used = _lay(
+            points, self._place, body, np.cumsum([0, *count]),
+            np.concatenate([np.asarray(found, dtype=np.int64) for found in reached]),
+            pieces.middle, pieces.along, pieces.behind, pieces.body, pieces.curve,
+            len(self._turns), self._step, self._cell, self._longest, self._waist,
+        )  # fmt: skip
+        if len(used) == 0:
             return rows
-        point, piece, ahead = point[chosen], piece[chosen], ahead[chosen]
-        across, before, after = across[chosen], before[chosen], after[chosen]
-        half = 0.5 * pieces.along[piece]
-        half -= np.einsum("nd,nd->n", half, ahead)[:, None] * ahead
-        one, two = across - half, across + half
-        cross = -np.einsum("nd,nd->n", np.cross(one, two), ahead)
-        swept = np.arctan2(cross, np.einsum("nd,nd->n", one, two))
-        r1, r2 = (np.sqrt(np.einsum("nd,nd->n", end, end)) for end in (one, two))
-        # Where the bisector of the angle meets the piece.
-        radius = 2.0 * r1 * r2 * np.cos(0.5 * swept) / np.maximum(r1 + r2, 1e-300)
-        detour = np.sqrt(before**2 + radius**2) + np.sqrt(after**2 + radius**2) - before - after
-        place = np.minimum(detour / self._step, len(self._turns) - 2.0)
-        index = place.astype(np.int64)
-        share = place - index
-        used, point = np.unique(point, return_inverse=True)
-        size = len(used) * len(self._turns)
-        at = point * len(self._turns) + index
-
-        def lay(weight: Floats) -> Floats:
-            laid: NDArray[Any] = np.bincount(at, weight * (1.0 - share), size)
-            laid += np.bincount(at + 1, weight * share, size)
-            table: Floats = laid.reshape(len(used), -1)
-            return table
-
         lit = self._caster.visible(points[used] - self._cell * way[used], self._place)
-        found = lit[:, None] + _product(lay(swept), self._turns)
-        curve = pieces.curve[piece]
-        if curve.any():
-            # How far the way is in the shadow, as an angle by which sound bends.
-            length = 2.0 * np.sqrt(np.einsum("nd,nd->n", half, half))
-            reduced = before * after / (before + after)
-            bent = cross / np.maximum(length, 1e-300) / reduced
-            grazing = np.maximum(curve * self._waist, 1e-300)
-            weight = length / reduced * curve * np.clip(1.0 + bent * grazing / LIT, 0.0, 1.0)
-            bent = np.minimum(bent, SHADED / grazing) * curve
-            for factor in self._creep:
-                found += _product(lay(weight), factor)
-                weight = weight * bent
+        found = lit[:, None] + _product(laid[0], self._turns)
+        for weight, factor in zip(laid[1:], self._creep, strict=True):
+            if weight.any():
+                found += _product(weight, factor)
         rows[used] = len(self._table) + np.arange(len(used))
         self._table = np.concatenate([self._table, found.astype(np.complex64)])
         return rows
+
+
+@compiled
+def _lay(
+    points: Floats,
+    place: Floats,
+    bodies: Ints,
+    start: Ints,
+    reached: Ints,
+    middles: Floats,
+    alongs: Floats,
+    behinds: Floats,
+    owners: Ints,
+    curves: Floats,
+    bins: int,
+    step: float,
+    cell: float,
+    longest: float,
+    waist: float,
+) -> tuple[Floats, Ints]:
+    """Sort what pieces of an outline send to points by its detour.
+
+    Args:
+        points ((N, 3), m): Where sound arrives.
+        place ((3,), m): Where it comes from.
+        bodies (N,): On which body the points lie.
+        start (N + 1,): Where the pieces of each point begin among those reached.
+        reached (R,): Pieces that may send something there.
+        middles, alongs, behinds, owners, curves: Of the pieces; see :class:`_Pieces`.
+        bins: Their number.
+        step (m): Their width.
+        cell, longest, waist: Of the shadow.
+
+    Returns:
+        laid (4, U, bins): The angle swept, and weights of the powers of Pekeris' function.
+        used (U,): The points that any piece sends something to.
+    """
+    table = np.zeros((4, len(points), bins))
+    is_used = np.zeros(len(points), np.bool_)
+    ahead, across, half, one, two = (
+        np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    )  # fmt: skip
+    for i in range(len(points)):
+        far = 0.0
+        for k in range(3):
+            ahead[k] = points[i, k] - place[k]
+            far += ahead[k] * ahead[k]
+        far = math.sqrt(far)
+        for k in range(3):
+            ahead[k] /= far
+        for at in range(start[i], start[i + 1]):
+            piece = reached[at]
+            before = 0.0
+            for k in range(3):
+                across[k] = middles[piece, k] - place[k]
+                before += across[k] * ahead[k]
+            after, behind = far - before, behinds[piece]
+            if not (after > cell and before > 0.0):
+                continue
+            if owners[piece] == bodies[i]:
+                if not abs(far - behind) < 0.5 * (behind - before):
+                    continue
+            elif not behind > before + 0.5 * after:
+                continue
+            square, off = 0.0, 0.0
+            for k in range(3):
+                across[k] -= before * ahead[k]
+                square += across[k] * across[k]
+                half[k] = 0.5 * alongs[piece, k]
+                off += half[k] * ahead[k]
+            detour = math.sqrt(before * before + square) + math.sqrt(after * after + square) - far
+            if not detour < longest:
+                continue
+            length, r1, r2, inner = 0.0, 0.0, 0.0, 0.0
+            for k in range(3):
+                half[k] -= off * ahead[k]
+                one[k], two[k] = across[k] - half[k], across[k] + half[k]
+                length += half[k] * half[k]
+                r1 += one[k] * one[k]
+                r2 += two[k] * two[k]
+                inner += one[k] * two[k]
+            cross = -(one[1] * two[2] - one[2] * two[1]) * ahead[0]
+            cross -= (one[2] * two[0] - one[0] * two[2]) * ahead[1]
+            cross -= (one[0] * two[1] - one[1] * two[0]) * ahead[2]
+            swept = math.atan2(cross, inner)
+            r1, r2 = math.sqrt(r1), math.sqrt(r2)
+            # Where the bisector of the angle meets the piece.
+            radius = 2.0 * r1 * r2 * math.cos(0.5 * swept) / max(r1 + r2, 1e-300)
+            detour = math.sqrt(before**2 + radius**2) + math.sqrt(after**2 + radius**2) - far
+            along = min(detour / step, bins - 2.0)
+            bin_ = int(along)
+            late = along - bin_
+            table[0, i, bin_] += swept * (1.0 - late)
+            table[0, i, bin_ + 1] += swept * late
+            is_used[i] = True
+            curve = curves[piece]
+            if curve == 0.0:
+                continue
+            # How far the way is in the shadow, as an angle by which sound bends.
+            length = 2.0 * math.sqrt(length)
+            reduced = before * after / (before + after)
+            bent = cross / max(length, 1e-300) / reduced
+            grazing = max(curve * waist, 1e-300)
+            weight = length / reduced * curve * min(max(1.0 + bent * grazing / LIT, 0.0), 1.0)
+            bent = min(bent, SHADED / grazing) * curve
+            for power in range(1, 4):
+                table[power, i, bin_] += weight * (1.0 - late)
+                table[power, i, bin_ + 1] += weight * late
+                weight *= bent
+    used = np.flatnonzero(is_used)
+    laid = np.zeros((4, len(used), bins))
+    for power in range(4):
+        for i in range(len(used)):
+            laid[power, i] = table[power, used[i]]
+    return laid, used
 
 
 def _product(real: Floats, factor: Complexes) -> Complexes:
@@ -407,14 +387,8 @@ def behind(
             break
     hidden = [part for part in found if len(part[1])] or found[:1]
     joined = Hits(
-        *(
-            np.concatenate([getattr(part, name) for part, _ in hidden], axis=axis)
-            for name, axis in (
-                ("ray", 0), ("points", 0), ("normals", 0), ("triangle", 0), ("distance", 0),
-                ("flat", 0), ("gradients", 2),
-            )
-        )
-    )  # fmt: skip
+        *(np.concatenate([getattr(part, of.name) for part, _ in hidden]) for of in fields(Hits))
+    )
     return joined, np.concatenate([way for _, way in hidden])
 
 
@@ -426,5 +400,5 @@ def _chosen(hits: Hits, kept: Ints, ray: Ints) -> Hits:
         hits.triangle[kept],
         hits.distance[kept],
         hits.flat[kept],
-        hits.gradients[:, :, kept],
+        hits.gradients[kept],
     )

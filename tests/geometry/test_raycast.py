@@ -98,7 +98,7 @@ def test_a_triangle_without_area_spoils_nothing():
 
 def normal_change(hits, shift):
     """How the smooth normals turn as the hits move along their triangles."""
-    to_second, to_third, second, third = hits.gradients.transpose(0, 2, 1).astype(float)
+    to_second, to_third, second, third = hits.gradients.transpose(1, 0, 2).astype(float)
     change = np.einsum("nd,nd->n", shift, to_second)[:, None] * second
     change += np.einsum("nd,nd->n", shift, to_third)[:, None] * third
     return change - np.einsum("nd,nd->n", change, hits.normals)[:, None] * hits.normals
@@ -109,9 +109,9 @@ def test_gradients_and_flat_normals_are_those_of_the_triangles_hit():
     directions = fibonacci_cap(300, axis=(-1, 0, 0), half_angle=0.3, offset=(0.5, 0.0))
     hits = shoot(RayCaster(mesh), np.array([0.3, 0.02, 0.01]), directions)
     corners = mesh.triangles.view(np.ndarray)[hits.triangle]
-    assert hits.gradients.shape == (4, 3, len(hits.ray))
+    assert hits.gradients.shape == (len(hits.ray), 4, 3)
     np.testing.assert_allclose(hits.flat, mesh.face_normals[hits.triangle], atol=1e-9)
-    to_second, to_third, second, third = hits.gradients.transpose(0, 2, 1)
+    to_second, to_third, second, third = hits.gradients.transpose(1, 0, 2)
     first, sides = corners[:, 0], corners[:, 1:] - corners[:, :1]
     weights = np.stack(
         [np.einsum("nd,nd->n", hits.points - first, g) for g in (to_second, to_third)]

@@ -279,7 +279,7 @@ def test_smooth_bodies_have_none_and_cost_no_search():
     reflections = (reflection(RIGID, NODES, speed_of_sound=SPEED),)
     found = Diffraction(scene, NoSearch(scene.mesh), reflections)
     sound = found.sound(hearing(), np.zeros(3), np.eye(3), points=1000, offset=0.5)
-    assert not sound.settle(0).values.any()
+    assert not sound.bins[0].values.any()
 
 
 def test_a_materials_strength_is_that_of_its_edges():

@@ -34,10 +34,11 @@ def detour(bounce, listener):
     """Detour, spread and stiffness (H,) towards a place."""
     away = listener - bounce.points
     distance = np.linalg.norm(away, axis=1)
-    found = bounce.detour(away / distance[:, None], distance)
-    rise = np.einsum("nd,nd->n", away, bounce.flat) / distance
-    np.testing.assert_allclose(found[0], rise, atol=1e-6)
-    return [values.astype(float) for values in found[1:]]
+    ways = bounce.ways_to(listener)
+    np.testing.assert_allclose(ways.distance, distance)
+    for found, axis in ((ways.rise, bounce.flat), (ways.cosine, bounce.mirrored)):
+        np.testing.assert_allclose(found, np.einsum("nd,nd->n", away, axis) / distance, atol=1e-6)
+    return [values.astype(float) for values in (ways.detour, ways.spread, ways.stiffness)]
 
 
 def shift(bounce):
@@ -88,7 +89,8 @@ def test_a_ray_into_a_corner_comes_back_after_two_bounces():
     assert first.length[0] == pytest.approx(1 / math.cos(0.6))
     np.testing.assert_allclose(second.mirrored, -direction, atol=1e-12)
     np.testing.assert_allclose(second.emitted, direction)
-    np.testing.assert_allclose(second.incoming, first.mirrored, atol=1e-12)
+    way = second.points - first.points
+    np.testing.assert_allclose(way / np.linalg.norm(way), first.mirrored, atol=1e-4)
     # Unfolded, the path runs straight on to the mirrored second plate at y = 1.
     assert second.length[0] == pytest.approx(1 / math.sin(0.6), abs=1e-5)
     assert (first.number, second.number) == (1, 2)
@@ -117,9 +119,9 @@ def test_differentials_are_the_moves_of_neighbouring_rays_over_three_bounces():
     plain = bounces(caster, directions, 3)
     first = plain[0]
     # The library's turns: the first hit's shift, square to the ray, over its length.
-    along = np.einsum("knd,nd->kn", shift(first), first.incoming)
+    along = np.einsum("knd,nd->kn", shift(first), first.emitted)
     turns = np.full((2, *directions.shape), np.nan)
-    turns[:, first.ray] = shift(first) - along[..., None] * first.incoming
+    turns[:, first.ray] = shift(first) - along[..., None] * first.emitted
     turns[:, first.ray] /= first.length[:, None]
     assert len(plain) == 3
     for side in sides(directions):
@@ -167,7 +169,7 @@ def test_a_convex_mirror_widens_a_bundle_as_geometrical_acoustics_says(radius):
     np.testing.assert_array_equal(first.ray, second.ray)
     d1, d2 = first.length, second.length - first.length
     normal = (first.points - [0.3, 0, 0]) / radius
-    cosine = -np.einsum("nd,nd->n", normal, first.incoming)
+    cosine = -np.einsum("nd,nd->n", normal, first.emitted)
     expected = (d1 + d2 + 2 * d1 * d2 / (radius * cosine)) * (
         d1 + d2 + 2 * d1 * d2 * cosine / radius
     )
@@ -386,7 +388,7 @@ def test_the_chosen_hits_are_the_chosen_hits():
     (bounce, _) = bounces(corner(), CapSpiral(50, (1.0, 1.0, 0.0), 0.5, (0.5, 0.0)).directions(), 2)
     chosen = np.array([7, 3, 40])
     few = bounce[chosen]
-    for name in ("ray", "emitted", "incoming", "points", "flat", "mirrored", "length", "triangles"):
+    for name in ("ray", "emitted", "points", "flat", "mirrored", "length", "triangles"):
         np.testing.assert_array_equal(getattr(few, name), getattr(bounce, name)[chosen])
     for name in ("shift", "square", "bend", "curving", "onward", "sink", "tube"):
         whole = getattr(bounce.footprint, name)
@@ -410,8 +412,7 @@ def test_hits_that_are_gathered_are_the_same_hits():
             for bounce in bounces:
                 if bounce.number == number and len(bounce.ray):
                     angle = np.broadcast_to(bounce.solid_angle, len(bounce.ray))
-                    towards = np.broadcast_to([0.0, 1.0, 0.0], bounce.points.shape)
-                    felt = bounce.detour(towards, np.ones(len(bounce.ray)))
+                    felt = detour(bounce, np.array([0.1, 0.2, 0.3]))
                     rows.append(np.column_stack([bounce.points, bounce.length, angle, *felt]))
             found = np.concatenate(rows)
             totals.append(found[np.lexsort(found.T)])

@@ -8,9 +8,8 @@ from scipy.integrate import quad
 
 from sononerf.scene.material import RIGID, SONOTRACELAB, Material
 from sononerf.simulation.reflection import (
-    keep_outside,
+    leave,
     lobe_exponent,
-    mirror,
     reflection,
     unfaded,
 )
@@ -100,18 +99,12 @@ def test_reach_ends_where_the_widest_lobe_is_seventy_decibels_down():
     assert at(SONOTRACELAB, 20e3).reach == math.pi  # four times 70 degrees
 
 
-def test_mirror_keeps_along_and_turns_across():
-    found = mirror(np.array([[0.6, 0.0, -0.8]]), np.array([[0.0, 0.0, 1.0]]))
-    np.testing.assert_allclose(found, [[0.6, 0.0, 0.8]])
-    np.testing.assert_allclose(
-        mirror(np.array([[0.6, 0.0, -0.8]]), np.array([[0, 0, -1.0]])), found
-    )
-
-
-def test_directions_into_the_surface_are_turned_to_graze_it():
-    flat = np.array([[0.0, 0.0, 1.0]] * 2)
-    found = keep_outside(np.array([[0.6, 0.0, 0.8], [0.6, 0.0, -0.8]]), flat)
-    np.testing.assert_allclose(found[0], [0.6, 0.0, 0.8])
+def test_rays_leave_off_the_surface_and_those_into_it_graze_it():
+    flat, points = np.array([[0.0, 0.0, 1.0]] * 2), np.array([[0.1, 0.2, 0.3]] * 2)
+    directions = np.array([[0.6, 0.0, 0.8], [0.6, 0.0, -0.8]])
+    origins, found = leave(directions, flat, points, 1e-3)
+    np.testing.assert_allclose(origins, [[0.1, 0.2, 0.301]] * 2)
+    np.testing.assert_array_equal(found[0], directions[0])
     np.testing.assert_allclose(found[1], [1.0, 0.0, 0.0], atol=1e-3)
     assert found[1, 2] > 0.0
 
