@@ -164,11 +164,16 @@ def predict(
         Path | None, typer.Option(help="CSV of your own poses: x,y,z,yaw,pitch,roll (m, degrees).")
     ] = None,
     output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
+    pictures: Annotated[
+        str, typer.Option(help="How many poses are drawn, best to worst: a number, or all.")
+    ] = "3",
     accelerator: OnWhat = "auto",
 ) -> None:
     """Predict the spectrograms of poses that were never heard."""
     if split is not None and poses is not None:
         raise SettingsError("--split and --poses exclude each other; give one")
+    if pictures != "all" and not pictures.isdecimal():
+        raise SettingsError(f"--pictures: found {pictures!r}; give all or a whole number from 0 on")
     from sononerf.progress import Progress
     from sononerf.run.predict import predict as predict_run
 
@@ -177,6 +182,7 @@ def predict(
         split=split or "test",
         poses_csv=poses,
         output=output,
+        pictures="all" if pictures == "all" else int(pictures),
         accelerator=accelerator,
         progress=Progress(),
     )

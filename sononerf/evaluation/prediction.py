@@ -11,7 +11,7 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from sononerf.array_types import Floats, Singles
+from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import NumericalError
 from sononerf.evaluation.traced import Traced, mix, trace_poses
@@ -107,6 +107,25 @@ def predict(
     weight = 0.0 if traced is None else float(traced.weight.mean())
     fault = None if traced is None else traced.fault or None
     return Prediction(magnitude, rendered, weight, fault, reference)
+
+
+def ranked(measured_db: ArrayLike, predicted_db: ArrayLike) -> Ints:
+    """Return the order of poses (P,) from the best predicted to the worst, over all cells.
+
+    Args:
+        measured_db, predicted_db ((P, E, R, F), dB): 0 dB is silence.
+    """
+    measured, predicted = same_shape(measured_db, predicted_db)
+    error_db = np.abs(predicted - measured).mean(axis=(1, 2, 3))
+    order: Ints = np.argsort(error_db, kind="stable")
+    return order
+
+
+def evenly(order: Ints, count: int) -> Ints:
+    """Return so many of an order (P,), evenly spaced from the first to the last."""
+    places = np.linspace(0.0, len(order) - 1.0, count)
+    chosen: Ints = order[np.floor(places + 0.5).astype(np.int64)]
+    return chosen
 
 
 def prediction_metrics(

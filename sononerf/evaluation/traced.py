@@ -19,6 +19,7 @@ from sononerf.head.decibels import compress
 from sononerf.head.head import Head
 from sononerf.progress import Progress
 from sononerf.settings.schema import SimulationSettings
+from sononerf.simulation.ensemble import spectrograms
 from sononerf.simulation.simulator import Simulator
 
 RAYS = 100_000
@@ -98,9 +99,12 @@ def learn_traced(
         places = zip(*(_places(poses) for poses in sets if len(poses)), strict=True)
         positions, rotations = (np.concatenate(parts) for parts in places)
         simulator.prepare(positions, rotations, progress)
-        traced = compress(_trace(simulator, some, seed, progress), reference)
-        gain = gain_db(compress(_measured(some), reference), traced)
-        traced = _trace(simulator, validation, seed, progress)
+        count = len(some) + len(validation)
+        heard = _trace(simulator, positions[:count], rotations[:count], seed, progress)
+        gain = gain_db(
+            compress(_measured(some), reference), compress(heard[: len(some)], reference)
+        )
+        traced = heard[len(some) :]
     except ResourceError:
         raise  # another time there may be more memory
     except SonoNerfError as error:  # some meshes can be drawn but not simulated
@@ -125,7 +129,7 @@ def trace_poses(
     """Trace echoes off the surface, (P, E, R, F) linear magnitude, without noise."""
     simulator = traced.simulator or Simulator.of_surface(traced.mesh, head, simulation, rays=RAYS)
     simulator.prepare(*_places(poses), progress)
-    found = _trace(simulator, poses, seed, progress)
+    found = _trace(simulator, *_places(poses), seed, progress)
     return found * 10 ** (traced.gain_db[:, None] / 20)
 
 
@@ -141,14 +145,13 @@ def _places(poses: WholePoses) -> tuple[Floats, Floats]:
     return positions, rotations
 
 
-def _trace(simulator: Simulator, poses: WholePoses, seed: int, progress: Progress) -> Floats:
+def _trace(
+    simulator: Simulator, positions: Floats, rotations: Floats, seed: int, progress: Progress
+) -> Floats:
     """Return the spectrograms of poses (P, E, R, F), linear."""
-    traced = []
-    with progress.task("tracing", len(poses)) as task:
-        for place, turn in zip(*_places(poses), strict=True):
-            traced.append(simulator.spectrogram(place, turn, seed=seed))
-            task.advance()
-    return np.stack(traced).astype(np.float64)
+    with progress.task("tracing", len(positions)) as task:
+        found = spectrograms(simulator, positions, rotations, seed=seed, done=task.advance)
+    return found.astype(np.float64)
 
 
 LOUD_DB = 20.0

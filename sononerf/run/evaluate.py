@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
 from sononerf import storage
-from sononerf.evaluation.geometry import Kind, Truth, baselines
+from sononerf.evaluation.geometry import BASELINES, Kind, Truth, baselines
 from sononerf.progress import Progress
 from sononerf.run.build import read_truth, true_scene
 from sononerf.run.reconstruct import reconstruct
@@ -52,15 +53,18 @@ def evaluate(
         geometry: dict[str, Any] | None = None
         baseline: dict[str, Any] = {"backprojection": None, "voxels": None}
         if true is not None:
-            with progress.task("evaluating", 3) as task:
+            corners = (corner.double().numpy() for corner in fitted.module.field.region)
+            with (
+                progress.task("evaluating", 1 + len(BASELINES)) as task,
+                ThreadPoolExecutor(len(BASELINES)) as pool,
+            ):
+                volumes = baselines(pool, run.echoes, *corners)
                 kind = registration or settings.evaluation.registration
                 level = storage.read_json(run.reconstruction / "read_out.json")["level"]
                 laid = Truth(true, run.mesh(), kind)
-                of_mesh = laid.of_reconstruction(scene)
-                geometry = {**of_mesh, "level": level}
+                geometry = {**laid.of_reconstruction(scene), "level": level}
                 task.advance()
-                corners = (corner.double().numpy() for corner in fitted.module.field.region)
-                for name, volume in baselines(run.echoes, *corners):
+                for name, volume in volumes:
                     baseline[name] = laid.of_volume(volume)
                     task.advance()
         run.write_metrics("geometry", geometry)

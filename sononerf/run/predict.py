@@ -5,15 +5,16 @@ from __future__ import annotations
 
 import io
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from sononerf import storage
-from sononerf.array_types import Floats
+from sononerf.array_types import Floats, Ints
 from sononerf.errors import InputError
+from sononerf.evaluation.prediction import evenly, ranked
 from sononerf.evaluation.prediction import predict as predict_poses
 from sononerf.evaluation.traced import Traced
 from sononerf.field.datamodule import WholePoses
@@ -27,6 +28,9 @@ from sononerf.run.fitted import NAME as TRACED_NAME
 from sononerf.run.fitted import Fitted
 from sononerf.run.run_folder import RunFolder
 
+DRAWN = 3
+"""Poses that are drawn where no number is given: the best, the median and the worst."""
+
 
 def predict(
     run: Path | RunFolder,
@@ -34,6 +38,7 @@ def predict(
     split: Split = "test",
     poses_csv: Path | None = None,
     output: Path | None = None,
+    pictures: int | Literal["all"] = DRAWN,
     accelerator: str = "auto",
     progress: Progress | None = None,
 ) -> Path:
@@ -44,11 +49,13 @@ def predict(
         split: Which poses of the ensemble.
         poses_csv: Poses of the user's instead: header ``x,y,z,yaw,pitch,roll``, metres and degrees.
         output: Folder of the results; ``RUN/prediction`` where None.
+        pictures: How many poses are drawn: from the best to the worst where they were measured,
+            else from the first to the last.
         accelerator: What to render on.
         progress: Where to show it.
 
     Returns:
-        folder: With ``spectrograms.npz`` and a picture per pose.
+        folder: With ``spectrograms.npz`` and pictures.
 
     Raises:
         InputError: If the run or the poses are none, a pose can hear nothing of what was fitted, or
@@ -101,7 +108,10 @@ def predict(
             storage.commit(folder / "spectrograms.npz", lambda file: _save_npz(file, arrays))
             predicted = compress(found.magnitude, found.reference)
             measured = compress(arrays["measured"], found.reference) if own is None else None
-            _pictures(folder, poses, measured, predicted, axes, progress)
+            drawn = np.arange(len(poses)) if measured is None else ranked(measured, predicted)
+            if pictures != "all":
+                drawn = evenly(drawn, pictures)
+            _pictures(folder, poses, np.unique(drawn), measured, predicted, axes, progress)
             if own is None and output is None and split == "test":
                 numbers = found.numbers(run.echoes, arrays["measured"])
                 run.write_metrics("prediction", {"split": split, **numbers})
@@ -154,13 +164,15 @@ def _save_npz(file: BinaryIO, arrays: dict[str, NDArray[np.generic]]) -> None:
 def _pictures(
     folder: Path,
     poses: WholePoses,
+    rows: Ints,
     measured: Floats | None,
     predicted: Floats,
     axes: dict[str, Floats],
     progress: Progress,
 ) -> None:
-    with progress.task("drawing", len(poses)) as task:
-        for row, number in enumerate(poses.numbers.tolist()):
+    with progress.task("drawing", len(rows)) as task:
+        for row in rows:
+            number = int(poses.numbers[row])
             picture = spectrogram_png(
                 None if measured is None else measured[row],
                 predicted[row],

@@ -15,7 +15,8 @@ import torch
 
 from sononerf import storage
 from sononerf.errors import InputError, NumericalError
-from sononerf.head.decibels import compress
+from sononerf.evaluation.prediction import evenly, ranked
+from sononerf.head.decibels import compress, mae_db
 from sononerf.progress import Progress
 from sononerf.report.pictures.mesh_picture import mesh_png
 from sononerf.report.pictures.scene_picture import scene_png
@@ -205,12 +206,11 @@ def _predictions(path: Path, pictures: dict[str, bytes]) -> Iterator[str]:
         raise InputError(
             f"{file}: damaged ({error}); {_command('predict', path)} makes it anew"
         ) from None
-    error_db = np.abs(predicted - measured).mean(axis=(1, 2, 3))
-    order = np.argsort(error_db, kind="stable")
-    chosen = {"worst": order[-1], "median": order[len(order) // 2], "best": order[0]}
-    for name, row in reversed(chosen.items()):
+    chosen = evenly(ranked(measured, predicted), 3)
+    for name, row in zip(("best", "median", "worst"), chosen, strict=True):
         picture = f"pose_{numbers[row]:04d}.png"
-        yield f"Pose {numbers[row]}, the {name} of {len(order)}: {error_db[row]:.2f} dB, all cells."
+        error_db = mae_db(measured[row], predicted[row])
+        yield f"Pose {numbers[row]}, the {name} of {len(numbers)}: {error_db:.2f} dB, all cells."
         yield _picture(path / "prediction" / picture, pictures, _command("predict", path))
 
 

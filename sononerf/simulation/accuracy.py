@@ -47,7 +47,7 @@ def settle_rays(
     Returns:
         rays: Per pose; None if the engine traces none.
     """
-    tracer = _tracer(simulator.engine)
+    tracer = tracer_of(simulator.engine)
     if tracer is None:
         return None
     if options.rays is not None:
@@ -71,7 +71,8 @@ def settle_rays(
     return tracer.rays
 
 
-def _tracer(engine: Engine) -> Rays | None:
+def tracer_of(engine: Engine) -> Rays | None:
+    """Return what traces the rays of an engine; None if nothing does."""
     if isinstance(engine, Hybrid):
         return engine.high
     return engine if isinstance(engine, Rays) else None

@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable
 from contextlib import closing
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,17 +21,17 @@ from sononerf.memory import available_cores
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SimulationSettings
-from sononerf.simulation.accuracy import MOST, settle_rays
-from sononerf.simulation.simulator import Simulator
-from sononerf.simulation.workers import in_processes, in_this_process, on_cluster
+from sononerf.simulation.accuracy import MOST, settle_rays, tracer_of
+from sononerf.simulation.simulator import Simulator, pose_seed
+from sononerf.simulation.workers import SeedOf, in_processes, in_this_process, on_cluster
 
 logger = logging.getLogger("sononerf")
 
 Write = Callable[[int, Singles], None]
 
 MOST_WORKERS = 8
-WORTH_WORKERS = 64
-"""Number of poses from which other processes save time: fewer are done before these start."""
+WORTH_WORKERS = 1_500_000
+"""Rays of all poses from which other processes save time: fewer are traced before these start."""
 
 
 def check_poses(scene: Scene, poses: Poses, *, offsets: Floats | None = None) -> None:
@@ -130,10 +131,6 @@ def simulate(
         progress: Where to show it.
     """
     missing = store.missing()
-    if workers is None:
-        cores = min(available_cores(), MOST_WORKERS)
-        alone = simulator.engine.prepares or len(missing) < WORTH_WORKERS
-        workers = 1 if alone else cores
     test = store.indices("test")[: options.noise_floor_poses]
     again: dict[int, Singles] = {}
     wanted = [*missing, *test]
@@ -156,14 +153,14 @@ def simulate(
             np.concatenate((poses.positions, poses.positions[test])),
             np.concatenate((poses.rotations, poses.rotations[test])),
         )
-        # A pose's seed is a function of its number, so the second time has other rays.
         extra = range(len(poses), len(poses) + len(test))
         simulate_ensemble(
             simulator,
             both,
             [*missing, *extra],
             keep,
-            seed=options.seed,
+            # A pose's seed is a function of its number, so the second time has other rays.
+            seed_of=partial(pose_seed, options.seed),
             workers=workers,
             scheduler=scheduler,
         )
@@ -179,25 +176,30 @@ def simulate_ensemble(
     indices: Iterable[int],
     write: Write,
     *,
-    seed: int,
-    workers: int = 1,
+    seed_of: SeedOf,
+    workers: int | None = None,
     scheduler: str | None = None,
 ) -> None:
     """Simulate poses and hand over each spectrogram as it comes.
 
-    The result of a pose depends on ``seed`` and its index alone, not on workers or order.
+    The result of a pose depends on its seed alone, not on workers or order.
 
     Args:
         simulator: Scene and head.
         poses: All poses of the ensemble.
         indices: Which of them to simulate.
         write: Takes an index and its spectrogram (E, R, F); called here, one at a time.
-        seed: Of the ensemble.
-        workers: Processes on this machine; one means this process.
+        seed_of: Gives the seed of a pose by its index.
+        workers: Processes on this machine; one means this process. Where None, as many as there are
+            cores, at most 8, if they save time.
         scheduler: Address of a Dask scheduler whose workers are used instead.
     """
     wanted = [int(index) for index in indices]
     engine = simulator.engine
+    if workers is None:
+        tracer = tracer_of(engine)
+        rays = 0 if tracer is None else tracer.rays * len(wanted)
+        workers = 1 if rays < WORTH_WORKERS else min(available_cores(), MOST_WORKERS)
     if engine.prepares and (scheduler is not None or workers > 1):
         logger.warning(
             "%s solves for all poses at once, in this process; workers and scheduler are not used",
@@ -206,12 +208,40 @@ def simulate_ensemble(
         workers, scheduler = 1, None
     engine.prepare(poses.positions[wanted], poses.rotations[wanted])
     if scheduler is not None:
-        results = on_cluster(simulator, poses, wanted, seed, scheduler)
+        results = on_cluster(simulator, poses, wanted, seed_of, scheduler)
     elif workers > 1:
-        results = in_processes(simulator, poses, wanted, seed, workers)
+        results = in_processes(simulator, poses, wanted, seed_of, workers)
     else:
-        results = in_this_process(simulator, poses, wanted, seed)
+        results = in_this_process(simulator, poses, wanted, seed_of)
     # Closed at once where a write fails: what runs elsewhere ends before the error is seen.
     with closing(results):
         for index, spectrogram in results:
             write(index, spectrogram)
+
+
+def spectrograms(
+    simulator: Simulator,
+    positions: Floats,
+    rotations: Floats,
+    *,
+    seed: int,
+    done: Callable[[], None],
+) -> Singles:
+    """Return the spectrograms of poses (P, E, R, F), linear magnitude, with the same rays for each.
+
+    Args:
+        simulator: Scene and head.
+        positions ((P, 3), m): Of the head, world frame.
+        rotations (P, 3, 3): Head to world.
+        seed: Of the rays.
+        done: Called after each pose.
+    """
+    found: dict[int, Singles] = {}
+
+    def keep(index: int, spectrogram: Singles) -> None:
+        found[index] = spectrogram
+        done()
+
+    poses = Poses(positions, rotations)
+    simulate_ensemble(simulator, poses, range(len(poses)), keep, seed_of=lambda _: seed)
+    return np.stack([found[index] for index in range(len(poses))])

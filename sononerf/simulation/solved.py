@@ -221,7 +221,6 @@ class Solved(Engine):
             yield map(respond, range(count))
             return
         workers = min(available_cores(), MOST_THREADS)
-        workers = min(available_cores(), MOST_THREADS)
         with threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(workers) as pool:
             waiting = [pool.submit(respond, index) for index in range(count)]
             try:

@@ -11,7 +11,7 @@ import sys
 import threading
 import warnings
 from collections import Counter, deque
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from sononerf.array_types import Floats, Singles
 from sononerf.errors import ResourceError, SettingsError, SonoNerfError
 from sononerf.geometry.poses import Poses
-from sononerf.simulation.simulator import Simulator, pose_seed
+from sononerf.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -40,20 +40,24 @@ PATIENCE_SECONDS = 10
 """Time without a result after which a cluster without workers is warned of, s."""
 
 Results = Generator[tuple[int, Singles], None, None]
+SeedOf = Callable[[int], int]
+"""Gives the seed of a pose by its index."""
 
 
-def in_this_process(simulator: Simulator, poses: Poses, indices: list[int], seed: int) -> Results:
+def in_this_process(
+    simulator: Simulator, poses: Poses, indices: list[int], seed_of: SeedOf
+) -> Results:
     """Simulate poses one after the other."""
     for index in indices:
         try:
-            spectrogram = _one(simulator, *_pose(poses, index), pose_seed(seed, index))
+            spectrogram = _one(simulator, *_pose(poses, index), seed_of(index))
         except Exception as error:
             raise _failed(index, error) from error
         yield index, spectrogram
 
 
 def in_processes(
-    simulator: Simulator, poses: Poses, indices: list[int], seed: int, workers: int
+    simulator: Simulator, poses: Poses, indices: list[int], seed_of: SeedOf, workers: int
 ) -> Results:
     """Simulate poses in other processes of this machine; they come in any order.
 
@@ -71,7 +75,7 @@ def in_processes(
             try:
                 while left or running:
                     while left and len(running) < most:
-                        task = _pose(poses, left[0]), pose_seed(seed, left[0])
+                        task = _pose(poses, left[0]), seed_of(left[0])
                         with _starting_workers():
                             running[pool.submit(_mine, *task)] = left[0]
                         left.popleft()
@@ -173,7 +177,7 @@ def _starting_workers() -> Iterator[None]:
 
 
 def on_cluster(
-    simulator: Simulator, poses: Poses, indices: list[int], seed: int, scheduler: str
+    simulator: Simulator, poses: Poses, indices: list[int], seed_of: SeedOf, scheduler: str
 ) -> Results:
     """Simulate poses on the workers of a Dask scheduler; they come in any order.
 
@@ -190,7 +194,7 @@ def on_cluster(
             threads = _threads(client)
             while left and len(running) < QUEUED_PER_WORKER * max(1, threads):
                 index = left.popleft()
-                task = *_pose(poses, index), pose_seed(seed, index)
+                task = *_pose(poses, index), seed_of(index)
                 running[executor.submit(_one, sent, *task)] = index
             done = wait(running, PATIENCE_SECONDS, return_when=FIRST_COMPLETED).done
             if not (done or threads or told):  # others may start some tomorrow

@@ -14,6 +14,7 @@ from PIL import Image
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
+from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.run import predict as predict_module
 from sononerf.run import run_folder as run_module
@@ -121,6 +122,23 @@ def test_poses_of_ones_own_need_neither_store_nor_scene(run, tmp_path, monkeypat
     np.testing.assert_allclose(arrays["rotation"][1][:, 0], [0, 0, -1], atol=1e-6)  # looks down
     assert len(list(folder.glob("pose_*.png"))) == 2
     assert not (run / "metrics.json").exists()
+
+
+@pytest.mark.parametrize(("pictures", "drawn"), [("all", 8), (0, 0), (1, 1), (3, 3), (100, 8)])
+def test_as_many_poses_are_drawn_as_wanted(run, pictures, drawn):
+    folder = predict(run, split="train", pictures=pictures, accelerator="cpu")
+    assert len(list(folder.glob("pose_*.png"))) == drawn
+
+
+def test_best_median_and_worst_are_drawn(run):
+    folder = predict(run, split="train", accelerator="cpu")
+    arrays = arrays_of(folder)
+    measured, predicted = (
+        compress(arrays[k], arrays["reference"]) for k in ("measured", "predicted")
+    )
+    order = np.argsort(np.abs(measured - predicted).mean(axis=(1, 2, 3)))
+    expected = {f"pose_{arrays['pose'][order[i]]:04d}.png" for i in (0, 4, 7)}
+    assert {path.name for path in folder.glob("pose_*.png")} == expected
 
 
 def test_what_was_not_measured_is_not_drawn(run, tmp_path, monkeypatch):

@@ -4,6 +4,7 @@ import multiprocessing
 import os
 import signal
 import time
+from functools import partial
 from multiprocessing import resource_tracker
 
 import numpy as np
@@ -18,6 +19,8 @@ from sononerf.settings.loading import validate_settings
 from sononerf.simulation import workers as workers_module
 from sononerf.simulation.ensemble import check_poses, check_reach, simulate_ensemble
 from sononerf.simulation.simulator import ensemble_poses, pose_seed
+
+SEED_OF = partial(pose_seed, 5)
 
 
 def settings(**sections):
@@ -168,7 +171,7 @@ def test_pose_seeds_are_those_of_the_pair():
 
 def collect(small, indices, **options):
     found = {}
-    simulate_ensemble(*small, indices, found.__setitem__, seed=5, **options)
+    simulate_ensemble(*small, indices, found.__setitem__, seed_of=SEED_OF, **options)
     return found
 
 
@@ -198,9 +201,9 @@ def test_a_failing_pose_is_named(small):
     broken.positions[3] = np.nan
     try:
         with pytest.raises(SonoNerfError, match="pose 3 cannot be simulated: ValueError"):
-            simulate_ensemble(simulator, broken, range(6), lambda *_: None, seed=0)
+            simulate_ensemble(simulator, broken, range(6), lambda *_: None, seed_of=SEED_OF)
         with pytest.raises(SonoNerfError, match="pose 3 cannot be simulated: ValueError"):
-            simulate_ensemble(simulator, broken, [3], lambda *_: None, seed=0, workers=2)
+            simulate_ensemble(simulator, broken, [3], lambda *_: None, seed_of=SEED_OF, workers=2)
     finally:
         poses.positions[3] = 0.4
 
@@ -210,13 +213,15 @@ def test_faults_of_the_writer_are_not_blamed_on_a_pose(small):
         raise OSError("disk full")
 
     with pytest.raises(OSError, match="disk full"):
-        simulate_ensemble(*small, [0], full, seed=0)
+        simulate_ensemble(*small, [0], full, seed_of=SEED_OF)
 
 
 def test_a_scheduler_that_is_not_there_is_named(small, monkeypatch):
     monkeypatch.setattr(workers_module, "CONNECT_SECONDS", 1)
     with pytest.raises(ResourceError, match=r"tcp://127\.0\.0\.1:9 cannot be reached"):
-        simulate_ensemble(*small, [0], lambda *_: None, seed=0, scheduler="tcp://127.0.0.1:9")
+        simulate_ensemble(
+            *small, [0], lambda *_: None, seed_of=SEED_OF, scheduler="tcp://127.0.0.1:9"
+        )
 
 
 class Idle:
@@ -251,9 +256,9 @@ def test_a_pose_is_not_blamed_for_its_workers(tmp_path, caplog, times):
     task = (Deadly(tmp_path, times), poses, range(3), found.__setitem__)
     if times == 99:
         with pytest.raises(ResourceError, match=r"pose (0, )?1: every worker that took it was"):
-            simulate_ensemble(*task, seed=0, workers=2)
+            simulate_ensemble(*task, seed_of=SEED_OF, workers=2)
     else:
-        simulate_ensemble(*task, seed=0, workers=2)
+        simulate_ensemble(*task, seed_of=SEED_OF, workers=2)
         assert {index: values.item() for index, values in found.items()} == {0: 1, 1: -2, 2: 3}
         assert not caplog.records
 
@@ -275,7 +280,7 @@ def test_a_fault_of_the_writer_ends_the_workers_at_once():
 
     poses = poses_at([1.0, 0.0, 0.0], [-2.0, 0.0, 0.0])
     with pytest.raises(OSError, match="disk full"):
-        simulate_ensemble(Slow(), poses, range(2), full, seed=0, workers=2)
+        simulate_ensemble(Slow(), poses, range(2), full, seed_of=SEED_OF, workers=2)
     end = time.monotonic() + 10.0
     while multiprocessing.active_children() and time.monotonic() < end:
         time.sleep(0.05)
@@ -296,7 +301,7 @@ class Deaf:
 def test_ctrl_c_is_for_us_and_not_for_our_workers():
     resource_tracker._resource_tracker._stop()  # as in a process that has started no other yet
     found, poses = {}, poses_at([1.0, 0.0, 0.0], [-2.0, 0.0, 0.0])
-    simulate_ensemble(Deaf(), poses, range(2), found.__setitem__, seed=0, workers=2)
+    simulate_ensemble(Deaf(), poses, range(2), found.__setitem__, seed_of=SEED_OF, workers=2)
     assert [found[index].item() for index in range(2)] == [1, 1]
     with pytest.raises(KeyboardInterrupt):
         signal.raise_signal(signal.SIGINT)

@@ -208,7 +208,7 @@ def test_an_ensemble_is_prepared_here_and_at_once(caplog, monkeypatch):
             poses,
             [0, 2],
             written.__setitem__,
-            seed=0,
+            seed_of=lambda _: 0,
             workers=4,
         )
     assert sorted(written) == [0, 2]

@@ -24,6 +24,7 @@ from torch import Tensor
 from sononerf.array_types import Ints
 from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.raycast import Occlusion
+from sononerf.simulation.ensemble import spectrograms
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
 from sononerf.surface.refine.objective import on_rows
@@ -54,8 +55,7 @@ class Correction:
         seed: int,
     ) -> None:
         self.numbers = numbers
-        self._optics, self._echoes, self._seed = optics, echoes, seed
-        self._simulator = simulator
+        self._optics, self._echoes = optics, echoes
         like = optics.get_buffer("wavenumber")
         faces = np.array(mesh.faces, dtype=np.int64)
         self._vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
@@ -68,6 +68,8 @@ class Correction:
         places = np.asarray(echoes.positions[numbers], dtype=np.float64)
         turns = np.asarray(echoes.rotations[numbers], dtype=np.float64)
         simulator.engine.prepare(places, turns)
+        heard = spectrograms(simulator, places, turns, seed=seed, done=lambda: None)
+        self._simulated = dict(zip(numbers.tolist(), torch.as_tensor(heard), strict=True))
 
     def batch(self, seed: int, step: int, size: int) -> Ints:
         """Return the poses of a step, drawn from the seed and the step's number."""
@@ -86,19 +88,12 @@ class Correction:
         """
         for number in numbers:
             if number not in self._kept:
-                self._kept[number] = self._simulated(number), self._rendered(number)
+                self._kept[number] = self._simulated[number], self._rendered(number)
         first, second = (
             on_rows([self._kept[number][part] for number in numbers], heard.row, heard.power)
             for part in (0, 1)
         )
         return first, second
-
-    def _simulated(self, number: int) -> Tensor:
-        position, rotation = (
-            np.asarray(part[number], float)
-            for part in (self._echoes.positions, self._echoes.rotations)
-        )
-        return torch.as_tensor(self._simulator.spectrogram(position, rotation, seed=self._seed))
 
     def _rendered(self, number: int) -> Tensor:
         position, rotation = (
