@@ -158,16 +158,21 @@ def _starting_workers() -> Iterator[None]:
     """Give processes that start in the block one thread each, and block SIGINT in them.
 
     A terminal sends Ctrl-C to all processes. This one ends the workers, so that none of them
-    prints a traceback.
+    prints a traceback. Workers do not run the script that started them: it need not be written
+    for that.
     """
+    script = vars(sys.modules["__main__"])
+    kept = {name: script[name] for name in ("__file__", "__spec__") if name in script}
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     # Where it is not running yet, its start would let the signal through again.
     resource_tracker.ensure_running()
     heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
+        script.update(dict.fromkeys(kept))
         yield
     finally:
+        script.update(kept)
         signal.pthread_sigmask(signal.SIG_SETMASK, heard)
         for name, value in before.items():
             if value is None:
