@@ -162,7 +162,9 @@ def _starting_workers() -> Iterator[None]:
     for that.
     """
     script = vars(sys.modules["__main__"])
-    kept = {name: script[name] for name in ("__file__", "__spec__") if name in script}
+    kept: dict[str, Any] = {
+        name: script[name] for name in ("__file__", "__spec__") if name in script
+    }
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))
     # Where it is not running yet, its start would let the signal through again.

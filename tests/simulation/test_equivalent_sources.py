@@ -70,6 +70,16 @@ def test_spheres_that_shade_each_other_are_those_of_multiple_scattering():
         assert np.abs(level_db(found) - level_db(expected)).mean() < 0.15
 
 
+def test_the_inside_of_the_sources_does_not_resonate():
+    """A resonance of it is a fraction of a percent wide: the error jumps at single frequencies."""
+    engine = sources(ball(0.015), most=200)
+    for ka in np.linspace(5.94, 6.04, 40):
+        frequency = ka * SPEED / (2 * np.pi * 0.015)
+        engine.respond(wavenumber(frequency), heads(1, frequency))
+    error = np.array(list(engine.error.values()))
+    assert np.max(error[1:-1] / np.maximum(error[:-2], error[2:])) < 1.1
+
+
 def test_a_pose_does_not_depend_on_the_others():
     engine = sources(ball(0.015), most=60)
     many, one = heads(70, 9e3), heads(70, 9e3)[slice(40, 41)]
