@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,6 +24,24 @@ from sononerf.cli.options import (
     say,
 )
 from sononerf.errors import SettingsError
+
+if TYPE_CHECKING:
+    from sononerf.settings.schema import Settings
+
+
+MANY = 64
+"""Poses from which the processes that simulate them are started before anything is known."""
+
+
+def _begin(settings: Settings, workers: int | None) -> None:
+    """Say at once what is simulated, and let other processes get ready for it."""
+    if settings.data.store is not None or settings.scene is None:
+        return
+    say(f"scene {settings.scene.name}")
+    if settings.poses.count >= MANY and workers != 1:
+        from sononerf.simulation.processes import begin
+
+        begin()
 
 
 @app.command()
@@ -51,6 +69,7 @@ def simulate(
     from sononerf.settings.loading import load_settings
 
     settings = load_settings(config, overrides or ())
+    _begin(settings, workers)
     from sononerf.progress import Progress
     from sononerf.run.build import results_folder
     from sononerf.run.scenes import draw_ensemble
@@ -98,6 +117,7 @@ def fit(
 
     extra = [] if seed is None else [f"fit.seed={seed}"]
     settings = load_settings(config, [*(overrides or ()), *extra])
+    _begin(settings, workers)
     from sononerf.progress import Progress
     from sononerf.run.fit import fit as run
     from sononerf.run.fit import follows

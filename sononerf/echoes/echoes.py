@@ -5,11 +5,9 @@ from __future__ import annotations
 
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from sononerf.array_types import Ints, Singles
 from sononerf.echoes.detection import Onsets, find_onsets
@@ -19,6 +17,9 @@ from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, NumericalError
 from sononerf.head.head import Head
+
+if TYPE_CHECKING:  # simulation starts without it
+    from torch import Tensor
 
 KEPT_BYTES = 400_000_000
 """Size of the spectrograms that stay in memory, bytes; further ones are read at each use."""
@@ -94,6 +95,8 @@ class Echoes:
     def magnitude(self, number: int) -> Tensor:
         """Return what a pose heard, (E, R, F) float32 linear magnitude, on the CPU."""
         if number not in self._kept:
+            import torch
+
             heard = torch.as_tensor(self.store.read_pose(number))
             size = heard.numel() * heard.element_size()
             if self._bytes + size > KEPT_BYTES:

@@ -226,7 +226,7 @@ def echo_paths(
     cells: Cells | None = None
     while True:
         weight = np.zeros(count)
-        found: list[Bounce] = []
+        found: list[tuple[Bounce, Ints]] = []
         solid_angle = cap.solid_angle / parts
         for start in range(0, len(directions), CHUNK):
             chunk = directions[start : start + CHUNK]
@@ -234,8 +234,8 @@ def echo_paths(
                 caster, emitter, chunk, bounces, solid_angle=solid_angle, beyond=beyond
             ):
                 bounce = replace(bounce, ray=rays.take(bounce.ray + start))
-                if extra < SPLIT**2:
-                    found.append(bounce)  # none can be divided any more
+                if extra < SPLIT**2:  # none can be divided any more
+                    found.append((bounce, np.arange(len(bounce.ray))))
                     continue
                 audible, doubt = judge(bounce)
                 # A ray hits once a time, so none stands here twice.
@@ -245,15 +245,16 @@ def echo_paths(
                     around = cap.neighbourhood(bounce.ray)
                     least = max(float(doubt.mean()), sys.float_info.min)
                     weight[around] = np.maximum(weight[around], least)
-                found.append(bounce[np.flatnonzero(audible)])
+                found.append((bounce, np.flatnonzero(audible)))
         chosen = np.flatnonzero(weight)
         most = extra // SPLIT**2
         if len(chosen) > most:
             chosen = np.sort(chosen[np.argsort(-weight[chosen], kind="stable")[:most]])
         left = np.ones(len(weight), dtype=bool)
         left[chosen] = False
-        for bounce in found:
-            yield bounce[np.flatnonzero(left[bounce.ray])] if len(chosen) else bounce
+        for bounce, heard in found:
+            kept = heard[left[bounce.ray.take(heard)]]
+            yield bounce if len(kept) == len(bounce.ray) else bounce[kept]
         if len(chosen) == 0:
             return
         cells = (cap.cells(chosen) if cells is None else cells[chosen]).divided(SPLIT)

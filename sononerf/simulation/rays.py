@@ -24,7 +24,7 @@ from sononerf.simulation.hearing import Hearing, Listener
 from sononerf.simulation.outlines import Outlines
 from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
 from sononerf.simulation.reflection import coarse_gain, unfaded
-from sononerf.simulation.shadows import LEAST, Shadow, behind
+from sononerf.simulation.shadows import LEAST, Shadow, behind, passing
 
 HIDDEN_SHARE = 0.15  # as many rays again, for what lies behind obstacles
 HIDDEN_DIVIDED = 0.4  # of these, kept as above
@@ -347,32 +347,11 @@ class Rays(Engine):
     ) -> tuple[Bools, tuple[Ints, NDArray[np.complex64]] | None]:
         """Which hits pass obstacles, and what passes of those near an outline."""
         points, triangle = bounce.points.take(near, axis=0), bounce.triangles[near, -1]
-        whole = np.broadcast_to(~np.bool_(bounce.hidden), near.shape)
-        legs = [(lit, whole), (shadow, seen)]
-        rows = []
-        dim = np.zeros(len(near), dtype=bool)
-        passes = np.ones(len(near), dtype=bool)
-        for leg, free in legs:
-            if leg is None:
-                row, table = np.full(len(near), -1), np.ones((1, 1), dtype=np.complex64)
-            else:
-                row, table = leg.passed(points, triangle)
-            rows.append((row, table))
-            dim |= row >= 0
-            passes &= free | (row >= 0)
-        dim &= passes
-        if not dim.any():
-            return passes, None
-        chosen = np.flatnonzero(dim)
-        passed = np.ones((len(chosen), len(self._wavenumber)), dtype=np.complex64)
-        for row, table in rows:
-            of = row[chosen]
-            some = np.flatnonzero(of >= 0)
-            passed[some] *= table[of[some]]
-        strong = np.abs(passed).max(axis=1) > LEAST
-        passes[chosen[~strong]] = False
-        place_of = np.cumsum(passes) - 1
-        return passes, (place_of[chosen[strong]], passed[strong])
+        if lit is None or shadow is None:
+            return seen, None
+        first, second = lit.passed(points, triangle), shadow.passed(points, triangle)
+        passes, dim, passed = passing(*first, not bounce.hidden, *second, seen)
+        return passes, (dim, passed) if len(dim) else None
 
     def _level(self, bounce: Bounce) -> Floats:
         """Level without lobe and beam, (H, 1) or (H, F) m."""

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sononerf.array_types import Complexes, Floats, Ints
+from sononerf.array_types import Bools, Complexes, Floats, Ints
 from sononerf.compiled import compiled
 from sononerf.geometry.raycast import Hits, RayCaster
 from sononerf.simulation.audibility import RESOLVED_FREQUENCY
@@ -280,9 +280,8 @@ def _lay(
     """
     table = np.zeros((4, len(points), bins))
     is_used = np.zeros(len(points), np.bool_)
-    ahead, across, half, one, two = (
-        np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
-    )  # fmt: skip
+    ahead, across, half = np.zeros(3), np.zeros(3), np.zeros(3)
+    one, two = np.zeros(3), np.zeros(3)
     for i in range(len(points)):
         far = 0.0
         for k in range(3):
@@ -351,11 +350,55 @@ def _lay(
                 table[power, i, bin_ + 1] += weight * late
                 weight *= bent
     used = np.flatnonzero(is_used)
-    laid = np.zeros((4, len(used), bins))
-    for power in range(4):
-        for i in range(len(used)):
-            laid[power, i] = table[power, used[i]]
-    return laid, used
+    return table[:, used].copy(), used
+
+
+@compiled
+def passing(
+    lit: NDArray[np.int32],
+    lit_table: NDArray[np.complex64],
+    is_lit: bool,
+    heard: NDArray[np.int32],
+    heard_table: NDArray[np.complex64],
+    is_seen: Bools,
+) -> tuple[Bools, Ints, NDArray[np.complex64]]:
+    """Return what passes obstacles on the ways to points and from there on.
+
+    Args:
+        lit, heard (N,): Rows of each point in the tables, from :meth:`Shadow.passed`.
+        lit_table, heard_table (C, F): What passes from the emitter, and to the ear.
+        is_lit: Whether nothing stands between the emitter and any point.
+        is_seen (N,): Whether nothing stands between a point and the ear.
+
+    Returns:
+        passes (N,): Whether a point is heard.
+        dim (M,): Which of those that are heard are near an outline, counted among them.
+        passed (M, F): What passes of these.
+    """
+    frequencies = lit_table.shape[1]
+    passes = np.zeros(len(lit), np.bool_)
+    dim, count, kept = np.zeros(len(lit), np.int64), 0, 0
+    passed = np.zeros((len(lit), frequencies), np.complex64)
+    for i in range(len(lit)):
+        if not ((is_lit or lit[i] >= 0) and (is_seen[i] or heard[i] >= 0)):
+            continue
+        if lit[i] >= 0 or heard[i] >= 0:
+            loudest = 0.0
+            for k in range(frequencies):
+                factor = np.complex64(1.0)
+                if lit[i] >= 0:
+                    factor *= lit_table[lit[i], k]
+                if heard[i] >= 0:
+                    factor *= heard_table[heard[i], k]
+                passed[kept, k] = factor
+                loudest = max(loudest, float(factor.real**2 + factor.imag**2))
+            if not loudest > LEAST**2:
+                continue
+            dim[kept] = count
+            kept += 1
+        passes[i] = True
+        count += 1
+    return passes, dim[:kept].copy(), passed[:kept].copy()
 
 
 def _product(real: Floats, factor: Complexes) -> Complexes:

@@ -6,8 +6,6 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
-import signal
-import sys
 import threading
 import warnings
 from collections import Counter, deque
@@ -15,12 +13,12 @@ from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
-from multiprocessing import resource_tracker
 from typing import TYPE_CHECKING, Any
 
 from sononerf.array_types import Floats, Singles
 from sononerf.errors import ResourceError, SettingsError, SonoNerfError
 from sononerf.geometry.poses import Poses
+from sononerf.simulation.processes import process_context, starting_workers
 from sononerf.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -32,8 +30,6 @@ QUEUED_PER_WORKER = 4
 """Poses that are sent per worker before results are taken. More would only fill the memory."""
 SENT_AGAIN = 3
 """Times that a pose is sent again after its worker died. Dask tries four workers each time."""
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
-"""Environment variables that limit numerical libraries to one thread in each worker."""
 CONNECT_SECONDS = 30
 """Time to wait for a Dask scheduler, s; across a network it answers in one."""
 PATIENCE_SECONDS = 10
@@ -76,7 +72,7 @@ def in_processes(
                 while left or running:
                     while left and len(running) < most:
                         task = _pose(poses, left[0]), seed_of(left[0])
-                        with _starting_workers():
+                        with starting_workers():
                             running[pool.submit(_mine, *task)] = left[0]
                         left.popleft()
                     for future in wait(running, return_when=FIRST_COMPLETED).done:
@@ -137,12 +133,8 @@ def _failed(index: int, error: BaseException) -> SonoNerfError:
 @contextmanager
 def _pool(simulator: Simulator, workers: int) -> Iterator[ProcessPoolExecutor]:
     """Open a pool of processes. If the block fails, they are terminated."""
-    # On Linux a server imports the simulator once and forks; elsewhere each process imports it.
-    context = multiprocessing.get_context("forkserver" if sys.platform == "linux" else "spawn")
-    if sys.platform == "linux":
-        context.set_forkserver_preload([__name__])
     others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(workers, context, _become, (simulator,))
+    pool = ProcessPoolExecutor(workers, process_context(), _become, (simulator,))
     try:
         yield pool
     except BaseException:
@@ -151,36 +143,6 @@ def _pool(simulator: Simulator, workers: int) -> Iterator[ProcessPoolExecutor]:
             child.terminate()
         raise
     pool.shutdown()
-
-
-@contextmanager
-def _starting_workers() -> Iterator[None]:
-    """Give processes that start in the block one thread each, and block SIGINT in them.
-
-    A terminal sends Ctrl-C to all processes. This one ends the workers, so that none of them
-    prints a traceback. Workers do not run the script that started them: it need not be written
-    for that.
-    """
-    script = vars(sys.modules["__main__"])
-    kept: dict[str, Any] = {
-        name: script[name] for name in ("__file__", "__spec__") if name in script
-    }
-    before = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    # Where it is not running yet, its start would let the signal through again.
-    resource_tracker.ensure_running()
-    heard = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        script.update(dict.fromkeys(kept))
-        yield
-    finally:
-        script.update(kept)
-        signal.pthread_sigmask(signal.SIG_SETMASK, heard)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 def on_cluster(
