@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.array_types import Floats, Singles
+from sononerf.compiled import compiled
 from sononerf.errors import NumericalError
 from sononerf.evaluation.solid import Nearest, Solid, sample_surface
 from sononerf.geometry.poses import Poses
@@ -60,15 +62,14 @@ def backprojection(
     emitters, receivers = head.places(poses.positions, poses.rotations)
     axis = head.range
     volume = grid_over(lower, upper, spacing)
-    axes = [along.astype(np.float32) for along in volume.axes()]
+    axes = volume.axes()
     step = float(np.diff(axis).mean())
     total = np.zeros(volume.values.shape)
     profiles = range_profiles(spectrograms, (*receivers.shape[:2], len(axis)))
     for energy, emitter, ears in zip(profiles, emitters, receivers, strict=True):
-        outward = _distances(axes, emitter)
         for profile, receiver in zip(energy, ears, strict=True):
-            half = (outward + _distances(axes, receiver)) * np.float32(0.5)
-            total += _interpolated(profile, half, axis[0], step)
+            squares = _squares(axes, emitter, receiver)
+            _spread(total, _padded(profile, np.float32), *squares, float(axis[0]), step)
     return volume.with_values(total / max(len(emitters), 1))
 
 
@@ -109,7 +110,7 @@ def coherent_backprojection(
     step = head.speed_of_sound / (2.0 * head.sampling_rate * finer)
     emitters, receivers = head.places(poses.positions, poses.rotations)
     volume = grid_over(lower, upper, spacing)
-    axes = [along.astype(np.float32) for along in volume.axes()]
+    axes = volume.axes()
     total = np.zeros(volume.values.shape, dtype=np.complex64)
     count = 0
     for count, recording in enumerate(waveforms, start=1):
@@ -121,11 +122,10 @@ def coherent_backprojection(
             )
         if not np.isfinite(heard).all():
             raise NumericalError(f"the recording of pose {count - 1} is not finite")
-        outward = _distances(axes, emitters[count - 1])
         compressed = matched_filter(heard, emitted, oversampling=finer).astype(np.complex64)
         for echo, receiver in zip(compressed, receivers[count - 1], strict=True):
-            half = (outward + _distances(axes, receiver)) * np.float32(0.5)
-            total += _interpolated(echo, half, 0.0, step)
+            squares = _squares(axes, emitters[count - 1], receiver)
+            _spread(total, _padded(echo, np.complex64), *squares, 0.0, step)
     if count != len(emitters):
         raise ValueError(f"recordings: {count}, expected one for each of {len(emitters)} poses")
     summed = np.abs(total).astype(np.float64) / max(receivers.shape[0] * receivers.shape[1], 1)
@@ -171,20 +171,57 @@ def range_profiles(
         raise ValueError(f"spectrograms: {count}, expected one for each of {poses} poses")
 
 
-def _interpolated(
-    profile: NDArray[Any], ranges: Singles, start: float, step: float
-) -> NDArray[Any]:
-    """Read an evenly spaced profile linearly; zero outside it. In single precision."""
-    # One silent slice at each end stands for everything beyond, and the last index stays inside.
-    kind = np.complex64 if np.iscomplexobj(profile) else np.float32
+Six: TypeAlias = tuple[Singles, Singles, Singles, Singles, Singles, Singles]
+
+
+def _squares(axes: list[Floats], out: Floats, back: Floats) -> Six:
+    """Return the squared distances, m², of grid lines from two places: three axes for each."""
+    x, y, z, u, v, w = (
+        np.square(along - at).astype(np.float32)
+        for place in (out, back)
+        for along, at in zip(axes, place, strict=True)
+    )
+    return x, y, z, u, v, w
+
+
+def _padded(profile: NDArray[Any], kind: type[np.generic]) -> NDArray[Any]:
+    """Put one silent slice at each end, and one more, so that the last index stays inside."""
     padded = np.zeros(len(profile) + 3, kind)
     padded[1:-2] = profile
-    place = np.clip((ranges - np.float32(start)) / np.float32(step) + 1, 0, len(profile) + 1)
-    index = place.astype(np.intp)
-    fraction = place - index.astype(np.float32)
-    low = padded[index]
-    value: NDArray[Any] = low + fraction * (padded[index + 1] - low)
-    return value
+    return padded
+
+
+@compiled
+def _spread(
+    total: NDArray[Any],
+    profile: NDArray[Any],
+    x_out: Singles,
+    y_out: Singles,
+    z_out: Singles,
+    x_back: Singles,
+    y_back: Singles,
+    z_back: Singles,
+    start: float,
+    step: float,
+) -> None:
+    """Add a profile to each voxel of a grid, read at half the way out and back, in place.
+
+    Args:
+        total (X, Y, Z): The grid.
+        profile (R + 3,): From :func:`_padded`; read linearly, zero outside.
+        x_out, y_out, z_out, x_back, y_back, z_back (m²): See :func:`_squares`.
+        start, step (m): Range of the profile's first slice, and from one to the next.
+    """
+    last, scale = len(profile) - 2.0, 0.5 / step
+    for i in range(total.shape[0]):
+        for j in range(total.shape[1]):
+            out, back = x_out[i] + y_out[j], x_back[i] + y_back[j]
+            for k in range(total.shape[2]):
+                way = math.sqrt(out + z_out[k]) + math.sqrt(back + z_back[k])
+                place = min(max(scale * way - start / step + 1.0, 0.0), last)
+                index = int(place)
+                low = profile[index]
+                total[i, j, k] += low + (place - index) * (profile[index + 1] - low)
 
 
 def best_level_surface(
@@ -301,26 +338,22 @@ def voxel_fit(
     spread[~np.isfinite(spread)] = 0.0
     audible = _heard_back(np.ones(len(axis)), kernel, spread)
     floor = FLOOR * max(float(energies.mean()), np.finfo(float).tiny) if energies.size else 1.0
-    axes = [along.astype(np.float32) for along in volume.axes()]
-    power = np.ones(volume.values.size)
+    axes = volume.axes()
+    power = np.ones(volume.shape)
+    index = np.zeros(volume.shape, np.int32)
     portions = max(1, min(PORTIONS, len(emitters)))
     for _ in range(passes):
         for portion in range(portions):
-            gained, sensed = np.zeros((2, len(power)), np.float32)
+            gained, sensed = np.zeros((2, *power.shape), np.float32)
             for pose in range(portion, len(emitters), portions):
-                outward = _distances(axes, emitters[pose])
                 for energy, receiver in zip(energies[pose], receivers[pose], strict=True):
-                    half = (outward + _distances(axes, receiver)) * np.float32(0.5 / step)
-                    index = (half - np.float32(first / step - 0.5)).astype(np.intp).ravel()
-                    # The kernel's ends are zero: the outermost bins, and all beyond, are silent.
-                    np.clip(index, 0, bins - 1, out=index)
-                    fine = np.bincount(index, power, minlength=bins) * spread
+                    squares = _squares(axes, emitters[pose], receiver)
+                    fine = _sorted(index, power, *squares, float(first), step, bins) * spread
                     model = np.convolve(fine, kernel, mode="valid")
                     ratio = energy / np.maximum(model, floor)
-                    gained += _heard_back(ratio, kernel, spread)[index]
-                    sensed += audible[index]
+                    _gather(gained, sensed, index, _heard_back(ratio, kernel, spread), audible)
             power *= np.divide(gained, sensed, out=np.zeros_like(gained), where=sensed > 0)
-    return volume.with_values(power.reshape(volume.shape))
+    return volume.with_values(power)
 
 
 def _kernel(values: Floats, window_step: float, step: float, depth: float) -> Floats:
@@ -344,8 +377,54 @@ def _heard_back(profile: Floats, kernel: Floats, spread: Floats) -> Singles:
     return result
 
 
-def _distances(axes: list[Singles], place: Floats) -> Singles:
-    """Return the distance of every voxel from a place, (X, Y, Z) m."""
-    x, y, z = (np.square(a - np.float32(b)) for a, b in zip(axes, place, strict=True))
-    distance: Singles = np.sqrt(x[:, None, None] + y[:, None] + z)
-    return distance
+@compiled
+def _sorted(
+    index: NDArray[np.int32],
+    power: Floats,
+    x_out: Singles,
+    y_out: Singles,
+    z_out: Singles,
+    x_back: Singles,
+    y_back: Singles,
+    z_back: Singles,
+    first: float,
+    step: float,
+    bins: int,
+) -> Floats:
+    """Return the power in each bin of range, and write into ``index`` which bin a voxel is in.
+
+    The ends of the window are zero: the outermost bins, and all that lies beyond, are silent.
+
+    Args:
+        index (X, Y, Z): Overwritten.
+        power (X, Y, Z): Of the voxels.
+        x_out, y_out, z_out, x_back, y_back, z_back (m²): See :func:`_squares`.
+        first, step (m): Range of the first bin, and from one to the next.
+        bins: Their number.
+    """
+    total = np.zeros(bins)
+    for i in range(power.shape[0]):
+        for j in range(power.shape[1]):
+            out, back = x_out[i] + y_out[j], x_back[i] + y_back[j]
+            for k in range(power.shape[2]):
+                way = math.sqrt(out + z_out[k]) + math.sqrt(back + z_back[k])
+                place = min(max(int(0.5 / step * way - first / step + 0.5), 0), bins - 1)
+                index[i, j, k] = place
+                total[place] += power[i, j, k]
+    return total
+
+
+@compiled
+def _gather(
+    gained: Singles,
+    sensed: Singles,
+    index: NDArray[np.int32],
+    heard: Singles,
+    audible: Singles,
+) -> None:
+    """Add to each voxel (X, Y, Z) what is heard and what is audible in its bin, in place."""
+    for i in range(index.shape[0]):
+        for j in range(index.shape[1]):
+            for k in range(index.shape[2]):
+                gained[i, j, k] += heard[index[i, j, k]]
+                sensed[i, j, k] += audible[index[i, j, k]]
