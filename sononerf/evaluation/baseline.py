@@ -174,7 +174,7 @@ def range_profiles(
 Six: TypeAlias = tuple[Singles, Singles, Singles, Singles, Singles, Singles]
 
 
-def _squares(axes: list[Floats], out: Floats, back: Floats) -> Six:
+def _squares(axes: tuple[Floats, Floats, Floats], out: Floats, back: Floats) -> Six:
     """Return the squared distances, m², of grid lines from two places: three axes for each."""
     x, y, z, u, v, w = (
         np.square(along - at).astype(np.float32)
