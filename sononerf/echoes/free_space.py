@@ -13,14 +13,15 @@ References:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
-from scipy.spatial.distance import cdist
 
 from sononerf.array_types import Bools, Floats
+from sononerf.compiled import compiled
 
 UNDETECTED = 0.05
 """Fraction of the onsets that may be wrong together where a place is judged, and of outliers that
@@ -111,21 +112,15 @@ class EchoHull:
 
         Plus infinity where it tells nothing of them.
         """
-        # No products of matrices: BLAS's threads wait for one another where a core is busy.
-        out = cdist(points, self.emitters)
-        first = self.trusted
-        behind = np.stack(
-            [
-                (out + cdist(points, self.receivers[:, ear])) / 2 - first[:, ear]
-                for ear in range(self.receivers.shape[1])
-            ],
-            axis=2,
-        )
-        if self.within > -1.0:
-            ahead = np.einsum("ni,pi->np", points, self.axes)
-            ahead -= (self.emitters * self.axes).sum(axis=1)
-            behind[ahead < self.within * out] = np.inf
-        return behind
+        return _behind(np.ascontiguousarray(points), *self._onsets)
+
+    @property
+    def _onsets(self) -> tuple[Floats, Floats, Floats, Floats, float]:
+        """What says how far places lie behind first echoes: see :func:`_behind`."""
+        looks = np.broadcast_to(self.axes, self.emitters.shape)
+        parts = (self.emitters, self.receivers, self.trusted, looks)
+        emitters, receivers, first, axes = (np.array(part, dtype=np.float64) for part in parts)
+        return emitters, receivers, first, axes, float(self.within)
 
     def _clearance(self, points: Floats) -> tuple[Floats, NDArray[np.intp]]:
         # Both ears bound the place: the nearer bound counts.
@@ -133,6 +128,94 @@ class EchoHull:
         spare = min(self.undetected, left.shape[1] - 1)
         pose = np.argpartition(left, spare, axis=1)[:, spare] if spare else left.argmin(axis=1)
         return left[np.arange(len(points)), pose], pose
+
+
+@compiled
+def _distance(point: Floats, place: Floats) -> float:
+    x, y, z = point[0] - place[0], point[1] - place[1], point[2] - place[2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@compiled
+def _is_beside(
+    point: Floats, emitter: Floats, axis: Floats, within: float, distance: float
+) -> bool:
+    """Whether a point lies outside the cone that an emitter hears."""
+    ahead = 0.0
+    for k in range(3):
+        ahead += (point[k] - emitter[k]) * axis[k]
+    return within > -1.0 and ahead < within * distance
+
+
+@compiled
+def _behind(
+    points: Floats,
+    emitters: Floats,
+    receivers: Floats,
+    first: Floats,
+    axes: Floats,
+    within: float,
+) -> Floats:
+    """Return how far points (N, 3) lie behind first echoes (P, E): (N, P, E), m.
+
+    Args:
+        points ((N, 3), m): World frame.
+        emitters, receivers ((P, 3), (P, E, 3), m): Of the poses.
+        first ((P, E), m): Ranges.
+        axes (P, 3): Where the poses look.
+        within: Cosine of the angle around the axis outside which an echo tells nothing.
+    """
+    found = np.full((len(points), *first.shape), np.inf)
+    for n in range(len(points)):
+        for pose in range(len(first)):
+            out = _distance(points[n], emitters[pose])
+            if _is_beside(points[n], emitters[pose], axes[pose], within, out):
+                continue
+            for ear in range(first.shape[1]):
+                back = _distance(points[n], receivers[pose, ear])
+                found[n, pose, ear] = 0.5 * (out + back) - first[pose, ear]
+    return found
+
+
+@compiled
+def _possible(
+    cells: Floats,
+    emitters: Floats,
+    receivers: Floats,
+    first: Floats,
+    axes: Floats,
+    within: float,
+    wanted: Bools,
+    few: int,
+    reach: float,
+) -> Bools:
+    """Return the cells (N,) that few onsets rule out and that lie at the range of a wanted one.
+
+    Args:
+        cells ((N, 3), m): Their middles.
+        emitters, receivers, first, axes, within: As of :func:`_behind`.
+        wanted (P, E): Which onsets are wanted.
+        few: So many onsets may rule a cell out.
+        reach (m): How far a cell reaches.
+    """
+    found = np.zeros(len(cells), np.bool_)
+    for n in range(len(cells)):
+        against, meets = 0, False
+        for pose in range(len(first)):
+            out = _distance(cells[n], emitters[pose])
+            if _is_beside(cells[n], emitters[pose], axes[pose], within, out):
+                continue
+            for ear in range(first.shape[1]):
+                back = _distance(cells[n], receivers[pose, ear])
+                behind = 0.5 * (out + back) - first[pose, ear]
+                if behind < -reach:
+                    against += 1
+                elif wanted[pose, ear] and behind <= reach:
+                    meets = True
+            if against > few:
+                break
+        found[n] = meets and against <= few
+    return found
 
 
 ACCURACY = 0.1
@@ -242,18 +325,20 @@ def _cells(
     side = float((upper - lower).max()) / COARSE
     axes = [np.arange(a + side / 2, b + side / 2, side) for a, b in zip(lower, upper, strict=True)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    is_wanted = np.zeros(hull.first.size, dtype=np.bool_)
+    is_wanted[wanted] = True
     while True:
-        reach = side * np.sqrt(3) / 2 + error
-        kept = []
-        for start in range(0, len(cells), hull.chunk):
-            part = cells[start : start + hull.chunk]
-            behind = hull.behind(part).reshape(len(part), -1)
-            against, meets = behind < -reach, np.abs(behind[:, wanted]) <= reach
-            keep = (against.sum(axis=1) <= few) & meets.any(axis=1)
-            kept.append((part[keep], against[keep], meets[keep]))
-        cells, against, meets = (np.concatenate(each) for each in zip(*kept, strict=True))
+        reach = float(side * np.sqrt(3) / 2 + error)
+        of_wanted = is_wanted.reshape(hull.first.shape)
+        cells = cells[_possible(cells, *hull._onsets, of_wanted, few, reach)]
         finer = 8.0 * len(cells) * hull.first.size
         if reach <= least + error or finer > MOST_PAIRS or not len(cells):
-            return against, meets
+            break
         cells = (cells[:, None] + side * OCTANTS).reshape(-1, 3)
         side /= 2
+    against, meets = [], []
+    for start in range(0, max(len(cells), 1), hull.chunk):
+        behind = hull.behind(cells[start : start + hull.chunk]).reshape(-1, hull.first.size)
+        against.append(behind < -reach)
+        meets.append(np.abs(behind[:, wanted]) <= reach)
+    return np.concatenate(against), np.concatenate(meets)
