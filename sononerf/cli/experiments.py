@@ -35,10 +35,8 @@ MANY = 64
 
 def _begin(settings: Settings, workers: int | None) -> None:
     """Say at once what is simulated, and let other processes get ready for it."""
-    if settings.data.store is not None or settings.scene is None:
-        return
-    say(f"scene {settings.scene.name}")
-    if settings.poses.count >= MANY and workers != 1:
+    say(f"echoes of {settings.data.store or (settings.scene and settings.scene.name)}")
+    if settings.data.store is None and settings.poses.count >= MANY and workers != 1:
         from sononerf.simulation.processes import begin
 
         begin()

@@ -30,7 +30,7 @@ logger = logging.getLogger("sononerf")
 Write = Callable[[int, Singles], None]
 
 MOST_WORKERS = 8
-WORTH_WORKERS = 1_500_000
+WORTH_WORKERS = 250_000
 """Rays of all poses from which other processes save time: fewer are traced before these start."""
 
 
@@ -225,7 +225,7 @@ def spectrograms(
     rotations: Floats,
     *,
     seed: int,
-    done: Callable[[], None],
+    done: Callable[[], None] | None = None,
 ) -> Singles:
     """Return the spectrograms of poses (P, E, R, F), linear magnitude, with the same rays for each.
 
@@ -240,7 +240,8 @@ def spectrograms(
 
     def keep(index: int, spectrogram: Singles) -> None:
         found[index] = spectrogram
-        done()
+        if done is not None:
+            done()
 
     poses = Poses(positions, rotations)
     simulate_ensemble(simulator, poses, range(len(poses)), keep, seed_of=lambda _: seed)

@@ -15,7 +15,7 @@ from typing import Any
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that limit numerical libraries to one thread in each worker."""
-SIMULATOR = "sononerf.simulation.workers"
+SIMULATOR = "sononerf.simulation.ready"
 """What workers import."""
 
 

@@ -62,10 +62,7 @@ class Comparison:
         if smooth:
             mesh, _ = finer(mesh, np.zeros(len(mesh.vertices)), self.optics.wavelength)
         tracer = Tracer(self.optics, mesh, rays=RAYS, seed=self.seed)
-        rendered = [
-            gain * tracer.spectrogram(positions[pose], rotations[pose])
-            for pose in self.poses.tolist()
-        ]
+        rendered = list(gain * tracer.spectrograms(positions[self.poses], rotations[self.poses]))
         heard = [self.echoes.magnitude(pose).numpy() for pose in self.poses.tolist()]
         weights = [math.sqrt(float(one.max())) for one in heard]
         if not sum(weights) > 0:

@@ -68,7 +68,7 @@ class Correction:
         places = np.asarray(echoes.positions[numbers], dtype=np.float64)
         turns = np.asarray(echoes.rotations[numbers], dtype=np.float64)
         simulator.engine.prepare(places, turns)
-        heard = spectrograms(simulator, places, turns, seed=seed, done=lambda: None)
+        heard = spectrograms(simulator, places, turns, seed=seed)
         self._simulated = dict(zip(numbers.tolist(), torch.as_tensor(heard), strict=True))
 
     def batch(self, seed: int, step: int, size: int) -> Ints:

@@ -15,6 +15,7 @@ from torch import Tensor
 from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.settings.schema import SimulationSettings
+from sononerf.simulation.ensemble import spectrograms
 from sononerf.simulation.rays import Rays
 from sononerf.simulation.simulator import Simulator, quiet_scene
 from sononerf.surface.refine.optics import Heard, Optics
@@ -63,9 +64,9 @@ class Tracer:
         self._simulator = Simulator.of(quiet_scene(mesh), optics.head, wanted)
         self._optics, self._seed = optics, seed
 
-    def spectrogram(self, position: Floats, rotation: Floats) -> Singles:
-        """Magnitude that a pose hears, (E, R, F)."""
-        return self._simulator.spectrogram(position, rotation, seed=self._seed)
+    def spectrograms(self, positions: Floats, rotations: Floats) -> Singles:
+        """Magnitude that poses hear, (P, E, R, F)."""
+        return spectrograms(self._simulator, positions, rotations, seed=self._seed)
 
     def later(self, position: Floats, rotation: Floats) -> Later:
         """Return what a pose hears after the first bounce."""

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: MIT
+"""Imported by the process that workers are forked from: what they compile is ready in each."""
+
+from __future__ import annotations
+
+import numpy as np
+import trimesh
+
+from sononerf.head.head import Head
+from sononerf.settings.schema import (
+    AirSettings,
+    CallSettings,
+    EarSettings,
+    NoiseSettings,
+    SimulationSettings,
+    SpectrogramSettings,
+)
+from sononerf.simulation import workers
+from sononerf.simulation.simulator import Simulator, quiet_scene
+
+__all__ = ["workers"]
+
+
+def trace_once() -> None:
+    """Trace a few rays off two spheres that shade each other, so that all loops are compiled."""
+    balls = [trimesh.creation.icosphere(1, radius=0.02) for _ in range(2)]
+    balls[1].apply_translation([-0.05, 0.0, 0.01])
+    options = SimulationSettings(engine="rays", rays=300, diffraction_points=10)
+    head = Head(
+        ears=EarSettings(),
+        call=CallSettings(),
+        air=AirSettings(),
+        analysis=SpectrogramSettings(),
+        noise=NoiseSettings(),
+    )
+    simulator = Simulator.of(quiet_scene(trimesh.util.concatenate(balls)), head, options)
+    simulator.spectrogram(np.array([-0.4, 0.0, 0.0]), np.eye(3), seed=0)
+
+
+trace_once()
