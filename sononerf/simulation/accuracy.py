@@ -3,17 +3,19 @@
 
 from __future__ import annotations
 
+import copy
+from contextlib import closing
+
 import numpy as np
 
-from sononerf.array_types import Floats
+from sononerf.array_types import Singles
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import RANGE_DB, compress, mae_db
 from sononerf.progress import Progress, Task
 from sononerf.settings.schema import SimulationSettings
-from sononerf.simulation.engine import Engine
-from sononerf.simulation.hybrid import Hybrid
-from sononerf.simulation.rays import Rays
+from sononerf.simulation.hybrid import tracer_of
 from sononerf.simulation.simulator import Simulator
+from sononerf.simulation.workers import simulated
 
 FIRST = 30_000
 """Rays per pose of the first trial. With fewer a pose takes hardly less time."""
@@ -71,26 +73,19 @@ def settle_rays(
     return tracer.rays
 
 
-def tracer_of(engine: Engine) -> Rays | None:
-    """Return what traces the rays of an engine; None if nothing does."""
-    if isinstance(engine, Hybrid):
-        return engine.high
-    return engine if isinstance(engine, Rays) else None
-
-
 def _difference(simulator: Simulator, poses: Poses, task: Task) -> float:
     """Return the mean difference between two seeds over active cells, dB."""
-    head = simulator.head.without_noise()
-
-    def heard(seed: int) -> Floats:
-        spectrograms = []
-        for index, pose in enumerate(zip(poses.positions, poses.rotations, strict=True)):
-            echo = simulator.echo(*pose, seed=2 * index + seed)
-            spectrograms.append(head.receive(echo, seed=seed)[1])
+    quiet = copy.copy(simulator)
+    quiet.head = simulator.head.without_noise()
+    found: dict[int, Singles] = {}
+    twice = Poses(*(np.concatenate([part, part]) for part in (poses.positions, poses.rotations)))
+    with closing(simulated(quiet, twice, list(range(len(twice))), lambda index: index)) as results:
+        for index, spectrogram in results:
+            found[index] = spectrogram
             task.advance()
-        return np.stack(spectrograms)
-
-    first, second = heard(0), heard(1)
+    first, second = (
+        np.stack([found[index + after] for index in range(len(poses))]) for after in (0, len(poses))
+    )
     loudest = float(max(first.max(), second.max()))
     if loudest <= 0.0:
         return 0.0

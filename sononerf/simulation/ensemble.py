@@ -17,21 +17,16 @@ from sononerf.echoes.store import EnsembleStore, seal
 from sononerf.errors import InputError, NumericalError
 from sononerf.geometry.poses import Poses
 from sononerf.geometry.raycast import winding_numbers
-from sononerf.memory import available_cores
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SimulationSettings
-from sononerf.simulation.accuracy import MOST, settle_rays, tracer_of
+from sononerf.simulation.accuracy import MOST, settle_rays
 from sononerf.simulation.simulator import Simulator, pose_seed
-from sononerf.simulation.workers import SeedOf, in_processes, in_this_process, on_cluster
+from sononerf.simulation.workers import SeedOf, simulated
 
 logger = logging.getLogger("sononerf")
 
 Write = Callable[[int, Singles], None]
-
-MOST_WORKERS = 8
-WORTH_WORKERS = 250_000
-"""Rays of all poses from which other processes save time: fewer are traced before these start."""
 
 
 def check_poses(scene: Scene, poses: Poses, *, offsets: Floats | None = None) -> None:
@@ -195,24 +190,7 @@ def simulate_ensemble(
         scheduler: Address of a Dask scheduler whose workers are used instead.
     """
     wanted = [int(index) for index in indices]
-    engine = simulator.engine
-    if workers is None:
-        tracer = tracer_of(engine)
-        rays = 0 if tracer is None else tracer.rays * len(wanted)
-        workers = 1 if rays < WORTH_WORKERS else min(available_cores(), MOST_WORKERS)
-    if engine.prepares and (scheduler is not None or workers > 1):
-        logger.warning(
-            "%s solves for all poses at once, in this process; workers and scheduler are not used",
-            type(engine).__name__,
-        )
-        workers, scheduler = 1, None
-    engine.prepare(poses.positions[wanted], poses.rotations[wanted])
-    if scheduler is not None:
-        results = on_cluster(simulator, poses, wanted, seed_of, scheduler)
-    elif workers > 1:
-        results = in_processes(simulator, poses, wanted, seed_of, workers)
-    else:
-        results = in_this_process(simulator, poses, wanted, seed_of)
+    results = simulated(simulator, poses, wanted, seed_of, workers=workers, scheduler=scheduler)
     # Closed at once where a write fails: what runs elsewhere ends before the error is seen.
     with closing(results):
         for index, spectrogram in results:

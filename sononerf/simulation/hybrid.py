@@ -64,6 +64,13 @@ class Hybrid(Engine):
         return self.high.hits(position, rotation, seed=seed)
 
 
+def tracer_of(engine: Engine) -> Rays | None:
+    """Return what traces the rays of an engine; None if nothing does."""
+    if isinstance(engine, Hybrid):
+        return engine.high
+    return engine if isinstance(engine, Rays) else None
+
+
 def hybrid(
     scene: Scene,
     hearing: Hearing,

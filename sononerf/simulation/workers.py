@@ -18,6 +18,8 @@ from typing import TYPE_CHECKING, Any
 from sononerf.array_types import Floats, Singles
 from sononerf.errors import ResourceError, SettingsError, SonoNerfError
 from sononerf.geometry.poses import Poses
+from sononerf.memory import available_cores
+from sononerf.simulation.hybrid import tracer_of
 from sononerf.simulation.processes import process_context, starting_workers
 from sononerf.simulation.simulator import Simulator
 
@@ -26,6 +28,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("sononerf")
 
+MOST_WORKERS = 8
+WORTH_WORKERS = 250_000
+"""Rays of all poses from which other processes save time: fewer are traced before these start."""
 QUEUED_PER_WORKER = 4
 """Poses that are sent per worker before results are taken. More would only fill the memory."""
 SENT_AGAIN = 3
@@ -38,6 +43,45 @@ PATIENCE_SECONDS = 10
 Results = Generator[tuple[int, Singles], None, None]
 SeedOf = Callable[[int], int]
 """Gives the seed of a pose by its index."""
+
+
+def simulated(
+    simulator: Simulator,
+    poses: Poses,
+    indices: list[int],
+    seed_of: SeedOf,
+    *,
+    workers: int | None = None,
+    scheduler: str | None = None,
+) -> Results:
+    """Yield indices and spectrograms of poses, in any order.
+
+    Args:
+        simulator: Scene and head.
+        poses: All of them.
+        indices: Which ones are wanted.
+        seed_of: Gives the seed of a pose by its index.
+        workers: Processes on this machine; one means this process. Where None, as many as there are
+            cores, at most 8, if they save time.
+        scheduler: Address of a Dask scheduler whose workers are used instead.
+    """
+    engine = simulator.engine
+    if workers is None:
+        tracer = tracer_of(engine)
+        rays = 0 if tracer is None else tracer.rays * len(indices)
+        workers = 1 if rays < WORTH_WORKERS else min(available_cores(), MOST_WORKERS)
+    if engine.prepares and (scheduler is not None or workers > 1):
+        logger.warning(
+            "%s solves for all poses at once, in this process; workers and scheduler are not used",
+            type(engine).__name__,
+        )
+        workers, scheduler = 1, None
+    engine.prepare(poses.positions[indices], poses.rotations[indices])
+    if scheduler is not None:
+        return on_cluster(simulator, poses, indices, seed_of, scheduler)
+    if workers > 1:
+        return in_processes(simulator, poses, indices, seed_of, workers)
+    return in_this_process(simulator, poses, indices, seed_of)
 
 
 def in_this_process(

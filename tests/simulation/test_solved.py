@@ -12,8 +12,8 @@ from sononerf.head.ears import beam_gain, ear_gain
 from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
-from sononerf.simulation import ensemble as ensemble_module
 from sononerf.simulation import solved as solved_module
+from sononerf.simulation import workers as workers_module
 from sononerf.simulation.ensemble import simulate_ensemble
 from sononerf.simulation.solved import Heads, Solved
 from tests.simulation.exact import SPEED, rigid_sphere
@@ -199,7 +199,7 @@ def test_what_takes_too_much_is_refused_before_it_starts(monkeypatch):
 
 
 def test_an_ensemble_is_prepared_here_and_at_once(caplog, monkeypatch):
-    monkeypatch.setattr(ensemble_module, "in_processes", None)
+    monkeypatch.setattr(workers_module, "in_processes", None)
     found, written = glint(), {}
     poses = Poses(np.stack([POSITION, POSITION + 0.1, POSITION + 0.2]), np.stack([POSE[1]] * 3))
     with caplog.at_level(logging.WARNING):

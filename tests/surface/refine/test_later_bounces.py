@@ -53,6 +53,6 @@ def test_later_bounces_are_as_loud_as_the_simulator_makes_them(optics, ball):
 def test_a_tracer_hears_what_the_simulator_hears(optics, echoes, ball):
     fine = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS)
     tracer = Tracer(optics, fine, rays=20_000, seed=0)
-    found = tracer.spectrogram(echoes.positions[0], echoes.rotations[0])
+    (found,) = tracer.spectrograms(echoes.positions[:1], echoes.rotations[:1])
     wanted = echoes.magnitude(0).numpy()
     assert np.allclose(found, wanted, atol=0.02 * wanted.max())
