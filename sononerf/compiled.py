@@ -18,7 +18,11 @@ def compiled(function: Callable[Given, Result]) -> Callable[Given, Result]:
     Dividing by zero gives infinity or NaN without a warning. Of compiled functions it may call
     those of its own file alone: what is kept on disk is made anew when that file changes.
     """
-    options = {"nogil": True, "error_model": "numpy"}
+    options = {
+        "nogil": True,
+        "error_model": "numpy",
+        "fastmath": {"contract", "arcp", "nsz", "reassoc"},
+    }
     try:
         made = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder may be written: it is compiled in each process

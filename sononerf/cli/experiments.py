@@ -55,6 +55,13 @@ def simulate(
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler to use instead.")
     ] = None,
+    shard: Annotated[
+        str | None,
+        typer.Option(
+            help="I/N: every N-th pose from the I-th on, for batch systems; the same command "
+            "without it joins the shards."
+        ),
+    ] = None,
     preview: Annotated[
         Path | None, typer.Option(help="Draw the scene with its poses into this folder.")
     ] = None,
@@ -71,16 +78,24 @@ def simulate(
     from sononerf.progress import Progress
     from sononerf.run.build import results_folder
     from sononerf.run.scenes import draw_ensemble
+    from sononerf.run.simulate import Shard
     from sononerf.run.simulate import simulate as run
 
+    if shard is not None and (preview is not None or waveforms is not None):
+        raise SettingsError("--shard takes no --preview and no --waveforms; give these without it")
     if workers is not None and scheduler is not None:
         raise SettingsError("--workers and --scheduler exclude each other; give one")
     # A folder that cannot be written is told before minutes of simulation.
     with results_folder(preview) if preview is not None else nullcontext():
         store = run(
-            settings, output=output, workers=workers, scheduler=scheduler, progress=Progress()
+            settings,
+            output=output,
+            shard=None if shard is None else Shard.of(shard),
+            workers=workers,
+            scheduler=scheduler,
+            progress=Progress(),
         )
-        say(f"wrote {store.path} ({len(store)} poses)")
+        say(f"wrote {store.path} ({len(store) - len(store.missing())} poses)")
         if preview is not None:
             for path in draw_ensemble(settings, store, preview):
                 say(f"wrote {path}")

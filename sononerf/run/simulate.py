@@ -3,8 +3,10 @@
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +30,41 @@ from sononerf.simulation.accuracy import settle_rays
 from sononerf.simulation.ensemble import check_poses, check_reach
 from sononerf.simulation.ensemble import simulate as simulate_poses
 from sononerf.simulation.simulator import VERSION, Simulator, ensemble_poses, pose_seed
+
+SHARD = ".shard-"
+"""What follows the name of an ensemble's store in those of its shards."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Some poses of an ensemble: every ``count``-th, from the ``number``-th on.
+
+    Attributes:
+        number: From 1 on.
+        count: How many there are.
+    """
+
+    number: int
+    count: int
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.number <= self.count:
+            raise SettingsError(
+                f"--shard: found {self.number}/{self.count}; give I/N with I from 1 to N"
+            )
+
+    @classmethod
+    def of(cls, text: str) -> Shard:
+        """Return the shard of a text ``I/N``."""
+        number, _, count = text.partition("/")
+        if not (number.isdecimal() and count.isdecimal()):
+            raise SettingsError(f"--shard: found {text!r}; give I/N, such as 3/16")
+        return cls(int(number), int(count))
+
+    def path(self, whole: Path) -> Path:
+        """Return the shard's store beside that of the whole ensemble."""
+        return whole.with_name(f"{whole.name}{SHARD}{self.number}-of-{self.count}")
+
 
 HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")
 
@@ -159,22 +196,28 @@ def simulate(
     *,
     scene: Scene | None = None,
     output: Path | None = None,
+    shard: Shard | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> EnsembleStore:
     """Simulate what is missing of an ensemble, and seal it.
 
+    Shards are stores beside the ensemble's, each with some of its poses. They can be simulated on
+    different machines at once. The same call without a shard takes the poses from there, simulates
+    what is missing, and seals.
+
     Args:
         settings: The experiment.
         scene: Another one than the settings'.
         output: The store; ``data/<scene>-<hash>`` where None.
+        shard: Which of how many; the whole ensemble where None.
         workers: Processes; as many as there are cores, at most 8, where None.
         scheduler: Address of a Dask scheduler to use instead.
         progress: Where to show it.
 
     Returns:
-        store: Complete; opened for reading.
+        store: Complete, or the shard; opened for reading.
 
     Raises:
         InputError: If scene or poses are no good.
@@ -186,6 +229,7 @@ def simulate(
     if scene is None:
         scene = scene_of(settings)
     path = store_path(settings, scene, output)
+    whole, path = path, path if shard is None else shard.path(path)
     wanted = echo_hash(settings, scene)
     if (path / "zarr.json").is_file():
         store = EnsembleStore.open(path)
@@ -223,16 +267,44 @@ def simulate(
             receivers=len(head.receivers),
         )
         attach(settings, path)
+        if shard is None:
+            _take_shards(store, whole)
         simulate_poses(
             simulator,
             poses,
             store,
             settings.simulation,
+            only=None if shard is None else range(shard.number - 1, len(poses), shard.count),
             workers=workers,
             scheduler=scheduler,
             progress=progress,
         )
     return EnsembleStore.open(path)
+
+
+def _take_shards(store: EnsembleStore, path: Path) -> None:
+    """Take what is missing of an ensemble from its shards.
+
+    Raises:
+        InputError: If a shard is damaged.
+        IncompatibleError: If a shard is of other settings, or was traced with other rays.
+    """
+    for folder in sorted(path.parent.glob(f"{glob.escape(path.name)}{SHARD}*")):
+        shard = EnsembleStore.open(folder)
+        rays = shard.attributes.get("rays")
+        for key, known in (
+            ("echo_hash", store.attributes.get("echo_hash")),
+            ("rays", store.attributes.get("rays", rays)),
+        ):
+            if shard.attributes.get(key) != known:
+                raise IncompatibleError(
+                    f"{folder}: is a shard of other echoes ({key} differs); remove it, or simulate "
+                    "it anew"
+                )
+        store.update_attributes(rays=rays)
+        there = set(range(len(shard))) - set(shard.missing())
+        for index in sorted(there & set(store.missing())):
+            store.write_pose(index, shard.read_pose(index))
 
 
 def _attributes(settings: Settings, wanted: str, simulator: Simulator) -> dict[str, object]:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from contextlib import closing
 from functools import partial
 
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sononerf.array_types import Bools, Floats, Singles
-from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore, seal
 from sononerf.errors import InputError, NumericalError
 from sononerf.geometry.poses import Poses
@@ -108,10 +107,11 @@ def simulate(
     store: EnsembleStore,
     options: SimulationSettings,
     *,
+    only: Collection[int] | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Progress,
-) -> Echoes:
+) -> None:
     """Simulate what is missing of a store, and seal it.
 
     The test poses are simulated twice, with other rays, which gives the noise floor.
@@ -121,12 +121,13 @@ def simulate(
         poses: Those of the store.
         store: Opened for writing.
         options: Seed, and number of test poses for the noise floor.
+        only: Of these poses alone; the store is then not sealed.
         workers: Processes; as many as there are cores, at most 8, where None.
         scheduler: Address of a Dask scheduler to use instead.
         progress: Where to show it.
     """
-    missing = store.missing()
-    test = store.indices("test")[: options.noise_floor_poses]
+    missing = [index for index in store.missing() if only is None or index in only]
+    test = store.indices("test")[: options.noise_floor_poses if only is None else 0]
     again: dict[int, Singles] = {}
     wanted = [*missing, *test]
     simulator.prepare(poses.positions[wanted], poses.rotations[wanted], progress)
@@ -159,10 +160,11 @@ def simulate(
             workers=workers,
             scheduler=scheduler,
         )
+    if only is not None:
+        return
     analysis = simulator.head.analysis
     silent = deaf(analysis.range_min, analysis.range_max)
     seal(store, {int(i): again[int(i)] for i in test}, silent=silent)
-    return Echoes(store, simulator.head)
 
 
 def simulate_ensemble(

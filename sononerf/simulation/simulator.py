@@ -43,7 +43,7 @@ COARSE = 1.25
 """Times ``RESOLVED_FREQUENCY``: bands that end above are warned of. The default band ends there."""
 UNSETTLED = 100_000
 """Rays per pose where neither a number is set nor an accuracy was measured, as in a preview."""
-VERSION = 4  # to be raised when the same settings give other echoes: stores are told apart by it
+VERSION = 5  # to be raised when the same settings give other echoes: stores are told apart by it
 
 
 class Simulator:

@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import signal
 import threading
 import warnings
 from collections import Counter, deque
@@ -13,6 +14,7 @@ from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from sononerf.array_types import Floats, Singles
@@ -35,6 +37,8 @@ QUEUED_PER_WORKER = 4
 """Poses that are sent per worker before results are taken. More would only fill the memory."""
 SENT_AGAIN = 3
 """Times that a pose is sent again after its worker died. Dask tries four workers each time."""
+ANSWER_SECONDS = 1.0
+"""Time that a worker that is stopped has to finish an answer, s; it takes some milliseconds."""
 CONNECT_SECONDS = 30
 """Time to wait for a Dask scheduler, s; across a network it answers in one."""
 PATIENCE_SECONDS = 10
@@ -140,12 +144,14 @@ def in_processes(
 
 
 _simulator: Simulator | None = None
+_tracing, _stopped = False, False
 
 
 def _become(simulator: Simulator) -> None:
     """Make this process a worker; it ends if the process that started it ends."""
     global _simulator
     _simulator = simulator
+    signal.signal(signal.SIGTERM, _stop)
     parent = multiprocessing.parent_process()
     assert parent is not None
 
@@ -156,9 +162,28 @@ def _become(simulator: Simulator) -> None:
     threading.Thread(target=follow, daemon=True).start()
 
 
+def _stop(number: int, frame: FrameType | None) -> None:
+    """End this process, but not in the middle of an answer: half of one would be waited for."""
+    global _stopped
+    del number, frame
+    if _tracing:
+        os._exit(1)
+    _stopped = True
+    later = threading.Timer(ANSWER_SECONDS, os._exit, (1,))
+    later.daemon = True
+    later.start()
+
+
 def _mine(pose: tuple[Floats, Floats], seed: int) -> Singles:
+    global _tracing
     assert _simulator is not None
-    return _one(_simulator, *pose, seed)
+    _tracing = True
+    if _stopped:
+        os._exit(1)
+    try:
+        return _one(_simulator, *pose, seed)
+    finally:
+        _tracing = False
 
 
 def _one(simulator: Simulator, position: Floats, rotation: Floats, seed: int) -> Singles:

@@ -27,6 +27,7 @@ from sononerf.head.directivity.sofa import write_sofa
 from sononerf.run import simulate as simulate_module
 from sononerf.run.import_recordings import import_recordings
 from sononerf.run.simulate import (
+    Shard,
     background_path,
     echo_hash,
     ensemble,
@@ -213,6 +214,41 @@ def test_stops_and_other_numbers_of_workers_change_no_byte(tiny, echoes, tmp_pat
     alone = EnsembleStore.open(echoes)
     assert stopper.written == len(alone) - 3 - 4
     assert content(store) == content(alone)
+
+
+def test_shards_that_stop_and_go_on_make_the_same_bytes_as_one_process(
+    tiny, echoes, tmp_path, monkeypatch
+):
+    stopper = Stopper(monkeypatch)
+
+    def stop():
+        raise KeyboardInterrupt
+
+    settings, whole = tiny(), tmp_path / "store"
+    for number in (1, 2, 4):  # the third machine never ran
+        stopper.arm(2, stop)
+        with pytest.raises(KeyboardInterrupt):
+            simulate(settings, output=whole, shard=Shard(number, 4), workers=1)
+        stopper.arm(-1, stop)
+        part = simulate(settings, output=whole, shard=Shard(number, 4), workers=1)
+        there = set(range(len(part))) - set(part.missing())
+        assert there == set(range(number - 1, len(part), 4))
+        assert "reference" not in part.attributes
+    alone = EnsembleStore.open(echoes)
+    assert not whole.exists()
+    assert content(simulate(settings, output=whole, workers=1)) == content(alone)
+
+
+def test_shards_of_other_echoes_are_not_joined(tiny, tmp_path):
+    simulate(tiny(), output=tmp_path / "store", shard=Shard(1, 2))
+    with pytest.raises(IncompatibleError, match=r"store\.shard-1-of-2: is a shard of other echoes"):
+        simulate(tiny(simulation={"rays": 600}), output=tmp_path / "store")
+
+
+@pytest.mark.parametrize("text", ["", "3", "0/4", "5/4", "a/b", "1/0", "-1/2", "1/2/3"])
+def test_what_is_no_shard_is_refused(text):
+    with pytest.raises(SettingsError, match=r"--shard: found .* give I/N"):
+        Shard.of(text)
 
 
 @pytest.mark.thorough
