@@ -59,6 +59,11 @@ def test_a_missing_part_costs_recall_alone():
     assert found["iou"] == pytest.approx(0.5, rel=1e-3)
     assert found["thickness_bias_m"] == pytest.approx(0, abs=1e-6)
     assert (found["components"], found["components_true"]) == (1, 2)
+    # Of a sphere's points the mean distance from a place at d outside is d + R² / 3 d.
+    away = 0.1 + RADIUS**2 / 0.3 - RADIUS
+    assert found["chamfer_m"] == pytest.approx(away / 4, rel=0.03)
+    grown = geometry_metrics(both, sphere(RADIUS), samples=5000)
+    assert grown["chamfer_m"] == pytest.approx(away / 4, rel=0.03)
 
 
 def test_inner_walls_of_the_truth_do_not_count():
