@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -34,8 +35,9 @@ MANY = 64
 
 
 def _begin(settings: Settings, workers: int | None) -> None:
-    """Say at once what is simulated, and let other processes get ready for it."""
-    say(f"echoes of {settings.data.store or (settings.scene and settings.scene.name)}")
+    """Say at once in a terminal what is heard, and let other processes get ready to simulate."""
+    if sys.stderr.isatty():  # elsewhere a wrong setting is told in one line, with none before it
+        say(f"echoes of {settings.data.store or (settings.scene and settings.scene.name)}")
     if settings.data.store is None and settings.poses.count >= MANY and workers != 1:
         from sononerf.simulation.processes import begin
 
