@@ -291,6 +291,9 @@ def _take_shards(store: EnsembleStore, path: Path) -> None:
     """
     for folder in sorted(path.parent.glob(f"{glob.escape(path.name)}{SHARD}*")):
         shard = EnsembleStore.open(folder)
+        there = set(range(len(shard))) - set(shard.missing())
+        if not there:  # it was stopped before it had anything
+            continue
         rays = shard.attributes.get("rays")
         for key, known in (
             ("echo_hash", store.attributes.get("echo_hash")),
@@ -302,7 +305,6 @@ def _take_shards(store: EnsembleStore, path: Path) -> None:
                     "it anew"
                 )
         store.update_attributes(rays=rays)
-        there = set(range(len(shard))) - set(shard.missing())
         for index in sorted(there & set(store.missing())):
             store.write_pose(index, shard.read_pose(index))
 

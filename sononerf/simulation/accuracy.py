@@ -34,7 +34,12 @@ STEP = 1.3, 10.0
 
 
 def settle_rays(
-    simulator: Simulator, poses: Poses, options: SimulationSettings, progress: Progress
+    simulator: Simulator,
+    poses: Poses,
+    options: SimulationSettings,
+    progress: Progress,
+    *,
+    workers: int | None = None,
 ) -> int | None:
     """Set the number of rays per pose that reaches the accuracy of the settings.
 
@@ -47,6 +52,7 @@ def settle_rays(
         poses: Those of the ensemble.
         options: A number of rays, or the accuracy to be reached.
         progress: Shows the trials and the number.
+        workers: See :func:`sononerf.simulation.workers.simulated`.
 
     Returns:
         rays: Per pose; None if the engine traces none.
@@ -63,7 +69,7 @@ def settle_rays(
     trials: list[float] = []  # what the error would be with one ray
     while tracer.rays < MOST:
         with progress.task(f"trying {tracer.rays} rays per pose", 2 * len(chosen)) as task:
-            found = max(_difference(simulator, some, task), LEAST_DB)
+            found = max(_difference(simulator, some, task, workers), LEAST_DB)
         trials.append(found * tracer.rays**CONVERGENCE)
         # A few poses tell it with a tenth of error or more; all trials together are more certain.
         error = float(np.exp(np.mean(np.log(trials)))) / tracer.rays**CONVERGENCE
@@ -79,13 +85,14 @@ def settle_rays(
     return tracer.rays
 
 
-def _difference(simulator: Simulator, poses: Poses, task: Task) -> float:
+def _difference(simulator: Simulator, poses: Poses, task: Task, workers: int | None) -> float:
     """Return the mean difference between two seeds over active cells, dB."""
     quiet = copy.copy(simulator)
     quiet.head = simulator.head.without_noise()
     found: dict[int, Singles] = {}
     twice = Poses(*(np.concatenate([part, part]) for part in (poses.positions, poses.rotations)))
-    with closing(simulated(quiet, twice, list(range(len(twice))), lambda index: index)) as results:
+    indices = list(range(len(twice)))
+    with closing(simulated(quiet, twice, indices, lambda index: index, workers=workers)) as results:
         for index, spectrogram in results:
             found[index] = spectrogram
             task.advance()

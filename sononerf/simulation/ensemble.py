@@ -135,7 +135,9 @@ def simulate(
     if options.rays is None and isinstance(known, int) and 0 < known <= MOST:
         # An interrupted simulation goes on with the number that it began with.
         options = options.model_copy(update={"rays": known})
-    store.update_attributes(rays=settle_rays(simulator, poses, options, progress))
+    here = 1 if scheduler is not None else workers
+    rays = settle_rays(simulator, poses, options, progress, workers=here)
+    store.update_attributes(rays=rays)
     with progress.task("simulating", len(missing) + len(test)) as task:
         # The second simulation of the test poses goes first where it can share the processes.
         def keep(index: int, spectrogram: Singles) -> None:

@@ -31,8 +31,10 @@ if TYPE_CHECKING:
 logger = logging.getLogger("sononerf")
 
 MOST_WORKERS = 8
-WORTH_WORKERS = 250_000
+WORTH_RAYS = 250_000
 """Rays of all poses from which other processes save time: fewer are traced before these start."""
+WORTH_POSES = 64
+"""Poses from which other processes save time if the engine traces no rays."""
 QUEUED_PER_WORKER = 4
 """Poses that are sent per worker before results are taken. More would only fill the memory."""
 SENT_AGAIN = 3
@@ -72,8 +74,10 @@ def simulated(
     engine = simulator.engine
     if workers is None:
         tracer = tracer_of(engine)
-        rays = 0 if tracer is None else tracer.rays * len(indices)
-        workers = 1 if rays < WORTH_WORKERS else min(available_cores(), MOST_WORKERS)
+        count = len(indices)
+        pays = count >= WORTH_POSES if tracer is None else count * tracer.rays >= WORTH_RAYS
+        alone = engine.prepares or not pays
+        workers = 1 if alone else min(available_cores(), MOST_WORKERS)
     if engine.prepares and (scheduler is not None or workers > 1):
         logger.warning(
             "%s solves for all poses at once, in this process; workers and scheduler are not used",

@@ -239,6 +239,21 @@ def test_shards_that_stop_and_go_on_make_the_same_bytes_as_one_process(
     assert content(simulate(settings, output=whole, workers=1)) == content(alone)
 
 
+def test_a_shard_that_was_stopped_before_it_had_anything_is_passed_over(
+    tiny, echoes, tmp_path, monkeypatch
+):
+    def stop(*given, **options):
+        raise KeyboardInterrupt
+
+    simulate(tiny(), output=tmp_path / "store", shard=Shard(1, 2))
+    with monkeypatch.context() as patch:
+        patch.setattr(simulate_module, "simulate_poses", stop)
+        with pytest.raises(KeyboardInterrupt):
+            simulate(tiny(), output=tmp_path / "store", shard=Shard(2, 2))
+    whole = simulate(tiny(), output=tmp_path / "store")
+    assert content(whole) == content(EnsembleStore.open(echoes))
+
+
 def test_shards_of_other_echoes_are_not_joined(tiny, tmp_path):
     simulate(tiny(), output=tmp_path / "store", shard=Shard(1, 2))
     with pytest.raises(IncompatibleError, match=r"store\.shard-1-of-2: is a shard of other echoes"):

@@ -10,7 +10,7 @@ from sononerf.run.build import simulator_of
 from sononerf.run.simulate import simulate
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import validate_settings
-from sononerf.simulation import accuracy
+from sononerf.simulation import accuracy, workers
 from sononerf.simulation.accuracy import settle_rays
 from sononerf.simulation.simulator import ensemble_poses
 
@@ -51,6 +51,12 @@ def test_the_accuracy_is_reached_and_costs_rays(few, tmp_path):
         assert store.attributes["noise_floor_mae_db_active"] < 1.5 * wanted
         rays.append(store.attributes["rays"])
     assert 500 <= rays[0] < rays[1] < accuracy.MOST
+
+
+def test_one_worker_is_this_process_in_trials_too(few, tmp_path, monkeypatch):
+    monkeypatch.setattr(workers, "WORTH_RAYS", 0)
+    monkeypatch.setattr(workers, "in_processes", None)
+    simulate(settings(accuracy_db=2.0), output=tmp_path / "store", workers=1)
 
 
 def test_noise_of_the_ears_asks_for_no_more_rays(few):

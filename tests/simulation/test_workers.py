@@ -4,7 +4,12 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+
+from sononerf.geometry.poses import Poses
+from sononerf.simulation import workers
+from sononerf.simulation.workers import simulated
 
 SCRIPT = """
 import numpy as np
@@ -27,9 +32,27 @@ class Loud:
     engine = None
 
     def spectrogram(self, position, rotation, *, seed):
-        import numpy as np
-
         return np.full((2, 900, 470), seed, np.float32)
+
+
+class Plain:
+    """A simulator whose engine traces no rays."""
+
+    class engine:  # noqa: N801
+        prepares = False
+
+        @staticmethod
+        def prepare(positions, rotations):
+            pass
+
+
+@pytest.mark.parametrize(("poses", "processes"), [(63, 1), (64, 3)])
+def test_many_poses_without_rays_are_simulated_in_other_processes(monkeypatch, poses, processes):
+    monkeypatch.setattr(workers, "available_cores", lambda: 3)
+    monkeypatch.setattr(workers, "in_processes", lambda *given: given[-1])
+    monkeypatch.setattr(workers, "in_this_process", lambda *given: 1)
+    places = Poses(np.zeros((poses, 3)), np.tile(np.eye(3), (poses, 1, 1)))
+    assert simulated(Plain(), places, list(range(poses)), lambda index: index) == processes
 
 
 @pytest.mark.thorough
