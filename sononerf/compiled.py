@@ -13,10 +13,11 @@ Result = TypeVar("Result")
 
 
 def compiled(function: Callable[Given, Result]) -> Callable[Given, Result]:
-    """Compile a function of numbers and arrays; other threads run meanwhile.
+    """Compile a function of numbers and arrays. While it runs, other threads can run too.
 
-    Dividing by zero gives infinity or NaN without a warning. Of compiled functions it may call
-    those of its own file alone: what is kept on disk is made anew when that file changes.
+    Division by zero gives infinity or NaN without a warning. The order of sums is the compiler's,
+    so results may differ from NumPy's by rounding. A compiled function may call compiled functions
+    of its own file only: numba compiles it anew when that file changes, and looks at no other.
     """
     options = {
         "nogil": True,

@@ -31,12 +31,12 @@ if TYPE_CHECKING:
 
 
 MANY = 64
-"""Poses from which the processes that simulate them are started before anything is known."""
+"""Number of poses from which worker processes are started at once. Fewer need none."""
 
 
 def _begin(settings: Settings, workers: int | None) -> None:
-    """Say at once in a terminal what is heard, and let other processes get ready to simulate."""
-    if sys.stderr.isatty():  # elsewhere a wrong setting is told in one line, with none before it
+    """In a terminal, say at once which echoes are wanted; let worker processes import meanwhile."""
+    if sys.stderr.isatty():  # elsewhere an error message stays the only line
         say(f"echoes of {settings.data.store or (settings.scene and settings.scene.name)}")
     if settings.data.store is None and settings.poses.count >= MANY and workers != 1:
         from sononerf.simulation.processes import begin

@@ -292,7 +292,7 @@ def _take_shards(store: EnsembleStore, path: Path) -> None:
     for folder in sorted(path.parent.glob(f"{glob.escape(path.name)}{SHARD}*")):
         shard = EnsembleStore.open(folder)
         there = set(range(len(shard))) - set(shard.missing())
-        if not there:  # it was stopped before it had anything
+        if not there:  # it was stopped before its first pose
             continue
         rays = shard.attributes.get("rays")
         for key, known in (

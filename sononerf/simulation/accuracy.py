@@ -66,12 +66,12 @@ def settle_rays(
     chosen = np.unique(np.linspace(0, len(poses) - 1, POSES).round().astype(int))
     some = Poses(poses.positions[chosen], poses.rotations[chosen])
     tracer.rays = FIRST
-    trials: list[float] = []  # what the error would be with one ray
+    trials: list[float] = []  # errors, scaled to one ray per pose
     while tracer.rays < MOST:
         with progress.task(f"trying {tracer.rays} rays per pose", 2 * len(chosen)) as task:
             found = max(_difference(simulator, some, task, workers), LEAST_DB)
         trials.append(found * tracer.rays**CONVERGENCE)
-        # A few poses tell it with a tenth of error or more; all trials together are more certain.
+        # A trial of so few poses is uncertain by a tenth or more, so all trials are averaged.
         error = float(np.exp(np.mean(np.log(trials)))) / tracer.rays**CONVERGENCE
         if error <= options.accuracy_db:
             progress.say(f"echoes: {tracer.rays} rays per pose, {error:.2g} dB between two seeds")

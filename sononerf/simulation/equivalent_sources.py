@@ -71,8 +71,8 @@ class Sources(Solved):
         \frac{e^{-j k |x_i - y_j|}}{4 \pi |x_i - y_j|} = -\partial_n p_{in}(x_i)
 
     with :math:`\nu_j` the normal of the surface above and :math:`\beta` a tenth, ``DIPOLE``.
-    Point sources without dipoles make no unique field where the inside of the sources resonates
-    [2]_: the response rings at these frequencies.
+    Without dipoles the solution is not unique at the resonances of the volume that the sources
+    enclose [2]_, and the response rings at these frequencies.
 
     The error is measured at further points of the surface. Bodies with sharp edges, such as a box,
     have a large error, and bodies thinner than about three distances between sources cannot be

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Imported by the process that workers are forked from: what they compile is ready in each."""
+"""Imported by the process that workers are forked from, so that each has all compiled loops."""
 
 from __future__ import annotations
 

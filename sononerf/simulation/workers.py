@@ -167,7 +167,7 @@ def _become(simulator: Simulator) -> None:
 
 
 def _stop(number: int, frame: FrameType | None) -> None:
-    """End this process, but not in the middle of an answer: half of one would be waited for."""
+    """End this process, but let it finish an answer: the receiver would wait for the other half."""
     global _stopped
     del number, frame
     if _tracing:
