@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
+import threading
+from collections.abc import Iterator
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -14,7 +15,7 @@ import trimesh
 from scipy.spatial import cKDTree
 from trimesh.registration import procrustes
 
-from sononerf.array_types import Floats
+from sononerf.array_types import Floats, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import NumericalError
 from sononerf.evaluation.baseline import backprojection, best_level_surface, voxel_fit
@@ -207,23 +208,29 @@ class Truth:
         return {**found, "level": level}
 
 
-def baselines(
-    pool: Executor, echoes: Echoes, lower: Floats, upper: Floats
-) -> Iterator[tuple[str, Volume]]:
-    """Begin what needs no learning, backprojection and voxel fit; yield names and volumes.
+def baseline_volume(
+    name: str, echoes: Echoes, lower: Floats, upper: Floats, stop: threading.Event
+) -> Volume:
+    """Compute what needs no learning: backprojection or a voxel fit of the training poses.
 
     Args:
-        pool: Where they are computed meanwhile.
-        echoes: Whose training poses are used.
+        name: Of ``BASELINES``.
+        echoes: Measured spectrograms; they are read one after the other.
         lower, upper ((3,), m): Corners of the region.
+        stop: Ends it early when set.
+
+    Raises:
+        CancelledError: If it was ended early.
     """
     store = echoes.store
     train = store.indices("train")
     poses = Poses(echoes.positions[train], echoes.rotations[train])
+
+    def heard() -> Iterator[Singles]:
+        for index in train:
+            if stop.is_set():
+                raise CancelledError
+            yield store.read_pose(int(index))
+
     spacing = float((upper - lower).max()) / BASELINE_VOXELS
-
-    def volume(baseline: Callable[..., Volume]) -> Volume:
-        heard = (store.read_pose(int(index)) for index in train)
-        return baseline(heard, poses, echoes.head, lower, upper, spacing)
-
-    return zip(BASELINES, pool.map(volume, BASELINES.values()), strict=True)
+    return BASELINES[name](heard(), poses, echoes.head, lower, upper, spacing)

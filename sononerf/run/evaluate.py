@@ -3,16 +3,104 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from concurrent.futures import Future, ThreadPoolExecutor
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import trimesh
+
 from sononerf import storage
-from sononerf.evaluation.geometry import BASELINES, Kind, Truth, baselines
+from sononerf.evaluation.geometry import BASELINES, Kind, Truth, baseline_volume
 from sononerf.progress import Progress
 from sononerf.run.build import read_truth, true_scene
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
+from sononerf.scene.scene import Scene
+from sononerf.surface.start.volume import Volume
+
+
+class Evaluation:
+    """An evaluation in other threads, beside other stages; a context that ends them.
+
+    The baselines need no surface: they begin at once.
+
+    Args:
+        run: A fitted run.
+        truth: File of the true surface; ``evaluation.truth`` of the run's settings where None, or
+            else the surface of its scene.
+        registration: What lays the reconstruction over the truth; ``evaluation.registration`` where
+            None.
+    """
+
+    def __init__(
+        self, run: RunFolder, truth: Path | None = None, registration: Kind | None = None
+    ) -> None:
+        settings = run.fitted.settings
+        self._run = run
+        self._file = truth or settings.evaluation.truth
+        self._kind: Kind = registration or settings.evaluation.registration
+        self._stop = threading.Event()
+        self._pool = ThreadPoolExecutor(len(BASELINES))
+        self._volumes = {name: self._pool.submit(self._volume, name) for name in BASELINES}
+        self._parts: dict[str, Future[dict[str, Any] | None]] = {}
+
+    def __enter__(self) -> Evaluation:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._stop.set()
+        self._pool.shutdown(cancel_futures=True)
+
+    def begin(self) -> None:
+        """Begin what needs the reconstructed surface; the run has it."""
+        laid = self._pool.submit(self._laid)
+        # A thread takes tasks in their order, so that none waits for one that is not yet taken.
+        self._parts["geometry"] = self._pool.submit(self._geometry, laid)
+        for name in BASELINES:
+            self._parts[name] = self._pool.submit(self._baseline, laid, name)
+
+    def result(self, progress: Progress) -> tuple[dict[str, Any] | None, dict[str, Any]]:
+        """Wait for the metrics of the surface and those of each baseline; None without a truth."""
+        with progress.task("evaluating", len(self._parts)) as task:
+            found = {}
+            for name, part in self._parts.items():
+                found[name] = part.result()
+                task.advance()
+        return found.pop("geometry"), found
+
+    @cached_property
+    def _scene(self) -> Scene | None:
+        return None if self._file else true_scene(self._run.fitted.settings)
+
+    @cached_property
+    def _truth(self) -> trimesh.Trimesh | None:
+        if self._file:
+            return read_truth(self._file)
+        return None if self._scene is None else self._scene.mesh
+
+    def _volume(self, name: str) -> Volume | None:
+        if self._truth is None:
+            return None
+        lower, upper = (c.double().numpy() for c in self._run.fitted.module.field.region)
+        return baseline_volume(name, self._run.echoes, lower, upper, self._stop)
+
+    def _laid(self) -> Truth | None:
+        if self._truth is None:
+            return None
+        return Truth(self._truth, self._run.mesh(), self._kind)
+
+    def _geometry(self, laid: Future[Truth | None]) -> dict[str, Any] | None:
+        truth = laid.result()
+        if truth is None:
+            return None
+        level = storage.read_json(self._run.reconstruction / "read_out.json")["level"]
+        return {**truth.of_reconstruction(self._scene), "level": level}
+
+    def _baseline(self, laid: Future[Truth | None], name: str) -> dict[str, Any] | None:
+        truth, volume = laid.result(), self._volumes[name].result()
+        return None if truth is None or volume is None else truth.of_volume(volume)
 
 
 def evaluate(
@@ -20,6 +108,7 @@ def evaluate(
     *,
     truth: Path | None = None,
     registration: Kind | None = None,
+    begun: Evaluation | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Compare a reconstruction with the true surface, and the baselines likewise.
@@ -28,10 +117,8 @@ def evaluate(
 
     Args:
         run: A run that was reconstructed.
-        truth: File of the true surface; ``evaluation.truth`` of the run's settings where None, or
-            else the surface of its scene.
-        registration: What lays the reconstruction over the truth; ``evaluation.registration`` where
-            None.
+        truth, registration: As of :class:`Evaluation`.
+        begun: An evaluation of this run that goes on already.
         progress: Where to show it.
 
     Returns:
@@ -42,31 +129,15 @@ def evaluate(
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder.of(run)
-    fitted = run.fitted
-    settings = fitted.settings
     with run.locked():
-        if not (run.reconstruction / "mesh.ply").is_file():
-            reconstruct(run, progress=progress)
-        file = truth or settings.evaluation.truth
-        scene = true_scene(settings) if file is None else None
-        true = read_truth(file) if file is not None else None if scene is None else scene.mesh
-        geometry: dict[str, Any] | None = None
-        baseline: dict[str, Any] = {"backprojection": None, "voxels": None}
-        if true is not None:
-            corners = (corner.double().numpy() for corner in fitted.module.field.region)
-            with (
-                progress.task("evaluating", 1 + len(BASELINES)) as task,
-                ThreadPoolExecutor(len(BASELINES)) as pool,
-            ):
-                volumes = baselines(pool, run.echoes, *corners)
-                kind = registration or settings.evaluation.registration
-                level = storage.read_json(run.reconstruction / "read_out.json")["level"]
-                laid = Truth(true, run.mesh(), kind)
-                geometry = {**laid.of_reconstruction(scene), "level": level}
-                task.advance()
-                for name, volume in volumes:
-                    baseline[name] = laid.of_volume(volume)
-                    task.advance()
+        if begun is None:
+            with Evaluation(run, truth, registration) as work:
+                if not (run.reconstruction / "mesh.ply").is_file():
+                    reconstruct(run, progress=progress)
+                work.begin()
+                geometry, baseline = work.result(progress)
+        else:
+            geometry, baseline = begun.result(progress)
         run.write_metrics("geometry", geometry)
         run.write_metrics("baseline", baseline)
     return run.read_metrics()

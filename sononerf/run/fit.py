@@ -6,6 +6,7 @@ from __future__ import annotations
 import resource
 import sys
 import time
+from contextlib import ExitStack
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ from sononerf.field.fitting import FittedField, require_accelerator
 from sononerf.field.fitting import fit as fit_field
 from sononerf.progress import Progress
 from sononerf.run.build import head_of, with_store
-from sononerf.run.evaluate import evaluate
+from sononerf.run.evaluate import Evaluation, evaluate
 from sononerf.run.model import check_plugins, data_for, field_and_renderer, module_for, region_of
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
@@ -64,10 +65,15 @@ def finish(
     run = RunFolder.of(run)
     shown: dict[str, Any] = {"accelerator": accelerator, "progress": progress}
     no_surface: NumericalError | None = None
-    with run.locked():
+    with run.locked(), ExitStack() as stack:
+        evaluation = None
+        if not run.is_done("evaluation"):
+            evaluation = stack.enter_context(Evaluation(run))
         try:
             if not run.is_done("surface"):
                 reconstruct(run, **shown)
+            if evaluation is not None:
+                evaluation.begin()
             if not run.is_done("traced"):
                 _learn_traced(run, accelerator, progress)
         except NumericalError as error:
@@ -77,7 +83,7 @@ def finish(
         if no_surface is not None:
             raise no_surface
         if not run.is_done("evaluation"):
-            evaluate(run, progress=progress)
+            evaluate(run, begun=evaluation, progress=progress)
     return run.read_metrics()
 
 

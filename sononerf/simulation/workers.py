@@ -4,17 +4,11 @@
 from __future__ import annotations
 
 import logging
-import multiprocessing
-import os
-import signal
-import threading
 import warnings
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from contextlib import ExitStack, contextmanager
-from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from sononerf.array_types import Floats, Singles
@@ -22,7 +16,7 @@ from sononerf.errors import ResourceError, SettingsError, SonoNerfError
 from sononerf.geometry.poses import Poses
 from sononerf.memory import available_cores
 from sononerf.simulation.hybrid import tracer_of
-from sononerf.simulation.processes import process_context, starting_workers
+from sononerf.simulation.pool import QUEUED, SENT_AGAIN, TaskError, computed, fault_of
 from sononerf.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -33,14 +27,8 @@ logger = logging.getLogger("sononerf")
 MOST_WORKERS = 8
 WORTH_RAYS = 250_000
 """Rays of all poses from which other processes save time: fewer are traced before these start."""
-WORTH_POSES = 64
-"""Poses from which other processes save time if the engine traces no rays."""
-QUEUED_PER_WORKER = 4
-"""Poses that are sent per worker before results are taken. More would only fill the memory."""
-SENT_AGAIN = 3
-"""Times that a pose is sent again after its worker died. Dask tries four workers each time."""
-ANSWER_SECONDS = 1.0
-"""Time that a worker that is stopped has to finish an answer, s; it takes some milliseconds."""
+RAYS_FOR_OTHERS = 4_000
+"""What a pose counts if its engine traces no rays: 63 poses save time then."""
 CONNECT_SECONDS = 30
 """Time to wait for a Dask scheduler, s; across a network it answers in one."""
 PATIENCE_SECONDS = 10
@@ -49,6 +37,11 @@ PATIENCE_SECONDS = 10
 Results = Generator[tuple[int, Singles], None, None]
 SeedOf = Callable[[int], int]
 """Gives the seed of a pose by its index."""
+
+
+def useful_workers(poses: int, rays: int) -> int:
+    """Return how many processes simulate so many poses soonest; one means this process."""
+    return min(available_cores(), MOST_WORKERS) if poses * rays >= WORTH_RAYS else 1
 
 
 def simulated(
@@ -74,10 +67,8 @@ def simulated(
     engine = simulator.engine
     if workers is None:
         tracer = tracer_of(engine)
-        count = len(indices)
-        pays = count >= WORTH_POSES if tracer is None else count * tracer.rays >= WORTH_RAYS
-        alone = engine.prepares or not pays
-        workers = 1 if alone else min(available_cores(), MOST_WORKERS)
+        rays = RAYS_FOR_OTHERS if tracer is None else tracer.rays
+        workers = 1 if engine.prepares else useful_workers(len(indices), rays)
     if engine.prepares and (scheduler is not None or workers > 1):
         logger.warning(
             "%s solves for all poses at once, in this process; workers and scheduler are not used",
@@ -100,7 +91,7 @@ def in_this_process(
         try:
             spectrogram = _one(simulator, *_pose(poses, index), seed_of(index))
         except Exception as error:
-            raise _failed(index, error) from error
+            raise _failed(index, fault_of(error)) from error
         yield index, spectrogram
 
 
@@ -109,85 +100,14 @@ def in_processes(
 ) -> Results:
     """Simulate poses in other processes of this machine; they come in any order.
 
-    If a worker is killed, the poses that were being simulated are sent again.
-
     Raises:
         ResourceError: If the workers of a pose die again and again.
     """
-    left, lost = deque(indices), Counter[int]()
-    while left:
-        running: dict[Future[Singles], int] = {}
-        # After a death no pose waits at a worker, so that few are blamed for the next one.
-        most = workers if lost else QUEUED_PER_WORKER * workers
-        with _pool(simulator, workers) as pool:
-            try:
-                while left or running:
-                    while left and len(running) < most:
-                        task = _pose(poses, left[0]), seed_of(left[0])
-                        with starting_workers():
-                            running[pool.submit(_mine, *task)] = left[0]
-                        left.popleft()
-                    for future in wait(running, return_when=FIRST_COMPLETED).done:
-                        try:
-                            spectrogram = future.result()
-                        except BrokenProcessPool:
-                            raise
-                        except Exception as error:
-                            raise _failed(running[future], error) from error
-                        yield running.pop(future), spectrogram
-            except BrokenProcessPool as error:
-                again = sorted(running.values())
-                lost.update(again)
-                if max(lost.values()) > SENT_AGAIN:
-                    named = ", ".join(str(i) for i in again if lost[i] > SENT_AGAIN)
-                    raise ResourceError(
-                        f"pose {named}: every worker that took it was killed; give workers more "
-                        "memory, or start fewer; the same command goes on with what is missing"
-                    ) from error
-                left.extendleft(reversed(again))
-
-
-_simulator: Simulator | None = None
-_tracing, _stopped = False, False
-
-
-def _become(simulator: Simulator) -> None:
-    """Make this process a worker; it ends if the process that started it ends."""
-    global _simulator
-    _simulator = simulator
-    signal.signal(signal.SIGTERM, _stop)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        parent.join()
-        os._exit(1)
-
-    threading.Thread(target=follow, daemon=True).start()
-
-
-def _stop(number: int, frame: FrameType | None) -> None:
-    """End this process, but let it finish an answer: the receiver would wait for the other half."""
-    global _stopped
-    del number, frame
-    if _tracing:
-        os._exit(1)
-    _stopped = True
-    later = threading.Timer(ANSWER_SECONDS, os._exit, (1,))
-    later.daemon = True
-    later.start()
-
-
-def _mine(pose: tuple[Floats, Floats], seed: int) -> Singles:
-    global _tracing
-    assert _simulator is not None
-    _tracing = True
-    if _stopped:
-        os._exit(1)
+    tasks = {index: (*_pose(poses, index), seed_of(index)) for index in indices}
     try:
-        return _one(_simulator, *pose, seed)
-    finally:
-        _tracing = False
+        yield from computed(_one, simulator, tasks, workers)
+    except TaskError as error:
+        raise _failed(error.number, str(error)) from error
 
 
 def _one(simulator: Simulator, position: Floats, rotation: Floats, seed: int) -> Singles:
@@ -198,24 +118,8 @@ def _pose(poses: Poses, index: int) -> tuple[Floats, Floats]:
     return poses.positions[index], poses.rotations[index]
 
 
-def _failed(index: int, error: BaseException) -> SonoNerfError:
-    text = " ".join(str(error).split())
-    return SonoNerfError(f"pose {index} cannot be simulated: {type(error).__name__}: {text}")
-
-
-@contextmanager
-def _pool(simulator: Simulator, workers: int) -> Iterator[ProcessPoolExecutor]:
-    """Open a pool of processes. If the block fails, they are terminated."""
-    others = set(multiprocessing.active_children())
-    pool = ProcessPoolExecutor(workers, process_context(), _become, (simulator,))
-    try:
-        yield pool
-    except BaseException:
-        pool.shutdown(wait=False, cancel_futures=True)
-        for child in set(multiprocessing.active_children()) - others:
-            child.terminate()
-        raise
-    pool.shutdown()
+def _failed(index: int, text: str) -> SonoNerfError:
+    return SonoNerfError(f"pose {index} cannot be simulated: {text}")
 
 
 def on_cluster(
@@ -234,7 +138,7 @@ def on_cluster(
         while left or running:
             # Workers come and go.
             threads = _threads(client)
-            while left and len(running) < QUEUED_PER_WORKER * max(1, threads):
+            while left and len(running) < QUEUED * max(1, threads):
                 index = left.popleft()
                 task = *_pose(poses, index), seed_of(index)
                 running[executor.submit(_one, sent, *task)] = index
@@ -250,7 +154,7 @@ def on_cluster(
                     raise _unreachable(error) from error
                 except Exception as error:
                     if type(error).__name__ != "KilledWorker":
-                        raise _failed(index, error) from error
+                        raise _failed(index, fault_of(error)) from error
                     # A pose is blamed only after repeated deaths of its workers.
                     lost[index] += 1
                     if lost[index] > SENT_AGAIN:

@@ -46,7 +46,7 @@ class Plain:
             pass
 
 
-@pytest.mark.parametrize(("poses", "processes"), [(63, 1), (64, 3)])
+@pytest.mark.parametrize(("poses", "processes"), [(62, 1), (63, 3)])
 def test_many_poses_without_rays_are_simulated_in_other_processes(monkeypatch, poses, processes):
     monkeypatch.setattr(workers, "available_cores", lambda: 3)
     monkeypatch.setattr(workers, "in_processes", lambda *given: given[-1])

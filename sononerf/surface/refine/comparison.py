@@ -13,10 +13,10 @@ from sononerf.array_types import Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.surface.refine.descent import ONSETS
-from sononerf.surface.refine.later_bounces import Tracer
 from sononerf.surface.refine.objective import FLOOR_DB, Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.remesh import finer
+from sononerf.surface.refine.tracer import Tracer
 
 ASKED = 24
 """At most so many validation poses compare surfaces."""

@@ -67,7 +67,6 @@ class Correction:
         self._kept: dict[int, tuple[Tensor, Tensor]] = {}
         places = np.asarray(echoes.positions[numbers], dtype=np.float64)
         turns = np.asarray(echoes.rotations[numbers], dtype=np.float64)
-        simulator.engine.prepare(places, turns)
         heard = spectrograms(simulator, places, turns, seed=seed)
         self._simulated = dict(zip(numbers.tolist(), torch.as_tensor(heard), strict=True))
 

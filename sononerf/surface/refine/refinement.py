@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 from collections.abc import Callable, Iterable, Mapping
@@ -20,7 +21,14 @@ from sononerf.errors import SonoNerfError
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.comparison import Comparison
 from sononerf.surface.refine.correction import Correction
-from sononerf.surface.refine.descent import SHARP, STAGES, Descent, Stage, poses_that_hear
+from sononerf.surface.refine.descent import (
+    POSES,
+    SHARP,
+    STAGES,
+    Descent,
+    Stage,
+    poses_that_hear,
+)
 from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.objective import Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
@@ -260,6 +268,7 @@ class Refinement:
         elif stage.beyond == "trace" or self._later is None:
             source = self.candidates[self._source]
             self._later = LaterBounces(self.optics, source, self.echoes, seed=self.seed)
+            self._later.trace(self._coming())
         return Descent(
             mesh,
             self.echoes,
@@ -274,6 +283,18 @@ class Refinement:
             sheet=self.way == "sheet",
             seed=self.seed,
         )
+
+    def _coming(self) -> list[int]:
+        """Return the poses of all steps that later bounces of the present surface are added to."""
+        steps = self.stages[self.stage].steps - self.step
+        for stage in itertools.takewhile(
+            lambda stage: stage.beyond == "keep", self.stages[self.stage + 1 :]
+        ):
+            steps += stage.steps
+        drawn = [
+            self.echoes.batch(self.seed, self.drawn + step, POSES).tolist() for step in range(steps)
+        ]
+        return sorted(set(itertools.chain.from_iterable(drawn)))
 
     def _correction(self, mesh: trimesh.Trimesh) -> Correction | None:
         """Return the correction on a surface; None where it cannot be simulated."""

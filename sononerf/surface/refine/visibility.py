@@ -76,16 +76,15 @@ def _candidates(
     heads: tuple[Tensor, Tensor, Tensor],
 ) -> tuple[Tensor, Tensor]:
     """Which poses could hear which vertices (Q,), (Q,), if nothing stood in between."""
-    found = []
-    for number, (emitter, places) in enumerate(zip(heads[0], heads[1], strict=True)):
-        middle = places.mean(0)
-        towards = 0.5 * (emitter + middle)
-        some = torch.nonzero(((towards - points) * area).sum(1) > 0.0)[:, 0]
-        exponent = optics.near_mirror(points[some], area[some], bending[some], emitter, middle)[4]
-        some = some[exponent < SILENT]
-        found.append((torch.full_like(some, number), some))
-    pose, vertex = zip(*found, strict=True)
-    return torch.cat(pose), torch.cat(vertex)
+    emitters, middles = heads[0], heads[1].mean(1)
+    towards = 0.5 * (emitters + middles)
+    facing = towards @ area.T > (points * area).sum(1)
+    pose, vertex = torch.nonzero(facing, as_tuple=True)
+    exponent = optics.near_mirror(
+        points[vertex], area[vertex], bending[vertex], emitters[pose], middles[pose]
+    )[4]
+    heard = exponent < SILENT
+    return pose[heard], vertex[heard]
 
 
 def _visible(

@@ -5,8 +5,8 @@ import numpy as np
 import torch
 import trimesh
 
-from sononerf.surface.refine.later_bounces import Tracer
 from sononerf.surface.refine.optics import Heard
+from sononerf.surface.refine.tracer import Tracer
 from tests.surface.conftest import RADIUS
 
 

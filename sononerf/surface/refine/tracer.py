@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: MIT
+"""The simulator's rays on the current surface; without torch, which workers need not import."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from sononerf.array_types import Floats, Ints, Singles
+from sononerf.settings.schema import SimulationSettings
+from sononerf.simulation.ensemble import spectrograms
+from sononerf.simulation.rays import Rays
+from sononerf.simulation.simulator import Simulator, quiet_scene
+
+if TYPE_CHECKING:
+    from sononerf.surface.refine.optics import Optics
+
+BOUNCES = 3
+"""As the simulator's default; what comes later is faint."""
+LATER_RAYS = 4_000
+"""Per pose, of the later bounces; only their power is used."""
+FAINT = 3e-3
+"""Echoes below this part of the strongest are left out: 50 dB."""
+
+
+@dataclass(frozen=True, eq=False)
+class Later:
+    """Echoes of one pose after the first bounce.
+
+    Attributes:
+        ear (N,): Which ear hears it.
+        delay ((N,), s): From the emission.
+        weight ((N, F) float32): Strength at the nodes that the optics keep, with spread and
+            absorption.
+    """
+
+    ear: Ints
+    delay: Floats
+    weight: Singles
+
+
+class Tracer:
+    """The simulator's rays on a surface.
+
+    Args:
+        optics: Head, air, call and analysis.
+        mesh: The surface, m.
+        rays: Per pose.
+        seed: Of the pattern of rays.
+    """
+
+    def __init__(self, optics: Optics, mesh: trimesh.Trimesh, *, rays: int, seed: int) -> None:
+        wanted = SimulationSettings(
+            engine="rays",
+            rays=rays,
+            bounces=BOUNCES,
+            diffraction_points=max(rays // 30, 1),  # as many as the simulator's defaults have
+        )
+        self._simulator = Simulator.of(quiet_scene(mesh), optics.head, wanted)
+        self._nodes, self._seed = _Nodes.of(optics), seed
+
+    def spectrograms(self, positions: Floats, rotations: Floats) -> Singles:
+        """Magnitude that poses hear, (P, E, R, F)."""
+        return spectrograms(self._simulator, positions, rotations, seed=self._seed)
+
+    def later(self, position: Floats, rotation: Floats) -> Later:
+        """Return what a pose hears after the first bounce."""
+        found, engine = _Collected(self._nodes), self._simulator.engine
+        assert isinstance(engine, Rays)
+        engine.later(found, position, rotation, seed=self._seed)
+        return found.whole()
+
+
+@dataclass(frozen=True, eq=False)
+class _Nodes:
+    """The nodes that an optics keeps (N,), wave numbers (N,) and decay (N,) there, and c."""
+
+    kept: Ints
+    wavenumber: Floats
+    decay: Floats
+    speed: float
+
+    @classmethod
+    def of(cls, optics: Optics) -> _Nodes:
+        k, decay = (optics.get_buffer(name).cpu().numpy() for name in ("wavenumber", "decay"))
+        return cls(optics.kept_nodes, k, decay, optics.speed_of_sound)
+
+
+class _Collected:
+    """Keeps echoes with what spread and air leave of them."""
+
+    def __init__(self, nodes: _Nodes) -> None:
+        self._nodes = nodes
+        self._parts: list[tuple[NDArray[Any], ...]] = []
+
+    def add(
+        self, ear: int, delay: NDArray[Any], spread: NDArray[Any], strength: NDArray[Any]
+    ) -> None:
+        """Take echoes: delay (N,) s, spread (N,) s, strength (N, F)."""
+        nodes = self._nodes
+        loss = np.multiply.outer(0.5 * (spread * nodes.speed) ** 2, nodes.wavenumber**2)
+        loss += np.multiply.outer(delay * nodes.speed, nodes.decay)
+        weight = strength[:, nodes.kept] * np.exp(-loss)
+        self._parts.append((np.full(len(delay), ear), delay, weight.astype(np.float32)))
+
+    def whole(self) -> Later:
+        """Return them all but the faintest."""
+        if not self._parts:
+            nodes = len(self._nodes.kept)
+            return Later(np.zeros(0, np.int64), np.zeros(0), np.zeros((0, nodes), np.float32))
+        ear, delay, weight = (np.concatenate(parts) for parts in zip(*self._parts, strict=True))
+        loud = weight.max(axis=1)
+        kept = loud > FAINT * loud.max(initial=0.0)
+        return Later(ear[kept], delay[kept], weight[kept])
