@@ -59,6 +59,6 @@ def test_a_worker_that_is_killed_in_the_middle_of_an_answer_keeps_nobody_waiting
 
 
 def test_an_object_that_workers_cannot_make_is_told_in_one_line():
-    with pytest.raises(TaskError, match="^ImportError: no module of this name$"):
+    with pytest.raises(TaskError, match=r"^ImportError: no module of this name$"):
         list(computed(remembered, Elsewhere(), TASKS, 2))
     assert set(dict(computed(remembered, "other", TASKS, 2)).values()) == {"other"}
