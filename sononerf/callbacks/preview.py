@@ -11,10 +11,10 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from sononerf import storage
-from sononerf.callbacks.epoch import EpochCallback
+from sononerf.callbacks.epoch import echo_module
 from sononerf.errors import NumericalError
 from sononerf.field.datamodule import WholePoses
-from sononerf.field.module import EchoModule, decibels
+from sononerf.field.module import decibels
 from sononerf.report.mesh_files import mesh_bytes
 from sononerf.report.pictures.figure import png_from_pixels
 from sononerf.report.pictures.mip_picture import maximum_intensity_projections, mip_image
@@ -23,7 +23,7 @@ from sononerf.surface.start.read_out import energy_volume
 from sononerf.surface.start.volume import automatic_level, isosurface
 
 
-class PreviewCallback(EpochCallback):
+class PreviewCallback(lightning.Callback):
     """Writes ``epochs/0001/`` and shows the projections in TensorBoard.
 
     Args:
@@ -39,8 +39,11 @@ class PreviewCallback(EpochCallback):
         self.voxels = voxels
         self.directions = directions
 
-    def on_epoch(self, trainer: lightning.Trainer, module: EchoModule, epoch: int) -> None:
+    def on_train_epoch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
         """Read the field out coarsely and write what is seen."""
+        module, epoch = echo_module(pl_module), trainer.current_epoch + 1
         if epoch % self.every_epochs or not trainer.is_global_zero:
             return
         target = self.folder / "epochs" / f"{epoch:04d}"
@@ -80,7 +83,7 @@ SHARE = 0.05
 """Part of the time that drawing may take; short epochs may go without a picture, but the last."""
 
 
-class SpectrogramImages(EpochCallback):
+class SpectrogramImages(lightning.Callback):
     """Shows the first validation pose.
 
     Args:
@@ -96,15 +99,17 @@ class SpectrogramImages(EpochCallback):
         self.frequency_hz = frequency_hz.double().numpy()
         self.next_at = 0.0  # of the monotonic clock, s
 
-    def on_epoch(self, trainer: lightning.Trainer, module: EchoModule, epoch: int) -> None:
+    def on_train_epoch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
         """Render one pose and show it."""
-        del epoch
+        module = echo_module(pl_module)
         if not trainer.is_global_zero or not isinstance(trainer.logger, TensorBoardLogger):
             return
         if not len(self.poses):
             return
         started = time.monotonic()
-        if started < self.next_at and module.global_step < trainer.max_steps:
+        if started < self.next_at and module.global_step < module.total_steps:
             return
         batch = trainer.strategy.batch_to_device(self.poses[0])
         was_training = module.training

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, Literal, NamedTuple
 
 import lightning
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import SettingsError
@@ -232,17 +232,45 @@ class WholePoses(Dataset[RangeSlices]):
         )
 
 
-class StepSampler(Sampler[int]):
-    """Counts steps without end; ``start`` is where an interrupted fit goes on."""
+LEAST_STEPS = 60
+"""Least steps of an epoch: few poses give a shorter pass, and an epoch is then several passes."""
 
-    def __init__(self) -> None:
-        self.start = 0
+
+class EpochSampler(DistributedSampler[int]):
+    """The numbers of an epoch's batches; it begins at the step that the trainer has reached.
+
+    A batch is a function of its number, so a fit that goes on from a checkpoint in the middle of an
+    epoch meets the batches that are left. Each device gets its share of each batch from the
+    stream: as a ``DistributedSampler`` this one is not replaced by Lightning.
+
+    Args:
+        steps: Of an epoch.
+        done: Returns how many steps were done, in all epochs.
+    """
+
+    def __init__(self, steps: int, done: Callable[[], int]) -> None:
+        self.steps, self.done = steps, done
+
+    def set_epoch(self, epoch: int) -> None:
+        """Do nothing: the step says it all."""
+
+    def __len__(self) -> int:
+        return self.steps
 
     def __iter__(self) -> Iterator[int]:
-        step = self.start
-        while True:
-            yield step
-            step += 1
+        first = self.done()
+        return iter(range(first, (first // self.steps + 1) * self.steps))
+
+
+class EpochLoader(DataLoader[RangeSlices]):
+    """Loads the batches of an :class:`EpochSampler`, which needs no state to go on."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return nothing; that it is there tells Lightning that an epoch can go on."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Do nothing."""
 
 
 class EchoDataModule(lightning.LightningDataModule):
@@ -258,6 +286,8 @@ class EchoDataModule(lightning.LightningDataModule):
         memory_bytes: How much of the ensemble may be kept in memory.
         silent_share, silent_below: Which part of the silent slices is met, and what magnitude no
             cell of these reaches.
+        steps_per_epoch: Where None, as many as meet every pose or slice once, and ``LEAST_STEPS``
+            at least.
     """
 
     def __init__(
@@ -272,6 +302,7 @@ class EchoDataModule(lightning.LightningDataModule):
         memory_bytes: int = 2_000_000_000,
         silent_share: float = 1.0,
         silent_below: float = 0.0,
+        steps_per_epoch: int | None = None,
     ) -> None:
         super().__init__()
         self.store = store
@@ -283,7 +314,17 @@ class EchoDataModule(lightning.LightningDataModule):
         self.memory_bytes = memory_bytes
         self.silent_share = silent_share
         self.silent_below = silent_below
-        self.sampler = StepSampler()
+        self._steps = steps_per_epoch
+
+    @property
+    def steps_per_epoch(self) -> int:
+        """Training batches of an epoch."""
+        return self._epoch_of(self.stream())
+
+    def _epoch_of(self, stream: SliceStream) -> int:
+        steps = self._steps or max(stream.batches_per_pass, LEAST_STEPS)
+        most = -1 if self.trainer is None else self.trainer.max_steps
+        return steps if most < 0 else min(steps, max(most, 1))
 
     def stream(self) -> SliceStream:
         """Return this device's share of the training batches."""
@@ -322,32 +363,32 @@ class EchoDataModule(lightning.LightningDataModule):
             return batch
         return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
-    def _loader(
-        self, dataset: SliceStream | WholePoses, sampler: Sampler[int] | None
-    ) -> DataLoader[RangeSlices]:
-        endless = sampler is not None
-        return DataLoader(
-            dataset,
-            batch_size=None,
-            sampler=sampler,
-            num_workers=self.workers if endless else 0,
-            # A forked child may hang on the store's threads.
-            multiprocessing_context="spawn" if self.workers and endless else None,
-            persistent_workers=bool(self.workers and endless),
-        )
-
     def train_dataloader(self) -> DataLoader[RangeSlices]:
-        """Return the endless stream of training batches."""
-        return self._loader(self.stream(), self.sampler)
+        """Return the training batches of an epoch."""
+        trainer = self.trainer
+
+        def done() -> int:
+            return 0 if trainer is None else trainer.global_step * trainer.accumulate_grad_batches
+
+        stream = self.stream()
+        return EpochLoader(
+            stream,
+            batch_size=None,
+            sampler=EpochSampler(self._epoch_of(stream), done),
+            num_workers=self.workers,
+            # A forked child may hang on the store's threads.
+            multiprocessing_context="spawn" if self.workers else None,
+            persistent_workers=self.workers > 0,
+        )
 
     def val_dataloader(self) -> DataLoader[RangeSlices] | list[DataLoader[RangeSlices]]:
         """Return the validation poses, or nothing where there are none."""
         whole = self.whole("val")
-        return self._loader(whole, None) if len(whole) else []
+        return DataLoader(whole, batch_size=None) if len(whole) else []
 
     def test_dataloader(self) -> DataLoader[RangeSlices]:
         """Return the test poses."""
-        return self._loader(self.whole("test"), None)
+        return DataLoader(self.whole("test"), batch_size=None)
 
     def predict_dataloader(self) -> DataLoader[RangeSlices]:
         """Return the test poses."""

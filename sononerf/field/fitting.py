@@ -52,10 +52,9 @@ def quiet_lightning() -> None:
         logging.getLogger(name).setLevel(logging.ERROR)
     for pattern in (
         r".*does not have many workers.*",  # the ensemble lies in memory
+        r".*is smaller than the logging interval.*",  # short epochs still log their last step
         r".*GPU available but not used.*",  # the user chose
-        r".*resumed from a checkpoint that ended before the epoch.*",  # ours go by the step
         r".*\.*Checkpoint directory .* exists and is not empty.*",
-        r".*`max_epochs` was not set.*",
         r".*treespec, LeafSpec.* is deprecated.*",  # Lightning's own call of torch
     ):
         warnings.filterwarnings("ignore", message=pattern)
@@ -80,6 +79,8 @@ def fit(
     *,
     callbacks: list[lightning.Callback],
     gradient_clip: float | None,
+    max_epochs: int,
+    max_steps: int | None = None,
     logger: Logger | None = None,
     folder: Path | None = None,
     checkpoint: Path | None = None,
@@ -87,7 +88,7 @@ def fit(
     devices: int | str = "auto",
     num_nodes: int = 1,
 ) -> FittedField:
-    """Fit a module to echoes for its number of steps; validate after each of its epochs.
+    """Fit a module to echoes; validate after each epoch.
 
     Args:
         echoes: What is fitted to.
@@ -95,6 +96,7 @@ def fit(
         data: Streams the echoes.
         callbacks: What happens around the fit.
         gradient_clip: Largest norm of a gradient; not limited where None.
+        max_epochs, max_steps: The fit ends at the smaller of both.
         logger: Where scalars and pictures go.
         folder: Where Lightning and its callbacks write by default.
         checkpoint: Where the fit goes on; from the beginning where None.
@@ -108,10 +110,8 @@ def fit(
         accelerator=accelerator,
         devices=devices,
         num_nodes=num_nodes,
-        max_epochs=-1,
-        max_steps=module.total_steps,
-        val_check_interval=module.steps_per_epoch,
-        check_val_every_n_epoch=None,
+        max_epochs=max_epochs,
+        max_steps=max_steps or -1,
         limit_val_batches=1.0 if len(echoes.store.indices("val")) else 0,
         num_sanity_val_steps=0,
         gradient_clip_val=gradient_clip,

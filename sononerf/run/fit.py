@@ -17,14 +17,13 @@ from lightning.fabric.utilities.rank_zero import rank_zero_only
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from sononerf import storage
-from sononerf.callbacks.epoch import CheckpointCallback, ProgressCallback, ThreadsCallback
+from sononerf.callbacks.epoch import CheckpointCallback, ProgressCallback
 from sononerf.callbacks.preview import PreviewCallback, SpectrogramImages
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.evaluation.traced import Traced, learn_traced
-from sononerf.field.checkpoint_io import DurableCheckpointIO, save_weights
-from sononerf.field.datamodule import EchoDataModule
+from sononerf.field.checkpoint_io import previous_of, save_weights
 from sononerf.field.fitting import FittedField, require_accelerator
 from sononerf.field.fitting import fit as fit_field
 from sononerf.progress import Progress
@@ -115,9 +114,6 @@ WAIT_SECONDS = 0.5
 PATIENCE_SECONDS = 120.0
 """How long other processes wait for the first one to take the run's folder, s. Importing torch from
 a slow network disk takes a minute."""
-LEAST_STEPS = 60
-"""Least steps of an epoch: few poses give a shorter pass, and an epoch is then several passes."""
-
 LINE = (
     "all training poses lie on a straight line: the echoes do not tell the angle around it, so the "
     "surface may be drawn out around the line; fly another way as well"
@@ -230,16 +226,6 @@ def fit(
     return run
 
 
-def _length(settings: Settings, per_pass: int) -> tuple[int, int]:
-    """Return steps per epoch and steps in all."""
-    steps = settings.fit.steps_per_epoch
-    per_epoch = max(per_pass, LEAST_STEPS) if steps == "auto" else steps
-    total = per_epoch * settings.fit.epochs
-    if settings.fit.max_steps is not None:
-        total = min(total, settings.fit.max_steps)
-    return min(per_epoch, total), total
-
-
 def _fit(
     settings: Settings,
     run: RunFolder,
@@ -255,17 +241,16 @@ def _fit(
         progress.say(LINE)
     field, renderer = field_and_renderer(settings, echoes.head, region)
     data = data_for(settings, echoes.store, renderer)
-    per_epoch, total = _length(settings, data.stream().batches_per_pass)
+    total = data.steps_per_epoch * settings.fit.epochs
+    total = min(total, settings.fit.max_steps or total)
     module = module_for(
         settings,
         field,
         renderer,
         reference=echoes.reference,
         possible=possible,
-        total_steps=total,
-        steps_per_epoch=per_epoch,
     )
-    resumed = _resume(run, data)
+    resumed = _can_resume(run)
     if not resumed and not follows():
         run.clear_previews()
     with progress.task("fitting", total) as task, keeper.watching():
@@ -275,7 +260,6 @@ def _fit(
             data,
             callbacks=[
                 ProgressCallback(task),
-                ThreadsCallback(),
                 PreviewCallback(
                     run.path,
                     every_epochs=settings.preview.every_epochs,
@@ -286,6 +270,8 @@ def _fit(
                 keeper,
             ],
             gradient_clip=settings.fit.gradient_clip,
+            max_epochs=settings.fit.epochs,
+            max_steps=settings.fit.max_steps,
             logger=TensorBoardLogger(run.path, name="tensorboard", version=""),
             folder=run.path,
             checkpoint=run.checkpoint if resumed else None,
@@ -302,13 +288,8 @@ def _fit(
         )
 
 
-def _resume(run: RunFolder, data: EchoDataModule) -> bool:
-    previous = run.checkpoint.with_name(f"{run.checkpoint.name}.previous")
-    if not run.checkpoint.is_file() and not previous.is_file():
-        return False
-    step = DurableCheckpointIO().load_checkpoint(run.checkpoint)["global_step"]
-    data.sampler.start = int(step)
-    return True
+def _can_resume(run: RunFolder) -> bool:
+    return run.checkpoint.is_file() or previous_of(run.checkpoint).is_file()
 
 
 def _keep(

@@ -94,6 +94,7 @@ def check_plugins(settings: Settings, head: Head) -> None:
 def data_for(settings: Settings, store: EnsembleStore, renderer: Renderer) -> EchoDataModule:
     """Return the LightningDataModule that streams an ensemble as a renderer wants it."""
     fit = settings.fit
+    steps = None if fit.steps_per_epoch == "auto" else fit.steps_per_epoch
     return EchoDataModule(
         store,
         whole_poses=renderer.whole_poses,
@@ -104,6 +105,7 @@ def data_for(settings: Settings, store: EnsembleStore, renderer: Renderer) -> Ec
         memory_bytes=settings.data.memory_bytes,
         silent_share=fit.silent_share,
         silent_below=float(store.attributes["reference"]) * (10 ** (ACTIVE_DB / 20) - 1),
+        steps_per_epoch=steps,
     )
 
 
@@ -114,8 +116,6 @@ def module_for(
     *,
     reference: float,
     possible: Possible | None = None,
-    total_steps: int = 1,
-    steps_per_epoch: int = 1,
 ) -> EchoModule:
     """Return the LightningModule around field and renderer."""
     fit = settings.fit
@@ -128,8 +128,6 @@ def module_for(
         early_share=fit.early_share,
         possible=possible,
         learning_rate=fit.learning_rate or field.learning_rate,
-        total_steps=total_steps,
-        steps_per_epoch=steps_per_epoch,
         schedule=fit.schedule,
         final_rate_factor=fit.final_rate_factor,
         staircase_factor=fit.staircase_factor,

@@ -43,7 +43,7 @@ def training(ensemble, tmp_path):
     """Make module, data and a trainer with callbacks; ``train`` runs them."""
     settings, path = ensemble
 
-    def make(*callbacks, validation=True, sanity=0, logger=False, start=0, steps=STEPS):
+    def make(*callbacks, validation=True, sanity=0, logger=False, steps=STEPS):
         quiet_lightning()
         store = EnsembleStore.open(path)
         head = head_of(settings)
@@ -53,17 +53,18 @@ def training(ensemble, tmp_path):
             *field_and_renderer(settings, head, region),
             reference=store.attributes["reference"],
             possible=possible,
-            total_steps=steps,
+        )
+        data = EchoDataModule(
+            store,
+            whole_poses=True,
+            batch=2,
+            batch_frequencies=2,
+            seed=0,
             steps_per_epoch=PER_EPOCH,
         )
-        data = EchoDataModule(store, whole_poses=True, batch=2, batch_frequencies=2, seed=0)
-        data.sampler.start = start
         trainer = lightning.Trainer(
             accelerator="cpu",
-            max_epochs=-1,
-            max_steps=steps,
-            val_check_interval=PER_EPOCH,
-            check_val_every_n_epoch=None,
+            max_epochs=steps // PER_EPOCH,
             limit_val_batches=1.0 if validation else 0,
             num_sanity_val_steps=sanity,
             logger=TensorBoardLogger(tmp_path, name="tensorboard", version="") if logger else False,

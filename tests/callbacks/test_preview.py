@@ -118,8 +118,9 @@ def test_other_faults_are_not_hidden(training, tmp_path, monkeypatch):
 def test_only_one_of_many_devices_writes(training, tmp_path):
     class Second:
         is_global_zero = False
+        current_epoch = 0
 
-    previews(tmp_path).on_epoch(Second(), training().module, 1)
+    previews(tmp_path).on_train_epoch_end(Second(), training().module)
     assert list(tmp_path.iterdir()) == []
 
 

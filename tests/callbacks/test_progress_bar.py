@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""Every step moves the bar, in epochs of ours."""
+"""Every step moves the bar."""
 
 from __future__ import annotations
 
-from sononerf.callbacks.epoch import EpochCallback, ProgressCallback
+import lightning
+
+from sononerf.callbacks.epoch import ProgressCallback
 
 
 class Task:
@@ -18,14 +20,14 @@ class Task:
             self.notes.append(note)
 
 
-class Save(EpochCallback):
+class Save(lightning.Callback):
     """Keeps the first epoch."""
 
     def __init__(self, path):
         self.path = path
 
-    def on_epoch(self, trainer, module, epoch):
-        if epoch == 1:
+    def on_train_epoch_end(self, trainer, pl_module):
+        if trainer.current_epoch == 0:
             trainer.save_checkpoint(self.path)
 
 
@@ -34,8 +36,8 @@ def test_a_count_per_step_and_the_error_behind_it(training):
     training(ProgressCallback(task)).train()
     assert task.done == 8
     assert [note.split(",")[0] for note in task.notes] == [
-        *["epoch 1 of 2"] * 3,
-        *["epoch 2 of 2"] * 5,
+        *["epoch 1 of 2"] * 4,
+        *["epoch 2 of 2"] * 4,
     ]
     assert "validation" not in task.notes[3]
     assert task.notes[4].startswith("epoch 2 of 2, validation ")
@@ -45,6 +47,6 @@ def test_a_count_per_step_and_the_error_behind_it(training):
 def test_a_resumed_fit_starts_where_it_stopped(training, tmp_path):
     training(Save(tmp_path / "c.ckpt")).train()
     task = Task()
-    training(ProgressCallback(task), start=4).train(tmp_path / "c.ckpt")
+    training(ProgressCallback(task)).train(tmp_path / "c.ckpt")
     assert task.done == 8
     assert len(task.notes) == 4

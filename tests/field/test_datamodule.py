@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from sononerf.echoes.store import EnsembleStore
-from sononerf.field.datamodule import EchoDataModule, StepSampler
+from sononerf.field.datamodule import EchoDataModule, EpochSampler
 
 POSES, RANGES, FREQUENCIES = 12, 5, 4
 SPLIT = np.array([0, 0, 1, 0, 2, 0, 0, 2, 0, 1, 0, 0])
@@ -68,17 +68,33 @@ def test_workers_change_nothing(store, whole):
 
 
 def test_an_interrupted_fit_goes_on_where_it_stopped(store):
-    whole = first(module(store).train_dataloader(), 9)
-    resumed = module(store)
-    resumed.sampler.start = 5
-    assert_same(first(resumed.train_dataloader(), 4), whole[5:])
+    whole = list(module(store, steps_per_epoch=9).train_dataloader())
+    resumed = module(store, steps_per_epoch=9)
+    resumed.trainer = SimpleNamespace(
+        global_rank=0, world_size=1, max_steps=-1, global_step=5, accumulate_grad_batches=1
+    )
+    assert_same(list(resumed.train_dataloader()), whole[5:])
 
 
-def test_the_sampler_counts_without_end():
-    sampler = StepSampler()
-    assert list(itertools.islice(sampler, 3)) == [0, 1, 2]
-    sampler.start = 1000
-    assert list(itertools.islice(sampler, 2)) == [1000, 1001]
+@pytest.mark.parametrize(
+    ("done", "steps"), [(0, [0, 1, 2]), (1, [1, 2]), (3, [3, 4, 5]), (8, [8]), (9, [9, 10, 11])]
+)
+def test_an_epoch_begins_where_the_steps_before_ended(done, steps):
+    sampler = EpochSampler(3, lambda: done)
+    assert list(sampler) == steps
+    assert len(sampler) == 3
+
+
+@pytest.mark.parametrize(
+    ("steps", "most", "expected"),
+    [(None, -1, 60), (4, -1, 4), (None, 7, 7), (4, 2, 2), (4, 5, 4)],
+)
+def test_an_epoch_has_at_least_sixty_steps_unless_somebody_says_how_many(
+    store, steps, most, expected
+):
+    data = module(store, steps_per_epoch=steps)
+    data.trainer = SimpleNamespace(global_rank=0, world_size=1, max_steps=most)
+    assert data.steps_per_epoch == expected
 
 
 def test_splits_are_by_pose_and_never_mixed(store):
@@ -108,7 +124,7 @@ def test_each_device_gets_its_share(store):
     poses = []
     for rank in (0, 1):
         data = module(store, batch=6)
-        data.trainer = SimpleNamespace(global_rank=rank, world_size=2)
+        data.trainer = SimpleNamespace(global_rank=rank, world_size=2, max_steps=-1)
         poses.append(data.stream()[3].pose)
     assert torch.equal(torch.stack(poses, 1).reshape(-1), alone[3].pose)
 

@@ -12,7 +12,7 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import NumericalError
 from sononerf.field.datamodule import EchoDataModule, RangeSlices
 from sononerf.field.grid import GridField
-from sononerf.field.module import EchoModule, decibels
+from sononerf.field.module import WORTH_THREADS, EchoModule, decibels
 from sononerf.field.profile import ProfileRenderer
 from sononerf.field.renderer import Renderer, ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
@@ -51,9 +51,12 @@ def module(renderer, field=None, **options):
     field = field or GridField(REGION, FREQUENCY, spacing=0.01, levels=1)
     given = {
         "reference": 0.001, "dynamic_range_db": 60.0, "possible": None, "learning_rate": 0.1,
-        "total_steps": 100, "steps_per_epoch": 10, **options,
+        **options,
     }  # fmt: skip
-    return EchoModule(field, renderer, **given)
+    total = given.pop("total_steps", 100)
+    found = EchoModule(field, renderer, **given)
+    found.total_steps, found.steps_per_epoch = total, 10
+    return found
 
 
 def batch(spectrum):
@@ -374,7 +377,7 @@ def test_validation_is_in_the_decibels_of_every_report(monkeypatch):
     found.renderer.values.data = levels[1, :1].reshape(1, 1, 1, 1)
     found.validation_step(batch(levels[0, :1].reshape(1, 1, 1, 1)), 0)
     found.on_validation_epoch_end()
-    assert values == {"val/mae_db": pytest.approx(2, rel=1e-4), "epoch": 0.0}
+    assert values == {"val/mae_db": pytest.approx(2, rel=1e-4)}
 
 
 def test_the_first_step_sets_the_gain(monkeypatch):
@@ -425,13 +428,6 @@ def test_all_devices_begin_with_one_gain(monkeypatch):
     torch.testing.assert_close(found.renderer.values.detach(), (PREDICTED + other) / 2)
 
 
-def test_epochs_are_counted_from_the_step(monkeypatch):
-    found = module(Given(PREDICTED))
-    for step, epoch in ((0, 0), (9, 0), (10, 1), (25, 2)):
-        monkeypatch.setattr(type(found), "global_step", step)
-        assert found.epoch_done == epoch
-
-
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     """Echoes of a known field: three places of a grid, heard from 12 poses."""
@@ -471,8 +467,6 @@ def fit(store, renderer, path, steps):
         renderer,
         field,
         reference=store.attributes["reference"],
-        total_steps=steps,
-        steps_per_epoch=steps,
         learning_rate=0.3,
     )
     data = EchoDataModule(
@@ -481,6 +475,7 @@ def fit(store, renderer, path, steps):
         batch=4 if renderer.whole_poses else 200,
         batch_frequencies=None,
         seed=0,
+        steps_per_epoch=steps,
     )
     losses = []
 
@@ -489,8 +484,7 @@ def fit(store, renderer, path, steps):
             losses.append(float(outputs["loss"]))
 
     trainer = lightning.Trainer(
-        accelerator="cpu", max_epochs=-1, max_steps=steps, logger=False,
-        val_check_interval=steps, check_val_every_n_epoch=None, num_sanity_val_steps=0,
+        accelerator="cpu", max_epochs=1, logger=False, num_sanity_val_steps=0,
         enable_checkpointing=False, enable_progress_bar=False, enable_model_summary=False,
         use_distributed_sampler=False, default_root_dir=path, callbacks=[Losses()],
     )  # fmt: skip
@@ -513,23 +507,43 @@ def test_training_on_single_slices_lowers_the_loss(store, tmp_path):
     assert all(p.isfinite().all() for p in found.parameters())
 
 
-@pytest.mark.parametrize(("step", "epoch"), [(0, 1.0), (9, 1.0), (10, 2.0)])
-def test_tensorboard_counts_our_epochs(monkeypatch, step, epoch):
-    found = module(Given(MEASURED))
-    values = logged(found, monkeypatch)
-    monkeypatch.setattr(type(found), "global_step", step)
-    found.training_step(batch(MEASURED), 0)
-    assert values["epoch"] == epoch  # ten steps each
-
-
 @pytest.mark.parametrize(
     ("step", "read"), [(0, False), (3, False), (4, True), (10, False), (11, True), (12, True)]
 )
 def test_only_steps_that_somebody_reads_are_logged(monkeypatch, step, read):
     """The logger every fifth, a preview each twelfth, and the last."""
-    found = module(Given(MEASURED), total_steps=13, steps_per_epoch=12)
+    found = module(Given(MEASURED), total_steps=13)
+    found.steps_per_epoch = 12
     values = logged(found, monkeypatch)
     monkeypatch.setattr(type(found), "global_step", step)
     found._trainer = SimpleNamespace(log_every_n_steps=5)
     found.training_step(batch(MEASURED), 0)
-    assert values.keys() == ({"epoch", "train/loss"} if read else set())
+    assert values.keys() == ({"train/loss"} if read else set())
+
+
+@pytest.fixture
+def two_threads():
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize(
+    ("places", "poses", "costly", "expected"),
+    [
+        (WORTH_THREADS // 4 - 1, 4, False, 1),
+        (WORTH_THREADS // 4, 4, False, 2),
+        (100, 4, True, 2),  # a network
+        (None, 4, False, 2),  # not known: as torch would
+    ],
+)
+def test_small_steps_take_one_thread(two_threads, monkeypatch, places, poses, costly, expected):
+    found = module(Given(MEASURED))
+    monkeypatch.setattr(Given, "places_per_pose", places)
+    monkeypatch.setattr(type(found.field), "costly", costly)
+    found.setup("fit")
+    found.on_train_batch_start(SimpleNamespace(pose=range(poses)), 0)
+    assert torch.get_num_threads() == expected
+    found.teardown("fit")
+    assert torch.get_num_threads() == 2

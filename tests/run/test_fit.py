@@ -33,7 +33,9 @@ from sononerf.errors import (
     ResourceError,
     StoppedError,
 )
+from sononerf.field import datamodule
 from sononerf.field.checkpoint_io import DurableCheckpointIO
+from sononerf.field.datamodule import EpochSampler
 from sononerf.field.fitting import require_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.head.directivity.sofa import write_sofa
@@ -153,13 +155,13 @@ class PowerCutError(BaseException):
 @pytest.mark.parametrize(
     ("owner", "hook", "step"),
     [
-        (PreviewCallback, "on_validation_end", PER_EPOCH),  # validated, not yet saved
-        (CheckpointCallback, "on_epoch", PER_EPOCH),  # previewed, not yet saved
-        (CheckpointCallback, "on_epoch", 2 * PER_EPOCH),
+        (PreviewCallback, "on_train_epoch_end", PER_EPOCH),  # validated, not yet saved
+        (CheckpointCallback, "on_train_epoch_end", PER_EPOCH),  # previewed, not yet saved
+        (CheckpointCallback, "on_train_epoch_end", 2 * PER_EPOCH),
         (CheckpointCallback, "on_train_batch_end", PER_EPOCH),  # not yet validated
         (CheckpointCallback, "on_train_batch_end", 6),
         (ProgressCallback, "on_train_batch_end", 1),
-        (CheckpointCallback, "on_epoch", STEPS),
+        (CheckpointCallback, "on_train_epoch_end", STEPS),
     ],
 )
 def test_a_fit_that_was_cut_off_ends_bit_for_bit_alike(
@@ -216,14 +218,7 @@ def lose(key):
 
 
 def begin_the_data_anew(monkeypatch):
-    real = fit_module._resume
-
-    def resume(folder, data):
-        found = real(folder, data)
-        data.sampler.start = 0
-        return found
-
-    monkeypatch.setattr(fit_module, "_resume", resume)
+    monkeypatch.setattr(EpochSampler, "__iter__", lambda self: iter(range(self.steps)))
 
 
 @pytest.mark.parametrize(
@@ -381,25 +376,15 @@ def test_what_a_fit_cost_is_counted_over_its_parts(tiny, tmp_path, interrupt, mo
         ({"steps_per_epoch": "auto"}, 1, 12, 3),  # 8 poses, 2 at a time
         ({"steps_per_epoch": "auto", "batch_poses": 3}, 1, 9, 3),
         ({"steps_per_epoch": "auto"}, 5, 15, 3),  # a pass is shorter than an epoch may be
-        ({"max_steps": 6}, 60, 6, 1),
+        ({"max_steps": 6}, 60, 6, 2),
         ({"max_steps": 2}, 60, 2, 1),  # shorter than an epoch: it is the epoch then
     ],
 )
 def test_the_smaller_bound_ends_the_fit(tiny, tmp_path, monkeypatch, changes, least, steps, epochs):
-    monkeypatch.setattr(fit_module, "LEAST_STEPS", least)
+    monkeypatch.setattr(datamodule, "LEAST_STEPS", least)
     run(tiny(fit=changes), tmp_path / "run")
     held = what_a_run_holds(tmp_path / "run")
     assert (held["steps"], len(held["epochs"])) == (steps, epochs)
-
-
-@pytest.mark.parametrize(
-    ("steps", "per_pass", "expected"),
-    [("auto", 4, (60, 180)), ("auto", 61, (61, 183)), (4, 61, (4, 12)), (4, 1, (4, 12))],
-)
-def test_an_epoch_has_at_least_sixty_steps_unless_the_settings_say_how_many(
-    tiny, steps, per_pass, expected
-):
-    assert fit_module._length(tiny(fit={"steps_per_epoch": steps}), per_pass) == expected
 
 
 def test_a_run_holds_where_its_training_poses_listened(finished, echoes, tiny):

@@ -26,7 +26,6 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from sononerf import storage
-from sononerf.callbacks.epoch import ThreadsCallback
 from sononerf.echoes.echoes import Echoes
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.field import Field
@@ -120,7 +119,7 @@ def _network(field: FourierField, places: Tensor, toward: Tensor) -> Tensor:
 
 
 class Stopwatch(lightning.Callback):
-    """Times the steps after the first ones, and counts in one more."""
+    """Times the steps after the first ones, counts in one more, and stops."""
 
     def __init__(self, warm: int, timed: int, counted: bool) -> None:
         self.warm, self.timed, self.counted = warm, timed, counted
@@ -148,6 +147,7 @@ class Stopwatch(lightning.Callback):
         """Stop it."""
         del outputs, batch, batch_idx
         self._settle()
+        trainer.should_stop = trainer.global_step >= self.warm + self.timed + self.counted
         if self._counter is not None:
             self._counter.__exit__(None, None, None)
             self.flop = self._counter.get_total_flops()
@@ -215,27 +215,23 @@ def _measured(pair: Pair, settings: Settings, accelerator: str, products: dict[s
         renderer.load_state_dict(own)
     options = settings.fit
     data = data_for(settings, store, renderer)
-    per_epoch = data.stream().batches_per_pass
     module = module_for(
         settings,
         field,
         renderer,
         reference=float(store.attributes["reference"]),
         possible=possible,
-        total_steps=per_epoch * options.epochs,
-        steps_per_epoch=per_epoch,
     )
     watch = Stopwatch(pair.warm, pair.timed, counted=not naive)
     trainer = lightning.Trainer(
         accelerator=accelerator,
         devices=1,
-        max_epochs=-1,
-        max_steps=pair.warm + pair.timed + watch.counted,
+        max_epochs=options.epochs,
         limit_val_batches=0,
         num_sanity_val_steps=0,
         gradient_clip_val=options.gradient_clip,
         logger=False,
-        callbacks=[ThreadsCallback(), watch],
+        callbacks=[watch],
         enable_checkpointing=False,
         enable_progress_bar=False,
         enable_model_summary=False,
