@@ -399,7 +399,9 @@ def test_floors_hold(project, name, refused, allowed):
 def test_every_folder_is_packaged(project):
     folders = {path.parent for path in sources()}
     names = {".".join(folder.relative_to(ROOT).parts) for folder in folders}
-    assert {*names, "sononerf_scenes"} == set(project["tool"]["setuptools"]["packages"])
+    assert {*names, "sononerf_scenes", "sononerf_configs"} == set(
+        project["tool"]["setuptools"]["packages"]
+    )
 
 
 def test_the_settings_of_an_experiment_stay_with_those_who_turn_them_into_objects():

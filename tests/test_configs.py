@@ -19,7 +19,7 @@ from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import dump_yaml, load_settings, read_yaml, validate_settings
 
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
-FILES = sorted(set(CONFIGS.rglob("*.yaml")) - {CONFIGS / "store.yaml"})  # it needs a store
+FILES = sorted(CONFIGS.rglob("*.yaml"))
 BOX = torch.tensor([[-0.05] * 3, [0.05] * 3])
 
 

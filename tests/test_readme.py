@@ -67,10 +67,12 @@ def test_a_command_exists(words, tmp_path):
         parameters = parse(arguments)
         config = parameters.get("config")
         if config is not None:
-            path = ROOT / config
-            if path.name == str(config):
+            path = config
+            if str(config) in shown():
                 path = tmp_path / config
                 path.write_text(shown()[str(config)], encoding="utf-8")
+            elif config.suffix == ".yaml":
+                path = ROOT / config
             load_settings(path, parameters["overrides"] or ())
     elif program == "python" and arguments[0] == "-c":
         compile(arguments[1], "command", "exec")

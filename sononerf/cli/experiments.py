@@ -113,7 +113,8 @@ def fit(
     config: Config,
     overrides: Overrides = None,
     output: Annotated[
-        Path | None, typer.Option(help="The run's folder; runs/<config's name> by default.")
+        Path | None,
+        typer.Option(help="The run's folder; runs/<name of config or scene> by default."),
     ] = None,
     accelerator: OnWhat = "auto",
     devices: Annotated[int | None, typer.Option(min=1, help="How many devices.")] = None,
@@ -137,7 +138,7 @@ def fit(
     from sononerf.run.fit import fit as run
     from sononerf.run.fit import follows
 
-    folder = output or Path("runs") / config.stem
+    folder = output or Path("runs") / _name(settings, config)
     done = run(
         settings,
         folder,
@@ -151,6 +152,15 @@ def fit(
     )
     if not follows():  # the first process does the rest
         _summary(folder, done.read_metrics())
+
+
+def _name(settings: Settings, config: Path) -> str:
+    """Return the name of a run: the config's, or the scene's where there is no config."""
+    from sononerf.settings.loading import is_assignment
+
+    if not is_assignment(config):
+        return config.stem
+    return "recorded" if settings.scene is None else settings.scene.name
 
 
 def _summary(folder: Path, metrics: dict[str, Any]) -> None:

@@ -24,7 +24,12 @@ SurfaceMethod = Literal["auto", "open", "filled", "hull", "sheet", "isosurface"]
 Registration = Literal["none", "rigid", "similarity"]
 Exported = Literal["auto", "echoes", "prediction", "volume", "points"]
 Split = Literal["test", "val", "train"]
-Config = Annotated[Path, typer.Argument(help="Settings file, such as configs/three_spheres.yaml.")]
+Config = Annotated[
+    Path,
+    typer.Argument(
+        help="Settings file; or the name of a shipped one, such as three_spheres; or KEY=VALUE."
+    ),
+]
 Overrides = Annotated[
     list[str] | None,
     typer.Argument(metavar="[KEY=VALUE]...", help="Settings by dotted key, such as fit.epochs=5."),

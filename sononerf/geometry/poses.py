@@ -57,6 +57,60 @@ class Poses:
             index = np.asarray(index)
         return Poses(self.positions[index], self.rotations[index])
 
+    @classmethod
+    def sphere(
+        cls,
+        count: int,
+        *,
+        radius: float,
+        aim_jitter: float = 0.0,
+        generator: np.random.Generator | None = None,
+    ) -> Poses:
+        """Return level poses on a spiral around the origin that look at it, each a little off.
+
+        Args:
+            count: How many.
+            radius (m): Distance from the origin.
+            aim_jitter (rad): Standard deviation of the two turns about the head's own y and z axes.
+            generator: Draws the turns; one of seed 0 where None.
+        """
+        generator = generator or np.random.default_rng(0)
+        return _aimed(radius * fibonacci_sphere(count), aim_jitter, generator)
+
+    @classmethod
+    def read(cls, path: Path) -> Poses:
+        """Read poses from a table with the header ``x,y,z,yaw,pitch,roll`` (m, degrees).
+
+        Args:
+            path: The columns may stand in any order; others are not allowed.
+
+        Raises:
+            InputError: If the file cannot be read, or anything in it is no finite number, naming
+                file, line and column.
+        """
+        header, rows = read_rows(path)
+        if sorted(header) != sorted(CSV_COLUMNS):
+            raise InputError(
+                f"{path}:1: the header is {','.join(header)!r}, expected {','.join(CSV_COLUMNS)}"
+            )
+        values = np.array(
+            [
+                [number_in(path, line, name, cell) for name, cell in zip(header, row, strict=True)]
+                for line, row in rows
+            ]
+        )
+        columns = dict(zip(header, values.T, strict=True))
+        angles = (np.radians(columns[name]) for name in ("yaw", "pitch", "roll"))
+        positions = np.stack([columns[name] for name in ("x", "y", "z")], axis=1)
+        return cls(positions, rotation_from_euler(*angles))
+
+    def table(self) -> str:
+        """Return the text of a table that :meth:`read` reads back (m, degrees)."""
+        yaw, pitch, roll = (np.degrees(angle) for angle in euler_from_rotation(self.rotations))
+        table = np.column_stack([self.positions, yaw, pitch, roll])
+        lines = [",".join(CSV_COLUMNS), *(",".join(repr(float(v)) for v in row) for row in table)]
+        return "\n".join(lines) + "\n"
+
 
 def rotation_from_euler(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> Floats:
     """Rotation matrices from yaw, pitch and roll.
@@ -138,27 +192,10 @@ def _aimed(positions: Floats, aim_jitter: float, generator: np.random.Generator)
     return Poses(positions, look_at(np.zeros_like(positions), turned[:, :, 0]))
 
 
-def sphere_poses(
-    count: int, *, radius: float, aim_jitter: float, generator: np.random.Generator
-) -> Poses:
-    """Poses on a spiral around the origin that look at it, each a little off.
-
-    Args:
-        count: How many.
-        radius (m): Distance from the origin.
-        aim_jitter (rad): Standard deviation of the two turns about the head's own y and z axes.
-        generator: Draws the turns.
-
-    Returns:
-        poses: Level (roll 0), ``count`` of them.
-    """
-    return _aimed(radius * fibonacci_sphere(count), aim_jitter, generator)
-
-
 def random_sphere_poses(
     count: int, *, radius: float, aim_jitter: float, generator: np.random.Generator
 ) -> Poses:
-    """Poses at random places of a sphere; parameters and result as :func:`sphere_poses`."""
+    """Poses at random places of a sphere; parameters and result as :meth:`Poses.sphere`."""
     places = generator.standard_normal((count, 3))
     places /= np.linalg.norm(places, axis=1, keepdims=True)
     return _aimed(radius * places, aim_jitter, generator)
@@ -177,7 +214,7 @@ def cap_poses(
 
     ``axis`` (3,), of any length but zero, points from the origin to the middle of the cap, and
     ``half_angle`` (rad, 0 to pi) is that from the axis to the rim; the others, and the result, as
-    :func:`sphere_poses`.
+    :meth:`Poses.sphere`.
     """
     spiral = fibonacci_cap(count, axis=axis, half_angle=half_angle, offset=(0.5, 0.0))
     return _aimed(radius * spiral, aim_jitter, generator)
@@ -208,41 +245,3 @@ def random_poses(
     distance = near if near == far else np.cbrt(near**3 + depth * (far**3 - near**3))[:, None]
     places = distance * (places @ look_at(np.zeros(3), axis).T)
     return _aimed(places, aim_jitter, generator)
-
-
-def read_pose_csv(path: Path) -> Poses:
-    """Read poses from a table with the header ``x,y,z,yaw,pitch,roll`` (m, degrees).
-
-    Args:
-        path: The columns may stand in any order; others are not allowed.
-
-    Returns:
-        poses: One per row.
-
-    Raises:
-        InputError: If the file cannot be read, or anything in it is no finite number, naming file,
-            line and column.
-    """
-    header, rows = read_rows(path)
-    if sorted(header) != sorted(CSV_COLUMNS):
-        raise InputError(
-            f"{path}:1: the header is {','.join(header)!r}, expected {','.join(CSV_COLUMNS)}"
-        )
-    values = np.array(
-        [
-            [number_in(path, line, name, cell) for name, cell in zip(header, row, strict=True)]
-            for line, row in rows
-        ]
-    )
-    columns = dict(zip(header, values.T, strict=True))
-    angles = (np.radians(columns[name]) for name in ("yaw", "pitch", "roll"))
-    positions = np.stack([columns[name] for name in ("x", "y", "z")], axis=1)
-    return Poses(positions, rotation_from_euler(*angles))
-
-
-def write_pose_csv(poses: Poses) -> str:
-    """Return the text of a table that :func:`read_pose_csv` reads back (m, degrees)."""
-    yaw, pitch, roll = (np.degrees(angle) for angle in euler_from_rotation(poses.rotations))
-    table = np.column_stack([poses.positions, yaw, pitch, roll])
-    lines = [",".join(CSV_COLUMNS), *(",".join(repr(float(v)) for v in row) for row in table)]
-    return "\n".join(lines) + "\n"

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sononerf import __version__, storage
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
-from sononerf.geometry.poses import Poses, write_pose_csv
+from sononerf.geometry.poses import Poses
 from sononerf.run.build import complete_store
 from sononerf.run.run_folder import RunFolder
 
@@ -187,7 +187,7 @@ Part = tuple[dict[str, Named], dict[str, str]]
 def _csv(source: Path, what: What) -> str:
     if what == "echoes":
         store = EnsembleStore.open(source)
-        return write_pose_csv(Poses(store.positions, store.rotations))
+        return Poses(store.positions, store.rotations).table()
     if what != "points":
         raise SettingsError(f"{what}: a .csv file holds poses or points; choose .mat, .h5 or .nc")
     arrays, _ = _points(source)

@@ -19,7 +19,7 @@ from sononerf.evaluation.prediction import predict as predict_poses
 from sononerf.evaluation.traced import Traced
 from sononerf.field.datamodule import WholePoses
 from sononerf.field.fitting import Split, poses_of
-from sononerf.geometry.poses import Poses, read_pose_csv
+from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.spectrogram_picture import spectrogram_png
@@ -63,7 +63,7 @@ def predict(
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder.of(run)
-    own = read_pose_csv(poses_csv) if poses_csv else None
+    own = Poses.read(poses_csv) if poses_csv else None
     fitted, settings = run.fitted, run.fitted.settings
     renderer = fitted.module.renderer
     kind = "" if own is None and split == "test" else f"-{'poses' if own is not None else split}"

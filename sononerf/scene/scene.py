@@ -6,7 +6,8 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -106,6 +107,26 @@ class Scene:
     def materials(self) -> tuple[Material, ...]:
         """All of them; ``part`` counts through them."""
         return self.material if isinstance(self.material, tuple) else (self.material,)
+
+    @classmethod
+    def load(
+        cls, path: Path | str, *, unit: Literal["m", "cm", "mm"] | None = None, **options: Any
+    ) -> Scene:
+        """Load a surface from a file: STL, PLY, OBJ, OFF, GLB or glTF.
+
+        The middle of its bounding box is moved to the origin, at which poses look.
+
+        Args:
+            path: The file.
+            unit: Of its numbers. GLB and glTF are in metres; for others it must be given.
+            options: Others of the scene ``mesh``: ``scale``, ``centre``, ``material``,
+                ``materials``; ``sononerf scenes mesh`` explains them.
+
+        Raises:
+            InputError: If the file cannot be read, is damaged, or holds no surface.
+            SettingsError: If an option is not allowed.
+        """
+        return load_scene("mesh", {"path": str(path), "unit": unit, **options})
 
     def surface(self, *, background: bool) -> trimesh.Trimesh | None:
         """Return the surroundings alone, or the target alone; None where there is none of it."""

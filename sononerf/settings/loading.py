@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import difflib
+import importlib.resources
 import re
 import typing
 from collections.abc import Iterable, Iterator, Mapping
@@ -152,19 +153,57 @@ def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
     return settings
 
 
-def load_settings(path: Path, overrides: Iterable[str] = ()) -> Settings:
+def shipped_configs() -> dict[str, Path]:
+    """Return the settings files that come with the package, by name: ``ua``, ``paper/ua`` ..."""
+    folder = Path(str(importlib.resources.files("sononerf_configs")))
+    files = sorted(folder.rglob("*.yaml"))
+    return {file.relative_to(folder).with_suffix("").as_posix(): file for file in files}
+
+
+def _settings_file(config: Path) -> Path:
+    """Return the file of a path, or of the name of a shipped one."""
+    name = config.as_posix()
+    if config.suffix or config.is_file():
+        return config
+    shipped = shipped_configs()
+    if name not in shipped:
+        near = difflib.get_close_matches(name, shipped, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"shipped are {', '.join(shipped)}"
+        raise SettingsError(f"{name}: no such settings file; {hint}")
+    return shipped[name]
+
+
+def load_settings(config: Path, overrides: Iterable[str] = ()) -> Settings:
     """Read a settings file and lay ``KEY=VALUE`` assignments over it.
 
     An assignment that names another scene, field or renderer than the file does takes the file's
     options for the old one away.
+
+    Args:
+        config: A file; the name of a shipped one, such as ``three_spheres``; or an assignment,
+            which is laid over the defaults.
+        overrides: Further assignments.
+
+    Raises:
+        SettingsError: As :func:`read_yaml` and :func:`validate_settings` say.
     """
-    data = read_yaml(path)
     overrides = list(overrides)
+    if is_assignment(config):
+        overrides.insert(0, str(config))
+        data, source = dict[str, Any](), "command line"
+    else:
+        file = _settings_file(config)
+        data, source = read_yaml(file), str(file)
     for assignment in overrides:
         _drop_options_of_another(data, assignment)
     for assignment in overrides:
         apply_override(data, assignment)
-    return validate_settings(data, str(path))
+    return validate_settings(data, source)
+
+
+def is_assignment(config: Path) -> bool:
+    """Whether a settings file is none, but ``KEY=VALUE``."""
+    return "=" in str(config) and not config.is_file()
 
 
 def dump_yaml(settings: Settings) -> str:

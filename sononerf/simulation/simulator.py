@@ -16,14 +16,7 @@ from numpy.typing import NDArray
 
 from sononerf.array_types import Floats, Singles
 from sononerf.errors import InputError
-from sononerf.geometry.poses import (
-    Poses,
-    cap_poses,
-    random_poses,
-    random_sphere_poses,
-    read_pose_csv,
-    sphere_poses,
-)
+from sononerf.geometry.poses import Poses, cap_poses, random_poses, random_sphere_poses
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
@@ -263,7 +256,7 @@ def _arrangement(wanted: PoseSettings) -> tuple[Callable[..., Poses], Callable[.
     """Return what makes the training poses, and what draws those for validation and test."""
     radius, axis = wanted.radius, wanted.axis
     if wanted.arrangement == "sphere":
-        return partial(sphere_poses, radius=radius), partial(random_sphere_poses, radius=radius)
+        return partial(Poses.sphere, radius=radius), partial(random_sphere_poses, radius=radius)
     angle = math.pi if wanted.half_angle_deg is None else math.radians(wanted.half_angle_deg)
     distances = radius, wanted.radius_max or radius
     draw = partial(random_poses, radius=distances, axis=axis, half_angle=angle)
@@ -274,7 +267,7 @@ def _arrangement(wanted: PoseSettings) -> tuple[Callable[..., Poses], Callable[.
 
 def _path_poses(wanted: PoseSettings, path: Path) -> tuple[Poses, NDArray[np.int8]]:
     """Read a flight path; its rows for validation and test are drawn at random."""
-    poses = read_pose_csv(path)
+    poses = Poses.read(path)
     if len(poses) <= wanted.validation + wanted.heldout:
         raise InputError(
             f"{path}: {len(poses)} poses, of which poses.validation takes {wanted.validation} and "

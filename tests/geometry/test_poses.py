@@ -11,10 +11,7 @@ from sononerf.geometry.poses import (
     look_at,
     random_poses,
     random_sphere_poses,
-    read_pose_csv,
     rotation_from_euler,
-    sphere_poses,
-    write_pose_csv,
 )
 
 
@@ -73,12 +70,12 @@ def test_look_at_the_own_place_is_refused():
 
 
 def test_sphere_poses_without_jitter_look_at_the_origin():
-    poses = sphere_poses(30, radius=0.4, aim_jitter=0.0, generator=np.random.default_rng(0))
+    poses = Poses.sphere(30, radius=0.4, aim_jitter=0.0, generator=np.random.default_rng(0))
     np.testing.assert_allclose(np.linalg.norm(poses.positions, axis=1), 0.4)
     np.testing.assert_allclose(poses.rotations[:, :, 0], -poses.positions / 0.4, atol=1e-12)
 
 
-@pytest.mark.parametrize("draw", [sphere_poses, random_sphere_poses])
+@pytest.mark.parametrize("draw", [Poses.sphere, random_sphere_poses])
 def test_jitter_has_its_standard_deviation_about_both_axes_and_no_roll(draw):
     poses = draw(4000, radius=1.0, aim_jitter=0.1, generator=np.random.default_rng(3))
     straight = look_at(poses.positions, np.zeros(3))
@@ -139,7 +136,7 @@ def test_random_poses_are_uniform_in_the_volume_of_their_cone():
 
 
 def test_indexing_gives_poses():
-    poses = sphere_poses(9, radius=1.0, aim_jitter=0.1, generator=np.random.default_rng(0))
+    poses = Poses.sphere(9, radius=1.0, aim_jitter=0.1, generator=np.random.default_rng(0))
     assert len(poses[3]) == 1
     np.testing.assert_array_equal(poses[3].rotations[0], poses.rotations[3])
     assert len(poses[2:5]) == 3
@@ -156,8 +153,8 @@ def test_shapes_are_checked():
 def test_table_comes_back(tmp_path):
     poses = random_sphere_poses(20, radius=0.4, aim_jitter=0.3, generator=np.random.default_rng(0))
     path = tmp_path / "poses.csv"
-    path.write_text(write_pose_csv(poses), encoding="utf-8")
-    found = read_pose_csv(path)
+    path.write_text(poses.table(), encoding="utf-8")
+    found = Poses.read(path)
     np.testing.assert_array_equal(found.positions, poses.positions)
     np.testing.assert_allclose(found.rotations, poses.rotations, atol=1e-14)
 
@@ -165,7 +162,7 @@ def test_table_comes_back(tmp_path):
 def test_table_is_in_degrees_in_any_order_of_columns(tmp_path):
     path = tmp_path / "poses.csv"
     path.write_bytes("\ufeffroll,x,y,z,yaw,pitch\r\n0, 1,2,3,90,30\r\n\r\n".encode())
-    poses = read_pose_csv(path)
+    poses = Poses.read(path)
     np.testing.assert_array_equal(poses.positions, [[1, 2, 3]])
     np.testing.assert_allclose(poses.rotations[0, :, 0], [0, np.cos(np.pi / 6), -0.5], atol=1e-12)
 
@@ -189,12 +186,12 @@ def test_faults_of_a_table_name_the_place(tmp_path, text, match):
     path = tmp_path / "poses.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=match):
-        read_pose_csv(path)
+        Poses.read(path)
 
 
 def test_unreadable_tables_are_named(tmp_path):
     with pytest.raises(InputError, match="cannot be read"):
-        read_pose_csv(tmp_path / "none.csv")
+        Poses.read(tmp_path / "none.csv")
     (tmp_path / "latin.csv").write_bytes(b"x,y,z\xe4")
     with pytest.raises(InputError, match="UTF-8"):
-        read_pose_csv(tmp_path / "latin.csv")
+        Poses.read(tmp_path / "latin.csv")

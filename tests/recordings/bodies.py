@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sononerf.geometry.poses import cap_poses, euler_from_rotation, random_poses, sphere_poses
+from sononerf.geometry.poses import Poses, cap_poses, euler_from_rotation, random_poses
 from sononerf.recordings.columns import Columns
 from sononerf.recordings.conventions import turntable_poses
 
@@ -46,7 +46,7 @@ def poses_of(rng, kind):
     """Poses on a sphere, in a volume, on a cap, or of a turntable."""
     jitter, radius = np.radians(12), rng.uniform(0.3, 0.6)
     if kind == "sphere":
-        return sphere_poses(90, radius=radius, aim_jitter=jitter, generator=rng)
+        return Poses.sphere(90, radius=radius, aim_jitter=jitter, generator=rng)
     if kind == "volume":
         return random_poses(
             90, radius=(0.3, 0.6), axis=rng.normal(size=3), half_angle=np.pi, aim_jitter=jitter,

@@ -11,7 +11,7 @@ import soundfile
 from scipy.io import wavfile
 
 from sononerf.errors import InputError
-from sononerf.geometry.poses import sphere_poses
+from sononerf.geometry.poses import Poses
 from sononerf.recordings.audio import as_float, pose_table, read_audio, wav_bytes
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.folder import read_folder
@@ -97,7 +97,7 @@ def test_flac_needs_a_package_and_says_which(tmp_path, monkeypatch):
 
 
 def test_a_folder_comes_back(tmp_path):
-    poses = sphere_poses(3, radius=0.4, aim_jitter=0.2, generator=np.random.default_rng(0))
+    poses = Poses.sphere(3, radius=0.4, aim_jitter=0.2, generator=np.random.default_rng(0))
     waves = np.random.default_rng(1).standard_normal((3, 2, 70)).astype("float32")
     names = [f"{index}.wav" for index in range(3)]
     for name, wave in zip(names, waves, strict=True):

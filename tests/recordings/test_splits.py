@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.geometry.poses import Poses, sphere_poses
+from sononerf.geometry.poses import Poses
 from sononerf.recordings.splits import assign_split, pose_groups, repeats
 
 
 def poses_of(count):
     generator = np.random.default_rng(0)
-    return sphere_poses(count, radius=0.4, aim_jitter=0.1, generator=generator)
+    return Poses.sphere(count, radius=0.4, aim_jitter=0.1, generator=generator)
 
 
 def split(poses, stated=None, **given):

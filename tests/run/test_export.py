@@ -13,7 +13,7 @@ import zarr
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
-from sononerf.geometry.poses import read_pose_csv
+from sononerf.geometry.poses import Poses
 from sononerf.run import export as export_module
 from sononerf.run.export import Named, export, file_bytes
 from sononerf.run.predict import predict
@@ -35,7 +35,7 @@ def test_echoes_of_a_store(echoes, tmp_path):
     assert np.array_equal(found["frequency"].ravel(), store.frequency)
     assert found["split"].ravel().tolist() == store.split.tolist()
     assert "sphere" not in str(found["attributes"]["origin"])
-    poses = read_pose_csv(export(echoes, tmp_path / "poses.csv"))
+    poses = Poses.read(export(echoes, tmp_path / "poses.csv"))
     assert np.allclose(poses.positions, store.positions)
     assert np.allclose(poses.rotations, store.rotations)
 

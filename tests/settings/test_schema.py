@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from sononerf.errors import SettingsError
@@ -46,6 +48,29 @@ def test_precedence(write):
     path = write(SCENE + "fit: {epochs: 3, seed: 1}\n")
     settings = load_settings(path, ["fit.seed=2", "fit.seed=4"])
     assert (settings.fit.epochs, settings.fit.seed) == (3, 4)
+
+
+def test_a_shipped_file_is_found_by_its_name_wherever_one_is(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert load_settings(Path("three_spheres")).scene.name == "three_spheres"
+    paper = load_settings(Path("paper/three_spheres"), ["fit.epochs=2"])
+    assert (paper.field.kind, paper.fit.epochs) == ("fourier", 2)
+    assert faults(Path("three_sphere")) == [
+        "three_sphere: no such settings file; did you mean three_spheres?"
+    ]
+    assert "shipped are kettle, neural, " in faults(Path("mine"))[0]
+
+
+def test_a_file_of_the_users_goes_before_a_shipped_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("ua").write_text("scene: {name: torus}\n")
+    assert load_settings(Path("ua")).scene.name == "torus"
+
+
+def test_assignments_need_no_file():
+    settings = load_settings(Path("scene.name=sphere"), ["scene.options.radius=0.02"])
+    assert (settings.scene.name, settings.scene.options) == ("sphere", {"radius": 0.02})
+    assert any("command line: scene.nam: unknown key" in f for f in faults(Path("scene.nam=a")))
 
 
 def test_what_is_dumped_reads_back(write):

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
-from sononerf.geometry.poses import Poses, look_at, write_pose_csv
+from sononerf.geometry.poses import Poses, look_at
 from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
@@ -102,7 +102,7 @@ def flight(tmp_path):
         positions = np.stack([np.linspace(-0.5, 0.5, rows), *np.full((2, rows), 0.4)], axis=1)
         poses = Poses(positions, look_at(positions, np.zeros(3)))
         path = tmp_path / f"flight{rows}.csv"
-        path.write_text(write_pose_csv(poses), encoding="utf-8")
+        path.write_text(poses.table(), encoding="utf-8")
         return {"arrangement": "path", "path": str(path)}, poses
 
     return write

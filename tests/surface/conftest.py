@@ -8,7 +8,7 @@ import pytest
 import torch
 import trimesh
 
-from sononerf.geometry.poses import sphere_poses
+from sononerf.geometry.poses import Poses
 from sononerf.run.build import head_of
 from sononerf.scene.scene import Scene
 from sononerf.settings.loading import validate_settings
@@ -47,7 +47,7 @@ def optics(settings):
 
 @pytest.fixture(scope="session")
 def poses():
-    return sphere_poses(POSES, radius=0.3, aim_jitter=0.1, generator=np.random.default_rng(0))
+    return Poses.sphere(POSES, radius=0.3, aim_jitter=0.1, generator=np.random.default_rng(0))
 
 
 @pytest.fixture(scope="session")

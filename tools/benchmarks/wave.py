@@ -61,7 +61,7 @@ def wave(arguments: argparse.Namespace) -> dict[str, Any]:
 
 def _heard(scene: Any, engine: str, poses: int) -> dict[str, Any]:
     """Return spectrograms in dB (P, E, R, F), their frequencies, and what they cost."""
-    from sononerf.geometry.poses import sphere_poses
+    from sononerf.geometry.poses import Poses
     from sononerf.run.build import simulator_of
     from sononerf.settings.loading import validate_settings
     from sononerf.simulation.solved import Solved
@@ -73,7 +73,7 @@ def _heard(scene: Any, engine: str, poses: int) -> dict[str, Any]:
     started = time.perf_counter()
     simulator = simulator_of(scene, validate_settings(data, "benchmark wave"))
     generator = np.random.default_rng(0)
-    places = sphere_poses(poses, radius=DISTANCE, aim_jitter=0.0, generator=generator)
+    places = Poses.sphere(poses, radius=DISTANCE, aim_jitter=0.0, generator=generator)
     solver = simulator.engine
     solver.prepare(places.positions, places.rotations)
     levels = []

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from sononerf.errors import NumericalError
-from sononerf.geometry.poses import sphere_poses
+from sononerf.geometry.poses import Poses
 from sononerf.report.pictures.spectrogram_picture import (
     pings_png,
     sounding_slice,
@@ -112,7 +112,7 @@ def test_a_logarithmic_axis_is_drawn_as_one():
 @pytest.mark.parametrize(("pings", "receivers"), [(1, 1), (3, 2)])
 def test_a_row_for_each_ping(pings, receivers):
     rng = np.random.default_rng(0)
-    poses = sphere_poses(9, radius=0.4, aim_jitter=0.1, generator=rng)
+    poses = Poses.sphere(9, radius=0.4, aim_jitter=0.1, generator=rng)
 
     def picture(level):
         return pings_png(

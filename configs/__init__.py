@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: MIT
+"""Experiments that come with the package; `sononerf fit NAME` finds them."""

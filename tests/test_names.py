@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: MIT
+"""The public names: all are there, each is what it says, and none is imported too early."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import trimesh
+
+import sononerf
+from sononerf.errors import InputError, SettingsError
+from sononerf.scene.material import MATERIALS
+
+
+def test_all_names_are_there_and_have_docstrings():
+    assert dir(sononerf) == sononerf.__all__
+    for name in set(sononerf.__all__) - {"__version__"}:
+        found = getattr(sononerf, name)
+        assert found.__name__ == name
+        assert found.__doc__
+    with pytest.raises(AttributeError, match="has no attribute 'Scenes'"):
+        sononerf.Scenes  # noqa: B018
+
+
+def test_an_import_of_the_package_imports_nothing_else():
+    script = (
+        "import sys, sononerf; print(sorted({'numpy', 'torch', 'trimesh'} & set(sys.modules)));"
+        "sononerf.Poses; print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout == "[]\nFalse\n", done.stderr
+
+
+def test_a_scene_from_a_file(tmp_path):
+    trimesh.creation.box((10.0, 20.0, 30.0)).export(tmp_path / "box.stl")
+    scene = sononerf.Scene.load(tmp_path / "box.stl", unit="mm", material="leaf")
+    np.testing.assert_allclose(scene.mesh.extents, (0.01, 0.02, 0.03))
+    assert scene.material == MATERIALS["leaf"]
+    with pytest.raises(InputError, match="states no unit"):
+        sononerf.Scene.load(tmp_path / "box.stl")
+    with pytest.raises(SettingsError, match="unknown"):
+        sononerf.Scene.load(tmp_path / "box.stl", unit="mm", colour="red")
