@@ -11,8 +11,9 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Floats, Singles
+from sononerf.array_types import Floats, Ints, Singles
 from sononerf.compiled import compiled
+from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import NumericalError
 from sononerf.evaluation.solid import Nearest, Solid, sample_surface
 from sononerf.geometry.poses import Poses
@@ -428,3 +429,13 @@ def _gather(
             for k in range(index.shape[2]):
                 gained[i, j, k] += heard[index[i, j, k]]
                 sensed[i, j, k] += audible[index[i, j, k]]
+
+
+BASELINES = {"backprojection": backprojection, "voxels": voxel_fit}
+"""Baselines of a surface, by their names in ``metrics.json``."""
+
+
+def volume_of(store: EnsembleStore, name: str, numbers: Ints, *given: Any) -> Volume:
+    """Return the volume of a baseline; what it takes after the spectrograms is ``given``."""
+    heard = (store.read_pose(int(number)) for number in numbers)
+    return BASELINES[name](heard, *given)

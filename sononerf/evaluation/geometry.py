@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import itertools
 import threading
-from collections.abc import Iterator
-from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,18 +13,19 @@ import trimesh
 from scipy.spatial import cKDTree
 from trimesh.registration import procrustes
 
-from sononerf.array_types import Floats, Singles
+from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import NumericalError
-from sononerf.evaluation.baseline import backprojection, best_level_surface, voxel_fit
+from sononerf.evaluation.baseline import best_level_surface, volume_of
 from sononerf.evaluation.metrics import geometry_metrics, target_metrics
 from sononerf.evaluation.solid import Solid
 from sononerf.geometry.poses import Poses
 from sononerf.scene.scene import Scene
+from sononerf.simulation.pool import computed
 from sononerf.surface.start.volume import Volume
 
-BASELINES = {"backprojection": backprojection, "voxels": voxel_fit}
-"""Baselines of a surface, by their names in ``metrics.json``."""
+MANY = 64
+"""Training poses from which another process pays."""
 
 Kind = Literal["none", "rigid", "similarity"]
 
@@ -213,6 +212,8 @@ def baseline_volume(
 ) -> Volume:
     """Compute what needs no learning: backprojection or a voxel fit of the training poses.
 
+    Where there are many poses it is done in another process, and this thread waits.
+
     Args:
         name: Of ``BASELINES``.
         echoes: Measured spectrograms; they are read one after the other.
@@ -222,15 +223,12 @@ def baseline_volume(
     Raises:
         CancelledError: If it was ended early.
     """
-    store = echoes.store
-    train = store.indices("train")
-    poses = Poses(echoes.positions[train], echoes.rotations[train])
-
-    def heard() -> Iterator[Singles]:
-        for index in train:
-            if stop.is_set():
-                raise CancelledError
-            yield store.read_pose(int(index))
-
+    train = echoes.store.indices("train")
     spacing = float((upper - lower).max()) / BASELINE_VOXELS
-    return BASELINES[name](heard(), poses, echoes.head, lower, upper, spacing)
+    poses = Poses(echoes.positions[train], echoes.rotations[train])
+    task = name, train, poses, echoes.head, lower, upper, spacing
+    if len(train) < MANY:
+        return volume_of(echoes.store, *task)
+    ((_, volume),) = computed(volume_of, echoes.store, {0: task}, 1, stop=stop)
+    assert isinstance(volume, Volume)
+    return volume

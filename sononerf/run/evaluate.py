@@ -12,7 +12,8 @@ from typing import Any
 import trimesh
 
 from sononerf import storage
-from sononerf.evaluation.geometry import BASELINES, Kind, Truth, baseline_volume
+from sononerf.evaluation.baseline import BASELINES
+from sononerf.evaluation.geometry import Kind, Truth, baseline_volume
 from sononerf.progress import Progress
 from sononerf.run.build import read_truth, true_scene
 from sononerf.run.reconstruct import reconstruct

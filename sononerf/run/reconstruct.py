@@ -7,7 +7,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -230,7 +230,8 @@ def reconstruct(
         if method == "isosurface":
             surface = _isosurface(run, spacing, level, progress)
         else:
-            with _task(progress) as shown:
+            costly = run.fitted.module.field.costly
+            with _task(progress) as shown, nullcontext() if costly else _one_thread():
                 reading = read_field(
                     run.fitted.module.field,
                     run.fitted.hull,

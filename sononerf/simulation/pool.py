@@ -7,6 +7,7 @@ import os
 import threading
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Mapping
+from concurrent.futures import CancelledError
 from dataclasses import dataclass, field
 from multiprocessing import parent_process
 from multiprocessing.connection import Connection, wait
@@ -18,6 +19,8 @@ from sononerf.simulation.processes import process_context, starting_workers
 
 QUEUED = 4
 """Tasks that a worker has at most, so that it need not wait for the next one."""
+LOOK_SECONDS = 0.2
+"""How often it is asked whether to stop, s."""
 SENT_AGAIN = 3
 """Times that a task is sent again after its worker died."""
 
@@ -81,6 +84,8 @@ def computed(
     thing: object,
     tasks: Mapping[int, tuple[Any, ...]],
     workers: int,
+    *,
+    stop: threading.Event | None = None,
 ) -> Generator[tuple[int, Any], None, None]:
     """Yield the number of each task and ``function(thing, *task)``, in any order.
 
@@ -91,8 +96,10 @@ def computed(
         thing: What all tasks need; each worker is sent it once, and forgets it afterwards.
         tasks: What else the function takes, by a number; sent one by one.
         workers: How many processes.
+        stop: Ends it when set.
 
     Raises:
+        CancelledError: If it was stopped.
         TaskError: If the function, or sending its argument, raises an error in a worker.
         ResourceError: If the workers of a task die again and again.
     """
@@ -106,7 +113,10 @@ def computed(
                 except OSError:
                     crew[place] = _replaced(worker, left, lost)
             busy = {worker.pipe: place for place, worker in enumerate(crew) if worker.tasks}
-            for pipe in wait(list(busy)):
+            ready = wait(list(busy), None if stop is None else LOOK_SECONDS)
+            if stop is not None and stop.is_set():
+                raise CancelledError
+            for pipe in ready:
                 worker = crew[busy[pipe]]  # type: ignore[index]
                 try:
                     answer, fault = worker.pipe.recv()
