@@ -166,7 +166,8 @@ def fit(
 ) -> RunFolder:
     """Simulate where needed, or open the store of ``data.store``; fit, and keep the fitted field.
 
-    The same call goes on where an interrupted one stopped; a finished run is left as it is.
+    The same call goes on where an interrupted one stopped; a finished run is left as it is. More
+    ``fit.epochs`` than a run has go on from its last one.
 
     Args:
         settings: The experiment.
@@ -205,6 +206,7 @@ def fit(
     created = storage.probe_writable(path)
     try:
         with run.locked():
+            run.prolong(settings)
             run.check(settings)
             if not run.is_done("fit"):
                 started = time.monotonic()

@@ -221,6 +221,23 @@ class RunFolder:
             return
         self._refuse_foreign()
 
+    def prolong(self, settings: Settings) -> None:
+        """Take over a larger number of epochs, if nothing else differs.
+
+        The fit then goes on from its last checkpoint, and the stages after it are done again.
+
+        Args:
+            settings: Of the fit that is asked for.
+        """
+        if not self.config.is_file():
+            return
+        old = self.open()
+        if differing_keys(old, settings) == ["fit.epochs"] and settings.fit.epochs > old.fit.epochs:
+            storage.remove_file(self.path / DESCRIPTION_NAME)
+            self.begin("surface")
+            self.begin("traced")
+            storage.commit_text(self.config, dump_yaml(settings))
+
     def _refuse_foreign(self) -> None:
         foreign = [p.name for p in self.path.iterdir() if not p.name.startswith(".")]
         if foreign:

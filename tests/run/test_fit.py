@@ -44,7 +44,7 @@ from sononerf.run import fit as fit_module
 from sononerf.run.build import head_of
 from sononerf.run.fit import fit, peak_memory_bytes
 from sononerf.run.reconstruct import reconstruct
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run_folder import STAGES, RunFolder
 from tests.head.directivity.patterns import pair
 
 STEPS, PER_EPOCH = 12, 4
@@ -272,6 +272,23 @@ def test_a_finished_run_is_left_as_it_is(tiny, finished):
     found = run(tiny(data={"memory_bytes": 10**9}, fit={"checkpoint_seconds": 5}), finished)
     assert found.is_done("fit")
     assert files(finished) == before
+
+
+def test_more_epochs_go_on_and_the_stages_after_them_are_done_again(tiny, tmp_path):
+    path = tmp_path / "run"
+    run(tiny(), path)
+    before = what_a_run_holds(path)
+    opened = RunFolder(path)
+    reconstruct(path, accelerator="cpu")
+    opened.write_metrics("prediction", {})
+    run(tiny(fit={"epochs": 5}), path)
+    after = what_a_run_holds(path)
+    assert (after["steps"], after["epochs"]) == (20, ["0001", "0002", "0003", "0004", "0005"])
+    assert after["previews"][:3] == before["previews"]  # it did not begin anew
+    assert "field.grids.0" in differences({**after, "previews": before["previews"]}, before)
+    assert [stage for stage in STAGES if opened.is_done(stage)] == ["fit"]
+    with pytest.raises(IncompatibleError, match=r"other settings \(fit\.epochs\)"):
+        run(tiny(fit={"epochs": 4}), path)
 
 
 def test_other_settings_are_refused_by_name(tiny, finished):
