@@ -130,6 +130,7 @@ def evaluate(
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder.of(run)
+    _ = run.fitted  # a folder that is no run is refused before it is locked
     with run.locked():
         if begun is None:
             with Evaluation(run, truth, registration) as work:
