@@ -229,6 +229,6 @@ def baseline_volume(
     task = name, train, poses, echoes.head, lower, upper, spacing
     if len(train) < MANY:
         return volume_of(echoes.store, *task)
-    ((_, volume),) = computed(volume_of, echoes.store, {0: task}, 1, stop=stop)
+    ((_, volume),) = computed(volume_of, echoes.store, {0: task}, 1, what="baseline", stop=stop)
     assert isinstance(volume, Volume)
     return volume

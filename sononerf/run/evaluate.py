@@ -5,13 +5,14 @@ from __future__ import annotations
 
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import cached_property
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import trimesh
 
 from sononerf import storage
+from sononerf.errors import InputError
 from sononerf.evaluation.baseline import BASELINES
 from sononerf.evaluation.geometry import Kind, Truth, baseline_volume
 from sononerf.progress import Progress
@@ -43,7 +44,10 @@ class Evaluation:
         self._file = truth or settings.evaluation.truth
         self._kind: Kind = registration or settings.evaluation.registration
         self._stop = threading.Event()
+        with suppress(InputError):  # told by the part that needs them
+            _ = run.echoes  # loaded once, before other threads ask for them
         self._pool = ThreadPoolExecutor(len(BASELINES))
+        self._true = self._pool.submit(self._truth)
         self._volumes = {name: self._pool.submit(self._volume, name) for name in BASELINES}
         self._parts: dict[str, Future[dict[str, Any] | None]] = {}
 
@@ -71,33 +75,29 @@ class Evaluation:
                 task.advance()
         return found.pop("geometry"), found
 
-    @cached_property
-    def _scene(self) -> Scene | None:
-        return None if self._file else true_scene(self._run.fitted.settings)
-
-    @cached_property
-    def _truth(self) -> trimesh.Trimesh | None:
+    def _truth(self) -> tuple[Scene | None, trimesh.Trimesh | None]:
+        """Return the scene, where that gives the true surface, and the surface."""
         if self._file:
-            return read_truth(self._file)
-        return None if self._scene is None else self._scene.mesh
+            return None, read_truth(self._file)
+        scene = true_scene(self._run.fitted.settings)
+        return scene, None if scene is None else scene.mesh
 
     def _volume(self, name: str) -> Volume | None:
-        if self._truth is None:
+        if self._true.result()[1] is None:
             return None
         lower, upper = (c.double().numpy() for c in self._run.fitted.module.field.region)
         return baseline_volume(name, self._run.echoes, lower, upper, self._stop)
 
     def _laid(self) -> Truth | None:
-        if self._truth is None:
-            return None
-        return Truth(self._truth, self._run.mesh(), self._kind)
+        true = self._true.result()[1]
+        return None if true is None else Truth(true, self._run.mesh(), self._kind)
 
     def _geometry(self, laid: Future[Truth | None]) -> dict[str, Any] | None:
         truth = laid.result()
         if truth is None:
             return None
         level = storage.read_json(self._run.reconstruction / "read_out.json")["level"]
-        return {**truth.of_reconstruction(self._scene), "level": level}
+        return {**truth.of_reconstruction(self._true.result()[0]), "level": level}
 
     def _baseline(self, laid: Future[Truth | None], name: str) -> dict[str, Any] | None:
         truth, volume = laid.result(), self._volumes[name].result()

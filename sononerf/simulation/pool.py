@@ -18,7 +18,7 @@ from sononerf.errors import ResourceError, SonoNerfError
 from sononerf.simulation.processes import process_context, starting_workers
 
 QUEUED = 4
-"""Tasks that a worker has at most, so that it need not wait for the next one."""
+"""Tasks that a worker has at most: one that it computes, and others so that it need not wait."""
 LOOK_SECONDS = 0.2
 """How often it is asked whether to stop, s."""
 SENT_AGAIN = 3
@@ -26,11 +26,16 @@ SENT_AGAIN = 3
 
 
 class TaskError(SonoNerfError):
-    """A task failed in a worker; ``number`` says which one."""
+    """A task failed in a worker.
 
-    def __init__(self, number: int, text: str) -> None:
+    Attributes:
+        number: Of the task.
+        exit_code: Of the error that the worker raised.
+    """
+
+    def __init__(self, number: int, text: str, exit_code: int) -> None:
         super().__init__(text)
-        self.number = number
+        self.number, self.exit_code = number, exit_code
 
 
 @dataclass(eq=False)
@@ -79,12 +84,21 @@ _idle: list[_Worker] = []
 os.register_at_fork(after_in_child=_idle.clear)
 
 
+def _taken() -> _Worker:
+    """Take an idle worker, or start one; other threads may take some at the same time."""
+    try:
+        return _idle.pop()
+    except IndexError:
+        return _Worker.start()
+
+
 def computed(
     function: Callable[..., Any],
     thing: object,
     tasks: Mapping[int, tuple[Any, ...]],
     workers: int,
     *,
+    what: str = "pose",
     stop: threading.Event | None = None,
 ) -> Generator[tuple[int, Any], None, None]:
     """Yield the number of each task and ``function(thing, *task)``, in any order.
@@ -96,6 +110,7 @@ def computed(
         thing: What all tasks need; each worker is sent it once, and forgets it afterwards.
         tasks: What else the function takes, by a number; sent one by one.
         workers: How many processes.
+        what: What a number counts, for messages.
         stop: Ends it when set.
 
     Raises:
@@ -104,28 +119,31 @@ def computed(
         ResourceError: If the workers of a task die again and again.
     """
     left, lost = deque(tasks), Counter[int]()
-    crew = [_idle.pop() if _idle else _Worker.start() for _ in range(workers)]
+    crew = [_taken() for _ in range(workers)]
     try:
         while left or any(worker.tasks for worker in crew):
             for place, worker in enumerate(crew):
                 try:
                     _feed(worker, left, tasks, (function, thing))
                 except OSError:
-                    crew[place] = _replaced(worker, left, lost)
-            busy = {worker.pipe: place for place, worker in enumerate(crew) if worker.tasks}
-            ready = wait(list(busy), None if stop is None else LOOK_SECONDS)
+                    crew[place] = _replaced(worker, left, lost, what)
+            ready = wait(
+                [worker.pipe for worker in crew if worker.tasks],
+                None if stop is None else LOOK_SECONDS,
+            )
             if stop is not None and stop.is_set():
                 raise CancelledError
-            for pipe in ready:
-                worker = crew[busy[pipe]]  # type: ignore[index]
+            for place, worker in enumerate(crew):
+                if worker.pipe not in ready:
+                    continue
                 try:
                     answer, fault = worker.pipe.recv()
                 except (EOFError, OSError):
-                    crew[busy[pipe]] = _replaced(worker, left, lost)  # type: ignore[index]
+                    crew[place] = _replaced(worker, left, lost, what)
                     continue
                 number = worker.tasks.popleft()
                 if fault is not None:
-                    raise TaskError(number, fault)
+                    raise TaskError(number, *fault)
                 yield number, answer
     finally:
         for worker in crew:
@@ -151,7 +169,7 @@ def _feed(
         worker.pipe.send(tasks[worker.tasks[-1]])
 
 
-def _replaced(worker: _Worker, left: deque[int], lost: Counter[int]) -> _Worker:
+def _replaced(worker: _Worker, left: deque[int], lost: Counter[int], what: str) -> _Worker:
     """Take a dead worker's tasks back; return another worker.
 
     Raises:
@@ -164,7 +182,7 @@ def _replaced(worker: _Worker, left: deque[int], lost: Counter[int]) -> _Worker:
     lost[first] += 1
     if lost[first] > SENT_AGAIN:
         raise ResourceError(
-            f"pose {first}: every worker that took it was killed; give workers more memory, or "
+            f"{what} {first}: every worker that took it was killed; give workers more memory, or "
             "start fewer; the same command goes on with what is missing"
         )
     return _Worker.start()
@@ -199,7 +217,10 @@ def _answer(pipe: Connection) -> None:
     except (EOFError, OSError):
         raise
     except Exception as error:
-        fault = fault_of(error)  # the object cannot be made here: each task is told so
+        fault = (
+            fault_of(error),
+            SonoNerfError.exit_code,
+        )  # the object cannot be made here: each task is told so
     while (task := pipe.recv()) is not None:
         answer = None
         if function is not None:
@@ -207,10 +228,11 @@ def _answer(pipe: Connection) -> None:
             try:
                 answer = function(thing, *task)
             except Exception as error:
-                fault = fault_of(error)
+                fault = fault_of(error), getattr(error, "exit_code", SonoNerfError.exit_code)
         pipe.send((answer, fault))
 
 
 def fault_of(error: Exception) -> str:
-    """Return the kind and the text of an error, in one line."""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}"
+    """Return the text of an error in one line; of an error that is not ours, its kind too."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, SonoNerfError) else f"{type(error).__name__}: {text}"

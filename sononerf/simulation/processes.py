@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import forkserver, resource_tracker
@@ -39,6 +40,9 @@ def begin() -> None:
             forkserver.ensure_running()
 
 
+_STARTING = threading.RLock()
+
+
 @contextmanager
 def starting_workers() -> Iterator[None]:
     """Give processes that start in the block one thread each, and block SIGINT in them.
@@ -47,6 +51,11 @@ def starting_workers() -> Iterator[None]:
     prints a traceback. Workers do not run the script that started them: it need not be written
     for that.
     """
+    with _STARTING:  # environment and script are put back before another thread changes them
+        yield from _changed()
+
+
+def _changed() -> Iterator[None]:
     script = vars(sys.modules["__main__"])
     kept: dict[str, Any] = {
         name: script[name] for name in ("__file__", "__spec__") if name in script

@@ -3,10 +3,13 @@
 
 import os
 import signal
+import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
+from sononerf.errors import NumericalError
 from sononerf.simulation.pool import TaskError, computed
 
 TASKS = {number: (number,) for number in range(6)}
@@ -62,3 +65,25 @@ def test_an_object_that_workers_cannot_make_is_told_in_one_line():
     with pytest.raises(TaskError, match=r"^ImportError: no module of this name$"):
         list(computed(remembered, Elsewhere(), TASKS, 2))
     assert set(dict(computed(remembered, "other", TASKS, 2)).values()) == {"other"}
+
+
+def unsound(thing, number):
+    raise NumericalError("the spectrogram is not finite")
+
+
+def test_an_error_keeps_its_text_and_its_exit_code():
+    with pytest.raises(TaskError, match=r"^the spectrogram is not finite$") as caught:
+        list(computed(unsound, None, TASKS, 1))
+    assert caught.value.exit_code == NumericalError.exit_code
+
+
+def test_several_threads_use_processes_at_once_and_leave_the_script_as_it_was():
+    script, environment = dict(vars(sys.modules["__main__"])), dict(os.environ)
+    with ThreadPoolExecutor(4) as threads:
+        found = [threads.submit(lambda: dict(computed(process, None, TASKS, 2))) for _ in range(8)]
+        assert all(each.result().keys() == TASKS.keys() for each in found)
+    after = vars(sys.modules["__main__"])
+    assert {name: after.get(name) for name in ("__file__", "__spec__")} == {
+        name: script.get(name) for name in ("__file__", "__spec__")
+    }
+    assert dict(os.environ) == environment
