@@ -436,6 +436,13 @@ BASELINES = {"backprojection": backprojection, "voxels": voxel_fit}
 
 
 def volume_of(store: EnsembleStore, name: str, numbers: Ints, *given: Any) -> Volume:
-    """Return the volume of a baseline; what it takes after the spectrograms is ``given``."""
+    """Return the volume of a baseline; a function that other processes can import.
+
+    Args:
+        store: Where the spectrograms are.
+        name: Of ``BASELINES``.
+        numbers (P,): Of the poses.
+        given: Further arguments of the baseline.
+    """
     heard = (store.read_pose(int(number)) for number in numbers)
     return BASELINES[name](heard, *given)

@@ -252,7 +252,7 @@ class EpochSampler(DistributedSampler[int]):
         self.steps, self.done = steps, done
 
     def set_epoch(self, epoch: int) -> None:
-        """Do nothing: the step says it all."""
+        """Do nothing: the step decides the batches, not the epoch."""
 
     def __len__(self) -> int:
         return self.steps
@@ -263,10 +263,10 @@ class EpochSampler(DistributedSampler[int]):
 
 
 class EpochLoader(DataLoader[RangeSlices]):
-    """Loads the batches of an :class:`EpochSampler`, which needs no state to go on."""
+    """Loads the batches of an :class:`EpochSampler`, which needs no state to resume."""
 
     def state_dict(self) -> dict[str, Any]:
-        """Return nothing; that it is there tells Lightning that an epoch can go on."""
+        """Return no state. With this method Lightning knows that it can resume within an epoch."""
         return {}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

@@ -203,11 +203,11 @@ class EchoModule(lightning.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clip the gradient's norm, and stop before one that is no number is stepped along."""
+        """Clip the norm of the gradient; stop the fit if the gradient is not finite."""
         del optimizer, gradient_clip_algorithm
         named = {n: p for n, p in self.named_parameters() if p.grad is not None}
         norm = get_total_norm([p.grad for p in named.values() if p.grad is not None])
-        # What is no number stays none: a GPU is asked where the loss is logged too.
+        # NaNs persist, so on a GPU it is enough to look at steps whose loss is logged.
         asked = self.renderer.may_ask or self._is_logged(self.global_step)
         if asked and not bool(norm.isfinite()):
             for name, parameter in named.items():
@@ -221,7 +221,7 @@ class EchoModule(lightning.LightningModule):
             clip_grads_with_norm_(named.values(), gradient_clip_val, norm)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Refuse to replace a sound checkpoint by one that holds what is no number."""
+        """Refuse to save parameters that are not finite, so that the last checkpoint stays."""
         del checkpoint
         for name, parameter in self.named_parameters():
             if not bool(parameter.isfinite().all()):

@@ -44,7 +44,7 @@ class Evaluation:
         self._file = truth or settings.evaluation.truth
         self._kind: Kind = registration or settings.evaluation.registration
         self._stop = threading.Event()
-        with suppress(InputError):  # told by the part that needs them
+        with suppress(InputError):  # raised again by the part that needs the echoes
             _ = run.echoes  # loaded once, before other threads ask for them
         self._pool = ThreadPoolExecutor(len(BASELINES))
         self._true = self._pool.submit(self._truth)

@@ -285,7 +285,7 @@ class Refinement:
         )
 
     def _coming(self) -> list[int]:
-        """Return the poses of all steps that later bounces of the present surface are added to."""
+        """Return the poses of all further steps that use the later bounces of this surface."""
         steps = self.stages[self.stage].steps - self.step
         for stage in itertools.takewhile(
             lambda stage: stage.beyond == "keep", self.stages[self.stage + 1 :]
