@@ -80,8 +80,8 @@ def simulate(
     from sononerf.progress import Progress
     from sononerf.run.build import results_folder
     from sononerf.run.scenes import draw_ensemble
-    from sononerf.run.simulate import Shard
     from sononerf.run.simulate import simulate as run
+    from sononerf.simulation.ensemble import Shard
 
     if shard is not None and (preview is not None or waveforms is not None):
         raise SettingsError("--shard takes no --preview and no --waveforms; give these without it")

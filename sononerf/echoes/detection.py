@@ -43,7 +43,7 @@ import numpy as np
 from scipy.special import gammainc, gammaincinv
 
 from sononerf.array_types import Bools, Floats, Ints
-from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.head.head import PointEcho, own_top
 from sononerf.head.row_filters import band_mean
 
@@ -219,14 +219,14 @@ class Onsets:
         return float(gammainc(np.isfinite(self.first).sum(), FALSE_ALARMS * tries))
 
 
-def asked_poses(store: EnsembleStore) -> Ints:
+def asked_poses(store: Ensemble) -> Ints:
     """Return the numbers of the training poses that are asked, ascending."""
     train = np.asarray(store.indices("train"))
     chosen = np.linspace(0, len(train) - 1, min(MOST_POSES, len(train))).round().astype(int)
     return np.asarray(train[chosen])
 
 
-def find_onsets(store: EnsembleStore, echo: PointEcho) -> Onsets:
+def find_onsets(store: Ensemble, echo: PointEcho) -> Onsets:
     """Detect the echoes of a sealed ensemble's asked poses.
 
     Args:

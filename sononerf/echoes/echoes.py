@@ -1,37 +1,52 @@
 # SPDX-License-Identifier: MIT
-"""Echoes: a store, its head, and what is found in them once; echoes minus those of a background."""
+"""Echoes: spectrograms, their head, and what is found in them; echoes less a background's."""
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
 
+from sononerf import storage
 from sononerf.array_types import Ints, Singles
 from sononerf.echoes.detection import Onsets, find_onsets
 from sononerf.echoes.free_space import EchoHull, weighted
-from sononerf.echoes.layout import AXES
+from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
+from sononerf.echoes.splits import repeats, split_of
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import IncompatibleError, InputError, NumericalError
+from sononerf.errors import InputError, SettingsError
+from sononerf.geometry.poses import Poses
+from sononerf.head.attached import attach, attached
 from sononerf.head.head import Head
+from sononerf.settings.schema import HEAD_SECTIONS
 
 if TYPE_CHECKING:  # simulation starts without it
     from torch import Tensor
 
 KEPT_BYTES = 400_000_000
 """Size of the spectrograms that stay in memory, bytes; further ones are read at each use."""
+SAME = 1e-6
+"""Poses are the same if positions (m) and rotations differ by no more."""
+Split = Literal["train", "val", "test"]
 HELD_BACK = 10
 """Without validation poses, one of this many training poses validates the refinement."""
 
 
 class Echoes:
-    """The spectrograms of one store, and the head that heard them.
+    """The spectrograms of an ensemble of poses, and the head that heard them.
+
+    Make them with :func:`sononerf.simulate`, :func:`sononerf.read_recordings`,
+    :meth:`from_arrays` or :meth:`open`.
 
     Args:
-        store: Poses, splits, axes and spectrograms.
+        store: Poses, splits, axes and spectrograms, in memory or on disk.
         head: What heard them.
         hull: The free space, where it is known already; found from the onsets where None.
 
@@ -42,7 +57,7 @@ class Echoes:
             store has no validation poses, some of its training poses validate.
     """
 
-    def __init__(self, store: EnsembleStore, head: Head, hull: EchoHull | None = None) -> None:
+    def __init__(self, store: Ensemble, head: Head, hull: EchoHull | None = None) -> None:
         self.store, self.head = store, head
         self.positions, self.rotations = store.positions, store.rotations
         training, validation = store.indices("train"), store.indices("val")
@@ -55,6 +70,158 @@ class Echoes:
         self._bytes = 0
         if hull is not None:
             self.hull = hull
+
+    @classmethod
+    def from_arrays(
+        cls,
+        spectrograms: ArrayLike,
+        poses: Poses,
+        head: Head,
+        *,
+        split: ArrayLike | None = None,
+        calibrated: bool = False,
+    ) -> Echoes:
+        """Return echoes in memory from spectrograms of your own.
+
+        Args:
+            spectrograms (P, E, R, F): Linear magnitude over the ranges ``head.range`` and the
+                frequencies ``head.frequency``.
+            poses: P of them.
+            head: What heard them.
+            split (P,): What each pose is for: ``"train"``, ``"val"`` or ``"test"``, or 0, 1, 2.
+                Where None, a twentieth of the poses validates and a tenth is held out (10 and 20 at
+                most), drawn at random with seed 0.
+            calibrated: True if magnitudes are sound pressure over that of the call at 1 m. Else one
+                gain is learned.
+
+        Raises:
+            InputError: If shapes do not fit, or a magnitude is negative.
+            NumericalError: If a magnitude is NaN or infinite, or all training poses are silent.
+        """
+        given = np.asarray(spectrograms)
+        axes = len(head.receivers), len(head.range), len(head.frequency)
+        if given.shape != (len(poses), *axes):
+            raise InputError(
+                f"spectrograms have shape {given.shape}, expected (poses, receivers, ranges, "
+                f"frequencies) {(len(poses), *axes)}, as poses and head say"
+            )
+        if given.dtype.kind not in "fiub":
+            raise InputError(f"spectrograms are {given.dtype}, expected real magnitudes")
+        bad = np.flatnonzero((given < 0).any(axis=(1, 2, 3)))
+        if len(bad):
+            raise InputError(
+                f"spectrograms: pose {bad[0]} has magnitudes below 0; give linear magnitude, not "
+                "decibels"
+            )
+        digest = hashlib.sha256(given.astype("<f4").tobytes())
+        for part in (poses.positions, poses.rotations):
+            digest.update(part.astype("<f8").tobytes())
+        purposes = split_of(poses, split)
+        store = MemoryEnsemble(
+            positions=poses.positions,
+            rotations=poses.rotations,
+            split=purposes,
+            range=head.range,
+            frequency=head.frequency,
+            receivers=axes[0],
+            attributes={
+                "echo_hash": digest.hexdigest(),
+                "origin": "simulated" if calibrated else "recorded",
+                "settings": head.plain(),
+                "speed_of_sound": head.speed_of_sound,
+            },
+        )
+        for index, spectrogram in enumerate(given):
+            store.write_pose(index, spectrogram)
+        pairs = repeats(poses, purposes)
+        again = {index: store.read_pose(other) for index, other in pairs.items()}
+        seal(store, again, silent="spectrograms: all training poses are silent")
+        return cls(store, head)
+
+    @classmethod
+    def open(cls, path: Path | str) -> Echoes:
+        """Open a store of which nothing is missing; spectrograms are read when they are needed.
+
+        Args:
+            path: Folder that ``simulate``, ``import`` or :meth:`save` wrote.
+
+        Raises:
+            InputError: If there is no store, a pose is missing, or it does not state its head.
+            IncompatibleError: If another version of the format wrote it.
+        """
+        store = complete_store(Path(path))
+        sections = stated_head(store)
+        try:
+            head = Head.from_plain(sections)
+            copies = attached(head, store.path)
+        except SettingsError as error:
+            raise InputError(f"{path}: states a head that cannot be used: {error}") from None
+        return cls(store, dataclasses.replace(head, **copies) if copies else head)
+
+    def save(self, path: Path | str) -> None:
+        """Write the echoes into a folder that :meth:`open` and every command take.
+
+        Args:
+            path: Not there, empty, or a store of the same echoes.
+
+        Raises:
+            IncompatibleError: If the folder holds other echoes.
+            StorageError: If it cannot be written.
+        """
+        path, mine = Path(path), self.store
+        storage.probe_writable(path)
+        with storage.lock(path):
+            written = EnsembleStore.create(
+                path,
+                poses_positions=mine.positions,
+                poses_rotations=mine.rotations,
+                split=mine.split,
+                range=mine.range,
+                frequency=mine.frequency,
+                attributes=mine.attributes,
+                receivers=mine.receivers,
+            )
+            attach(self.head, path)
+            for index in written.missing():
+                written.write_pose(index, mine.read_pose(index))
+            written.seal()
+
+    def __len__(self) -> int:
+        return len(self.store)
+
+    def poses(self, split: Split | None = None) -> Poses:
+        """Return the poses of a split; all of them where None."""
+        some = slice(None) if split is None else self.store.indices(split)
+        return Poses(self.positions[some], self.rotations[some])
+
+    def numbers_of(self, poses: Poses) -> Ints:
+        """Return which poses of the ensemble these are, (P,).
+
+        Raises:
+            InputError: If one is not among them.
+        """
+        mine, theirs = (
+            np.concatenate((each.positions, each.rotations.reshape(-1, 9)), axis=1)
+            for each in (self.poses(), poses)
+        )
+        distance, found = cKDTree(mine).query(theirs)
+        strange = np.flatnonzero(distance > SAME)
+        if len(strange):
+            raise InputError(
+                f"{self.store.path}: pose {strange[0]} is not among the {len(self)} poses of these "
+                "echoes; nothing was measured there"
+            )
+        return np.asarray(found, dtype=np.int64)
+
+    def spectrogram(self, pose: int) -> Singles:
+        """Return what a pose heard, (E, R, F) linear magnitude.
+
+        The axes are ``head.range`` (m) and ``head.frequency`` (Hz).
+
+        Raises:
+            InputError: If there is no such pose, or it is damaged.
+        """
+        return self.store.read_pose(pose)
 
     @property
     def reference(self) -> float:
@@ -93,7 +260,7 @@ class Echoes:
         return EchoRegion(self.onsets, self.hull, self.head.gains, turned, self.head.resolution)
 
     def magnitude(self, number: int) -> Tensor:
-        """Return what a pose heard, (E, R, F) float32 linear magnitude, on the CPU."""
+        """Return the spectrogram of a pose as a tensor that is kept, (E, R, F) float32."""
         if number not in self._kept:
             import torch
 
@@ -116,61 +283,32 @@ class Echoes:
         return np.array(wanted, dtype=np.int64)
 
 
-class SubtractedStore(EnsembleStore):
-    """Reads an ensemble, and takes the power of another one at the same poses off it.
-
-    Phase is not heard, so what both have in one cell is taken off as power; what sounded there with
-    more power alone than together leaves silence.
-
-    Args:
-        path: What was heard of target and surroundings.
-        background: What was heard of the surroundings alone.
+def complete_store(path: Path) -> EnsembleStore:
+    """Open a store of which nothing is missing.
 
     Raises:
-        InputError: If there is no such store, one is damaged, or a pose is missing.
-        IncompatibleError: If poses, ranges or frequencies differ.
+        InputError: If a pose is missing, or the store is not finished.
     """
+    store = EnsembleStore.open(path)
+    missing = store.missing()
+    if missing or "reference" not in store.attributes:
+        what = f"{len(missing)} poses are missing" if missing else "it is not finished"
+        raise InputError(f"{path}: {what}; give the same simulate or import command again")
+    return store
 
-    def __init__(self, path: Path, background: Path) -> None:
-        super().__init__(path)
-        self._background = EnsembleStore.open(background)
-        for name in AXES:
-            mine, theirs = self._axes[name], self._background._axes[name]
-            if mine.shape != theirs.shape or not np.allclose(mine, theirs, rtol=0, atol=1e-6):
-                raise IncompatibleError(
-                    f"{background}: its {name} differs from that of {path}; a background is heard "
-                    "at the same poses and analysed alike"
-                )
-        missing = self._background.missing()
-        if missing:
-            raise InputError(
-                f"{background}: pose {missing[0]} is missing; finish it with `sononerf simulate`"
-            )
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return SubtractedStore, (self.path, self._background.path)
+def stated_head(store: EnsembleStore) -> dict[str, dict[str, Any]]:
+    """Return the sections of settings that describe the head of a store, plain data.
 
-    def read_pose(self, index: int) -> Singles:
-        """Return one pose's magnitude, (E, R, F), less the surroundings."""
-        whole = np.square(super().read_pose(index), dtype=np.float64)
-        left = whole - np.square(self._background.read_pose(index), dtype=np.float64)
-        return np.sqrt(left.clip(min=0.0)).astype(np.float32)
-
-    @property
-    def attributes(self) -> dict[str, Any]:
-        """As of the whole, but for the loudness of what is left; its noise floor is not known."""
-        unknown = dict.fromkeys(("noise_floor_mae_db", "noise_floor_mae_db_active"))
-        given = super().attributes
-        return {**given, **unknown, "reference": given["reference"] * self._part}
-
-    @cached_property
-    def _part(self) -> float:
-        """How loud the loudest training cell is beside that of the whole."""
-        train = [int(index) for index in self.indices("train")]
-        left = max(float(self.read_pose(index).max()) for index in train)
-        if not left > 0.0:
-            raise NumericalError(
-                f"{self._background.path}: as loud as {self.path} everywhere, so nothing is left; "
-                "is it the same ensemble?"
-            )
-        return left / max(float(super(SubtractedStore, self).read_pose(i).max()) for i in train)
+    Raises:
+        InputError: If the store does not state all of them.
+    """
+    known = store.attributes.get("settings")
+    if not isinstance(known, dict) or not all(
+        isinstance(known.get(k), dict) for k in HEAD_SECTIONS
+    ):
+        raise InputError(
+            f"{store.path}: does not state its head (settings of {', '.join(HEAD_SECTIONS)}); "
+            "import the recordings again"
+        )
+    return {name: known[name] for name in HEAD_SECTIONS}

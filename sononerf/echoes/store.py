@@ -9,14 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 import zarr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sononerf import storage
-from sononerf.array_types import Floats, Ints, Singles
+from sononerf.array_types import Singles
 from sononerf.echoes.layout import (
     AXES,
     SPECTROGRAM,
-    SPLITS,
     DurableStore,
     Manifest,
     PoseRecord,
@@ -28,11 +27,11 @@ from sononerf.echoes.layout import (
     read_axes,
     write_group,
 )
-from sononerf.errors import IncompatibleError, InputError, NumericalError
-from sononerf.head.decibels import RANGE_DB, compress, mae_db
+from sononerf.echoes.memory_ensemble import Ensemble
+from sononerf.errors import IncompatibleError, InputError
 
 
-class EnsembleStore:
+class EnsembleStore(Ensemble):
     """An ensemble in a zarr v3 group, one chunk per pose; open it with :meth:`open`.
 
     A pose is committed in two durable steps: its chunk, then its line in the manifest. A
@@ -138,49 +137,10 @@ class EnsembleStore:
             )
         return store
 
-    def __len__(self) -> int:
-        return len(self._axes["position"])
-
-    @property
-    def positions(self) -> Floats:
-        """Head positions, (P, 3), m, world frame."""
-        return self._axes["position"].copy()
-
-    @property
-    def rotations(self) -> Floats:
-        """Head to world, (P, 3, 3)."""
-        return self._axes["rotation"].copy()
-
-    @property
-    def split(self) -> NDArray[np.int8]:
-        """What each pose is for, (P,): 0 train, 1 validation, 2 test."""
-        return self._axes["split"].copy()
-
-    @property
-    def range(self) -> Floats:
-        """One-way distances of the slices, (R,), m."""
-        return self._axes["range"].copy()
-
-    @property
-    def frequency(self) -> Floats:
-        """Frequencies of the bins, (F,), Hz."""
-        return self._axes["frequency"].copy()
-
     @property
     def receivers(self) -> int:
         """Number of receivers."""
         return int(self._spectrogram.shape[1])
-
-    @property
-    def attributes(self) -> dict[str, Any]:
-        """What the ensemble says of itself, a copy: settings, versions, units, c, m0 ..."""
-        return dict(self._attributes)
-
-    def indices(self, split: Literal["train", "val", "test"]) -> Ints:
-        """Return the numbers of a split's poses, in order."""
-        if split not in SPLITS:
-            raise InputError(f"split {split!r}: there are {', '.join(SPLITS)}")
-        return np.flatnonzero(self.split == SPLITS[split])
 
     def update_attributes(self, **values: Any) -> None:
         """Set attributes, all at once or, if the process dies, none."""
@@ -202,15 +162,7 @@ class EnsembleStore:
             StorageError: If it cannot be written; the pose then counts as missing.
         """
         self._refuse_reading()
-        self._refuse_unknown(index)
-        values = np.ascontiguousarray(spectrogram, dtype="<f4")
-        if values.shape != self._spectrogram.shape[1:]:
-            raise InputError(
-                f"{self.path}: pose {index} has shape {values.shape}, "
-                f"expected (receivers, ranges, frequencies) {self._spectrogram.shape[1:]}"
-            )
-        if not np.isfinite(values).all():
-            raise NumericalError(f"{self.path}: pose {index} holds NaN or infinite magnitudes")
+        values = self._checked(index, spectrogram)
         self._spectrogram[index] = values
         size = self._chunk(index).stat().st_size
         record = PoseRecord(size, _sha256(values))
@@ -278,10 +230,6 @@ class EnsembleStore:
         if self.mode == "r":
             raise InputError(f"{self.path}: opened for reading; open it with mode='r+'")
 
-    def _refuse_unknown(self, index: int) -> None:
-        if not 0 <= index < len(self):
-            raise InputError(f"{self.path}: no pose {index}; there are 0 to {len(self) - 1}")
-
 
 def _reopen(path: Path, mode: Literal["r", "r+"]) -> EnsembleStore:
     return EnsembleStore(path, mode=mode)
@@ -301,28 +249,3 @@ def _refuse_foreign(path: Path) -> None:
     foreign = sorted(p.name for p in path.iterdir() if p.name not in ours and p.name[0] != ".")
     if foreign:
         raise InputError(f"{path}: holds {foreign[0]!r} and is no ensemble store; choose another")
-
-
-def seal(store: EnsembleStore, again: dict[int, Singles], *, silent: str) -> None:
-    """Fix the reported decibels and the noise floor of a complete ensemble, and seal it.
-
-    Args:
-        store: No pose is missing.
-        again: By number of a test pose, what the same pose heard another time, (E, R, F).
-        silent: What to say if no training pose heard anything.
-
-    Raises:
-        NumericalError: If no training pose heard anything.
-    """
-    loudest = max(float(store.read_pose(int(i)).max()) for i in store.indices("train"))
-    if loudest <= 0.0:
-        raise NumericalError(silent)
-    reference = loudest * 10.0 ** (-RANGE_DB / 20.0)
-    noise: dict[str, float | None] = {"noise_floor_mae_db": None, "noise_floor_mae_db_active": None}
-    if again:
-        first = compress(np.stack([store.read_pose(i) for i in again]), reference)
-        second = compress(np.stack(list(again.values())), reference)
-        noise["noise_floor_mae_db"] = mae_db(first, second)
-        noise["noise_floor_mae_db_active"] = mae_db(first, second, active=True)
-    store.update_attributes(reference=reference, **noise)
-    store.seal()

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sononerf.array_types import Floats, Ints, Singles
 from sononerf.compiled import compiled
-from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import NumericalError
 from sononerf.evaluation.solid import Nearest, Solid, sample_surface
 from sononerf.geometry.poses import Poses
@@ -435,7 +435,7 @@ BASELINES = {"backprojection": backprojection, "voxels": voxel_fit}
 """Baselines of a surface, by their names in ``metrics.json``."""
 
 
-def volume_of(store: EnsembleStore, name: str, numbers: Ints, *given: Any) -> Volume:
+def volume_of(store: Ensemble, name: str, numbers: Ints, *given: Any) -> Volume:
     """Return the volume of a baseline; a function that other processes can import.
 
     Args:

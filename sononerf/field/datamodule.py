@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
-from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import SettingsError
 
 
@@ -46,7 +46,7 @@ class PoseReader:
         memory_bytes: How much may be kept.
     """
 
-    def __init__(self, store: EnsembleStore, memory_bytes: int) -> None:
+    def __init__(self, store: Ensemble, memory_bytes: int) -> None:
         self.store = store
         each = store.receivers * len(store.range) * len(store.frequency) * 4
         self.most = max(1, memory_bytes // each)
@@ -88,7 +88,7 @@ class SliceStream(Dataset[RangeSlices]):
 
     def __init__(
         self,
-        store: EnsembleStore,
+        store: Ensemble,
         split: Literal["train", "val", "test"],
         *,
         whole_poses: bool,
@@ -292,7 +292,7 @@ class EchoDataModule(lightning.LightningDataModule):
 
     def __init__(
         self,
-        store: EnsembleStore,
+        store: Ensemble,
         *,
         whole_poses: bool,
         batch: int,

@@ -7,7 +7,6 @@ import logging
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import lightning
 import numpy as np
@@ -16,7 +15,7 @@ from lightning.pytorch.loggers import Logger
 from torch.utils.data import DataLoader
 
 from sononerf.array_types import Singles
-from sononerf.echoes.echoes import Echoes
+from sononerf.echoes.echoes import Echoes, Split
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError, ResourceError
 from sononerf.field.checkpoint_io import DurableCheckpointIO
@@ -25,8 +24,6 @@ from sononerf.field.module import EchoModule
 from sononerf.field.renderer import Renderer
 from sononerf.head.head import Head
 from sononerf.progress import Progress
-
-Split = Literal["train", "val", "test"]
 
 
 @dataclass(frozen=True)

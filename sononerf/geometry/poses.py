@@ -12,13 +12,16 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_cap, fibonacci_sphere
 from sononerf.tables import number_in, read_rows
 
+ORTHOGONAL = 1e-3
+"""Largest error of a rotation's product with its transpose, no unit: of matrices in a table with
+four decimals."""
 CSV_COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
 
 
@@ -29,6 +32,9 @@ class Poses:
     Attributes:
         positions ((P, 3), m): World frame.
         rotations (P, 3, 3): Head to world.
+
+    Raises:
+        InputError: If shapes do not fit, a number is not finite, or a matrix is no rotation.
     """
 
     positions: Floats
@@ -38,11 +44,18 @@ class Poses:
         positions = np.asarray(self.positions, dtype=np.float64)
         rotations = np.asarray(self.rotations, dtype=np.float64)
         if positions.ndim != 2 or positions.shape[1] != 3:
-            raise ValueError(f"positions have shape {positions.shape}, expected (P, 3)")
+            raise InputError(f"positions have shape {positions.shape}, expected (P, 3)")
         if rotations.shape != (len(positions), 3, 3):
-            raise ValueError(
+            raise InputError(
                 f"rotations have shape {rotations.shape}, expected ({len(positions)}, 3, 3)"
             )
+        finite = np.isfinite(positions).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
+        _refuse(np.logical_not(finite), "hold NaN or infinite numbers; correct them")
+        product = rotations @ rotations.swapaxes(1, 2)
+        far = np.abs(product - np.eye(3)).max(axis=(1, 2)) > ORTHOGONAL
+        _refuse(
+            far | (np.linalg.det(rotations) < 0), "are no rotations; expected R @ R.T = 1, det 1"
+        )
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "rotations", rotations)
 
@@ -110,6 +123,12 @@ class Poses:
         table = np.column_stack([self.positions, yaw, pitch, roll])
         lines = [",".join(CSV_COLUMNS), *(",".join(repr(float(v)) for v in row) for row in table)]
         return "\n".join(lines) + "\n"
+
+
+def _refuse(bad: NDArray[np.bool_], what: str) -> None:
+    if bad.any():
+        first = ", ".join(str(index) for index in np.flatnonzero(bad)[:10])
+        raise InputError(f"{bad.sum()} of {len(bad)} poses ({first}) {what}")
 
 
 def rotation_from_euler(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> Floats:

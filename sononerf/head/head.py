@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,12 +27,14 @@ from sononerf.head.noise import draw_noise, loudest_power, noise_level, target_g
 from sononerf.head.reception import effective_window, within_band
 from sononerf.head.row_filters import RowFilters, band_mean, band_parts, row_filters
 from sononerf.head.spectrogram import echo_samples, frequency_axis, range_axis, spectrogram
+from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import (
     AirSettings,
     CallSettings,
     EarSettings,
     NoiseSettings,
     SpectrogramSettings,
+    check_call,
 )
 
 
@@ -101,39 +105,81 @@ def own_top(window: Floats) -> int:
     return top
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, init=False)
 class Head:
     """Emitter and receivers in air, the call, and the analysis that makes spectrograms.
 
-    What costs time is computed when it is first asked for, and kept.
+    Two synthetic ears, an impulse and the analysis of the paper by default. What costs time is
+    computed when it is first asked for, and kept.
 
-    Attributes:
-        ears: Places and directivities of emitter and receivers.
-        call: What is emitted.
-        air: Speed of sound and absorption.
-        analysis: Front end: filters, hop, range limits.
-        noise: Noise of the receivers.
+    Args:
+        ears: Places and directivities of emitter and receivers, m and degrees, head frame: keys of
+            the section ``ears`` of the settings, such as ``{"receivers": [(0, 0.02, 0)],
+            "directivity": "omnidirectional"}``.
+        call: What is emitted, s and Hz: section ``call``, such as ``{"kind": "hyperbolic",
+            "duration": 1e-3, "frequency_start": 90e3, "frequency_end": 30e3}``, or ``{"kind":
+            "file", "file": "call.wav"}``.
+        air: Speed of sound and absorption: section ``air``, such as ``{"temperature_c": 20}``.
+        analysis: Filters, hop, range limits, Hz and m: section ``spectrogram``, such as
+            ``{"frequency_min": 20e3, "frequency_max": 90e3, "range_max": 1.0}``.
+        noise: Of the receivers: section ``noise``, such as ``{"snr_db": 20}``.
 
     Raises:
         InputError: If a file of the call or of the directivity cannot be used.
-        SettingsError: If receivers of settings and file do not fit, or noise is set for two of
-            others.
+        SettingsError: If a key or a value is not allowed, or keys do not fit together.
+
+    Examples:
+        >>> head = Head(air={"temperature_c": 20.0})
+        >>> round(head.speed_of_sound, 1), len(head.receivers), len(head.frequency)
+        (343.2, 2, 47)
     """
 
-    ears: EarSettings = dataclasses.field(default_factory=EarSettings)
-    call: CallSettings = dataclasses.field(default_factory=CallSettings)
-    air: AirSettings = dataclasses.field(default_factory=AirSettings)
-    analysis: SpectrogramSettings = dataclasses.field(default_factory=SpectrogramSettings)
-    noise: NoiseSettings = dataclasses.field(default_factory=NoiseSettings)
+    ears: EarSettings
+    call: CallSettings
+    air: AirSettings
+    analysis: SpectrogramSettings
+    noise: NoiseSettings
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        ears: EarSettings | Mapping[str, Any] | None = None,
+        call: CallSettings | Mapping[str, Any] | None = None,
+        air: AirSettings | Mapping[str, Any] | None = None,
+        analysis: SpectrogramSettings | Mapping[str, Any] | None = None,
+        noise: NoiseSettings | Mapping[str, Any] | None = None,
+    ) -> None:
+        for name, kind, given in (
+            ("ears", EarSettings, ears),
+            ("call", CallSettings, call),
+            ("air", AirSettings, air),
+            ("analysis", SpectrogramSettings, analysis),
+            ("noise", NoiseSettings, noise),
+        ):
+            object.__setattr__(self, name, checked_section(kind, given or {}, name))
         if isinstance(self.noise.snr_db, tuple) and len(self.receivers) != 2:
             raise SettingsError(
-                f"noise.snr_db: gives 2 levels, but {self.ears.file} holds {len(self.receivers)} "
-                "receivers; give one level for all"
+                f"noise.snr_db: gives 2 levels, but there are {len(self.receivers)} receivers; "
+                "give one level for all"
             )
+        try:
+            check_call(self.call, self.analysis)
+        except ValueError as error:
+            raise SettingsError(str(error)) from None
         if self.call.file is not None:
             self._check_band()
+
+    def plain(self) -> dict[str, Any]:
+        """Return the sections of the settings that describe this head, as plain data."""
+        named = {"ears": self.ears, "call": self.call, "air": self.air}
+        sections = {**named, "spectrogram": self.analysis, "noise": self.noise}
+        return {name: section.model_dump(mode="json") for name, section in sections.items()}
+
+    @classmethod
+    def from_plain(cls, sections: Mapping[str, Any]) -> Head:
+        """Return the head that :meth:`plain` described."""
+        given = {"analysis" if k == "spectrogram" else k: v for k, v in sections.items()}
+        names = ("ears", "call", "air", "analysis", "noise")
+        return cls(**{name: given[name] for name in names if name in given})
 
     def __getstate__(self) -> dict[str, object]:
         # Other processes compute again what they need of it; the tables are large.

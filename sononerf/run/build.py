@@ -12,12 +12,14 @@ import numpy as np
 import trimesh
 
 from sononerf import storage
+from sononerf.echoes.echoes import stated_head
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, SonoNerfError
+from sononerf.head.attached import attached
 from sononerf.head.head import Head
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
-from sononerf.settings.schema import FILE_SECTIONS, HEAD_SECTIONS, Settings
+from sononerf.settings.schema import HEAD_SECTIONS, Settings
 from sononerf.simulation.simulator import Simulator
 
 OWN_KEYS = ("spectrogram.dynamic_range_db",)
@@ -42,14 +44,7 @@ def with_store(settings: Settings) -> Settings:
     if settings.scene is not None or settings.data.store is None:
         return settings
     path = settings.data.store
-    known = EnsembleStore.open(path).attributes.get("settings")
-    if not isinstance(known, dict) or not all(
-        isinstance(known.get(k), dict) for k in HEAD_SECTIONS
-    ):
-        raise InputError(
-            f"{path}: does not state its head (settings of {', '.join(HEAD_SECTIONS)}); "
-            "import the recordings again"
-        )
+    known = stated_head(EnsembleStore.open(path))
     resolved = settings.plain()
     different = []
     for section in HEAD_SECTIONS:
@@ -72,59 +67,10 @@ def with_store(settings: Settings) -> Settings:
     return with_attached(validate_settings(resolved, settings.source or str(path)), path)
 
 
-def complete_store(path: Path) -> EnsembleStore:
-    """Open a store of which nothing is missing.
-
-    Raises:
-        InputError: If a pose is missing, or the store is not finished.
-    """
-    store = EnsembleStore.open(path)
-    missing = store.missing()
-    if missing or "reference" not in store.attributes:
-        what = f"{len(missing)} poses are missing" if missing else "it is not finished"
-        raise InputError(f"{path}: {what}; give the same simulate or import command again")
-    return store
-
-
-FOLDER = "attached"
-"""Where the copies are, in the folder of a run or a store."""
-
-
-def attach(settings: Settings, folder: Path) -> None:
-    """Copy the files that settings name into a folder, if they are not there yet.
-
-    Args:
-        settings: Of the run or the store.
-        folder: Of the run or the store.
-
-    Raises:
-        InputError: If a file cannot be read.
-        StorageError: If a copy cannot be written.
-    """
-    for section in FILE_SECTIONS:
-        file = getattr(settings, section).file
-        if file is None or (copy := _copy_of(file, section, folder)).is_file():
-            continue
-        try:
-            content = file.read_bytes()
-        except OSError as error:
-            raise InputError(f"{file}: cannot be read ({error.strerror})") from None
-        storage.make_folder(copy.parent)
-        storage.commit_bytes(copy, content)
-
-
 def with_attached(settings: Settings, folder: Path) -> Settings:
     """Return the settings with the paths of copies in a folder, where there are copies."""
-    found = {}
-    for section in FILE_SECTIONS:
-        own = getattr(settings, section)
-        if own.file is not None and (copy := _copy_of(own.file, section, folder)).is_file():
-            found[section] = own.model_copy(update={"file": copy})
+    found = attached(settings, folder)
     return settings.model_copy(update=found) if found else settings
-
-
-def _copy_of(file: Path, section: str, folder: Path) -> Path:
-    return folder / FOLDER / f"{section}{file.suffix}"
 
 
 def head_of(settings: Settings) -> Head:

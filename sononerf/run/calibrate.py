@@ -17,12 +17,13 @@ from scipy.spatial.transform import Rotation
 from sononerf import storage
 from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.store import EnsembleStore, seal
+from sononerf.echoes.memory_ensemble import Ensemble, seal
+from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, SettingsError
+from sononerf.head.attached import attach
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
-from sononerf.run.build import attach
 from sononerf.run.fitted import Fitted
 from sononerf.run.run_folder import RunFolder
 from sononerf.settings.schema import HEAD_SECTIONS, SpectrogramSettings
@@ -133,7 +134,7 @@ def dependent_cells(analysis: SpectrogramSettings) -> float:
 
 def _write(
     fitted: Fitted,
-    store: EnsembleStore,
+    store: Ensemble,
     output: Path,
     found: Calibration,
     kinds: Sequence[Kind],
@@ -220,7 +221,7 @@ def _fingerprint(found: Calibration) -> str:
 
 def describe(
     head: Head,
-    store: EnsembleStore,
+    store: Ensemble,
     mesh: trimesh.Trimesh,
     estimate: Estimate,
     kinds: Sequence[Kind],
@@ -290,7 +291,7 @@ def describe(
     return lines, warnings
 
 
-def _one_distance(store: EnsembleStore, mesh: trimesh.Trimesh, resolution: float) -> bool:
+def _one_distance(store: Ensemble, mesh: trimesh.Trimesh, resolution: float) -> bool:
     """Whether all training poses are at one distance, as far as ranges can be resolved."""
     away = np.linalg.norm(store.positions[store.indices("train")] - mesh.centroid, axis=1)
     return float(np.std(away)) < resolution

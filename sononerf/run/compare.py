@@ -11,6 +11,7 @@ import trimesh
 
 from sononerf import storage
 from sononerf.array_types import Floats
+from sononerf.echoes.splits import TRAIN
 from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.evaluation.baseline import backprojection
 from sononerf.evaluation.prediction import added_part, compare
@@ -23,7 +24,6 @@ from sononerf.report.pictures.mip_picture import difference_pngs, overlay_png
 from sononerf.run.build import results_folder, true_mesh
 from sononerf.run.fitted import Fitted, all_poses
 from sononerf.run.run_folder import RunFolder, differing_keys
-from sononerf.simulation.simulator import TRAIN
 from sononerf.surface.start.volume import Volume, vti_bytes
 
 HEARING = ("air", "ears", "call", "spectrogram")

@@ -16,10 +16,10 @@ import scipy.io
 from numpy.typing import NDArray
 
 from sononerf import __version__, storage
+from sononerf.echoes.echoes import complete_store
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
 from sononerf.geometry.poses import Poses
-from sononerf.run.build import complete_store
 from sononerf.run.run_folder import RunFolder
 
 FileType = Literal["mat", "h5", "nc"]

@@ -35,8 +35,8 @@ from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
 from sononerf.run.simulate import (
     background_path,
-    ensemble,
     open_ensemble,
+    open_or_simulate,
     store_path,
 )
 from sononerf.settings.schema import Settings
@@ -210,15 +210,15 @@ def fit(
             run.check(settings)
             if not run.is_done("fit"):
                 started = time.monotonic()
-                store = ensemble(settings, workers=workers, progress=progress)
+                echoes = open_or_simulate(settings, workers=workers, progress=progress)
                 simulated = time.monotonic() - started
                 run.begin_fit(settings)
                 run.write_provenance(
-                    echo_hash=store.attributes["echo_hash"], threads=torch.get_num_threads()
+                    echo_hash=echoes.store.attributes["echo_hash"], threads=torch.get_num_threads()
                 )
                 if "simulate_s" not in run.read_metrics().get("cost", {}):
                     run.write_metrics("cost", {"simulate_s": simulated}, merge=True)
-                _fit(settings, run, Echoes(store, head), hardware, progress)
+                _fit(settings, run, echoes, hardware, progress)
             if finishes and run.is_finished:
                 progress.say(f"{path}: is finished; --overwrite fits it anew")
             elif finishes:

@@ -17,14 +17,15 @@ import numpy as np
 from sononerf import __version__, storage
 from sononerf.array_types import Singles
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.store import EnsembleStore, seal
+from sononerf.echoes.memory_ensemble import seal
+from sononerf.echoes.splits import repeats
+from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError
+from sononerf.head.attached import attach
 from sononerf.head.reception import warn_of_call
 from sononerf.progress import Progress
 from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses
-from sononerf.recordings.splits import repeats
 from sononerf.report.pictures.spectrogram_picture import pings_png
-from sononerf.run.build import attach
 from sononerf.run.understand import Understood, understand
 from sononerf.settings.schema import HEAD_SECTIONS, CallSettings
 

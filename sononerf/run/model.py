@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import InputError, SettingsError
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.field import Field
@@ -91,7 +91,7 @@ def check_plugins(settings: Settings, head: Head) -> None:
             )
 
 
-def data_for(settings: Settings, store: EnsembleStore, renderer: Renderer) -> EchoDataModule:
+def data_for(settings: Settings, store: Ensemble, renderer: Renderer) -> EchoDataModule:
     """Return the LightningDataModule that streams an ensemble as a renderer wants it."""
     fit = settings.fit
     steps = None if fit.steps_per_epoch == "auto" else fit.steps_per_epoch

@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from sononerf import storage
 from sononerf.array_types import Floats, Ints
+from sononerf.echoes.echoes import Split
 from sononerf.errors import InputError
 from sononerf.evaluation.prediction import evenly, ranked
 from sononerf.evaluation.prediction import predict as predict_poses
 from sononerf.evaluation.traced import Traced
 from sononerf.field.datamodule import WholePoses
-from sononerf.field.fitting import Split, poses_of
+from sononerf.field.fitting import poses_of
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress

@@ -22,7 +22,7 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.errors import IncompatibleError, InputError
 from sononerf.evaluation.traced import Traced
 from sononerf.field.checkpoint_io import DESCRIPTION_NAME
-from sononerf.run.build import attach
+from sononerf.head.attached import attach
 from sononerf.run.fitted import Fitted, echoes_of, load_fitted, load_traced, save_traced
 from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
 from sononerf.settings.schema import Settings

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sononerf import storage
-from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import InputError, SonoNerfError
 from sononerf.head.decibels import compress
 from sononerf.report.pictures.echo_picture import echo_png
@@ -174,7 +174,7 @@ def draw_scenes(folder: Path) -> tuple[list[Path], list[str]]:
     return written, skipped
 
 
-def draw_ensemble(settings: Settings, store: EnsembleStore, folder: Path) -> list[Path]:
+def draw_ensemble(settings: Settings, store: Ensemble, folder: Path) -> list[Path]:
     """Draw a scene with the poses of its ensemble, and the echo of the first test pose.
 
     The first pose of all where none is for the test.

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sononerf.array_types import Ints
 from sononerf.echoes.detection import RANK
+from sononerf.echoes.splits import draw_split, split_of
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import Poses
 from sononerf.head.call import call_content, call_waveform
@@ -27,7 +28,6 @@ from sononerf.recordings.folder import read_folder
 from sononerf.recordings.import_ranges import calibrated, found_ranges
 from sononerf.recordings.pings import Cutter, check_numbers, clipped_pings, mix
 from sononerf.recordings.sonotrace import read_sononerf_matlab, read_sonotracelab
-from sononerf.recordings.splits import assign_split
 from sononerf.run.build import head_of
 from sononerf.settings.import_schema import ImportSettings, read_import_settings
 from sononerf.settings.loading import apply_override, read_yaml, validate_settings
@@ -139,14 +139,17 @@ def understand(
     head = head_of(settings)
     check_numbers(recording, cutter, head.samples)
     kept, clipped = _without_clipped(recording, cutter, head, wanted)
-    split = assign_split(
-        poses[kept],
-        recording.columns.take(kept).split(),
-        validation=wanted.validation,
-        heldout=wanted.heldout,
-        seed=wanted.seed,
-        where=str(recording.path),
-    )
+    stated, where = recording.columns.take(kept).split(), str(recording.path)
+    if stated is not None:
+        split = split_of(poses[kept], stated, where=f"{where}: column split")
+    else:
+        split = draw_split(
+            poses[kept],
+            validation=wanted.validation,
+            heldout=wanted.heldout,
+            seed=wanted.seed,
+            where=where,
+        )
     noise = np.quantile(power, RANK, axis=-1)
     ratio = power.max(axis=-1) / np.maximum(noise, 1e-300)
     return Understood(

@@ -10,7 +10,7 @@ import typing
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
@@ -20,6 +20,7 @@ from sononerf.settings.schema import Settings
 
 MAX_SETTINGS_BYTES = 1_000_000
 MAX_SETTINGS_DEPTH = 50
+SectionT = TypeVar("SectionT", bound=BaseModel)
 PLUGIN_NAMES = (("scene", "name"), ("field", "kind"), ("renderer", "kind"))
 """Keys whose value decides what the options beside it mean."""
 
@@ -151,6 +152,31 @@ def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
     refuse_truths(data, settings, source=source)
     settings.__dict__["source"] = source
     return settings
+
+
+def checked_section(
+    model: type[SectionT], given: SectionT | Mapping[str, Any], where: str
+) -> SectionT:
+    """Return a section of the settings from plain data; one that is checked already stays.
+
+    Args:
+        model: The section.
+        given: Its keys and values.
+        where: Name of the section, for messages.
+
+    Raises:
+        SettingsError: One line per fault.
+    """
+    if isinstance(given, model):
+        return given
+    if not isinstance(given, Mapping):
+        raise SettingsError(f"{where}: found {type(given).__name__}, expected keys and values")
+    try:
+        section = model.model_validate(dict(given))
+    except ValidationError as error:
+        raise SettingsError(describe_faults(error, model, None, where)) from None
+    refuse_truths(given, section, prefix=where)
+    return section
 
 
 def shipped_configs() -> dict[str, Path]:

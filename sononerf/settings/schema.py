@@ -241,6 +241,29 @@ class SpectrogramSettings(_Section):
         return self
 
 
+def check_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
+    """Refuse a sweep that the sampling rate cannot hold, or of which nothing is analysed.
+
+    Raises:
+        ValueError: If it is one.
+    """
+    bands, half = call.bands, analysis.sampling_rate / 2
+    for number, (_, high) in bands.items():
+        if high > half:
+            raise ValueError(
+                f"call: harmonic {number} reaches {high:g} Hz, above half of "
+                f"spectrogram.sampling_rate ({half:g} Hz); lower the call's frequencies, leave "
+                "the harmonic out (amplitude 0) or raise the rate"
+            )
+    low, high = analysis.frequency_min, analysis.frequency_max
+    if bands and not any(lo <= high and hi >= low for lo, hi in bands.values()):
+        swept = ", ".join(f"{lo:g} to {hi:g} Hz" for lo, hi in bands.values())
+        raise ValueError(
+            f"call: sweeps {swept}, all outside spectrogram.frequency_min to frequency_max "
+            f"({low:g} to {high:g} Hz); nothing would be heard"
+        )
+
+
 class NoiseSettings(_Section):
     """White noise of the ears; what the ratio is measured by stands in ``acoustics.noise``."""
 
@@ -337,21 +360,17 @@ class ReconstructionSettings(_Section):
     smoothing: Annotated[float, Field(ge=0, le=1)] = 0.0  # side of a box over the volume, m
 
     @model_validator(mode="after")
-    def _level_is_of_an_isosurface(self) -> ReconstructionSettings:
-        if self.level != "auto" and self.method not in ("auto", "isosurface"):
-            raise ValueError(
-                f"level is of the method isosurface, not of {self.method}; set method, or leave "
-                "it out"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _smooths_what_is_cut(self) -> ReconstructionSettings:
-        if self.smoothing and self.method != "isosurface":
-            raise ValueError(
-                f"smoothing is of the method isosurface, not of {self.method}; set method, or "
-                "leave it out"
-            )
+    def _keys_of_an_isosurface(self) -> ReconstructionSettings:
+        others = {
+            "level": self.level != "auto" and self.method != "auto",
+            "smoothing": bool(self.smoothing),
+        }
+        for name, stands_alone in others.items():
+            if stands_alone and self.method != "isosurface":
+                raise ValueError(
+                    f"{name} is of the method isosurface, not of {self.method}; set method, or "
+                    "leave it out"
+                )
         return self
 
 
@@ -415,22 +434,7 @@ class Settings(_Section):
 
     @model_validator(mode="after")
     def _call_is_sampled_and_heard(self) -> Settings:
-        bands, analysis = self.call.bands, self.spectrogram
-        half = analysis.sampling_rate / 2
-        for number, (_, high) in bands.items():
-            if high > half:
-                raise ValueError(
-                    f"call: harmonic {number} reaches {high:g} Hz, above half of "
-                    f"spectrogram.sampling_rate ({half:g} Hz); lower the call's frequencies, leave "
-                    "the harmonic out (amplitude 0) or raise the rate"
-                )
-        low, high = analysis.frequency_min, analysis.frequency_max
-        if bands and not any(lo <= high and hi >= low for lo, hi in bands.values()):
-            swept = ", ".join(f"{lo:g} to {hi:g} Hz" for lo, hi in bands.values())
-            raise ValueError(
-                f"call: sweeps {swept}, all outside spectrogram.frequency_min to frequency_max "
-                f"({low:g} to {high:g} Hz); nothing would be heard"
-            )
+        check_call(self.call, self.spectrogram)
         return self
 
     @cached_property

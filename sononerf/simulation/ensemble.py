@@ -1,130 +1,302 @@
 # SPDX-License-Identifier: MIT
-"""Many poses: which ones, whether they make sense, and all their spectrograms."""
+"""The echoes of a scene at many poses, in memory or on disk, whole or in shards."""
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Collection, Iterable
+import glob
+import hashlib
+import json
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Bools, Floats, Singles
-from sononerf.echoes.store import EnsembleStore, seal
-from sononerf.errors import InputError, NumericalError
+from sononerf import __version__, storage
+from sononerf.array_types import Floats, Singles
+from sononerf.echoes.echoes import Echoes
+from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
+from sononerf.echoes.splits import split_of
+from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.geometry.poses import Poses
-from sononerf.geometry.raycast import winding_numbers
+from sononerf.head.attached import attach
+from sononerf.head.call import call_content
+from sononerf.head.ears import directivity_content
+from sononerf.head.head import Head
+from sononerf.head.reception import warn_of_call
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
+from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.accuracy import MOST, settle_rays
-from sononerf.simulation.simulator import Simulator, pose_seed
+from sononerf.simulation.pose_faults import check_poses, check_reach, deaf
+from sononerf.simulation.simulator import VERSION, Simulator, pose_seed
 from sononerf.simulation.workers import SeedOf, simulated
 
-logger = logging.getLogger("sononerf")
-
 Write = Callable[[int, Singles], None]
+HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")
+"""Sections of the settings that the echoes depend on."""
+SHARD = ".shard-"
+"""What follows the name of an ensemble's store in those of its shards."""
 
 
-def check_poses(scene: Scene, poses: Poses, *, offsets: Floats | None = None) -> None:
-    """Refuse poses that are no numbers or lie inside the surface.
+@dataclass(frozen=True)
+class Shard:
+    """Some poses of an ensemble: every ``count``-th, from the ``number``-th on.
 
-    Args:
-        scene: What is ensonified.
-        poses: To be checked.
-        offsets ((K, 3), m): Further points of the head that must be outside, such as emitter and
-            ears; head frame.
+    Attributes:
+        number: From 1 on.
+        count: How many there are.
     """
-    finite = np.isfinite(poses.positions).all(axis=1) & np.isfinite(poses.rotations).all((1, 2))
-    _refuse(~finite, "no finite numbers")
-    points = np.zeros((1, 3)) if offsets is None else np.vstack([np.zeros((1, 3)), offsets])
-    places = poses.positions[:, None] + np.einsum("pij,kj->pki", poses.rotations, points)
-    winding = winding_numbers(scene.mesh.vertices, scene.mesh.faces, places.reshape(-1, 3))
-    inside = np.abs(winding.reshape(places.shape[:2])) > 0.5
-    _refuse(inside.any(axis=1), "inside the scene's surface")
 
+    number: int
+    count: int
 
-def _refuse(bad: ArrayLike, what: str) -> None:
-    bad = np.asarray(bad)
-    if bad.any():
-        raise InputError(f"{_named(bad)} {what}; move them, or raise poses.radius")
-
-
-def _named(bad: Bools) -> str:
-    """Say how many poses there are of a kind, and which are the first ten."""
-    indices = np.flatnonzero(bad)
-    listed = ", ".join(str(index) for index in indices[:10])
-    return (
-        f"{len(indices)} of {len(bad)} poses ({listed}{', ...' if len(indices) > 10 else ''}) are"
-    )
-
-
-def check_reach(
-    scene: Scene, poses: Poses, *, bounces: int, range_min: float, range_max: float
-) -> None:
-    """Warn of poses that no echo can reach within the range limits.
-
-    Args:
-        scene: What is ensonified.
-        poses: To be checked.
-        bounces: How often sound may hit.
-        range_min, range_max (m): The limits of the spectrograms.
-
-    Raises:
-        NumericalError: If it is so for all poses; the tails of the analysis would pass for echoes.
-    """
-    lower, upper = np.asarray(scene.mesh.bounds)
-    radius = float(np.linalg.norm(upper - lower)) / 2.0
-    nearest = np.linalg.norm(poses.positions - np.clip(poses.positions, lower, upper), axis=1)
-    distance = np.linalg.norm(poses.positions - (lower + upper) / 2.0, axis=1)
-    far, near = nearest > range_max, distance + bounces * radius < range_min
-    if (far | near).all():
-        raise NumericalError(deaf(range_min, range_max))
-    for bad, what, limit in (
-        (far, "farther from the scene than range_max", range_max),
-        (near, "nearer to all of the scene than range_min", range_min),
-    ):
-        if bad.any():
-            logger.warning(
-                "%s %s (%g m) and will hear nothing; set spectrogram.range_%s, or move them",
-                *(_named(bad), what, limit, "max" if bad is far else "min"),
+    def __post_init__(self) -> None:
+        if not 1 <= self.number <= self.count:
+            raise SettingsError(
+                f"--shard: found {self.number}/{self.count}; give I/N with I from 1 to N"
             )
 
+    @classmethod
+    def of(cls, text: str) -> Shard:
+        """Return the shard of a text ``I/N``."""
+        number, _, count = text.partition("/")
+        if not (number.isdecimal() and count.isdecimal()):
+            raise SettingsError(f"--shard: found {text!r}; give I/N, such as 3/16")
+        return cls(int(number), int(count))
 
-def deaf(range_min: float, range_max: float) -> str:
-    """Say that no pose hears anything within the range limits."""
-    return (
-        f"no pose received an echo between {range_min} and {range_max} m; check poses.radius, "
-        "the scene's size (of a file, its unit) and the range limits"
-    )
+    def path(self, whole: Path) -> Path:
+        """Return the shard's store beside that of the whole ensemble."""
+        return whole.with_name(f"{whole.name}{SHARD}{self.number}-of-{self.count}")
 
 
 def simulate(
+    scene: Scene,
+    poses: Poses,
+    head: Head | None = None,
+    *,
+    split: ArrayLike | None = None,
+    output: Path | str | None = None,
+    options: SimulationSettings | Mapping[str, Any] | None = None,
+    about: Mapping[str, Any] | None = None,
+    shard: Shard | None = None,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> Echoes:
+    """Simulate what a head hears of a scene at poses.
+
+    The same call goes on with an ensemble on disk that was interrupted, and opens one that is
+    complete. Shards are stores beside the ensemble's, each with some of its poses. They can be
+    simulated on different machines at once. The same call without a shard takes the poses from
+    there, simulates what is missing, and seals.
+
+    Args:
+        scene: What is ensonified.
+        poses: Of the head, P of them.
+        head: What calls and hears; the default head where None.
+        split (P,): What each pose is for: ``"train"``, ``"val"`` or ``"test"``, or 0, 1, 2. Where
+            None, a twentieth of the poses validates and a tenth is held out (10 and 20 at most),
+            drawn at random with seed 0.
+        output: Folder of the store. The echoes are kept in memory where None.
+        options: Engine, accuracy and seed: keys of the section ``simulation`` of the settings, such
+            as ``{"accuracy_db": 0.4, "bounces": 1, "seed": 1}``.
+        about: Further attributes of the ensemble, plain data.
+        shard: Which of how many; the whole ensemble where None. It needs ``output``.
+        workers: Processes; as many as there are cores, at most 8, where None.
+        scheduler: Address of a Dask scheduler to use instead.
+        progress: Where to show it; on stderr where None.
+
+    Returns:
+        echoes: Complete, or the shard.
+
+    Raises:
+        InputError: If a pose is inside the scene, or the poses are too few to split.
+        SettingsError: If an option is not allowed.
+        NumericalError: If no pose hears anything.
+        StorageError: If the store cannot be written.
+        IncompatibleError: If the folder holds another ensemble.
+    """
+    progress = progress or Progress()
+    head = head or Head()
+    settings = checked_section(SimulationSettings, options or {}, "simulation")
+    purposes = split_of(poses, split)
+    wanted = echo_hash(scene, poses, purposes, head, settings)
+    path = None if output is None else Path(output)
+    whole = path
+    if shard is not None and path is not None:
+        path = shard.path(path)
+    if path is not None and (path / "zarr.json").is_file():
+        store = EnsembleStore.open(path)
+        if store.attributes.get("echo_hash") != wanted:
+            raise IncompatibleError(
+                f"{path}: holds echoes of other settings; choose another --output, or leave the "
+                "scene out of the settings to take the echoes as they are"
+            )
+        if "reference" in store.attributes and not store.missing():
+            return Echoes(store, head)
+    warn_of_call(head.call, head.analysis)
+    simulator = Simulator.of(scene, head, settings)
+    check_poses(scene, poses, offsets=np.vstack((head.emitter, head.receivers)))
+    check_reach(
+        scene,
+        poses,
+        bounces=settings.bounces,
+        range_min=head.analysis.range_min,
+        range_max=head.analysis.range_max,
+    )
+    if path is not None:
+        storage.probe_writable(path)
+    if simulator.engine.note:
+        progress.say(f"echoes: {simulator.engine.note}")
+    given: dict[str, Any] = {
+        "split": purposes,
+        "range": head.range,
+        "frequency": head.frequency,
+        "attributes": _attributes(wanted, head, settings, about or {}),
+        "receivers": len(head.receivers),
+    }
+    only = None if shard is None else range(shard.number - 1, len(poses), shard.count)
+    how: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "progress": progress}
+    if path is None:
+        kept = MemoryEnsemble(positions=poses.positions, rotations=poses.rotations, **given)
+        _fill(kept, simulator, poses, settings, **how)
+        return Echoes(kept, head)
+    with storage.lock(path):
+        store = EnsembleStore.create(
+            path, poses_positions=poses.positions, poses_rotations=poses.rotations, **given
+        )
+        attach(head, path)
+        if shard is None and whole is not None:
+            _take_shards(store, whole)
+        _fill(store, simulator, poses, settings, only=only, **how)
+    return Echoes(EnsembleStore.open(path), head)
+
+
+def echo_hash(
+    scene: Scene,
+    poses: Poses,
+    split: NDArray[np.int8],
+    head: Head,
+    options: SimulationSettings,
+) -> str:
+    """Return a hash of all that the echoes depend on.
+
+    Poses count as what they are, not as how they were asked for: a changed table at the same
+    place is another ensemble, the same table at another place is not.
+    """
+    plain = _heard_settings(head, options)
+    digest = hashlib.sha256(f"simulator {VERSION}".encode())
+    digest.update(json.dumps([plain[name] for name in HASHED_SECTIONS], sort_keys=True).encode())
+    for values in (poses.positions, poses.rotations):
+        # The last bits of a sine are the processor's own; adding zero makes -0 the same as 0.
+        digest.update((np.round(values, 9) + 0.0).astype("<f8").tobytes())
+    digest.update(split.tobytes())
+    digest.update(np.ascontiguousarray(scene.mesh.vertices, dtype="<f8").tobytes())
+    digest.update(np.ascontiguousarray(scene.mesh.faces, dtype="<i8").tobytes())
+    digest.update(repr(scene.material).encode())
+    if scene.part is not None:
+        digest.update(scene.part.astype("<i8").tobytes())
+    return digest.hexdigest()
+
+
+def _heard_settings(head: Head, options: SimulationSettings) -> dict[str, Any]:
+    """Return the settings that the echoes depend on, without optional keys that do not apply."""
+    plain = {**_plain(head, options), "call": call_content(head.call)}
+    ears, air, analysis = plain["ears"], plain["air"], plain["spectrogram"]
+    if analysis["kind"] == "stft":
+        for key in ("kind", "channels", "q"):
+            del analysis[key]
+    if plain["simulation"]["rays"] is not None:
+        del plain["simulation"]["accuracy_db"]
+    if ears["directivity"] != "piston":
+        del ears["piston_radius"]
+    for section, key, default in (
+        (air, "speed_of_sound", None),
+        (ears, "receivers", None),
+        (ears, "file", None),
+        (ears, "directivity", "ear"),
+    ):
+        if section[key] == default:
+            del section[key]
+    if "file" in ears:
+        # A measured directivity counts as what it is, not as where it lies.
+        ears["file"] = directivity_content(head.ears)
+    return plain
+
+
+def _plain(head: Head, options: SimulationSettings) -> dict[str, Any]:
+    return {"simulation": options.model_dump(mode="json"), **head.plain()}
+
+
+def _attributes(
+    wanted: str, head: Head, options: SimulationSettings, about: Mapping[str, Any]
+) -> dict[str, Any]:
+    further = dict(about)
+    sections = {**further.pop("settings", {}), **_plain(head, options)}
+    return {
+        "echo_hash": wanted,
+        "origin": "simulated",
+        "settings": sections,
+        "speed_of_sound": head.speed_of_sound,
+        "units": {
+            "spectrogram": "linear magnitude, sound pressure over that of the call at 1 m",
+            "position": "m",
+            "range": "m",
+            "frequency": "Hz",
+        },
+        "sononerf": __version__,
+        **further,
+    }
+
+
+def _take_shards(store: EnsembleStore, path: Path) -> None:
+    """Take what is missing of an ensemble from its shards.
+
+    Raises:
+        InputError: If a shard is damaged.
+        IncompatibleError: If a shard is of other settings, or was traced with other rays.
+    """
+    for folder in sorted(path.parent.glob(f"{glob.escape(path.name)}{SHARD}*")):
+        shard = EnsembleStore.open(folder)
+        there = set(range(len(shard))) - set(shard.missing())
+        if not there:  # it was stopped before its first pose
+            continue
+        rays = shard.attributes.get("rays")
+        for key, known in (
+            ("echo_hash", store.attributes.get("echo_hash")),
+            ("rays", store.attributes.get("rays", rays)),
+        ):
+            if shard.attributes.get(key) != known:
+                raise IncompatibleError(
+                    f"{folder}: is a shard of other echoes ({key} differs); remove it, or simulate "
+                    "it anew"
+                )
+        store.update_attributes(rays=rays)
+        for index in sorted(there & set(store.missing())):
+            store.write_pose(index, shard.read_pose(index))
+
+
+def _fill(
+    store: Ensemble,
     simulator: Simulator,
     poses: Poses,
-    store: EnsembleStore,
     options: SimulationSettings,
     *,
     only: Collection[int] | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
+    workers: int | None,
+    scheduler: str | None,
     progress: Progress,
 ) -> None:
-    """Simulate what is missing of a store, and seal it.
+    """Simulate what is missing of a store, and seal it; of some poses ``only``, it is not sealed.
 
     The test poses are simulated twice, with other rays, which gives the noise floor.
-
-    Args:
-        simulator: Scene and head.
-        poses: Those of the store.
-        store: Opened for writing.
-        options: Seed, and number of test poses for the noise floor.
-        only: Of these poses alone; the store is then not sealed.
-        workers: Processes; as many as there are cores, at most 8, where None.
-        scheduler: Address of a Dask scheduler to use instead.
-        progress: Where to show it.
     """
     missing = [index for index in store.missing() if only is None or index in only]
     test = store.indices("test")[: options.noise_floor_poses if only is None else 0]

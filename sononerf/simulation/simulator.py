@@ -15,6 +15,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from sononerf.array_types import Floats, Singles
+from sononerf.echoes.splits import TEST, TRAIN, VALIDATION
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses, cap_poses, random_poses, random_sphere_poses
 from sononerf.head.head import Head
@@ -212,9 +213,6 @@ def solved_frequency(wanted: SimulationSettings, analysis: SpectrogramSettings) 
             *(wanted.frequency_max, whole, analysis.frequency_max),
         )
     return wanted.frequency_max
-
-
-TRAIN, VALIDATION, TEST = 0, 1, 2
 
 
 def ensemble_poses(wanted: PoseSettings) -> tuple[Poses, NDArray[np.int8]]:

@@ -11,7 +11,7 @@ from sononerf.head.air import air_absorption
 from sononerf.head.ears import analysed_ears
 from sononerf.head.spectrogram import frequency_axis, range_axis
 from sononerf.run.build import simulator_of
-from sononerf.run.simulate import _attributes, echo_hash, simulate
+from sononerf.run.simulate import echo_hash, simulate
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
 from sononerf.simulation.simulator import ensemble_poses
@@ -72,7 +72,10 @@ def test_echoes_are_those_of_the_unscaled_world(worlds, tmp_path):
         split=split,
         range=simulator.head.range,
         frequency=simulator.head.frequency,
-        attributes=_attributes(plain, echo_hash(plain, scene), simulator),
+        attributes={
+            "echo_hash": echo_hash(plain, scene),
+            "speed_of_sound": simulator.head.speed_of_sound,
+        },
     )
     random = np.random.default_rng(0)
     shape = (2, len(simulator.head.range), len(simulator.head.frequency))

@@ -17,7 +17,8 @@ import pytest
 import zarr
 
 from sononerf import storage
-from sononerf.echoes.store import EnsembleStore, seal
+from sononerf.echoes.memory_ensemble import seal
+from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, NumericalError, StorageError
 from sononerf.head.decibels import compress
 

@@ -143,11 +143,19 @@ def test_indexing_gives_poses():
     np.testing.assert_array_equal(poses[np.array([7, 1])].positions, poses.positions[[7, 1]])
 
 
-def test_shapes_are_checked():
-    with pytest.raises(ValueError, match=r"positions have shape \(3,\)"):
-        Poses(np.zeros(3), np.eye(3)[None])
-    with pytest.raises(ValueError, match="rotations have shape"):
-        Poses(np.zeros((2, 3)), np.eye(3)[None])
+@pytest.mark.parametrize(
+    ("positions", "rotations", "message"),
+    [
+        (np.zeros(3), np.eye(3)[None], r"positions have shape \(3,\)"),
+        (np.zeros((2, 3)), np.eye(3)[None], "rotations have shape"),
+        ([[0.4, 0, 0], [np.nan, 0, 0]], [np.eye(3)] * 2, r"1 of 2 poses \(1\) hold NaN"),
+        (np.zeros((2, 3)), [np.eye(3), 2 * np.eye(3)], r"1 of 2 poses \(1\) are no rotations"),
+        (np.zeros((1, 3)), [np.diag([1.0, 1.0, -1.0])], "are no rotations"),
+    ],
+)
+def test_what_is_no_pose_is_refused(positions, rotations, message):
+    with pytest.raises(InputError, match=message):
+        Poses(positions, rotations)
 
 
 def test_table_comes_back(tmp_path):

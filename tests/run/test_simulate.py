@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.echoes.echoes import SubtractedStore
 from sononerf.echoes.store import EnsembleStore
+from sononerf.echoes.subtracted import SubtractedStore
 from sononerf.errors import (
     IncompatibleError,
     InputError,
@@ -24,19 +24,19 @@ from sononerf.errors import (
 )
 from sononerf.head.decibels import compress
 from sononerf.head.directivity.sofa import write_sofa
-from sononerf.run import simulate as simulate_module
 from sononerf.run.import_recordings import import_recordings
 from sononerf.run.simulate import (
-    Shard,
     background_path,
     echo_hash,
-    ensemble,
+    open_or_simulate,
     simulate,
     store_path,
     write_waveforms,
 )
 from sononerf.scene.material import LEAF, RIGID
 from sononerf.scene.scene import Scene, load_scene
+from sononerf.simulation import ensemble as simulate_module
+from sononerf.simulation.ensemble import Shard
 from sononerf.storage import lock
 from tests.head.directivity.patterns import pair
 
@@ -247,7 +247,7 @@ def test_a_shard_that_was_stopped_before_it_had_anything_is_passed_over(
 
     simulate(tiny(), output=tmp_path / "store", shard=Shard(1, 2))
     with monkeypatch.context() as patch:
-        patch.setattr(simulate_module, "simulate_poses", stop)
+        patch.setattr(simulate_module, "simulate_ensemble", stop)
         with pytest.raises(KeyboardInterrupt):
             simulate(tiny(), output=tmp_path / "store", shard=Shard(2, 2))
     whole = simulate(tiny(), output=tmp_path / "store")
@@ -330,7 +330,7 @@ def test_the_scenes_own_background_is_simulated_alone_and_taken_off(tiny, tmp_pa
     settings = tiny(data={"store": None, "background": "scene"})
     scene = before_a_wall(settings)
     monkeypatch.setattr(simulate_module, "load_scene", lambda *given, **named: scene)
-    left = ensemble(settings, workers=1)
+    left = open_or_simulate(settings, workers=1).store
     whole = simulate(tiny(data={"store": None}), workers=1)
     alone = EnsembleStore.open(background_path(settings))
     assert left.path == whole.path
@@ -347,27 +347,27 @@ def test_the_scenes_own_background_is_simulated_alone_and_taken_off(tiny, tmp_pa
     assert plate.materials == (RIGID, LEAF)
     # What is there is not simulated again.
     monkeypatch.setattr(simulate_module, "Simulator", None)
-    np.testing.assert_array_equal(ensemble(settings).read_pose(0), left.read_pose(0))
+    np.testing.assert_array_equal(open_or_simulate(settings).store.read_pose(0), left.read_pose(0))
 
 
 def test_a_background_of_ones_own_is_taken_off(tiny, echoes, tmp_path):
     settings = tiny(data={"background": str(echoes)})
     assert background_path(settings) == echoes
-    assert isinstance(ensemble(settings), SubtractedStore)
+    assert isinstance(open_or_simulate(settings).store, SubtractedStore)
     assert background_path(tiny()) is None
-    assert not isinstance(ensemble(tiny()), SubtractedStore)
+    assert not isinstance(open_or_simulate(tiny()).store, SubtractedStore)
 
 
 def test_a_background_that_is_not_there_is_told_before_anything_is_simulated(tiny, monkeypatch):
     monkeypatch.setattr(simulate_module, "simulate", None)
     with pytest.raises(InputError, match="nowhere: no ensemble store"):
-        ensemble(tiny(data={"background": "nowhere"}))
+        open_or_simulate(tiny(data={"background": "nowhere"}))
 
 
 def test_a_scene_without_background_has_none_to_take_off(tiny, monkeypatch):
     monkeypatch.setattr(simulate_module, "simulate", None)
     with pytest.raises(SettingsError, match="the scene 'sphere' marks no background") as error:
-        ensemble(tiny(data={"background": "scene"}))
+        open_or_simulate(tiny(data={"background": "scene"}))
     assert "\n" not in str(error.value)
 
 

@@ -17,7 +17,8 @@ from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
 from sononerf.simulation import workers as workers_module
-from sononerf.simulation.ensemble import check_poses, check_reach, simulate_ensemble
+from sononerf.simulation.ensemble import simulate_ensemble
+from sononerf.simulation.pose_faults import check_poses, check_reach
 from sononerf.simulation.simulator import ensemble_poses, pose_seed
 
 SEED_OF = partial(pose_seed, 5)
@@ -360,9 +361,3 @@ def test_ears_inside_are_refused():
     check_poses(scene, outside, offsets=np.array([[0.01, 0.0, 0.0]]))
     with pytest.raises(InputError, match="inside"):
         check_poses(scene, outside, offsets=np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]]))
-
-
-def test_poses_that_are_no_numbers_are_refused():
-    poses = Poses(np.array([[0.4, 0.0, 0.0], [np.nan, 0.0, 0.0]]), np.stack([np.eye(3)] * 2))
-    with pytest.raises(InputError, match=r"1 of 2 poses \(1\) are no finite numbers"):
-        check_poses(load_scene("sphere"), poses)

@@ -8,9 +8,10 @@ from pathlib import Path
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.head.spectrogram import frequency_axis, range_axis
-from sononerf.run.simulate import HASHED_SECTIONS, echo_hash
+from sononerf.run.simulate import echo_hash
 from sononerf.scene.scene import load_scene
 from sononerf.settings.schema import Settings
+from sononerf.simulation.ensemble import HASHED_SECTIONS
 from sononerf.simulation.simulator import ensemble_poses
 
 UNSCALED = ("ears.notch_depth=0",)

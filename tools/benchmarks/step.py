@@ -36,7 +36,7 @@ from sononerf.field.renderer import ShellRenderer
 from sononerf.progress import Progress
 from sononerf.run.build import head_of
 from sononerf.run.model import data_for, field_and_renderer, module_for, region_of
-from sononerf.run.simulate import default_store, echo_hash, ensemble
+from sononerf.run.simulate import default_store, echo_hash, open_or_simulate
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
 from sononerf.settings.schema import Settings
@@ -204,7 +204,7 @@ def _settings(pair: Pair, arguments: argparse.Namespace, output: Path) -> Settin
 
 
 def _measured(pair: Pair, settings: Settings, accelerator: str, products: dict[str, float]) -> Row:
-    store = ensemble(settings, progress=Progress())
+    store = open_or_simulate(settings, progress=Progress().store)
     region, possible = region_of(settings, Echoes(store, head_of(settings)))
     field, renderer = field_and_renderer(settings, head_of(settings), region)
     naive = pair.name == NAIVE

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sononerf.echoes.splits import draw_split, pose_groups, repeats, split_of
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses
-from sononerf.recordings.splits import assign_split, pose_groups, repeats
 
 
 def poses_of(count):
@@ -16,9 +16,8 @@ def poses_of(count):
     return Poses.sphere(count, radius=0.4, aim_jitter=0.1, generator=generator)
 
 
-def split(poses, stated=None, **given):
-    wanted = {"validation": None, "heldout": None, "seed": 0, **given}
-    return assign_split(poses, stated, where="t", **wanted)
+def split(poses, **given):
+    return draw_split(poses, where="t", **given)
 
 
 @pytest.mark.parametrize(
@@ -29,14 +28,32 @@ def test_sizes_follow_the_number_of_poses(count, expected):
     assert np.bincount(split(poses_of(count)), minlength=3).tolist() == expected
 
 
-def test_the_table_or_numbers_decide():
-    stated = np.array([0, 2, 1], dtype=np.int8)
-    assert split(poses_of(3), stated) is stated
+def test_numbers_and_seed_decide():
     found = split(poses_of(30), validation=5, heldout=7)
     assert np.bincount(found).tolist() == [18, 5, 7]
     assert (split(poses_of(30), seed=1) != split(poses_of(30))).any()
-    with pytest.raises(InputError, match="none is left to train on"):
+    with pytest.raises(InputError, match="t: 3 poses, of which 1 validate and 2 are held out"):
         split(poses_of(3), validation=1, heldout=2)
+
+
+@pytest.mark.parametrize("stated", [["train", "test", "val"], [0, 2, 1], np.array([0, 2, 1])])
+def test_what_is_stated_counts(stated):
+    assert split_of(poses_of(3), stated).tolist() == [0, 2, 1]
+    assert np.bincount(split_of(poses_of(40), None)).tolist() == [34, 2, 4]
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ([0, 1], r"shape \(2,\), expected \(3,\)"),
+        (["train", "test", "eval"], "found 'eval', expected train, val or test"),
+        ([0, 1, 3], "found 3"),
+        ([2, 1, 1], "no pose is for training"),
+    ],
+)
+def test_a_wrong_split_is_refused(stated, message):
+    with pytest.raises(InputError, match=message):
+        split_of(poses_of(3), stated)
 
 
 def test_repeats_stay_together_and_pair_up():

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: MIT
+"""Ensembles: what receivers heard at many poses. This module keeps them in memory."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from sononerf.array_types import Floats, Ints, Singles
+from sononerf.echoes.layout import SPLITS, checked_axes, plain_attributes
+from sononerf.errors import InputError, NumericalError
+from sononerf.head.decibels import RANGE_DB, compress, mae_db
+
+
+class Ensemble(ABC):
+    """What receivers heard at every pose; each pose is whole or missing.
+
+    Attributes:
+        path: Names the ensemble in messages; its folder where it is on disk.
+    """
+
+    path: Path
+    _axes: dict[str, NDArray[Any]]
+    _attributes: dict[str, Any]
+
+    def __len__(self) -> int:
+        return len(self._axes["position"])
+
+    @property
+    def positions(self) -> Floats:
+        """Head positions, (P, 3), m, world frame."""
+        return self._axes["position"].copy()
+
+    @property
+    def rotations(self) -> Floats:
+        """Head to world, (P, 3, 3)."""
+        return self._axes["rotation"].copy()
+
+    @property
+    def split(self) -> NDArray[np.int8]:
+        """What each pose is for, (P,): 0 train, 1 validation, 2 test."""
+        return self._axes["split"].copy()
+
+    @property
+    def range(self) -> Floats:
+        """One-way distances of the slices, (R,), m."""
+        return self._axes["range"].copy()
+
+    @property
+    def frequency(self) -> Floats:
+        """Frequencies of the bins, (F,), Hz."""
+        return self._axes["frequency"].copy()
+
+    @property
+    @abstractmethod
+    def receivers(self) -> int:
+        """Number of receivers."""
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """What the ensemble says of itself, a copy: settings, versions, units, c, m0 ..."""
+        return dict(self._attributes)
+
+    def indices(self, split: Literal["train", "val", "test"]) -> Ints:
+        """Return the numbers of a split's poses, in order."""
+        if split not in SPLITS:
+            raise InputError(f"split {split!r}: there are {', '.join(SPLITS)}")
+        return np.flatnonzero(self.split == SPLITS[split])
+
+    @abstractmethod
+    def update_attributes(self, **values: Any) -> None:
+        """Set attributes, all at once."""
+
+    @abstractmethod
+    def read_pose(self, index: int) -> Singles:
+        """Return one pose's magnitude, (E, R, F), linear.
+
+        Raises:
+            InputError: If the pose is missing or damaged.
+        """
+
+    @abstractmethod
+    def write_pose(self, index: int, spectrogram: ArrayLike) -> None:
+        """Keep one pose's magnitude, (E, R, F), linear.
+
+        Raises:
+            InputError: If there is no such pose, or the shape is another.
+            NumericalError: If a value is NaN or infinite.
+        """
+
+    @abstractmethod
+    def missing(self) -> list[int]:
+        """Return the numbers of the poses that are not there."""
+
+    @abstractmethod
+    def seal(self) -> None:
+        """Mark the ensemble as complete."""
+
+    def _checked(self, index: int, spectrogram: ArrayLike) -> Singles:
+        """Return a spectrogram in the type that is kept; refuse one that does not fit."""
+        self._refuse_unknown(index)
+        values = np.ascontiguousarray(spectrogram, dtype="<f4")
+        wanted = (self.receivers, len(self._axes["range"]), len(self._axes["frequency"]))
+        if values.shape != wanted:
+            raise InputError(
+                f"{self.path}: pose {index} has shape {values.shape}, "
+                f"expected (receivers, ranges, frequencies) {wanted}"
+            )
+        if not np.isfinite(values).all():
+            raise NumericalError(f"{self.path}: pose {index} holds NaN or infinite magnitudes")
+        return values
+
+    def _refuse_unknown(self, index: int) -> None:
+        if not 0 <= index < len(self):
+            raise InputError(f"{self.path}: no pose {index}; there are 0 to {len(self) - 1}")
+
+
+class MemoryEnsemble(Ensemble):
+    """An ensemble in memory, from which no pose is there at first.
+
+    Args:
+        positions ((P, 3), m): Of the head, world frame.
+        rotations (P, 3, 3): Head to world.
+        split (P,): 0 train, 1 validation, 2 test.
+        range ((R,), m): One-way distances of the slices.
+        frequency ((F,), Hz): Frequencies of the bins.
+        receivers: Number E of receivers.
+        attributes: Plain data.
+
+    Raises:
+        InputError: If shapes do not fit one another.
+        NumericalError: If an axis or an attribute is NaN or infinite.
+    """
+
+    def __init__(
+        self,
+        *,
+        positions: ArrayLike,
+        rotations: ArrayLike,
+        split: ArrayLike,
+        range: ArrayLike,  # noqa: A002 - the axis is called so
+        frequency: ArrayLike,
+        receivers: int,
+        attributes: dict[str, Any],
+    ) -> None:
+        self.path = Path("echoes")
+        self._axes = checked_axes(
+            position=positions, rotation=rotations, split=split, range=range, frequency=frequency
+        )
+        self._attributes = plain_attributes(self.path, attributes)
+        self._receivers = receivers
+        self._heard: dict[int, Singles] = {}
+
+    @property
+    def receivers(self) -> int:
+        """Number of receivers."""
+        return self._receivers
+
+    def update_attributes(self, **values: Any) -> None:
+        """Set attributes, all at once."""
+        self._attributes = plain_attributes(self.path, {**self._attributes, **values})
+
+    def read_pose(self, index: int) -> Singles:
+        """Return one pose's magnitude, (E, R, F), linear; raises as of the base class."""
+        self._refuse_unknown(index)
+        if index not in self._heard:
+            raise InputError(f"{self.path}: pose {index} is missing; simulate it, or write it")
+        return self._heard[index].copy()
+
+    def write_pose(self, index: int, spectrogram: ArrayLike) -> None:
+        """Keep one pose's magnitude, (E, R, F), linear; raises as of the base class."""
+        self._heard[index] = self._checked(index, spectrogram).copy()
+
+    def missing(self) -> list[int]:
+        """Return the numbers of the poses that are not there."""
+        return [index for index in np.arange(len(self)).tolist() if index not in self._heard]
+
+    def seal(self) -> None:
+        """Do nothing: what is complete in memory needs no mark."""
+
+
+def seal(ensemble: Ensemble, again: dict[int, Singles], *, silent: str) -> None:
+    """Fix the reported decibels and the noise floor of a complete ensemble, and seal it.
+
+    Args:
+        ensemble: No pose is missing.
+        again: By number of a test pose, what the same pose heard another time, (E, R, F).
+        silent: What to say if no training pose heard anything.
+
+    Raises:
+        NumericalError: If no training pose heard anything.
+    """
+    loudest = max(float(ensemble.read_pose(int(i)).max()) for i in ensemble.indices("train"))
+    if loudest <= 0.0:
+        raise NumericalError(silent)
+    reference = loudest * 10.0 ** (-RANGE_DB / 20.0)
+    noise: dict[str, float | None] = {"noise_floor_mae_db": None, "noise_floor_mae_db_active": None}
+    if again:
+        first = compress(np.stack([ensemble.read_pose(i) for i in again]), reference)
+        second = compress(np.stack(list(again.values())), reference)
+        noise["noise_floor_mae_db"] = mae_db(first, second)
+        noise["noise_floor_mae_db_active"] = mae_db(first, second, active=True)
+    ensemble.update_attributes(reference=reference, **noise)
+    ensemble.seal()
