@@ -12,9 +12,8 @@ import pytest
 import torch
 
 from sononerf.field.module import EchoModule
-from sononerf.run.build import head_of
+from sononerf.run.build import head_of, module_for
 from sononerf.run.fit import fit
-from sononerf.run.model import check_plugins, field_and_renderer
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import dump_yaml, load_settings, read_yaml, validate_settings
 
@@ -64,9 +63,9 @@ def test_it_says_only_what_differs_from_the_defaults(path):
 def test_its_scene_field_and_renderer_build(path):
     settings = load_settings(path)
     assert len(load_scene(settings.scene.name, settings.scene.options).mesh.faces) > 0
-    field, renderer = field_and_renderer(settings, head_of(settings), BOX)
-    assert sum(parameter.numel() for parameter in field.parameters()) > 0
-    assert renderer.whole_poses == (settings.renderer.kind != "shell")
+    module = module_for(settings, head_of(settings), BOX, 1.0)
+    assert sum(parameter.numel() for parameter in module.field.parameters()) > 0
+    assert module.renderer.whole_poses == (settings.renderer.kind != "shell")
 
 
 PAPER = CONFIGS / "paper" / "three_spheres.yaml"
@@ -90,7 +89,7 @@ def test_the_options_for_the_published_code_are_known():
     assert len(told) > 10
     for options in told:
         settings = load_settings(PAPER, shlex.split(options.replace("NUMBER", "20000")))
-        check_plugins(settings, head_of(settings))
+        module_for(settings, head_of(settings), None, 1.0)
         assert settings != load_settings(PAPER), options
 
 

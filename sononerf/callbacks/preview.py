@@ -13,12 +13,12 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from sononerf import storage
 from sononerf.callbacks.epoch import echo_module
 from sononerf.errors import NumericalError
-from sononerf.field.datamodule import WholePoses
 from sononerf.field.module import decibels
-from sononerf.report.mesh_files import mesh_bytes
+from sononerf.field.range_slices import WholePoses
 from sononerf.report.pictures.figure import png_from_pixels
 from sononerf.report.pictures.mip_picture import maximum_intensity_projections, mip_image
 from sononerf.report.pictures.spectrogram_picture import spectrogram_image
+from sononerf.surface.mesh_files import mesh_bytes
 from sononerf.surface.start.read_out import energy_volume
 from sononerf.surface.start.volume import automatic_level, isosurface
 

@@ -1,22 +1,24 @@
 # SPDX-License-Identifier: MIT
-"""Predicted spectrograms, their error in decibels, and what two runs differ in."""
+"""Predicted spectrograms, and their error in decibels."""
 
 from __future__ import annotations
 
+import logging
+import weakref
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import cKDTree
 
 from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.echoes import Echoes
-from sononerf.errors import NumericalError
-from sononerf.evaluation.traced import Traced, mix, trace_poses
-from sononerf.field.datamodule import WholePoses
-from sononerf.field.fitting import FittedField, render_poses
+from sononerf.errors import InputError
+from sononerf.evaluation.traced import Traced, learn_traced, mix, trace_poses
+from sononerf.field.fitting import render_poses
+from sononerf.field.module import EchoModule
+from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import (
     ACTIVE_DB,
     RANGE_DB,
@@ -27,8 +29,11 @@ from sononerf.head.decibels import (
     same_shape,
 )
 from sononerf.progress import Progress
+from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import SimulationSettings
-from sononerf.surface.start.volume import Volume
+from sononerf.surface.surface import Surface
+
+logger = logging.getLogger("sononerf")
 
 SSIM_WINDOW = 11
 """Side of the window over which SSIM compares, cells; smaller spectrograms have no SSIM."""
@@ -36,77 +41,164 @@ SSIM_WINDOW = 11
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """Spectrograms of poses, (P, E, R, F) linear magnitude.
+    """Predicted spectrograms of poses, (P, E, R, F) linear magnitude.
 
     Attributes:
+        poses: P of them.
         magnitude ((P, E, R, F) float32): The mean of rendered and traced levels.
         rendered ((P, E, R, F) float32): The field's own rendering.
+        range ((R,), m), frequency ((F,), Hz): Axes.
         traced_weight: Mean weight of the traced echoes.
         traced_fault: Why no echoes are traced off the surface.
         reference: Magnitude m0 of the reported decibels.
     """
 
+    poses: Poses
     magnitude: Singles
     rendered: Singles
+    range: Floats
+    frequency: Floats
     traced_weight: float
     traced_fault: str | None
     reference: float
 
-    def numbers(self, echoes: Echoes, measured: NDArray[np.floating]) -> dict[str, Any]:
-        """Compare with what the same poses measured, (P, E, R, F) linear magnitude.
-
-        The mean spectrogram of the training poses and the noise floor of the echoes stand beside.
-        """
-        store = echoes.store
-        train = store.indices("train")
-        mean = np.zeros(self.magnitude.shape[1:])
-        for index in train:
-            mean += compress(store.read_pose(int(index)), self.reference) / len(train)
-        level, predicted, alone = (
-            compress(part, self.reference) for part in (measured, self.magnitude, self.rendered)
-        )
-        floor = ("noise_floor_mae_db", "noise_floor_mae_db_active")
-        return {
-            "poses": len(level),
-            **prediction_metrics(level, predicted, mean_db=mean),
-            **{key: store.attributes.get(key) for key in floor},
-            "rendered_mae_db": mae_db(level, alone),
-            "rendered_mae_db_active": mae_db(level, alone, active=True),
-            "traced_weight": self.traced_weight,
-            "traced_fault": self.traced_fault,
-        }
+    @property
+    def level_db(self) -> Floats:
+        """The predicted levels (P, E, R, F) in reported decibels; 0 is silence."""
+        return compress(self.magnitude, self.reference)
 
 
 def predict(
-    fitted: FittedField,
-    traced: Traced | None,
-    poses: WholePoses,
-    simulation: SimulationSettings,
+    model: EchoModule,
+    surface: Surface | Traced | None,
+    poses: Poses,
     *,
-    seed: int,
+    options: SimulationSettings | Mapping[str, Any] | None = None,
     accelerator: str = "auto",
-    progress: Progress,
+    progress: Progress | None = None,
 ) -> Prediction:
-    """Predict the spectrograms of poses.
+    """Predict the spectrograms of poses, heard or not.
+
+    The field is rendered. With a surface, echoes are traced off it too, and both are averaged in
+    decibels, with weights that the validation poses decide.
 
     Args:
-        fitted: What is rendered.
-        traced: Surface that echoes are traced off as well.
-        poses: Where to hear.
-        simulation: Of the surface's echoes; engine and number of rays are replaced.
-        seed: Of the rays.
-        accelerator: What to render on.
-        progress: Where to show it.
+        model: Fitted.
+        surface: Reconstructed from echoes; one whose weights are known already; or None.
+        poses: P of them.
+        options: Of the simulator that traces: keys of the section ``simulation`` of the settings;
+            engine and number of rays are replaced.
+        accelerator: What to render on: ``auto``, ``cpu`` or ``gpu``.
+        progress: Where to show it; on stderr where None.
+
+    Raises:
+        InputError: If the surface does not know its echoes, or a pose is too far from the region
+            for anything to be heard.
+        SettingsError: If an option is not allowed.
+        ResourceError: If ``gpu`` is asked for and there is none.
     """
-    rendered = render_poses(fitted, poses, accelerator=accelerator, progress=progress)
-    reference, magnitude = fitted.module.reference, rendered
-    if traced is not None and traced.weight.any():
-        found = trace_poses(traced, fitted.head, poses, simulation, seed=seed, progress=progress)
-        level = mix(compress(rendered, reference), compress(found, reference), traced.weight)
-        magnitude = (reference * (10 ** (level / 20) - 1)).astype(np.float32)
-    weight = 0.0 if traced is None else float(traced.weight.mean())
-    fault = None if traced is None else traced.fault or None
-    return Prediction(magnitude, rendered, weight, fault, reference)
+    progress = progress or Progress()
+    simulation = checked_section(SimulationSettings, options or {}, "simulation")
+    how: dict[str, Any] = {"accelerator": accelerator, "progress": progress}
+    renderer, reference = model.renderer, model.reference
+    ranges, frequency = (
+        part.cpu().double().numpy() for part in (renderer.range, renderer.frequency)
+    )
+    check_hearing(model, poses)
+    lower, upper = _corners(model)
+    within = np.flatnonzero(((poses.positions >= lower) & (poses.positions <= upper)).all(axis=1))
+    if len(within):
+        numbers = ", ".join(map(str, within[:10])) + (" ..." if len(within) > 10 else "")
+        logger.warning("poses %s lie within the fitted region, where none was trained", numbers)
+    traced = surface
+    if isinstance(surface, Surface):
+        traced = traced_of(model, surface, simulation, **how)
+    rendered = render_poses(model, poses, **how)
+    magnitude, weight, fault = rendered, 0.0, None
+    if isinstance(traced, Traced):
+        weight, fault = float(traced.weight.mean()), traced.fault or None
+        if traced.weight.any():
+            assert model.head is not None  # the surface was heard by one
+            found = trace_poses(
+                traced, model.head, poses, simulation, seed=model.options.seed, progress=progress
+            )
+            level = mix(compress(rendered, reference), compress(found, reference), traced.weight)
+            magnitude = (reference * (10 ** (level / 20) - 1)).astype(np.float32)
+    return Prediction(poses, magnitude, rendered, ranges, frequency, weight, fault, reference)
+
+
+def check_hearing(model: EchoModule, poses: Poses) -> None:
+    """Refuse poses that can hear nothing of the region.
+
+    Raises:
+        InputError: If there is one.
+    """
+    lower, upper = _corners(model)
+    ranges = model.renderer.range.cpu().double().numpy()
+    below, above = lower - poses.positions, poses.positions - upper
+    with np.errstate(over="ignore"):  # what is too far for a number is too far
+        nearest = np.linalg.norm(np.maximum(np.maximum(below, above), 0), axis=1)
+        farthest = np.linalg.norm(np.maximum(-below, -above), axis=1)
+    deaf = np.flatnonzero((nearest > ranges[-1]) | (farthest < ranges[0]))
+    if len(deaf):
+        worst = deaf[0]
+        where = f"{nearest[worst]:.3g} to {farthest[worst]:.3g} m"
+        raise InputError(
+            f"from pose {worst} (the first is 0) the fitted region lies {where} away, and what is "
+            f"heard is {ranges[0]:.3g} to {ranges[-1]:.3g} m; positions are in metres"
+        )
+
+
+def _corners(model: EchoModule) -> tuple[Floats, Floats]:
+    lower, upper = model.field.region.cpu().double().numpy()
+    return lower, upper
+
+
+def traced_of(
+    model: EchoModule, surface: Surface, options: SimulationSettings, **how: Any
+) -> Traced:
+    """Return a surface with the weight of its echoes; learned once for each model and surface."""
+    for known, traced in surface.learned:
+        if known() is model:
+            assert isinstance(traced, Traced)
+            return traced
+    if surface.echoes is None:
+        raise InputError(
+            "the surface does not know the echoes that it was made from; take one from reconstruct "
+            "or refine, Surface(mesh, echoes=...), or None"
+        )
+    found = learn_traced(
+        model, surface.echoes, surface.mesh, options, seed=model.options.seed, **how
+    )
+    surface.learned.append((weakref.ref(model), found))
+    return found
+
+
+def prediction_numbers(
+    prediction: Prediction, echoes: Echoes, measured: NDArray[np.floating]
+) -> dict[str, Any]:
+    """Compare a prediction with what its poses measured, (P, E, R, F) linear magnitude.
+
+    The mean spectrogram of the training poses and the noise floor of the echoes stand beside.
+    """
+    store, reference = echoes.store, prediction.reference
+    train = store.indices("train")
+    mean = np.zeros(prediction.magnitude.shape[1:])
+    for index in train:
+        mean += compress(store.read_pose(int(index)), reference) / len(train)
+    level, predicted, alone = (
+        compress(part, reference) for part in (measured, prediction.magnitude, prediction.rendered)
+    )
+    floor = ("noise_floor_mae_db", "noise_floor_mae_db_active")
+    return {
+        "poses": len(level),
+        **prediction_metrics(level, predicted, mean_db=mean),
+        **{key: store.attributes.get(key) for key in floor},
+        "rendered_mae_db": mae_db(level, alone),
+        "rendered_mae_db_active": mae_db(level, alone, active=True),
+        "traced_weight": prediction.traced_weight,
+        "traced_fault": prediction.traced_fault,
+    }
 
 
 def ranked(measured_db: ArrayLike, predicted_db: ArrayLike) -> Ints:
@@ -213,64 +305,3 @@ def _image_metrics(
         "ssim": float(torch.as_tensor(ssim.compute())) if large else None,
         "pearson": float(torch.as_tensor(pearson.compute())) if varies else None,
     }
-
-
-SAME = 1e-6
-"""Triangles are the same where their corners' mean lies no farther apart, m."""
-
-
-@dataclass(frozen=True, eq=False)
-class Comparison:
-    """Two volumes over their common maximum, and what remains of one without the other.
-
-    Attributes:
-        first, second: 0 to 1, on one grid.
-        difference: First without second.
-        strongest ((3,) or None, m): Where the difference is greatest; None where it is nowhere
-            above zero.
-        score: How great it is at most: part of the common maximum.
-    """
-
-    first: Volume
-    second: Volume
-    difference: Volume
-    strongest: Floats | None
-    score: float
-
-
-def compare(first: Volume, second: Volume) -> Comparison:
-    """Compare two volumes, place by place.
-
-    Args:
-        first, second: What is heard from each place, on one grid.
-
-    Raises:
-        ValueError: If the grids differ.
-        NumericalError: If both are silent.
-    """
-    alike = first.shape == second.shape and np.allclose(first.origin, second.origin)
-    if not alike or first.spacing != second.spacing:
-        raise ValueError("the two volumes have different grids")
-    most = max(float(first.values.max()), float(second.values.max()))
-    if not most > 0:
-        raise NumericalError("nothing to compare: both are silent")
-    one, other = (volume.with_values(volume.values / most) for volume in (first, second))
-    difference = first.with_values(one.values - other.values)
-    index = np.unravel_index(int(difference.values.argmax()), difference.shape)
-    score = float(difference.values[index])
-    # Where nothing is stronger the greatest value lies anywhere, often in a corner.
-    strongest = difference.origin + difference.spacing * np.array(index) if score > 0 else None
-    return Comparison(one, other, difference, strongest, score)
-
-
-def added_part(mesh: trimesh.Trimesh, without: trimesh.Trimesh) -> trimesh.Trimesh | None:
-    """Return what a true surface has and another one has not; None where that is nothing.
-
-    Args:
-        mesh, without: Metres, one world frame; equal parts are equal triangle for triangle.
-    """
-    if not len(without.faces):
-        return mesh
-    distance, _ = cKDTree(without.triangles_center).query(mesh.triangles_center)
-    added = np.flatnonzero(distance > SAME)
-    return mesh.submesh([added], append=True) if len(added) else None

@@ -3,24 +3,27 @@
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 import trimesh
 from numpy.typing import ArrayLike
 
-from sononerf.array_types import Floats, Singles
+from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import ResourceError, SonoNerfError
-from sononerf.field.datamodule import WholePoses
-from sononerf.field.fitting import FittedField, poses_of, render_poses
+from sononerf.field.fitting import render_poses
+from sononerf.field.module import EchoModule
+from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.head.head import Head
 from sononerf.progress import Progress
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.ensemble import spectrograms
 from sononerf.simulation.simulator import Simulator
+
+logger = logging.getLogger("sononerf")
 
 RAYS = 100_000
 """Rays per pose. Echoes of the true three spheres differ from those of 300,000 rays by 0.1 dB over
@@ -55,7 +58,7 @@ class Traced:
 
 
 def learn_traced(
-    fitted: FittedField,
+    model: EchoModule,
     echoes: Echoes,
     mesh: trimesh.Trimesh,
     simulation: SimulationSettings,
@@ -70,7 +73,7 @@ def learn_traced(
     regression on the validation poses. Held-out poses take no part.
 
     Args:
-        fitted: What is rendered.
+        model: What is rendered.
         echoes: What was measured.
         mesh: The surface, m.
         simulation: Of the surface's echoes; engine and number of rays are replaced.
@@ -85,34 +88,32 @@ def learn_traced(
     Raises:
         ResourceError: If there is too little memory for it now.
     """
-    renderer, reference = fitted.module.renderer, fitted.module.reference
-    training = poses_of(echoes, "train", renderer)
-    validation = poses_of(echoes, "val", renderer)
+    reference, head, store = model.reference, echoes.head, echoes.store
+    training, validation = store.indices("train"), store.indices("val")
     if not len(validation):
-        return Traced.none(mesh, fitted.head, "there are no validation poses")
-    numbers = np.linspace(0, len(training) - 1, min(GAIN_POSES, len(training))).astype(int)
-    some = training.only(torch.as_tensor(numbers))
+        return Traced.none(mesh, head, "there are no validation poses")
+    some = training[np.linspace(0, len(training) - 1, min(GAIN_POSES, len(training))).astype(int)]
     try:
-        simulator = Simulator.of_surface(mesh, fitted.head, simulation, rays=RAYS)
+        simulator = Simulator.of_surface(mesh, head, simulation, rays=RAYS)
         # The prediction will need the test poses. Their echoes are not read here.
-        sets = (some, validation, poses_of(echoes, "test", renderer))
-        places = zip(*(_places(poses) for poses in sets if len(poses)), strict=True)
-        positions, rotations = (np.concatenate(parts) for parts in places)
+        numbers = np.concatenate([some, validation, store.indices("test")])
+        positions, rotations = echoes.positions[numbers], echoes.rotations[numbers]
         simulator.prepare(positions, rotations, progress)
         count = len(some) + len(validation)
         heard = _trace(simulator, positions[:count], rotations[:count], seed, progress)
         gain = gain_db(
-            compress(_measured(some), reference), compress(heard[: len(some)], reference)
+            compress(_measured(echoes, some), reference), compress(heard[: len(some)], reference)
         )
         traced = heard[len(some) :]
     except ResourceError:
         raise  # another time there may be more memory
     except SonoNerfError as error:  # some meshes can be drawn but not simulated
-        progress.say(f"no echoes are traced off the surface: {error}")
-        return Traced.none(mesh, fitted.head, str(error))
+        logger.warning("no echoes are traced off the surface: %s", error)
+        return Traced.none(mesh, head, str(error))
     traced = compress(traced * 10 ** (gain[:, None] / 20), reference)
-    rendered = render_poses(fitted, validation, accelerator=accelerator, progress=progress)
-    measured = compress(_measured(validation), reference)
+    poses = echoes.poses("val")
+    rendered = render_poses(model, poses, accelerator=accelerator, progress=progress)
+    measured = compress(_measured(echoes, validation), reference)
     weight = regress_weight(measured, compress(rendered, reference), traced)
     return Traced(mesh, gain, weight, simulator=simulator)
 
@@ -120,7 +121,7 @@ def learn_traced(
 def trace_poses(
     traced: Traced,
     head: Head,
-    poses: WholePoses,
+    poses: Poses,
     simulation: SimulationSettings,
     *,
     seed: int,
@@ -128,21 +129,14 @@ def trace_poses(
 ) -> Floats:
     """Trace echoes off the surface, (P, E, R, F) linear magnitude, without noise."""
     simulator = traced.simulator or Simulator.of_surface(traced.mesh, head, simulation, rays=RAYS)
-    simulator.prepare(*_places(poses), progress)
-    found = _trace(simulator, *_places(poses), seed, progress)
+    places = poses.positions, poses.rotations
+    simulator.prepare(*places, progress)
+    found = _trace(simulator, *places, seed, progress)
     return found * 10 ** (traced.gain_db[:, None] / 20)
 
 
-def _measured(poses: WholePoses) -> Singles:
-    return np.concatenate([poses[i].spectrum.numpy() for i in range(len(poses))])
-
-
-def _places(poses: WholePoses) -> tuple[Floats, Floats]:
-    positions, rotations = (
-        np.stack([part.double().numpy() for part in parts])
-        for parts in (poses.positions, poses.rotations)
-    )
-    return positions, rotations
+def _measured(echoes: Echoes, numbers: Ints) -> Singles:
+    return np.stack([echoes.spectrogram(int(number)) for number in numbers])
 
 
 def _trace(

@@ -5,8 +5,9 @@ from __future__ import annotations
 
 import logging
 import warnings
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import lightning
 import numpy as np
@@ -15,30 +16,15 @@ from lightning.pytorch.loggers import Logger
 from torch.utils.data import DataLoader
 
 from sononerf.array_types import Singles
-from sononerf.echoes.echoes import Echoes, Split
-from sononerf.echoes.free_space import EchoHull
-from sononerf.errors import NumericalError, ResourceError
+from sononerf.echoes.echoes import Echoes
+from sononerf.errors import NumericalError, ResourceError, SettingsError
 from sononerf.field.checkpoint_io import DurableCheckpointIO
-from sononerf.field.datamodule import EchoDataModule, PoseReader, WholePoses
+from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.module import EchoModule
-from sononerf.field.renderer import Renderer
-from sononerf.head.head import Head
+from sononerf.field.range_slices import WholePoses
+from sononerf.geometry.poses import Poses
 from sononerf.progress import Progress
-
-
-@dataclass(frozen=True)
-class FittedField:
-    """A fitted field with the head that it was heard with.
-
-    Attributes:
-        module: Field and renderer.
-        head: What heard the echoes.
-        hull: Free space in front of the onsets of the training poses.
-    """
-
-    module: EchoModule
-    head: Head
-    hull: EchoHull
+from sononerf.settings.schema import FitSettings
 
 
 def quiet_lightning() -> None:
@@ -71,49 +57,59 @@ def require_accelerator(accelerator: str) -> None:
 
 def fit(
     echoes: Echoes,
-    module: EchoModule,
-    data: EchoDataModule,
+    model: EchoModule | None = None,
+    data: EchoDataModule | None = None,
     *,
-    callbacks: list[lightning.Callback],
-    gradient_clip: float | None,
-    max_epochs: int,
-    max_steps: int | None = None,
+    options: FitSettings | Mapping[str, Any] | None = None,
+    callbacks: Sequence[lightning.Callback] = (),
     logger: Logger | None = None,
     folder: Path | None = None,
     checkpoint: Path | None = None,
     accelerator: str = "auto",
     devices: int | str = "auto",
     num_nodes: int = 1,
-) -> FittedField:
-    """Fit a module to echoes; validate after each epoch.
+) -> EchoModule:
+    """Fit a module to echoes and validate after each epoch, as the command ``fit`` does.
+
+    A Trainer of your own does as well: ``trainer.fit(model, EchoDataModule(echoes))``.
 
     Args:
         echoes: What is fitted to.
-        module: Field and renderer.
-        data: Streams the echoes.
+        model: Field and renderer; a default one for these echoes where None.
+        data: Streams the echoes; with the module's options where None.
+        options: How it is fitted: keys of the section ``fit`` of the settings, such as ``{"epochs":
+            40}``; of a model that is given, its own.
         callbacks: What happens around the fit.
-        gradient_clip: Largest norm of a gradient; not limited where None.
-        max_epochs, max_steps: The fit ends at the smaller of both.
         logger: Where scalars and pictures go.
         folder: Where Lightning and its callbacks write by default.
         checkpoint: Where the fit goes on; from the beginning where None.
         accelerator, devices, num_nodes: As of Lightning's Trainer.
 
+    Returns:
+        model: Fitted.
+
     Raises:
-        NumericalError: If a parameter is not finite at the end.
+        SettingsError: If an option is not allowed, or options are given beside a model.
+        NumericalError: If a gradient or a parameter is not finite.
+        ResourceError: If ``gpu`` is asked for and there is none.
     """
+    require_accelerator(accelerator)
+    if model is None:
+        model = EchoModule.for_echoes(echoes, options=options)
+    elif options is not None:
+        raise SettingsError("options: the model has its own; give them to EchoModule.for_echoes")
     quiet_lightning()
     trainer = lightning.Trainer(
         accelerator=accelerator,
         devices=devices,
         num_nodes=num_nodes,
-        max_epochs=max_epochs,
-        max_steps=max_steps or -1,
+        max_epochs=model.options.epochs,
+        max_steps=model.options.max_steps or -1,
         limit_val_batches=1.0 if len(echoes.store.indices("val")) else 0,
         num_sanity_val_steps=0,
-        gradient_clip_val=gradient_clip,
+        gradient_clip_val=model.options.gradient_clip,
         logger=logger or False,
-        callbacks=callbacks,
+        callbacks=list(callbacks),
         plugins=[DurableCheckpointIO()],
         enable_checkpointing=False,
         enable_progress_bar=False,
@@ -122,30 +118,23 @@ def fit(
         log_every_n_steps=5,
         default_root_dir=folder,
     )
-    trainer.fit(module, data, ckpt_path=checkpoint, weights_only=True)
-    bad = [n for n, p in module.named_parameters() if not bool(p.isfinite().all())]
+    trainer.fit(model, data or EchoDataModule(echoes), ckpt_path=checkpoint, weights_only=True)
+    bad = [n for n, p in model.named_parameters() if not bool(p.isfinite().all())]
     if bad:
         raise NumericalError(f"the fitted {bad[0]} is not finite; lower fit.learning_rate")
-    return FittedField(module, echoes.head, echoes.hull)
-
-
-def poses_of(echoes: Echoes, split: Split, renderer: Renderer) -> WholePoses:
-    """Return the poses of a split, one by one, with what was measured there."""
-    numbers = torch.as_tensor(echoes.store.indices(split))
-    return WholePoses(
-        torch.as_tensor(echoes.positions)[numbers],
-        torch.as_tensor(echoes.rotations)[numbers],
-        len(renderer.range),
-        len(renderer.frequency),
-        PoseReader(echoes.store, 1),
-        numbers,
-    )
+    return model
 
 
 def render_poses(
-    fitted: FittedField, poses: WholePoses, *, accelerator: str = "auto", progress: Progress
+    model: EchoModule, poses: Poses, *, accelerator: str = "auto", progress: Progress
 ) -> Singles:
-    """Render poses one by one, (P, E, R, F) linear magnitude."""
+    """Render poses one by one with a fitted model, (P, E, R, F) linear magnitude."""
+    whole = WholePoses(
+        torch.as_tensor(poses.positions),
+        torch.as_tensor(poses.rotations),
+        len(model.renderer.range),
+        len(model.renderer.frequency),
+    )
     quiet_lightning()
     require_accelerator(accelerator)
     rendered: list[Singles] = []
@@ -172,5 +161,5 @@ def render_poses(
             enable_progress_bar=False,
             enable_model_summary=False,
         )
-        trainer.predict(fitted.module, DataLoader(poses, batch_size=None), return_predictions=False)
+        trainer.predict(model, DataLoader(whole, batch_size=None), return_predictions=False)
     return np.concatenate(rendered)

@@ -4,19 +4,38 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
 
 import lightning
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torchmetrics import MeanMetric
 
-from sononerf.errors import NumericalError
-from sononerf.field.datamodule import RangeSlices, seed_of
+from sononerf.echoes.echoes import Echoes
+from sononerf.errors import NumericalError, SettingsError
+from sononerf.field.factories import (
+    FieldFactory,
+    RendererFactory,
+    box_of,
+    make_field,
+    make_renderer,
+)
 from sononerf.field.field import Field
+from sononerf.field.range_slices import RangeSlices, seed_of
 from sononerf.field.renderer import Possible, Renderer
 from sononerf.head.decibels import ACTIVE_DB, RANGE_DB
+from sononerf.head.head import Head
+from sononerf.settings.loading import checked_section
+from sononerf.settings.schema import (
+    FieldSettings,
+    FitSettings,
+    RendererSettings,
+    SpectrogramSettings,
+)
 
 ENDLESS = 10**9
 """Steps of a fit whose Trainer knows no end: the learning rate is never lowered."""
@@ -35,68 +54,142 @@ def decibels(magnitude: Tensor, reference: float | Tensor) -> Tensor:
 
 
 class EchoModule(lightning.LightningModule):
-    """Fits a field through a renderer.
+    """A reflectivity field and its renderer, fitted to echoes by any Lightning Trainer.
+
+    :meth:`for_echoes` makes one whose region and loudness follow from echoes. Hyperparameters are
+    plain data, so that ``load_from_checkpoint`` makes the module again; a field or a renderer that
+    was given as an object has to be given again.
 
     Args:
-        field: What is learned.
-        renderer: How it is heard.
+        field: What is learned: the name of a plugin, such as ``"grid"``, ``"fourier"`` or
+            ``"hash"``; a factory; or a field.
+        renderer: How it is heard: the name of a plugin, ``"profile"`` or ``"shell"``; a factory; or
+            a renderer.
         reference: Magnitude m0 of the reported decibels.
-        dynamic_range_db: How far below the loudest cell the fit's own compression starts.
-        early_range_db: How far below each pose's own loudest cell it starts at first, so that the
-            loud echoes, which come straight from a surface, settle before the faint ones, many of
-            which are second bounces, can draw places to where nothing is. No more than
-            ``dynamic_range_db`` is used.
-        early_share: The share of the fit that this is for.
+        region ((2, 3), m): Lower and upper corner of the box that holds the field; that of a field
+            object where None.
+        head: What heard the echoes, or what ``Head.plain`` says of it; needed unless field and
+            renderer are objects.
+        field_options, renderer_options: Keyword arguments of the factories.
+        options: How it is fitted: keys of the section ``fit`` of the settings, such as
+            ``{"learning_rate": 0.05, "loss": "l2", "schedule": "staircase", "seed": 1}``.
+        dynamic_range_db: How far below the loudest cell the fit's own compression starts; the
+            head's (``analysis``) where None.
         possible: Which places the echoes leave possible.
-        learning_rate: What Adam starts with.
-        schedule: Constant for one half, then falling to ``final_rate_factor``; or times
-            ``staircase_factor`` every ``staircase_epochs``.
-        loss: On compressed spectra, 1 being the full dynamic range.
-        silent_weight: Weight of cells that are silent in the measurement, beside 1.
-        seed: All random numbers of a step come from the seed and the step.
 
     Attributes:
+        head: As given; None where field and renderer are objects and it was not.
+        options: As given, with defaults.
         total_steps, steps_per_epoch: Length of the fit; the Trainer's, once it fits.
+
+    Raises:
+        SettingsError: If a name or an option is not allowed, or options do not go together.
+        InputError: If a plugin cannot be loaded, or makes something else.
     """
 
     def __init__(
         self,
-        field: Field,
-        renderer: Renderer,
+        field: Field | FieldFactory | str,
+        renderer: Renderer | RendererFactory | str,
         *,
         reference: float,
-        dynamic_range_db: float,
-        possible: Possible | None,
-        learning_rate: float,
-        early_range_db: float = 60.0,
-        early_share: float = 0.0,
-        schedule: Literal["cool", "staircase"] = "cool",
-        final_rate_factor: float = 0.1,
-        staircase_factor: float = 0.97,
-        staircase_epochs: int = 10,
-        loss: Literal["l1", "l2", "l1_4l2"] = "l1",
-        silent_weight: float = 1.0,
-        seed: int = 0,
+        region: ArrayLike | None = None,
+        head: Head | Mapping[str, Any] | None = None,
+        field_options: Mapping[str, Any] | None = None,
+        renderer_options: Mapping[str, Any] | None = None,
+        options: FitSettings | Mapping[str, Any] | None = None,
+        dynamic_range_db: float | None = None,
+        possible: Possible | None = None,
     ) -> None:
         super().__init__()
-        self.field = field
-        self.renderer = renderer
+        options = checked_section(FitSettings, options or {}, "fit")
+        self.head = Head.from_plain(head) if isinstance(head, Mapping) else head
+        if region is None:
+            if not isinstance(field, Field):
+                raise SettingsError("region: missing; give lower and upper corner in metres")
+            region = field.region
+        box = box_of(region)
+        region = box.tolist()  # plain: Lightning compares the arguments with a dictionary
+        self.save_hyperparameters(
+            {
+                **({"field": field} if isinstance(field, str) else {}),
+                **({"renderer": renderer} if isinstance(renderer, str) else {}),
+                "reference": float(reference),
+                "region": region,
+                "head": None if self.head is None else self.head.plain(),
+                "field_options": dict(field_options or {}),
+                "renderer_options": dict(renderer_options or {}),
+                "options": options.model_dump(mode="json"),
+                "dynamic_range_db": dynamic_range_db,
+            }
+        )
+        # A generator of its own: what the caller draws next does not depend on this.
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(options.seed)
+            self.field = make_field(field, box, self.head, field_options or {})
+            self.renderer = make_renderer(renderer, box, self.head, renderer_options or {})
+        if options.silent_share < 1.0 and self.renderer.whole_poses:
+            raise SettingsError(
+                f"fit.silent_share: found {options.silent_share:g}, but renderer {renderer!r} "
+                "takes whole poses; lower fit.silent_weight instead, or take a renderer of single "
+                "slices, such as shell"
+            )
+        if dynamic_range_db is None:
+            analysis = SpectrogramSettings() if self.head is None else self.head.analysis
+            dynamic_range_db = analysis.dynamic_range_db
         self.reference = reference
         self.dynamic_range_db = dynamic_range_db
-        self.early_range_db = early_range_db
-        self.early_share = early_share
+        self.options = options
         self.possible = possible
-        self.learning_rate = learning_rate
+        self.learning_rate = options.learning_rate or self.field.learning_rate
         self.total_steps = self.steps_per_epoch = 1
-        self.schedule = schedule
-        self.final_rate_factor = final_rate_factor
-        self.staircase_factor = staircase_factor
-        self.staircase_epochs = staircase_epochs
-        self.loss = loss
-        self.silent_weight = silent_weight
-        self.seed = seed
         self.mae = MeanMetric()
         self.mae_active = MeanMetric()
+
+    @classmethod
+    def for_echoes(
+        cls,
+        echoes: Echoes,
+        field: Field | FieldFactory | str = FieldSettings.model_fields["kind"].default,
+        renderer: Renderer | RendererFactory | str = RendererSettings.model_fields["kind"].default,
+        *,
+        region: ArrayLike | None = None,
+        field_options: Mapping[str, Any] | None = None,
+        renderer_options: Mapping[str, Any] | None = None,
+        options: FitSettings | Mapping[str, Any] | None = None,
+    ) -> EchoModule:
+        """Return an unfitted module whose region and loudness are those of echoes.
+
+        Args:
+            echoes: What will be fitted to.
+            field, renderer, field_options, renderer_options, options: As of the class.
+            region ((2, 3), m): Lower and upper corner; found from the echoes where None.
+
+        Raises:
+            NumericalError: If no pose heard anything, or no more than noise gives.
+            SettingsError, InputError: As the class.
+        """
+        if region is None:
+            region = field.region if isinstance(field, Field) else echoes.region.box()
+        found = echoes.region
+
+        def possible(places: Tensor, tolerance: float) -> Tensor:
+            left = found.possible(places.cpu().double().numpy(), tolerance)
+            if not left.any():
+                left[:] = True  # the user's own box is kept whole
+            return torch.as_tensor(left, device=places.device)
+
+        return cls(
+            field,
+            renderer,
+            reference=echoes.reference,
+            region=region,
+            head=echoes.head,
+            field_options=field_options,
+            renderer_options=renderer_options,
+            options=options,
+            possible=possible,
+        )
 
     def forward(self, batch: RangeSlices) -> Tensor:
         """Render a batch: (P, E, R, B) linear magnitude."""
@@ -133,24 +226,32 @@ class EchoModule(lightning.LightningModule):
         """Return the loss of one batch."""
         del batch_index
         step = self.global_step
-        self._seed(seed_of(self.seed, 3, step))
-        self.field.advance(step, self.total_steps)
-        self.renderer.advance(step, self.total_steps)
-        if self.renderer.prepare(self.field, self.possible, step):
-            with torch.no_grad():
-                self.renderer.calibrate(self(batch), batch.spectrum)
-                self._agree()
-        loss = self._loss(self(batch), batch.spectrum)
+        with self._own_random_numbers(step):
+            self.field.advance(step, self.total_steps)
+            self.renderer.advance(step, self.total_steps)
+            if self.renderer.prepare(self.field, self.possible, step):
+                with torch.no_grad():
+                    self.renderer.calibrate(self(batch), batch.spectrum)
+                    self._agree()
+            loss = self._loss(self(batch), batch.spectrum)
         if self._is_logged(step):
             self.log("train/loss", loss, batch_size=len(batch.pose))
         return loss
 
-    def _seed(self, number: int) -> None:
-        if self.device.type == "cpu":
-            # torch.manual_seed asks all other kinds of device too, a tenth of a small step.
-            torch.default_generator.manual_seed(number)
-        else:
-            torch.manual_seed(number)
+    @contextmanager
+    def _own_random_numbers(self, step: int) -> Iterator[None]:
+        """Draw a step's random numbers from seed and step, and none from the caller's generators.
+
+        Our fields and renderers draw none; those of others may, for example by dropout.
+        """
+        devices = [] if self.device.type == "cpu" else [self.device]
+        with torch.random.fork_rng(devices, device_type=self.device.type if devices else "cuda"):
+            number = seed_of(self.options.seed, 3, step)
+            if devices:
+                torch.manual_seed(number)
+            else:  # manual_seed asks all other kinds of device too, a tenth of a small step
+                torch.default_generator.manual_seed(number)
+            yield
 
     def _is_logged(self, step: int) -> bool:
         """Whether somebody reads this step's loss: the logger, or a preview after an epoch."""
@@ -166,24 +267,25 @@ class EchoModule(lightning.LightningModule):
 
     def range_db(self, step: int) -> float:
         """Return how far below the loudest cell the loss hears, at a step, in dB."""
-        early = step < self.early_share * self.total_steps
-        return min(self.early_range_db, self.dynamic_range_db) if early else self.dynamic_range_db
+        if step < self.options.early_share * self.total_steps:
+            return min(self.options.early_range_db, self.dynamic_range_db)
+        return self.dynamic_range_db
 
     def _loss(self, predicted: Tensor, measured: Tensor) -> Tensor:
         span = self.range_db(self.global_step)
         reference = self._reference(measured, span)
         # The difference of both decibels by fewer passes: every cell is looked at in each step.
         error = torch.log10((predicted + reference) / (measured + reference)) * (20.0 / span)
-        if self.loss == "l1":
+        if self.options.loss == "l1":
             cost = error.abs()
-        elif self.loss == "l2":
+        elif self.options.loss == "l2":
             cost = 0.5 * error.square()
         else:
             cost = error.abs() + 4.0 * error.square()
-        if self.silent_weight != 1.0:
+        if self.options.silent_weight != 1.0:
             loudest = torch.maximum(predicted.detach(), measured)
             silent = decibels(loudest, reference) < ACTIVE_DB
-            weight = torch.where(silent, self.silent_weight, 1.0)
+            weight = torch.where(silent, self.options.silent_weight, 1.0)
             return (cost * weight).sum() / weight.sum()
         return cost.mean()
 
@@ -271,11 +373,11 @@ class EchoModule(lightning.LightningModule):
         return self(batch)
 
     def _rate(self, step: int) -> float:
-        if self.schedule == "staircase":
-            stairs = step // (self.staircase_epochs * self.steps_per_epoch)
-            return float(self.staircase_factor**stairs)
+        if self.options.schedule == "staircase":
+            stairs = step // (self.options.staircase_epochs * self.steps_per_epoch)
+            return float(self.options.staircase_factor**stairs)
         late = max(0.0, 2.0 * step / max(1, self.total_steps) - 1.0)
-        return float(self.final_rate_factor**late)
+        return float(self.options.final_rate_factor**late)
 
     def configure_optimizers(self) -> Any:
         """Return Adam and the schedule, counted in steps."""

@@ -157,9 +157,10 @@ class Head:
         ):
             object.__setattr__(self, name, checked_section(kind, given or {}, name))
         if isinstance(self.noise.snr_db, tuple) and len(self.receivers) != 2:
+            count = len(self.receivers)
             raise SettingsError(
-                f"noise.snr_db: gives 2 levels, but there are {len(self.receivers)} receivers; "
-                "give one level for all"
+                f"noise.snr_db: gives 2 levels, but {self.ears.file or 'the head'} holds {count} "
+                f"receiver{'s' * (count != 1)}; give one level for all"
             )
         try:
             check_call(self.call, self.analysis)

@@ -10,15 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 
 from sononerf import storage
 from sononerf.echoes.echoes import stated_head
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, SonoNerfError
+from sononerf.field.module import EchoModule
 from sononerf.head.attached import attached
 from sononerf.head.head import Head
 from sononerf.scene.scene import Scene, load_scene
-from sononerf.settings.loading import validate_settings
+from sononerf.settings.loading import faults_of, validate_settings
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
 from sononerf.simulation.simulator import Simulator
 
@@ -86,6 +88,33 @@ def head_of(settings: Settings) -> Head:
         analysis=settings.spectrogram,
         noise=settings.noise,
     )
+
+
+def module_for(
+    settings: Settings, head: Head, region: ArrayLike | None, reference: float
+) -> EchoModule:
+    """Return an unfitted module that settings describe.
+
+    Args:
+        settings: Field, renderer and fit.
+        head: What heard the echoes.
+        region ((2, 3), m): Lower and upper corner; of a small box where None.
+        reference: Magnitude m0 of the reported decibels.
+
+    Raises:
+        SettingsError, InputError: As :class:`sononerf.field.module.EchoModule`.
+    """
+    with faults_of(settings.source):
+        return EchoModule(
+            settings.field.kind,
+            settings.renderer.kind,
+            head=head,
+            region=((-0.05,) * 3, (0.05,) * 3) if region is None else region,
+            reference=reference,
+            field_options=settings.field.options,
+            renderer_options=settings.renderer.options,
+            options=settings.fit,
+        )
 
 
 def simulator_of(scene: Scene, settings: Settings) -> Simulator:

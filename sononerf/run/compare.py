@@ -6,7 +6,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import torch
 import trimesh
 
 from sononerf import storage
@@ -14,8 +13,7 @@ from sononerf.array_types import Floats
 from sononerf.echoes.splits import TRAIN
 from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.evaluation.baseline import backprojection
-from sononerf.evaluation.prediction import added_part, compare
-from sononerf.field.datamodule import WholePoses
+from sononerf.evaluation.difference import added_part, compare
 from sononerf.field.fitting import render_poses
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
@@ -150,14 +148,7 @@ def _heard(
     progress: Progress,
 ) -> Volume:
     """Return the mean level that is heard from each place's range."""
-    renderer = run.module.renderer
-    whole = WholePoses(
-        torch.as_tensor(poses.positions),
-        torch.as_tensor(poses.rotations),
-        len(renderer.range),
-        len(renderer.frequency),
-    )
-    rendered = render_poses(run, whole, accelerator=accelerator, progress=progress)
+    rendered = render_poses(run.module, poses, accelerator=accelerator, progress=progress)
     # Delay-and-sum adds squares; the square of this is the level.
     roots = (np.sqrt(compress(spectrogram, reference)) for spectrogram in rendered)
     return backprojection(

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import resource
 import sys
 import time
@@ -24,12 +25,13 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.evaluation.traced import Traced, learn_traced
 from sononerf.field.checkpoint_io import previous_of, save_weights
-from sononerf.field.fitting import FittedField, require_accelerator
+from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import fit as fit_field
+from sononerf.field.fitting import require_accelerator
+from sononerf.field.module import EchoModule
 from sononerf.progress import Progress
-from sononerf.run.build import head_of, with_store
+from sononerf.run.build import head_of, module_for, with_store
 from sononerf.run.evaluate import Evaluation, evaluate
-from sononerf.run.model import check_plugins, data_for, field_and_renderer, module_for, region_of
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
@@ -39,7 +41,10 @@ from sononerf.run.simulate import (
     open_or_simulate,
     store_path,
 )
+from sononerf.settings.loading import faults_of
 from sononerf.settings.schema import Settings
+
+logger = logging.getLogger("sononerf")
 
 
 def finish(
@@ -94,7 +99,7 @@ def _learn_traced(run: RunFolder, accelerator: str, progress: Progress) -> None:
     else:
         try:
             traced = learn_traced(
-                run.fitted,
+                run.fitted.module,
                 run.echoes,
                 mesh,
                 settings.simulation,
@@ -192,7 +197,7 @@ def fit(
     require_accelerator(accelerator)
     settings = with_store(settings)
     head = head_of(settings)
-    check_plugins(settings, head)
+    module_for(settings, head, None, 1.0)  # unknown names and options are refused at once
     hardware = {"accelerator": accelerator, "devices": devices, "num_nodes": num_nodes}
     if follows():
         # The first process holds the lock, simulates and writes; the others only compute.
@@ -236,27 +241,36 @@ def _fit(
     progress: Progress,
 ) -> None:
     keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
-    region, possible = region_of(settings, echoes)
-    corners = (1000 * region).round().int().tolist()
+    lower, upper = settings.region.lower, settings.region.upper
+    with faults_of(settings.source):
+        module = EchoModule.for_echoes(
+            echoes,
+            settings.field.kind,
+            settings.renderer.kind,
+            region=None if lower is None or upper is None else (lower, upper),
+            field_options=settings.field.options,
+            renderer_options=settings.renderer.options,
+            options=settings.fit,
+        )
+    corners = (1000 * module.field.region).round().int().tolist()
     progress.say(f"region {corners[0]} to {corners[1]} mm")
     if echoes.hull.width < echoes.head.resolution:
-        progress.say(LINE)
-    field, renderer = field_and_renderer(settings, echoes.head, region)
-    data = data_for(settings, echoes.store, renderer)
+        logger.warning("%s", LINE)
+    renderer = module.renderer
+    data = EchoDataModule(
+        echoes,
+        settings.fit,
+        whole_poses=renderer.whole_poses,
+        workers=settings.data.workers,
+        memory_bytes=settings.data.memory_bytes,
+    )
     total = data.steps_per_epoch * settings.fit.epochs
     total = min(total, settings.fit.max_steps or total)
-    module = module_for(
-        settings,
-        field,
-        renderer,
-        reference=echoes.reference,
-        possible=possible,
-    )
     resumed = _can_resume(run)
     if not resumed and not follows():
         run.clear_previews()
     with progress.task("fitting", total) as task, keeper.watching():
-        fitted = fit_field(
+        fit_field(
             echoes,
             module,
             data,
@@ -271,16 +285,13 @@ def _fit(
                 SpectrogramImages(data.whole("val"), renderer.range, renderer.frequency),
                 keeper,
             ],
-            gradient_clip=settings.fit.gradient_clip,
-            max_epochs=settings.fit.epochs,
-            max_steps=settings.fit.max_steps,
             logger=TensorBoardLogger(run.path, name="tensorboard", version=""),
             folder=run.path,
             checkpoint=run.checkpoint if resumed else None,
             **hardware,
         )
         if module.trainer.is_global_zero:
-            _keep(settings, run, echoes, fitted, keeper.elapsed)
+            _keep(settings, run, echoes, module, keeper.elapsed)
     if torch.distributed.is_available() and torch.distributed.is_initialized():
         # What follows is for the first process alone; metrics would wait for the others.
         torch.distributed.destroy_process_group()
@@ -295,10 +306,10 @@ def _can_resume(run: RunFolder) -> bool:
 
 
 def _keep(
-    settings: Settings, run: RunFolder, echoes: Echoes, fitted: FittedField, seconds: float
+    settings: Settings, run: RunFolder, echoes: Echoes, module: EchoModule, seconds: float
 ) -> None:
     """Write the fitted field and what it cost."""
-    module, hull = fitted.module, fitted.hull
+    hull = echoes.hull
     state = {f"field.{k}": v for k, v in module.field.state_dict().items()}
     state |= {f"renderer.{k}": v for k, v in module.renderer.state_dict().items()}
     state |= {f"hull.{f.name}": _double(getattr(hull, f.name)) for f in fields(hull)}

@@ -21,10 +21,10 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.evaluation.traced import Traced
 from sononerf.field.checkpoint_io import DESCRIPTION_NAME, load_weights, model_checksum
-from sononerf.field.fitting import FittedField
+from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses
-from sononerf.run.build import head_of, with_attached
-from sononerf.run.model import field_and_renderer, module_for
+from sononerf.head.head import Head
+from sononerf.run.build import head_of, module_for, with_attached
 from sononerf.run.simulate import default_store, open_ensemble
 from sononerf.settings.loading import validate_settings
 from sononerf.settings.schema import Settings
@@ -32,16 +32,26 @@ from sononerf.simulation.simulator import ensemble_poses
 
 
 @dataclass(frozen=True)
-class Fitted(FittedField):
+class Fitted:
     """A fitted field as its run's two files describe it.
 
     Attributes:
+        module: Field and renderer.
+        hull: Free space in front of the onsets of the training poses.
         settings: Of the experiment.
         echo_hash: Of the echoes that were fitted to.
     """
 
+    module: EchoModule
+    hull: EchoHull
     settings: Settings
     echo_hash: str
+
+    @property
+    def head(self) -> Head:
+        """What heard the echoes."""
+        assert self.module.head is not None  # it was made with one
+        return self.module.head
 
 
 def load_fitted(path: Path) -> Fitted:
@@ -72,10 +82,8 @@ def load_fitted(path: Path) -> Fitted:
             "0; fetch the run again, or repeat the fit with --overwrite"
         )
     settings = with_attached(settings, path)
-    head = head_of(settings)
-    field, renderer = field_and_renderer(settings, head, region)
-    module = module_for(settings, field, renderer, reference=reference)
-    for part, prefix in ((field, "field."), (renderer, "renderer.")):
+    module = module_for(settings, head_of(settings), region, reference)
+    for part, prefix in ((module.field, "field."), (module.renderer, "renderer.")):
         own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
         try:
             part.load_state_dict(own)
@@ -85,7 +93,7 @@ def load_fitted(path: Path) -> Fitted:
                 f"{settings.renderer.kind} of this version: {str(error).splitlines()[-1].strip()}"
             ) from None
     module.eval()
-    return Fitted(module, head, hull, settings, echoes)
+    return Fitted(module, hull, settings, echoes)
 
 
 def _hull(state: dict[str, torch.Tensor]) -> EchoHull:

@@ -4,30 +4,37 @@
 from __future__ import annotations
 
 import io
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from sononerf import storage
-from sononerf.array_types import Floats, Ints
+from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.echoes import Split
 from sononerf.errors import InputError
-from sononerf.evaluation.prediction import evenly, ranked
+from sononerf.evaluation.prediction import (
+    Prediction,
+    check_hearing,
+    evenly,
+    prediction_numbers,
+    ranked,
+)
 from sononerf.evaluation.prediction import predict as predict_poses
 from sononerf.evaluation.traced import Traced
-from sononerf.field.datamodule import WholePoses
-from sononerf.field.fitting import poses_of
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.spectrogram_picture import spectrogram_png
 from sononerf.run.build import results_folder
 from sononerf.run.fitted import NAME as TRACED_NAME
-from sononerf.run.fitted import Fitted
 from sononerf.run.run_folder import RunFolder
+
+logger = logging.getLogger("sononerf")
 
 DRAWN = 3
 """Poses that are drawn where no number is given: the best, the median and the worst."""
@@ -65,95 +72,74 @@ def predict(
     progress = progress or Progress(quiet=True)
     run = RunFolder.of(run)
     own = Poses.read(poses_csv) if poses_csv else None
-    fitted, settings = run.fitted, run.fitted.settings
-    renderer = fitted.module.renderer
+    fitted = run.fitted
     kind = "" if own is None and split == "test" else f"-{'poses' if own is not None else split}"
     folder = output or run.path / f"prediction{kind}"
     if own is not None:
-        _check_poses(own, poses_csv, fitted, progress)
-        poses = WholePoses(
-            torch.as_tensor(own.positions),
-            torch.as_tensor(own.rotations),
-            len(renderer.range),
-            len(renderer.frequency),
-        )
+        poses, numbers = own, np.arange(len(own))
+        with _named(poses_csv):
+            check_hearing(fitted.module, poses)
     else:
-        poses = poses_of(run.echoes, split, renderer)
+        poses, numbers = run.echoes.poses(split), run.echoes.store.indices(split)
         if not len(poses):
             raise InputError(
                 f"{run.echoes.store.path}: holds no {split} poses; choose another --split"
             )
     with run.locked(folder):
-        traced = _traced(run, progress)
+        traced = _traced(run)
         with results_folder(folder):
             found = predict_poses(
-                fitted,
+                fitted.module,
                 traced,
                 poses,
-                settings.simulation,
-                seed=settings.fit.seed,
+                options=fitted.settings.simulation,
                 accelerator=accelerator,
                 progress=progress,
             )
-            axes = {
-                "range_m": renderer.range.double().numpy(),
-                "frequency_hz": renderer.frequency.double().numpy(),
+            axes = {"range_m": found.range, "frequency_hz": found.frequency}
+            arrays: dict[str, NDArray[Any]] = {
+                "predicted": found.magnitude,
+                "pose": numbers,
+                **axes,
             }
-            arrays = {"predicted": found.magnitude, "pose": poses.numbers.numpy(), **axes}
+            measured: Singles | None = None
             if own is None:
-                store = run.echoes.store
-                arrays["measured"] = np.stack([store.read_pose(int(i)) for i in poses.numbers])
-            arrays["position"] = poses.positions.numpy()
-            arrays["rotation"] = poses.rotations.numpy()
+                measured = np.stack([run.echoes.spectrogram(int(i)) for i in numbers])
+                arrays["measured"] = measured
+            arrays["position"], arrays["rotation"] = poses.positions, poses.rotations
             arrays["reference"] = np.asarray(found.reference)
             storage.commit(folder / "spectrograms.npz", lambda file: _save_npz(file, arrays))
-            predicted = compress(found.magnitude, found.reference)
-            measured = compress(arrays["measured"], found.reference) if own is None else None
-            drawn = np.arange(len(poses)) if measured is None else ranked(measured, predicted)
+            level = None if measured is None else compress(measured, found.reference)
+            drawn = np.arange(len(poses)) if level is None else ranked(level, found.level_db)
             if pictures != "all":
                 drawn = evenly(drawn, pictures)
-            _pictures(folder, poses, np.unique(drawn), measured, predicted, axes, progress)
-            if own is None and output is None and split == "test":
-                numbers = found.numbers(run.echoes, arrays["measured"])
-                run.write_metrics("prediction", {"split": split, **numbers})
+            _pictures(folder, found, numbers, np.unique(drawn), level, progress)
+            if measured is not None and output is None and split == "test":
+                metrics = prediction_numbers(found, run.echoes, measured)
+                run.write_metrics("prediction", {"split": split, **metrics})
     return folder
 
 
-def _traced(run: RunFolder, progress: Progress) -> Traced | None:
+@contextmanager
+def _named(file: Path | None) -> Iterator[None]:
+    """Name the file of poses in what is wrong with them."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+
+
+def _traced(run: RunFolder) -> Traced | None:
     """Return the surface that echoes are traced off; warn where the run has lost its own."""
     traced = run.traced()
     known = (run.read_metrics().get("prediction") or {}).get("traced_weight", 0)
     if traced is None and known > 0:
-        progress.say(
-            f"{run.path / TRACED_NAME} is missing: the prediction is rendered from the field "
-            "alone; the run's own also has echoes traced off its surface "
-            f"(weight {known:.2f})"
+        logger.warning(
+            "%s is missing: the prediction is rendered from the field alone; the run's own also "
+            "has echoes traced off its surface (weight %.2f)",
+            *(run.path / TRACED_NAME, known),
         )
     return traced
-
-
-def _check_poses(poses: Poses, csv: Path | None, fitted: Fitted, progress: Progress) -> None:
-    """Refuse poses that can hear nothing of the region; say which lie within it."""
-    lower, upper = (c.cpu().double().numpy() for c in fitted.module.field.region)
-    ranges = fitted.module.renderer.range.cpu().double().numpy()
-    below, above = lower - poses.positions, poses.positions - upper
-    with np.errstate(over="ignore"):  # what is too far for a number is too far
-        nearest = np.linalg.norm(np.maximum(np.maximum(below, above), 0), axis=1)
-        farthest = np.linalg.norm(np.maximum(-below, -above), axis=1)
-    deaf = np.flatnonzero((nearest > ranges[-1]) | (farthest < ranges[0]))
-    if len(deaf):
-        worst = deaf[0]
-        where = f"{nearest[worst]:.3g} to {farthest[worst]:.3g} m"
-        raise InputError(
-            f"{csv}: from pose {worst} (the first is 0) the fitted region lies {where} away, and "
-            f"what is heard is {ranges[0]:.3g} to {ranges[-1]:.3g} m; positions are in metres"
-        )
-    within = np.flatnonzero(nearest == 0)
-    if len(within):
-        numbers = ", ".join(map(str, within[:10])) + (" ..." if len(within) > 10 else "")
-        progress.say(
-            f"{csv}: within the fitted region, where no pose was trained, lie poses {numbers}"
-        )
 
 
 def _save_npz(file: BinaryIO, arrays: dict[str, NDArray[np.generic]]) -> None:
@@ -164,21 +150,21 @@ def _save_npz(file: BinaryIO, arrays: dict[str, NDArray[np.generic]]) -> None:
 
 def _pictures(
     folder: Path,
-    poses: WholePoses,
+    found: Prediction,
+    numbers: Ints,
     rows: Ints,
     measured: Floats | None,
-    predicted: Floats,
-    axes: dict[str, Floats],
     progress: Progress,
 ) -> None:
+    predicted = found.level_db
     with progress.task("drawing", len(rows)) as task:
         for row in rows:
-            number = int(poses.numbers[row])
+            number = int(numbers[row])
             picture = spectrogram_png(
                 None if measured is None else measured[row],
                 predicted[row],
-                axes["range_m"],
-                axes["frequency_hz"],
+                found.range,
+                found.frequency,
                 f"pose {number}",
             )
             storage.commit_bytes(folder / f"pose_{number:04d}.png", picture)

@@ -4,17 +4,11 @@
 from __future__ import annotations
 
 import hashlib
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
-from functools import partial
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
 import safetensors.torch
-import torch
 import trimesh
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
@@ -22,52 +16,31 @@ from torch import Tensor
 from sononerf import storage
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.field.checkpoint_io import model_checksum
-from sononerf.field.fitting import require_accelerator
 from sononerf.progress import Progress
-from sononerf.report.mesh_files import MeshFormat, mesh_bytes
 from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png, side_by_side_png
 from sononerf.report.pictures.mip_picture import mip_pngs
 from sononerf.run.build import results_folder, true_mesh
 from sononerf.run.run_folder import RunFolder
-from sononerf.simulation.simulator import Simulator
+from sononerf.surface import reconstruction
+from sononerf.surface.reconstruction import refine, starts_of
 from sononerf.surface.refine import descent as stages
-from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.refinement import (
-    STATE_VERSION,
-    Refined,
-    Refinement,
-    number_of_steps,
-    refine,
-)
-from sononerf.surface.start.read_out import (
-    FieldReading,
-    Method,
-    StartMethod,
-    read_field,
-    read_isosurface,
-    start_surfaces,
-)
+from sononerf.surface.refine.refinement import STATE_VERSION, Refinement
+from sononerf.surface.start.read_out import Method
 from sononerf.surface.start.volume import vti_bytes
-from sononerf.surface.surface import Surface, finished_surface
+from sononerf.surface.surface import FORMATS, Surface
 
 STATE = Path("checkpoints") / "surface.safetensors"
 """Where the state of an interrupted refinement is kept, in the run's folder."""
-RAYS = 20_000
-"""Rays per pose, for the correction of the last stage."""
 
 
 def refine_surface(
-    run: RunFolder,
-    starts: Mapping[StartMethod, trimesh.Trimesh],
-    *,
-    accelerator: str = "auto",
-    progress: Progress,
-) -> Refined:
-    """Refine start surfaces of a run, or go on where an interrupted refinement stopped.
+    run: RunFolder, surface: Surface, *, accelerator: str = "auto", progress: Progress
+) -> Surface:
+    """Refine the surface of a run, or go on where an interrupted refinement stopped.
 
     Args:
         run: Keeps the state until the refinement is done.
-        starts: Start surfaces, m, by their method.
+        surface: Read out of its field.
         accelerator: What to compute on.
         progress: Where to show it.
 
@@ -75,51 +48,34 @@ def refine_surface(
         InputError, IncompatibleError: If the run's echoes are not there, or are others.
         ResourceError: If ``gpu`` was asked for and there is none.
     """
-    require_accelerator(accelerator)
-    settings, head = run.fitted.settings, run.fitted.head
+    settings = run.fitted.settings
+    starts = starts_of(surface)
     digest = hashlib.sha256(b"".join(mesh.vertices.tobytes() for mesh in starts.values()))
     belongs = {**_version(), "of": f"{model_checksum(run.path)} {digest.hexdigest()}"}
     file = run.path / STATE
     saved = time.monotonic()
-    with progress.task("refining", number_of_steps(starts)) as task, _one_thread():
 
-        def after_step(work: Refinement, mismatch: float) -> None:
-            nonlocal saved
-            task.advance(work.drawn - task.done, f"mismatch {mismatch:.2f} dB")
-            if time.monotonic() - saved > settings.fit.checkpoint_seconds and not work.done:
-                tensors = {name: p.cpu().clone().contiguous() for name, p in work.state().items()}
-                data = safetensors.torch.save(tensors, metadata=belongs)
-                storage.commit_bytes(file, data)
-                saved = time.monotonic()
+    def after_step(work: Refinement, mismatch: float) -> None:
+        nonlocal saved
+        del mismatch
+        if time.monotonic() - saved > settings.fit.checkpoint_seconds and not work.done:
+            tensors = {name: p.cpu().clone().contiguous() for name, p in work.state().items()}
+            data = safetensors.torch.save(tensors, metadata=belongs)
+            storage.commit_bytes(file, data)
+            saved = time.monotonic()
 
-        refined = refine(
-            starts,
-            run.echoes,
-            optics=Optics(head).to(_device(accelerator)),
-            simulate=partial(
-                Simulator.of_surface, head=head, options=settings.simulation, rays=RAYS
-            ),
-            seed=settings.fit.seed,
-            state=_saved_state(file, belongs),
-            after_step=after_step,
-        )
+    refined = refine(
+        surface,
+        run.echoes,
+        options=settings.simulation,
+        seed=settings.fit.seed,
+        accelerator=accelerator,
+        state=_saved_state(file, belongs),
+        after_step=after_step,
+        progress=progress,
+    )
     storage.remove_file(file)
     return refined
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch compute in one thread, so that results do not depend on the number of cores.
-
-    On two idle cores a second one saves up to a tenth of the time. Beside two busy processes a step
-    takes 2.4 times as long with two: threads wait for each other.
-    """
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def check_state(run: RunFolder) -> None:
@@ -139,13 +95,6 @@ def check_state(run: RunFolder) -> None:
 
 def _version() -> dict[str, str]:
     return {"version": str(STATE_VERSION), "stages": repr(stages.STAGES)}
-
-
-def _device(accelerator: str) -> torch.device:
-    """Return the device that Lightning would take for the accelerator."""
-    if accelerator != "cpu" and torch.cuda.is_available():
-        return torch.device("cuda")
-    return torch.device("cpu")
 
 
 def _metadata(file: Path) -> dict[str, str] | None:
@@ -171,12 +120,6 @@ OPEN = {
     "left out",
 }
 """Messages about surfaces that do not enclose a body."""
-REFINED: tuple[StartMethod, ...] = ("open", "filled", "hull", "sheet")
-"""Start surfaces: the one that explains the validation poses best is refined, see
-:class:`~sononerf.surface.refine.refinement.Refinement`."""
-UNREFINED: tuple[StartMethod, ...] = ("filled", "hull")
-"""Without refinement the first of these that gives a surface is taken."""
-FORMATS: tuple[MeshFormat, ...] = ("ply", "stl", "glb")
 
 
 def reconstruct(
@@ -224,28 +167,17 @@ def reconstruct(
     if level != "auto" and method != "isosurface":
         raise SettingsError(f"method {method} has no level; leave out one of the two")
     refines = method == "auto" and options.refine and _has_echoes(run, progress)
+    chosen = options.model_copy(
+        update={"method": method, "level": level, "spacing": spacing or options.spacing}
+    )
     with run.locked(None if refines else folder), results_folder(folder):
         if refines:
             check_state(run)
-        if method == "isosurface":
-            surface = _isosurface(run, spacing, level, progress)
-        else:
-            costly = run.fitted.module.field.costly
-            with _task(progress) as shown, nullcontext() if costly else _one_thread():
-                reading = read_field(
-                    run.fitted.module.field,
-                    run.fitted.hull,
-                    resolution=run.fitted.head.resolution,
-                    spacing=spacing or options.spacing,
-                    directions=options.directions,
-                    progress=shown,
-                )
-            if refines:
-                surface = _refined(run, reading, accelerator, progress)
-            else:
-                methods = UNREFINED if method == "auto" else (method,)
-                chosen, mesh = next(start_surfaces(reading, methods))
-                surface = finished_surface(mesh, chosen, reading)
+        surface = reconstruction.reconstruct(
+            run.fitted.module, run.fitted.hull, options=chosen, progress=progress
+        )
+        if refines:
+            surface = refine_surface(run, surface, accelerator=accelerator, progress=progress)
         if own:
             run.begin("surface")
         _write(folder, surface, true_mesh(run.fitted.settings))
@@ -254,13 +186,6 @@ def reconstruct(
         if output is None:
             run.write_metrics("cost", {"reconstruct_s": time.monotonic() - started}, merge=True)
     return folder
-
-
-@contextmanager
-def _task(progress: Progress) -> Iterator[Callable[[int, int], None]]:
-    """Show how far a field is read out."""
-    with progress.task("reconstructing", 1000) as task, torch.inference_mode():
-        yield lambda done, total: task.advance(1000 * done // total - task.done)
 
 
 def _has_echoes(run: RunFolder, progress: Progress) -> bool:
@@ -272,42 +197,11 @@ def _has_echoes(run: RunFolder, progress: Progress) -> bool:
         return False
 
 
-def _isosurface(
-    run: RunFolder, spacing: float | None, level: float | Literal["auto"], progress: Progress
-) -> Surface:
-    options = run.fitted.settings.reconstruction
-    with _task(progress) as shown:
-        mesh, volume, found = read_isosurface(
-            run.fitted.module.field,
-            spacing=spacing or options.spacing,
-            level=level,
-            directions=options.directions,
-            smoothing=options.smoothing,
-            progress=shown,
-        )
-    return Surface(mesh, volume, "isosurface", level=found)
-
-
-def _refined(
-    run: RunFolder, reading: FieldReading, accelerator: str, progress: Progress
-) -> Surface:
-    starts = dict(start_surfaces(reading, REFINED))
-    refined = refine_surface(run, starts, accelerator=accelerator, progress=progress)
-    return finished_surface(
-        refined.mesh,
-        refined.start,
-        reading,
-        support=refined.support.round().astype(np.int32),
-        refined=refined.kept,
-        error_db=refined.error_db if math.isfinite(refined.error_db) else None,
-        faults=refined.faults,
-    )
-
-
 def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None) -> None:
     mesh, seen = surface.mesh, surface.support
+    assert surface.volume is not None  # it was read out of a field
     for kind in FORMATS:
-        storage.commit_bytes(folder / f"mesh.{kind}", mesh_bytes(mesh, kind, confidence=seen))
+        storage.commit_bytes(folder / f"mesh.{kind}", surface.file(kind))
     if seen is not None:
         storage.commit_bytes(folder / "confidence.png", confidence_png(mesh, seen))
     storage.commit_bytes(folder / "volume.vti", vti_bytes(surface.volume))

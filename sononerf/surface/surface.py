@@ -3,58 +3,103 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
+from sononerf import storage
 from sononerf.array_types import Bools, Floats
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.region import ENOUGH
+from sononerf.errors import InputError
 from sononerf.geometry.raycast import RayCaster
+from sononerf.surface.mesh_files import MeshFormat, mesh_bytes
 from sononerf.surface.start.evidence import ALIGNED, poses_that_heard
 from sononerf.surface.start.occupancy import QUIET
 from sononerf.surface.start.read_out import FieldReading, Method
 from sononerf.surface.start.sheet import THIN
 from sononerf.surface.start.volume import Volume
 
+FORMATS: tuple[MeshFormat, ...] = get_args(MeshFormat)
+"""Kinds of mesh files that are written."""
+
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """A reconstructed surface.
+    """A reconstructed surface, or one of your own: ``Surface(mesh)``.
 
     Attributes:
         mesh: World frame, m.
-        volume: The field's energy, or its loudness for an iso-surface.
+        volume: The field's energy, or its loudness for an iso-surface; None without a field.
         method: How the surface was found, or the start that was refined.
         level: Of an iso-surface, in the unit of the volume; None for other methods.
-        openness: What kind of surface it is; None for an iso-surface.
+        openness: What kind of surface it is; None for an iso-surface and for one of your own.
         support ((V,) int32 or None): How many poses heard the surface around each vertex.
         refined: True where the refined mesh explains the validation poses better than its start.
         error_db (dB): Objective of the refinement on validation poses; None without a refinement.
         faults: What went wrong in the refinement, one line each.
+        echoes: What it was made from; None where that is not known.
+        reading: Evidence that it was made from; None where there is none.
+        learned: Weights of its echoes beside what a model renders, by model.
+
+    Raises:
+        InputError: If the mesh has no triangles, or a vertex is not finite.
     """
 
     mesh: trimesh.Trimesh
-    volume: Volume
-    method: Method
+    volume: Volume | None = None
+    method: Method = "filled"
     level: float | None = None
     openness: Openness | None = None
     support: NDArray[np.int32] | None = None
     refined: bool = False
     error_db: float | None = None
     faults: Sequence[str] = ()
+    echoes: Echoes | None = field(default=None, repr=False)
+    reading: FieldReading | None = field(default=None, repr=False)
+    learned: list[tuple[weakref.ref[Any], object]] = field(default_factory=list, repr=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.mesh, trimesh.Trimesh):
+            raise InputError(f"mesh is a {type(self.mesh).__name__}, expected a trimesh.Trimesh")
+        if not len(self.mesh.faces) or not np.isfinite(self.mesh.vertices).all():
+            raise InputError("the mesh has no triangles, or a vertex is not finite")
+
+    def save(self, path: Path | str) -> None:
+        """Write the mesh, m: PLY (with normals and support), STL or GLB, by the name's ending.
+
+        Args:
+            path: The file; one that is there is replaced whole.
+
+        Raises:
+            InputError: If the ending is another one.
+            StorageError: If the file cannot be written.
+        """
+        path = Path(path)
+        kind = path.suffix.lower().removeprefix(".")
+        if kind not in FORMATS:
+            raise InputError(f"{path}: expected a name that ends in .{', .'.join(FORMATS)}")
+        storage.commit_bytes(path, self.file(kind))
+
+    def file(self, kind: MeshFormat) -> bytes:
+        """Return the mesh as the bytes of a file, see :meth:`save`."""
+        return mesh_bytes(self.mesh, kind, confidence=self.support)
 
 
 def finished_surface(
     mesh: trimesh.Trimesh,
     method: Method,
-    reading: FieldReading,
+    reading: FieldReading | None,
     *,
+    echoes: Echoes | None = None,
     support: NDArray[np.int32] | None = None,
     refined: bool = False,
     error_db: float | None = None,
@@ -67,33 +112,28 @@ def finished_surface(
     Args:
         mesh: A start surface or a refined one, m.
         method: How its start was found.
-        reading: Evidence that the start was made of.
+        reading: Evidence that the start was made of; without it the mesh stays whole.
         support ((V,) int32): How many poses heard each vertex; counted in the evidence where None.
-        refined, error_db, faults: As of :class:`Surface`.
+        echoes, refined, error_db, faults: As of :class:`Surface`.
     """
-    known = reading.gathered
+    known: dict[str, Any] = {"echoes": echoes, "reading": reading}
+    known |= {"refined": refined, "error_db": error_db, "faults": faults}
+    if reading is None:
+        return Surface(mesh, None, method, support=support, **known)
+    found = reading.gathered
     if support is None:
-        support = poses_that_heard(mesh, known.evidence, known.resolution)
-    openness = judge_openness(mesh, known.hull.sources, resolution=known.resolution)
+        support = poses_that_heard(mesh, found.evidence, found.resolution)
+    openness = judge_openness(mesh, found.hull.sources, resolution=found.resolution)
     if openness.kind == "one-sided":
-        reliable = known.evidence.where(known.weight > QUIET)
-        heard = poses_that_heard(mesh, reliable, known.resolution)
-        part = known_part(mesh, heard, known.hull, resolution=known.resolution)
-        part &= ~known.lattice.at_wall(mesh.triangles_center)
+        reliable = found.evidence.where(found.weight > QUIET)
+        heard = poses_that_heard(mesh, reliable, found.resolution)
+        part = known_part(mesh, heard, found.hull, resolution=found.resolution)
+        part &= ~found.lattice.at_wall(mesh.triangles_center)
         if (part & ~openness.unseen).any():
             openness = leaving_out(openness, ~part, mesh.area_faces)
         used = np.unique(mesh.faces[~openness.unseen])
         mesh, support = without_unseen(mesh, openness), support[used]
-    return Surface(
-        mesh,
-        reading.volume,
-        method,
-        openness=openness,
-        support=support,
-        refined=refined,
-        error_db=error_db,
-        faults=faults,
-    )
+    return Surface(mesh, reading.volume, method, openness=openness, support=support, **known)
 
 
 FACING = 0.1

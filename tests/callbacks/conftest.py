@@ -14,8 +14,8 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import quiet_lightning
+from sononerf.field.module import EchoModule
 from sononerf.run.build import head_of
-from sononerf.run.model import field_and_renderer, module_for, region_of
 from sononerf.run.simulate import simulate
 from sononerf.settings.loading import validate_settings
 
@@ -45,23 +45,15 @@ def training(ensemble, tmp_path):
 
     def make(*callbacks, validation=True, sanity=0, logger=False, steps=STEPS):
         quiet_lightning()
-        store = EnsembleStore.open(path)
-        head = head_of(settings)
-        region, possible = region_of(settings, Echoes(store, head))
-        module = module_for(
-            settings,
-            *field_and_renderer(settings, head, region),
-            reference=store.attributes["reference"],
-            possible=possible,
+        echoes = Echoes(EnsembleStore.open(path), head_of(settings))
+        options = settings.fit.model_copy(update={"steps_per_epoch": PER_EPOCH})
+        module = EchoModule.for_echoes(
+            echoes,
+            field_options=settings.field.options,
+            renderer_options=settings.renderer.options,
+            options=options,
         )
-        data = EchoDataModule(
-            store,
-            whole_poses=True,
-            batch=2,
-            batch_frequencies=2,
-            seed=0,
-            steps_per_epoch=PER_EPOCH,
-        )
+        data = EchoDataModule(echoes)
         trainer = lightning.Trainer(
             accelerator="cpu",
             max_epochs=steps // PER_EPOCH,

@@ -4,7 +4,7 @@ import pytest
 import trimesh
 
 from sononerf.errors import NumericalError
-from sononerf.evaluation.prediction import added_part, compare
+from sononerf.evaluation.difference import added_part, compare
 from sononerf.surface.start.volume import Volume, grid_over
 
 GRID = grid_over([-0.03] * 3, [0.03] * 3, 0.005)

@@ -35,9 +35,14 @@ def store(tmp_path_factory):
     return make(tmp_path_factory.mktemp("data") / "store")
 
 
-def module(store, **options):
-    given = {"whole_poses": True, "batch": 3, "batch_frequencies": 2, "seed": 4, **options}
-    return EchoDataModule(store, **given)
+def module(store, *, whole_poses=True, workers=0, memory_bytes=2_000_000_000, **options):
+    given = {"batch_frequencies": 2, "seed": 4, **options}
+    size = given.pop("batch", 3)
+    given |= {"batch_poses": size, "batch_slices": size}
+    heard = SimpleNamespace(store=store, reference=1.0)
+    return EchoDataModule(
+        heard, given, whole_poses=whole_poses, workers=workers, memory_bytes=memory_bytes
+    )
 
 
 def first(loader, count):
@@ -87,7 +92,7 @@ def test_an_epoch_begins_where_the_steps_before_ended(done, steps):
 
 @pytest.mark.parametrize(
     ("steps", "most", "expected"),
-    [(None, -1, 60), (4, -1, 4), (None, 7, 7), (4, 2, 2), (4, 5, 4)],
+    [("auto", -1, 60), (4, -1, 4), ("auto", 7, 7), (4, 2, 2), (4, 5, 4)],
 )
 def test_an_epoch_has_at_least_sixty_steps_unless_somebody_says_how_many(
     store, steps, most, expected

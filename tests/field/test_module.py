@@ -10,10 +10,11 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import NumericalError
-from sononerf.field.datamodule import EchoDataModule, RangeSlices
+from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.grid import GridField
 from sononerf.field.module import WORTH_THREADS, EchoModule, decibels
 from sononerf.field.profile import ProfileRenderer
+from sononerf.field.range_slices import RangeSlices
 from sononerf.field.renderer import Renderer, ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.poses import look_at
@@ -47,15 +48,13 @@ class Given(Renderer):
         return self.values
 
 
-def module(renderer, field=None, **options):
+def module(renderer, field=None, *, total_steps=100, **options):
     field = field or GridField(REGION, FREQUENCY, spacing=0.01, levels=1)
-    given = {
-        "reference": 0.001, "dynamic_range_db": 60.0, "possible": None, "learning_rate": 0.1,
-        **options,
-    }  # fmt: skip
-    total = given.pop("total_steps", 100)
-    found = EchoModule(field, renderer, **given)
-    found.total_steps, found.steps_per_epoch = total, 10
+    given = {"reference": 0.001, "dynamic_range_db": 60.0, "possible": None}
+    given |= {key: options.pop(key) for key in given if key in options}
+    plain = {"learning_rate": 0.1, "early_share": 0.0, **options}
+    found = EchoModule(field, renderer, options=plain, **given)
+    found.total_steps, found.steps_per_epoch = total_steps, 10
     return found
 
 
@@ -469,14 +468,9 @@ def fit(store, renderer, path, steps):
         reference=store.attributes["reference"],
         learning_rate=0.3,
     )
-    data = EchoDataModule(
-        store,
-        whole_poses=renderer.whole_poses,
-        batch=4 if renderer.whole_poses else 200,
-        batch_frequencies=None,
-        seed=0,
-        steps_per_epoch=steps,
-    )
+    options = {"batch_poses": 4, "batch_slices": 200, "batch_frequencies": "all"}
+    heard = SimpleNamespace(store=store, reference=store.attributes["reference"])
+    data = EchoDataModule(heard, {**options, "steps_per_epoch": steps})
     losses = []
 
     class Losses(lightning.Callback):

@@ -5,7 +5,7 @@ import torch
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import SettingsError
-from sononerf.field.datamodule import PoseReader, SliceStream, WholePoses, seed_of
+from sononerf.field.range_slices import PoseReader, SliceStream, WholePoses, seed_of
 
 POSES, RANGES, FREQUENCIES = 11, 6, 5
 TRAIN = [0, 2, 3, 5, 7, 8, 10]
@@ -225,23 +225,6 @@ def test_whole_poses_with_and_without_measurements(store):
     assert found.rows.tolist() == [list(range(RANGES))]
     assert found.spectrum.shape == (1, 2, RANGES, FREQUENCIES)
     assert found.spectrum[0, 1, 2, 3] == value(4, 1, 2, 3)
-
-
-def test_some_of_the_whole_poses(store):
-    positions, rotations = torch.rand(4, 3), torch.rand(4, 3, 3)
-    reader, numbers = PoseReader(store, 10**6), torch.tensor([1, 4, 6, 9])
-    given = WholePoses(positions, rotations, RANGES, FREQUENCIES, reader, numbers)
-    rows = [2, 0]
-    some = given.only(torch.tensor(rows))
-    assert (len(some), len(given)) == (2, 4)
-    assert some.numbers.tolist() == [6, 1]
-    for n, row in enumerate(rows):
-        assert same(some[n], given[row])
-        assert some[n].spectrum[0, 1, 2, 3] == value(int(numbers[row]), 1, 2, 3)
-    assert len(given.only(torch.zeros(0, dtype=torch.long))) == 0
-    unheard = WholePoses(positions, rotations, RANGES, FREQUENCIES).only(torch.tensor([3]))
-    assert unheard[0].pose.tolist() == [3]
-    assert unheard[0].spectrum.shape == (1, 0, RANGES, FREQUENCIES)
 
 
 def test_seeds_depend_on_every_part_and_fit_into_torch():

@@ -22,16 +22,17 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.region import WITNESS_GAIN
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, SettingsError
+from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.field.hash import HashField
+from sononerf.field.module import EchoModule
 from sononerf.field.profile import ProfileRenderer
 from sononerf.field.renderer import ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.reception import effective_window
-from sononerf.run.build import head_of, read_truth, true_mesh, with_store
+from sononerf.run.build import head_of, module_for, read_truth, true_mesh, with_store
 from sononerf.run.fit import finish, fit
-from sononerf.run.model import check_plugins, data_for, field_and_renderer, module_for, region_of
 from sononerf.run.simulate import simulate
 from sononerf.settings import plugins
 from sononerf.settings.loading import load_settings, validate_settings
@@ -43,6 +44,15 @@ from tests.memory import echoes_of
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 BOX = torch.tensor([[-0.05] * 3, [0.05] * 3])
+
+
+def region_of(settings, echoes):
+    """Return the region of a fit, and what is possible in it."""
+    lower, upper = settings.region.lower, settings.region.upper
+    region = None if lower is None else (lower, upper)
+    options = {"field_options": settings.field.options}
+    module = EchoModule.for_echoes(echoes, region=region, **options)
+    return module.field.region, module.possible
 
 
 def test_the_head_has_the_axes_of_the_store(tiny, echoes):
@@ -84,19 +94,14 @@ def test_any_field_with_any_renderer(tiny, field, renderer, kinds):
     settings = tiny(
         field={"kind": field, "options": {}}, renderer={"kind": renderer, "options": {}}
     )
-    made = field_and_renderer(settings, head_of(settings), BOX)
-    assert tuple(type(each) for each in made) == kinds
-    module = module_for(settings, *made, reference=1e-3)
-    assert module.learning_rate == made[0].learning_rate
+    module = module_for(settings, head_of(settings), BOX, 1e-3)
+    assert (type(module.field), type(module.renderer)) == kinds
+    assert module.learning_rate == module.field.learning_rate
 
 
 def test_the_module_is_told_what_is_heard_at_first(tiny):
     settings = tiny(fit={"early_range_db": 25.0, "early_share": 0.5})
-    module = module_for(
-        settings,
-        *field_and_renderer(settings, head_of(settings), BOX),
-        reference=1.0,
-    )
+    module = module_for(settings, head_of(settings), BOX, 1.0)
     module.total_steps = 8
     whole = settings.spectrogram.dynamic_range_db
     assert [module.range_db(step) for step in (0, 3, 4)] == [25.0, 25.0, whole]
@@ -107,9 +112,9 @@ def test_slices_without_an_active_cell_are_silent(tiny):
         renderer={"kind": "shell", "options": {}}, fit={"silent_share": 0.0, "batch_slices": 1}
     )
     known = head_of(settings)
-    heard = torch.zeros(2, len(known.range), len(known.frequency))
-    heard[1, 3, 2] = 0.41  # 2.98 dB where the reference is 1
-    heard[0, 5, 1] = 0.42  # 3.05 dB
+    spectrograms = torch.zeros(2, len(known.range), len(known.frequency))
+    spectrograms[1, 3, 2] = 0.41  # 2.98 dB where the reference is 1
+    spectrograms[0, 5, 1] = 0.42  # 3.05 dB
     store = SimpleNamespace(
         indices=lambda split: np.array([0]),
         positions=np.zeros((1, 3)),
@@ -118,10 +123,10 @@ def test_slices_without_an_active_cell_are_silent(tiny):
         frequency=known.frequency,
         receivers=2,
         attributes={"reference": 1.0},
-        read_pose=lambda number: heard.numpy(),
+        read_pose=lambda number: spectrograms.numpy(),
     )
-    _, renderer = field_and_renderer(settings, head_of(settings), BOX)
-    stream = data_for(settings, store, renderer).stream()
+    heard = SimpleNamespace(store=store, reference=1.0)
+    stream = EchoDataModule(heard, settings.fit, whole_poses=False).stream()
     assert stream.items == 1
     assert int(stream[0].rows) == 5
 
@@ -219,7 +224,7 @@ def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):
     def weights(seed):
         settings = tiny(field={"kind": "fourier", "options": {}}, fit={"seed": seed})
         torch.rand(3)  # whatever went before
-        return next(field_and_renderer(settings, head_of(settings), BOX)[0].parameters())
+        return next(module_for(settings, head_of(settings), BOX, 1.0).field.parameters())
 
     assert torch.equal(weights(1), weights(1))
     assert not torch.equal(weights(1), weights(2))
@@ -249,7 +254,7 @@ def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):
 )
 def test_wrong_kinds_and_options_are_refused(tiny, changes, message):
     with pytest.raises(SettingsError, match=f"^tiny: {message}"):
-        check_plugins(tiny(**changes), head_of(tiny(**changes)))
+        module_for(tiny(**changes), head_of(tiny(**changes)), None, 1.0)
 
 
 def test_a_plugin_that_makes_something_else(tiny, monkeypatch):
@@ -262,7 +267,7 @@ def test_a_plugin_that_makes_something_else(tiny, monkeypatch):
 
     monkeypatch.setattr(plugins, "load", load)
     with pytest.raises(InputError, match="'grid' makes a str, expected a sononerf Field"):
-        check_plugins(tiny(field={"options": {}}), head_of(tiny(field={"options": {}})))
+        module_for(tiny(field={"options": {}}), head_of(tiny()), None, 1.0)
 
 
 def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):

@@ -15,7 +15,7 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
 from sononerf.field.checkpoint_io import load_weights, save_weights
-from sononerf.field.fitting import poses_of, render_poses
+from sononerf.field.fitting import render_poses
 from sononerf.progress import Progress
 from sononerf.run.build import head_of
 from sononerf.run.fit import fit
@@ -168,63 +168,38 @@ def test_an_ensemble_of_other_echoes_is_refused(run):
         echoes_of(load_fitted(run))
 
 
-@pytest.mark.parametrize(("split", "count"), [("train", 8), ("val", 2), ("test", 2)])
-def test_poses_of_a_split_with_what_was_measured_there(run, split, count):
-    fitted = load_fitted(run)
-    heard = echoes_of(fitted)
-    store = heard.store
-    poses = poses_of(heard, split, fitted.module.renderer)
-    numbers = store.indices(split)
-    assert len(poses) == len(numbers) == count
-    for row, number in enumerate(numbers.tolist()):
-        found = poses[row]
-        assert found.pose.tolist() == [number]
-        np.testing.assert_allclose(found.position[0], store.positions[number], rtol=1e-6)
-        np.testing.assert_allclose(found.rotation[0], store.rotations[number], atol=1e-6)
-        np.testing.assert_array_equal(found.spectrum[0], store.read_pose(number))
-        assert (found.rows.shape[1], len(found.bins)) == store.read_pose(number).shape[1:]
-
-
-def test_a_split_without_poses_has_none(run, monkeypatch):
-    fitted = load_fitted(run)
-    heard = echoes_of(fitted)
-    monkeypatch.setattr(heard.store, "indices", lambda split: np.zeros(0, dtype=np.int64))
-    assert len(poses_of(heard, "val", fitted.module.renderer)) == 0
-
-
 def test_rendering_goes_pose_by_pose_and_in_order(run):
     fitted = load_fitted(run)
-    renderer = fitted.module.renderer
-    poses = poses_of(echoes_of(fitted), "train", renderer).only(torch.tensor([4, 1, 6]))
-    rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
+    poses = echoes_of(fitted).poses("train")[[4, 1, 6]]
+    rendered = render_poses(fitted.module, poses, accelerator="cpu", progress=QUIET)
     assert rendered.dtype == np.float32
-    assert rendered.shape == (3, 2, len(renderer.range), len(renderer.frequency))
+    assert rendered.shape == (3, 2, len(fitted.head.range), len(fitted.head.frequency))
     assert (rendered >= 0).all()
     for row in range(3):
-        alone = poses.only(torch.tensor([row]))
-        again = render_poses(fitted, alone, accelerator="cpu", progress=QUIET)
+        alone = poses[row]
+        again = render_poses(fitted.module, alone, accelerator="cpu", progress=QUIET)
         np.testing.assert_array_equal(again[0], rendered[row])
     assert np.abs(rendered[0] - rendered[1]).max() > 0
 
 
 def test_rendering_does_not_look_at_what_was_measured(run, monkeypatch):
     fitted = load_fitted(run)
-    poses = poses_of(echoes_of(fitted), "val", fitted.module.renderer)
-    rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
+    poses = echoes_of(fitted).poses("val")
+    rendered = render_poses(fitted.module, poses, accelerator="cpu", progress=QUIET)
     read = EnsembleStore.read_pose
     monkeypatch.setattr(EnsembleStore, "read_pose", lambda *given: 0 * read(*given))
-    again = poses_of(echoes_of(fitted), "val", fitted.module.renderer)
-    deaf = render_poses(fitted, again, accelerator="cpu", progress=QUIET)
+    again = echoes_of(fitted).poses("val")
+    deaf = render_poses(fitted.module, again, accelerator="cpu", progress=QUIET)
     np.testing.assert_array_equal(deaf, rendered)
 
 
 def test_a_gpu_that_is_not_there(run, monkeypatch):
     fitted = load_fitted(run)
-    poses = poses_of(echoes_of(fitted), "val", fitted.module.renderer)
+    poses = echoes_of(fitted).poses("val")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     with pytest.raises(ResourceError):
-        render_poses(fitted, poses, accelerator="gpu", progress=QUIET)
+        render_poses(fitted.module, poses, accelerator="gpu", progress=QUIET)
 
 
 @pytest.mark.thorough

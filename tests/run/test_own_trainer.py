@@ -10,10 +10,11 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
+from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import quiet_lightning
+from sononerf.field.module import EchoModule
 from sononerf.progress import Progress
 from sononerf.run.build import head_of
-from sononerf.run.model import data_for, field_and_renderer, module_for, region_of
 from sononerf.run.predict import predict
 from sononerf.run.run_folder import RunFolder
 
@@ -36,12 +37,14 @@ def made(tiny, echoes):
 
     def make():
         settings = tiny()
-        store = EnsembleStore.open(echoes)
-        heard = Echoes(store, head_of(settings))
-        region, possible = region_of(settings, heard)
-        field, renderer = field_and_renderer(settings, heard.head, region)
-        module = module_for(settings, field, renderer, reference=heard.reference, possible=possible)
-        return module, data_for(settings, store, renderer)
+        heard = Echoes(EnsembleStore.open(echoes), head_of(settings))
+        module = EchoModule.for_echoes(
+            heard,
+            field_options=settings.field.options,
+            renderer_options=settings.renderer.options,
+            options=settings.fit,
+        )
+        return module, EchoDataModule(heard)
 
     return make
 
@@ -87,7 +90,7 @@ def test_a_trainers_test_gives_the_numbers_of_a_prediction(run, tmp_path):
     predict(opened, accelerator="cpu", progress=Progress(quiet=True))
     numbers = opened.read_metrics()["prediction"]
     fitted = opened.fitted
-    data = data_for(fitted.settings, opened.echoes.store, fitted.module.renderer)
+    data = EchoDataModule(opened.echoes)
     (found,) = trainer(tmp_path, enable_checkpointing=False).test(
         fitted.module, data, verbose=False
     )

@@ -15,7 +15,6 @@ from PIL import Image
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
 from sononerf.head.decibels import compress
-from sononerf.progress import Progress
 from sononerf.run import predict as predict_module
 from sononerf.run import run_folder as run_module
 from sononerf.run.fit import fit
@@ -169,8 +168,8 @@ def test_nor_are_those_that_are_too_near_to_hear_any(run, tmp_path):
         predict(run, poses_csv=csv, accelerator="cpu")
 
 
-def test_poses_within_the_region_are_told(run, tmp_path, no_pictures, monkeypatch):
-    csv, told = tmp_path / "poses.csv", []
+def test_poses_within_the_region_are_told(run, tmp_path, no_pictures, caplog):
+    csv = tmp_path / "poses.csv"
     lower, upper = load_fitted(run).module.field.region.double().numpy()
     x, y, z = lower + 0.01 * (upper - lower)
     csv.write_text(f"{CSV}{x},{y},{z},0,0,0\n")
@@ -178,10 +177,9 @@ def test_poses_within_the_region_are_told(run, tmp_path, no_pictures, monkeypatc
     fitted.module.renderer.range[0] = 0.0
     within = RunFolder(run)
     within.fitted = fitted
-    monkeypatch.setattr(Progress, "say", lambda self, text: told.append(text))
     predict(within, poses_csv=csv, accelerator="cpu")
-    assert len(told) == 1
-    assert told[0].endswith("within the fitted region, where no pose was trained, lie poses 2")
+    (told,) = caplog.messages
+    assert told == "poses 2 lie within the fitted region, where none was trained"
 
 
 def test_a_pose_that_hears_the_regions_far_side_alone_will_do(run, tmp_path, no_pictures):
@@ -192,19 +190,17 @@ def test_a_pose_that_hears_the_regions_far_side_alone_will_do(run, tmp_path, no_
     assert len(arrays_of(predict(run, poses_csv=csv, accelerator="cpu"))["pose"]) == 3
 
 
-def test_that_tracing_is_missing_is_told(run, no_pictures, monkeypatch):
-    told = []
-    monkeypatch.setattr(Progress, "say", lambda self, text: told.append(text))
+def test_that_tracing_is_missing_is_told(run, no_pictures, caplog):
     predict(run, accelerator="cpu")
     predict(run, accelerator="cpu")  # nothing was traced
     RunFolder(run).write_metrics("prediction", None)
     predict(run, accelerator="cpu")
-    assert told == []
+    assert caplog.messages == []
     RunFolder(run).write_metrics("prediction", {"traced_weight": 0.3})
     predict(run, accelerator="cpu")
-    assert len(told) == 1
-    assert f"{run / 'traced.safetensors'} is missing" in told[0]
-    assert "0.30" in told[0]
+    (told,) = caplog.messages
+    assert f"{run / 'traced.safetensors'} is missing" in told
+    assert "0.30" in told
 
 
 def test_the_same_field_predicts_the_same_bits_wherever_it_lies(run, fitted, tmp_path, no_pictures):

@@ -14,9 +14,9 @@ from PIL import Image
 
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.progress import Progress
-from sononerf.run import reconstruct as reconstruct_module
 from sononerf.run.fitted import load_fitted
 from sononerf.run.reconstruct import reconstruct
+from sononerf.surface import reconstruction
 from sononerf.surface import surface as surface_module
 from sononerf.surface.start import read_out as read_out_module
 from sononerf.surface.surface import Openness
@@ -91,9 +91,9 @@ def test_what_kind_of_surface_it_is_is_written_and_of_open_ones_it_is_said(
     run, tmp_path, no_projections, monkeypatch, openness, name, said
 ):
     kind = Openness(np.zeros(0, dtype=bool), **openness)
-    real = reconstruct_module.finished_surface
+    real = reconstruction.finished_surface
     monkeypatch.setattr(
-        reconstruct_module,
+        reconstruction,
         "finished_surface",
         lambda *given, **more: replace(real(*given, **more), openness=kind),
     )

@@ -18,11 +18,13 @@ from sononerf.run import reconstruct as reconstruct_module
 from sononerf.run.reconstruct import STATE, reconstruct, refine_surface
 from sononerf.run.run_folder import RunFolder
 from sononerf.storage import read_json
+from sononerf.surface import reconstruction
 from sononerf.surface.refine import comparison as core
 from sononerf.surface.refine import descent as stages
 from sononerf.surface.refine import refinement as refinement_module
 from sononerf.surface.refine.descent import Stage
 from sononerf.surface.refine.refinement import Refinement
+from sononerf.surface.surface import Surface
 
 QUIET = Progress(quiet=True)
 BUMPY = trimesh.creation.icosphere(subdivisions=3, radius=0.0205)
@@ -47,7 +49,7 @@ class Heard(Progress):
 
 @pytest.fixture
 def run(fitted_run, tmp_path, monkeypatch):
-    for where, name in ((core, "RAYS"), (reconstruct_module, "RAYS")):
+    for where, name in ((core, "RAYS"), (reconstruction, "RAYS")):
         monkeypatch.setattr(where, name, 500)
     for where in (refinement_module, stages):
         monkeypatch.setattr(where, "STAGES", SHORT)
@@ -65,7 +67,7 @@ def with_settings(run, section, **values):
 
 
 def refined(path, start=BUMPY):
-    return refine_surface(RunFolder(path), {"filled": start}, accelerator="cpu", progress=QUIET)
+    return refine_surface(RunFolder(path), Surface(start), accelerator="cpu", progress=QUIET)
 
 
 def test_a_run_has_its_refined_surface(run, no_projections):
@@ -158,4 +160,4 @@ def test_a_state_of_another_version_is_refused_before_anything_is_written(
 def test_a_gpu_that_is_not_there_is_refused(run, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ResourceError, match="no GPU"):
-        refine_surface(RunFolder(run), {"filled": BUMPY}, accelerator="gpu", progress=QUIET)
+        refine_surface(RunFolder(run), Surface(BUMPY), accelerator="gpu", progress=QUIET)

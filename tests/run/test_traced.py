@@ -20,7 +20,7 @@ from sononerf.errors import InputError
 from sononerf.evaluation import traced as traced_module
 from sononerf.evaluation.traced import Traced, mix
 from sononerf.field.checkpoint_io import load_weights, save_weights
-from sononerf.field.fitting import poses_of, render_poses
+from sononerf.field.fitting import render_poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.run import fit as finish_module
@@ -135,8 +135,10 @@ def test_echoes_of_the_true_surface_have_a_great_weight(run):
 
 
 def test_nothing_is_traced_where_the_field_alone_is_right(run, monkeypatch):
-    def right(fitted, poses, **options):
-        return np.concatenate([poses[row].spectrum.numpy() for row in range(len(poses))])
+    heard = echoes_of(load_fitted(run))
+
+    def right(model, poses, **options):
+        return np.stack([heard.spectrogram(int(number)) for number in heard.numbers_of(poses)])
 
     monkeypatch.setattr(traced_module, "render_poses", right)
     assert not learn(run).any()
@@ -156,10 +158,10 @@ def test_the_regression_has_the_validation_poses_alone(run, monkeypatch):
     assert (surface.weight == 0.4).all()
     heard, reference = echoes_of(fitted), fitted.module.reference
     store = heard.store
-    poses = poses_of(heard, "val", fitted.module.renderer)
+    poses = heard.poses("val")
     measured = [store.read_pose(int(i)) for i in store.indices("val")]
     np.testing.assert_array_equal(given["measured"], compress(measured, reference))
-    rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
+    rendered = render_poses(fitted.module, poses, accelerator="cpu", progress=QUIET)
     np.testing.assert_array_equal(given["rendered"], compress(rendered, reference))
     traced = trace_poses(fitted, surface, poses, progress=QUIET)
     np.testing.assert_allclose(given["traced"], compress(traced, reference), rtol=1e-6, atol=1e-9)
@@ -308,12 +310,13 @@ def test_what_cannot_be_borne_out_or_is_not_wanted_is_not_traced(run, believe, m
 @pytest.mark.parametrize(
     ("scale", "words"), [(1e-3, "4e-05 m large"), (1e4, "400 m large")], ids=["small", "large"]
 )
-def test_a_surface_that_the_simulator_refuses_is_told_and_not_traced(run, believe, scale, words):
+def test_a_surface_that_the_simulator_refuses_is_told_and_not_traced(
+    run, believe, caplog, scale, words
+):
     believe(run, 1.0)
     reconstruct_as(run, SPHERE.copy().apply_scale(scale))
-    heard = Heard()
-    assert not learn(run, progress=heard).any()
-    (line,) = heard.said
+    assert not learn(run).any()
+    (line,) = caplog.messages
     assert line.startswith("no echoes are traced off the surface: the mesh is ")
     assert words in line
     assert "\n" not in line
@@ -341,7 +344,7 @@ def test_a_mesh_that_is_gone_or_damaged_is_an_error(run):
 def traceable(run):
     """A fitted run, what is traced off, and where."""
     fitted = load_fitted(run)
-    poses = poses_of(echoes_of(fitted), "val", fitted.module.renderer)
+    poses = echoes_of(fitted).poses("val")
     rows = len(fitted.module.renderer.frequency)
     return fitted, Traced(SPHERE, np.zeros((2, rows)), np.ones(rows)), poses
 
@@ -349,7 +352,7 @@ def traceable(run):
 def test_traced_echoes_are_those_that_were_measured(traceable, echoes):
     fitted, surface, poses = traceable
     store = EnsembleStore.open(echoes)
-    measured = np.stack([store.read_pose(int(number)) for number in poses.numbers])
+    measured = np.stack([store.read_pose(int(number)) for number in store.indices("val")])
     traced = trace_poses(fitted, surface, poses, progress=QUIET)
     assert traced.shape == measured.shape
     reference = store.attributes["reference"]
@@ -371,8 +374,9 @@ def test_noise_engine_and_rays_of_the_experiment_are_left_out(traceable, section
     changed = getattr(fitted.settings, section).model_copy(update=values)
     settings = fitted.settings.model_copy(update={section: changed})
     assert settings != fitted.settings
-    other = replace(fitted, settings=settings, head=head_of(settings))
-    some = poses.only(torch.tensor([0]))
+    other = replace(fitted, settings=settings)
+    other.module.head = head_of(settings)
+    some = poses[0]
     np.testing.assert_array_equal(
         trace_poses(other, surface, some, progress=QUIET),
         trace_poses(fitted, surface, some, progress=QUIET),
@@ -381,7 +385,7 @@ def test_noise_engine_and_rays_of_the_experiment_are_left_out(traceable, section
 
 def test_the_gain_applies_to_its_own_ear_and_frequency(traceable):
     fitted, surface, poses = traceable
-    some = poses.only(torch.tensor([0]))
+    some = poses[0]
     plain = trace_poses(fitted, surface, some, progress=QUIET)
     gain = np.zeros_like(surface.gain_db)
     gain[0, 3], gain[1, -1] = 20, -20
@@ -499,7 +503,7 @@ def arrays_and_numbers(path, **options):
 def parts(path, poses):
     """What the field renders and what is traced, as a blend takes them."""
     fitted = load_fitted(path)
-    rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
+    rendered = render_poses(fitted.module, poses, accelerator="cpu", progress=QUIET)
     traced = trace_poses(fitted, load_traced(path), poses, progress=QUIET)
     return rendered, traced, fitted.module.reference
 
@@ -509,7 +513,7 @@ def test_a_prediction_is_traced_as_far_as_it_is_believed(run, believe, share):
     believe(run, share)
     arrays, numbers = arrays_and_numbers(run)
     fitted = load_fitted(run)
-    poses = poses_of(echoes_of(fitted), "test", fitted.module.renderer)
+    poses = echoes_of(fitted).poses("test")
     rendered, traced, reference = parts(run, poses)
     assert arrays["predicted"].dtype == np.float32
     level = mix(compress(rendered, reference), compress(traced, reference), share)
@@ -529,8 +533,8 @@ def test_a_prediction_is_traced_as_far_as_it_is_believed(run, believe, share):
 def test_a_prediction_without_belief_is_the_rendering(run, believe):
     never_learned, numbers = arrays_and_numbers(run)
     fitted = load_fitted(run)
-    poses = poses_of(echoes_of(fitted), "test", fitted.module.renderer)
-    rendered = render_poses(fitted, poses, accelerator="cpu", progress=QUIET)
+    poses = echoes_of(fitted).poses("test")
+    rendered = render_poses(fitted.module, poses, accelerator="cpu", progress=QUIET)
     np.testing.assert_array_equal(never_learned["predicted"], rendered)
     believe(run, 0.0)
     with pytest.MonkeyPatch.context() as patch:

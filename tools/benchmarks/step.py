@@ -26,7 +26,6 @@ from torch import Tensor
 from torch.utils.flop_counter import FlopCounterMode
 
 from sononerf import storage
-from sononerf.echoes.echoes import Echoes
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.field import Field
 from sononerf.field.fitting import quiet_lightning, require_accelerator
@@ -35,7 +34,6 @@ from sononerf.field.module import EchoModule
 from sononerf.field.renderer import ShellRenderer
 from sononerf.progress import Progress
 from sononerf.run.build import head_of
-from sononerf.run.model import data_for, field_and_renderer, module_for, region_of
 from sononerf.run.simulate import default_store, echo_hash, open_or_simulate
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
@@ -204,24 +202,25 @@ def _settings(pair: Pair, arguments: argparse.Namespace, output: Path) -> Settin
 
 
 def _measured(pair: Pair, settings: Settings, accelerator: str, products: dict[str, float]) -> Row:
-    store = open_or_simulate(settings, progress=Progress().store)
-    region, possible = region_of(settings, Echoes(store, head_of(settings)))
-    field, renderer = field_and_renderer(settings, head_of(settings), region)
+    echoes = open_or_simulate(settings, progress=Progress())
+    module = EchoModule.for_echoes(
+        echoes,
+        settings.field.kind,
+        settings.renderer.kind,
+        field_options=settings.field.options,
+        renderer_options=settings.renderer.options,
+        options=settings.fit,
+    )
+    field, region = module.field, module.field.region
     naive = pair.name == NAIVE
     if naive:
-        own = renderer.state_dict()
+        own = module.renderer.state_dict()
         torch.manual_seed(settings.fit.seed)
-        renderer = EquationSeventeen(region, head_of(settings), **settings.renderer.options)
+        renderer = EquationSeventeen(region, echoes.head, **settings.renderer.options)
         renderer.load_state_dict(own)
+        module.renderer = renderer
     options = settings.fit
-    data = data_for(settings, store, renderer)
-    module = module_for(
-        settings,
-        field,
-        renderer,
-        reference=float(store.attributes["reference"]),
-        possible=possible,
-    )
+    data = EchoDataModule(echoes, workers=settings.data.workers)
     watch = Stopwatch(pair.warm, pair.timed, counted=not naive)
     trainer = lightning.Trainer(
         accelerator=accelerator,

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from sononerf.errors import NumericalError
-from sononerf.report.mesh_files import MANY_POSES, confidence_colours
 from sononerf.report.pictures.figure import png_from_pixels
 from sononerf.report.pictures.shading import (
     DEFAULT_VIEW,
@@ -22,6 +21,7 @@ from sononerf.report.pictures.shading import (
     camera_for,
     draw_mesh,
 )
+from sononerf.surface.mesh_files import MANY_POSES, confidence_colours
 
 STEEL, CLAY = (0.62, 0.72, 0.84), (0.93, 0.70, 0.52)
 INK = (60, 66, 74)

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
-from sononerf.evaluation.prediction import Comparison
+from sononerf.evaluation.difference import Comparison
 from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
 from sononerf.report.pictures.mesh_picture import mesh_png
 from sononerf.report.pictures.shading import DEFAULT_VIEW

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -47,10 +47,12 @@ class FieldReading:
     Attributes:
         volume: The field's energy.
         gathered: The evidence.
+        found: Start surfaces that were made of it, by method.
     """
 
     volume: Volume
     gathered: Gathered
+    found: dict[StartMethod, trimesh.Trimesh] = field(default_factory=dict, repr=False)
 
 
 def read_field(
@@ -98,13 +100,15 @@ def start_surfaces(
     found = False
     for method in methods:
         try:
-            known = reading.gathered
-            mesh = fit_sheet(known) if method == "sheet" else estimate_occupancy(known, method)
+            if method not in reading.found:
+                known = reading.gathered
+                mesh = fit_sheet(known) if method == "sheet" else estimate_occupancy(known, method)
+                reading.found[method] = mesh
         except NumericalError as error:
             first = first or error
             continue
         found = True
-        yield method, mesh
+        yield method, reading.found[method]
     if first is not None and not found:
         raise first
 

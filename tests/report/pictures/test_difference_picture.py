@@ -7,7 +7,7 @@ import pytest
 import trimesh
 from PIL import Image
 
-from sononerf.evaluation.prediction import compare
+from sononerf.evaluation.difference import compare
 from sononerf.report.pictures import mip_picture as difference_module
 from sononerf.report.pictures.mip_picture import SILENT, difference_pngs, overlay_png
 from sononerf.surface.start.volume import grid_over

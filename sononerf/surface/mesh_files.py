@@ -22,7 +22,7 @@ def mesh_bytes(
 
     With a confidence PLY and GLB carry a colour per vertex: from dark grey, heard by no pose, to
     bright yellow, heard by a hundred or more, in steps even to the eye over the logarithm (see
-    :func:`~sononerf.report.mesh_files.confidence_colours`). PLY also holds the numbers
+    :func:`~sononerf.surface.mesh_files.confidence_colours`). PLY also holds the numbers
     themselves, as the vertices' property ``poses``, and always their normals. STL knows neither.
 
     Args:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 import numpy as np
 
-from sononerf.report.mesh_files import MANY_POSES, confidence_colours, linear_light
+from sononerf.surface.mesh_files import MANY_POSES, confidence_colours, linear_light
 
 
 def test_colours_brighten_evenly_from_grey_to_yellow():

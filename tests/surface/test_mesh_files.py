@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from sononerf.errors import NumericalError
-from sononerf.report.mesh_files import confidence_colours, linear_light, mesh_bytes
+from sononerf.surface.mesh_files import confidence_colours, linear_light, mesh_bytes
 
 
 @pytest.mark.parametrize("file_type", ["ply", "stl", "glb"])

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: MIT
+"""What two runs, or two true surfaces, differ in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from scipy.spatial import cKDTree
+
+from sononerf.array_types import Floats
+from sononerf.errors import NumericalError
+from sononerf.surface.start.volume import Volume
+
+SAME = 1e-6
+"""Triangles are the same where their corners' mean lies no farther apart, m."""
+
+
+@dataclass(frozen=True, eq=False)
+class Comparison:
+    """Two volumes over their common maximum, and what remains of one without the other.
+
+    Attributes:
+        first, second: 0 to 1, on one grid.
+        difference: First without second.
+        strongest ((3,) or None, m): Where the difference is greatest; None where it is nowhere
+            above zero.
+        score: How great it is at most: part of the common maximum.
+    """
+
+    first: Volume
+    second: Volume
+    difference: Volume
+    strongest: Floats | None
+    score: float
+
+
+def compare(first: Volume, second: Volume) -> Comparison:
+    """Compare two volumes, place by place.
+
+    Args:
+        first, second: What is heard from each place, on one grid.
+
+    Raises:
+        ValueError: If the grids differ.
+        NumericalError: If both are silent.
+    """
+    alike = first.shape == second.shape and np.allclose(first.origin, second.origin)
+    if not alike or first.spacing != second.spacing:
+        raise ValueError("the two volumes have different grids")
+    most = max(float(first.values.max()), float(second.values.max()))
+    if not most > 0:
+        raise NumericalError("nothing to compare: both are silent")
+    one, other = (volume.with_values(volume.values / most) for volume in (first, second))
+    difference = first.with_values(one.values - other.values)
+    index = np.unravel_index(int(difference.values.argmax()), difference.shape)
+    score = float(difference.values[index])
+    # Where nothing is stronger the greatest value lies anywhere, often in a corner.
+    strongest = difference.origin + difference.spacing * np.array(index) if score > 0 else None
+    return Comparison(one, other, difference, strongest, score)
+
+
+def added_part(mesh: trimesh.Trimesh, without: trimesh.Trimesh) -> trimesh.Trimesh | None:
+    """Return what a true surface has and another one has not; None where that is nothing.
+
+    Args:
+        mesh, without: Metres, one world frame; equal parts are equal triangle for triangle.
+    """
+    if not len(without.faces):
+        return mesh
+    distance, _ = cKDTree(without.triangles_center).query(mesh.triangles_center)
+    added = np.flatnonzero(distance > SAME)
+    return mesh.submesh([added], append=True) if len(added) else None

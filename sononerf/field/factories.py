@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: MIT
+"""Fields and renderers by name: plugins, factories and objects."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from sononerf.errors import InputError, SettingsError
+from sononerf.field.field import Field
+from sononerf.field.renderer import Renderer, tensor
+from sononerf.head.head import Head
+from sononerf.settings import plugins
+
+FieldFactory = Callable[..., Field]
+"""Called with the region (2, 3), m, the frequencies (F,), Hz, and keyword options."""
+RendererFactory = Callable[..., Renderer]
+"""Called with the region (2, 3), m, the head, and keyword options."""
+
+
+def box_of(region: ArrayLike | Tensor) -> Tensor:
+    """Return a region (2, 3), m, in single precision.
+
+    Raises:
+        SettingsError: If it is no box.
+    """
+    given = region if isinstance(region, Tensor) else torch.as_tensor(np.array(region, np.float64))
+    box = given.detach().to(torch.float32)
+    if box.shape != (2, 3) or not bool((box[0] < box[1]).all()):
+        raise SettingsError(
+            f"region: found {box.tolist()}; give lower and upper corner, (2, 3) in metres, the "
+            "lower below the upper on every axis"
+        )
+    return box
+
+
+def make_field(
+    field: Field | FieldFactory | str,
+    region: Tensor,
+    head: Head | None,
+    options: Mapping[str, Any],
+) -> Field:
+    """Return the field of a name, of a factory, or the field itself.
+
+    Args:
+        field: Name of a plugin, factory, or field.
+        region ((2, 3), m): Lower and upper corner.
+        head: Its frequencies are those of the field.
+        options: Keyword arguments of the factory.
+
+    Raises:
+        SettingsError: If the name or an option is not allowed, or the head is missing.
+        InputError: If the plugin cannot be loaded, or makes something else.
+    """
+    if isinstance(field, Field):
+        return field
+    make = plugins.load(plugins.FIELDS, field) if isinstance(field, str) else field
+    given = plugins.check_options(make, options, where="field.options", given=2)
+    made = make(region, tensor(_known(head).frequency), **given)
+    if not isinstance(made, Field):
+        raise InputError(f"{field!r} makes a {type(made).__name__}, expected a sononerf Field")
+    return made
+
+
+def make_renderer(
+    renderer: Renderer | RendererFactory | str,
+    region: Tensor,
+    head: Head | None,
+    options: Mapping[str, Any],
+) -> Renderer:
+    """Return the renderer of a name, of a factory, or the renderer itself.
+
+    Args:
+        renderer: Name of a plugin, factory, or renderer.
+        region ((2, 3), m): Lower and upper corner.
+        head: What heard the echoes.
+        options: Keyword arguments of the factory.
+
+    Raises:
+        SettingsError, InputError: As :func:`make_field`.
+    """
+    if isinstance(renderer, Renderer):
+        return renderer
+    make = plugins.load(plugins.RENDERERS, renderer) if isinstance(renderer, str) else renderer
+    given = plugins.check_options(make, options, where="renderer.options", given=2)
+    made = make(region, _known(head), **given)
+    if not isinstance(made, Renderer):
+        raise InputError(
+            f"{renderer!r} makes a {type(made).__name__}, expected a sononerf Renderer"
+        )
+    return made
+
+
+def _known(head: Head | None) -> Head:
+    if head is None:
+        raise SettingsError("head: missing; give the head that heard the echoes")
+    return head

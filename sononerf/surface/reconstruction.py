@@ -1,0 +1,220 @@
+# SPDX-License-Identifier: MIT
+"""From a fitted field and its echoes to a surface, and from that to a refined one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext
+from functools import partial
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from lightning import Fabric
+from torch import Tensor
+
+from sononerf.echoes.echoes import Echoes
+from sononerf.echoes.free_space import EchoHull
+from sononerf.errors import SettingsError
+from sononerf.field.fitting import quiet_lightning, require_accelerator
+from sononerf.field.module import EchoModule
+from sononerf.progress import Progress
+from sononerf.settings.loading import checked_section
+from sononerf.settings.schema import ReconstructionSettings, SimulationSettings
+from sononerf.simulation.simulator import Simulator
+from sononerf.surface.refine.optics import Optics
+from sononerf.surface.refine.refinement import Refinement, number_of_steps
+from sononerf.surface.refine.refinement import refine as refine_starts
+from sononerf.surface.start.read_out import (
+    StartMethod,
+    read_field,
+    read_isosurface,
+    start_surfaces,
+)
+from sononerf.surface.surface import Surface, finished_surface
+
+UNREFINED: tuple[StartMethod, ...] = ("filled", "hull", "open", "sheet")
+"""Without refinement the first of these that gives a surface is taken."""
+REFINED: tuple[StartMethod, ...] = ("open", "filled", "hull", "sheet")
+"""Start surfaces: the one that explains the validation poses best is refined, see
+:class:`~sononerf.surface.refine.refinement.Refinement`."""
+RAYS = 20_000
+"""Rays per pose, for the correction of the last stage."""
+
+
+def reconstruct(
+    model: EchoModule,
+    echoes: Echoes | EchoHull,
+    *,
+    options: ReconstructionSettings | Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> Surface:
+    """Read a surface out of a fitted field and the first echoes; :func:`refine` improves it.
+
+    Args:
+        model: Fitted to the echoes.
+        echoes: What was fitted to, or its free space.
+        options: Keys of the section ``reconstruction`` of the settings, such as ``{"spacing":
+            0.002, "method": "hull"}`` or ``{"method": "isosurface", "level": 0.5}``.
+        progress: Where to show it; on stderr where None.
+
+    Returns:
+        surface: Not refined.
+
+    Raises:
+        SettingsError: If an option is not allowed, or the spacing is larger than the region.
+        NumericalError: If the field has no surface.
+    """
+    progress = progress or Progress()
+    chosen = checked_section(ReconstructionSettings, options or {}, "reconstruction")
+    hull = echoes if isinstance(echoes, EchoHull) else echoes.hull
+    heard = None if isinstance(echoes, EchoHull) else echoes
+    field = model.field
+    if chosen.level != "auto" or chosen.method == "isosurface":
+        with _shown(progress) as shown:
+            mesh, volume, level = read_isosurface(
+                field,
+                spacing=chosen.spacing,
+                level=chosen.level,
+                directions=chosen.directions,
+                smoothing=chosen.smoothing,
+                progress=shown,
+            )
+        return Surface(mesh, volume, "isosurface", level=level, echoes=heard)
+    with _shown(progress) as shown, nullcontext() if field.costly else _one_thread():
+        reading = read_field(
+            field,
+            hull,
+            resolution=_resolution(model, heard),
+            spacing=chosen.spacing,
+            directions=chosen.directions,
+            progress=shown,
+        )
+    methods = UNREFINED if chosen.method == "auto" else (chosen.method,)
+    method, mesh = next(start_surfaces(reading, methods))
+    return finished_surface(mesh, method, reading, echoes=heard)
+
+
+def _resolution(model: EchoModule, echoes: Echoes | None) -> float:
+    head = model.head if echoes is None else echoes.head
+    if head is None:
+        raise SettingsError("the model knows no head; give the echoes that it was fitted to")
+    return head.resolution
+
+
+def refine(
+    surface: Surface,
+    echoes: Echoes,
+    *,
+    options: SimulationSettings | Mapping[str, Any] | None = None,
+    seed: int = 0,
+    accelerator: str = "auto",
+    state: dict[str, Tensor] | None = None,
+    after_step: Callable[[Refinement, float], None] | None = None,
+    progress: Progress | None = None,
+) -> Surface:
+    """Move a surface until physical optics, corrected by the simulator, gives the echoes.
+
+    Of a surface that :func:`reconstruct` read out of a field, all start surfaces are tried, and the
+    one that explains the validation poses best is refined. A surface of your own is refined as it
+    is.
+
+    Args:
+        surface: The start.
+        echoes: What was measured; the surface is fitted to the training poses and compared on the
+            validation poses.
+        options: Of the simulator that corrects: keys of the section ``simulation`` of the settings.
+        seed: Order of the poses.
+        accelerator: What to compute on: ``auto``, ``cpu`` or ``gpu``.
+        state: Where an interrupted refinement of the same surface and echoes goes on, see
+            :meth:`sononerf.surface.refine.refinement.Refinement.state`.
+        after_step: Called after each step with the refinement and the step's mismatch, dB.
+        progress: Where to show it; on stderr where None.
+
+    Returns:
+        surface: The best one; the start where none explains the validation poses better.
+
+    Raises:
+        SettingsError: If an option is not allowed, or the surface is an iso-surface.
+        ResourceError: If ``gpu`` is asked for and there is none.
+    """
+    progress = progress or Progress()
+    require_accelerator(accelerator)
+    simulation = checked_section(SimulationSettings, options or {}, "simulation")
+    reading = surface.reading
+    starts = starts_of(surface)
+    with progress.task("refining", number_of_steps(starts)) as task, _one_thread():
+
+        def stepped(work: Refinement, mismatch: float) -> None:
+            task.advance(work.drawn - task.done, f"mismatch {mismatch:.2f} dB")
+            if after_step is not None:
+                after_step(work, mismatch)
+
+        refined = refine_starts(
+            starts,
+            echoes,
+            optics=_placed(Optics(echoes.head), accelerator),
+            simulate=partial(Simulator.of_surface, head=echoes.head, options=simulation, rays=RAYS),
+            seed=seed,
+            state=state,
+            after_step=stepped,
+        )
+    return finished_surface(
+        refined.mesh,
+        refined.start,
+        reading,
+        echoes=echoes,
+        support=refined.support.round().astype(np.int32),
+        refined=refined.kept,
+        error_db=refined.error_db if math.isfinite(refined.error_db) else None,
+        faults=refined.faults,
+    )
+
+
+def starts_of(surface: Surface) -> dict[StartMethod, trimesh.Trimesh]:
+    """Return the start surfaces of a refinement, m, by their method.
+
+    Raises:
+        SettingsError: If the surface is an iso-surface of a field.
+        NumericalError: If no method gives a surface.
+    """
+    if surface.method == "isosurface":
+        raise SettingsError(
+            "an iso-surface is not refined; reconstruct with the method auto, or give "
+            "Surface(mesh) to refine its mesh"
+        )
+    if surface.reading is None:
+        return {surface.method: surface.mesh}
+    return dict(start_surfaces(surface.reading, REFINED))
+
+
+def _placed(optics: Optics, accelerator: str) -> Optics:
+    """Return the optics on the device of an accelerator; other GPUs than NVIDIA's do without."""
+    quiet_lightning()
+    cuda = accelerator != "cpu" and torch.cuda.is_available()
+    Fabric(accelerator="cuda" if cuda else "cpu", devices=1).to_device(optics)
+    return optics
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Let torch compute in one thread, so that results do not depend on the number of cores.
+
+    On two idle cores a second one saves up to a tenth of the time. Beside two busy processes a step
+    takes 2.4 times as long with two: threads wait for each other.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+@contextmanager
+def _shown(progress: Progress) -> Iterator[Callable[[int, int], None]]:
+    """Show how far a field is read out."""
+    with progress.task("reconstructing", 1000) as task, torch.inference_mode():
+        yield lambda done, total: task.advance(1000 * done // total - task.done)
