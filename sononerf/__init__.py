@@ -12,39 +12,76 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from sononerf.echoes.echoes import Echoes
+    from sononerf.evaluation.difference import Comparison
+    from sononerf.evaluation.numbers import Evaluation, evaluate
+    from sononerf.evaluation.prediction import Prediction, predict
     from sononerf.field.datamodule import EchoDataModule
     from sononerf.field.field import Field
+    from sononerf.field.fitting import fit
     from sononerf.field.module import EchoModule
     from sononerf.field.renderer import Renderer
     from sononerf.geometry.poses import Poses
     from sononerf.head.head import Head
+    from sononerf.run.import_recordings import read_recordings
+    from sononerf.run.run import Run, compare, open_run
     from sononerf.scene.material import Material
     from sononerf.scene.scene import Scene
+    from sononerf.simulation.ensemble import simulate
+    from sononerf.surface.reconstruction import reconstruct, refine
+    from sononerf.surface.surface import Surface
 
 __version__ = "0.1.0"
 __all__ = [
+    "Comparison",
     "EchoDataModule",
     "EchoModule",
     "Echoes",
+    "Evaluation",
     "Field",
     "Head",
     "Material",
     "Poses",
+    "Prediction",
     "Renderer",
+    "Run",
     "Scene",
+    "Surface",
     "__version__",
+    "compare",
+    "evaluate",
+    "fit",
+    "open_run",
+    "predict",
+    "read_recordings",
+    "reconstruct",
+    "refine",
+    "simulate",
 ]
 
 _HOMES = {
+    "Comparison": "evaluation.difference",
     "EchoDataModule": "field.datamodule",
     "EchoModule": "field.module",
     "Echoes": "echoes.echoes",
+    "Evaluation": "evaluation.numbers",
     "Field": "field.field",
     "Head": "head.head",
     "Material": "scene.material",
     "Poses": "geometry.poses",
+    "Prediction": "evaluation.prediction",
     "Renderer": "field.renderer",
+    "Run": "run.run",
     "Scene": "scene.scene",
+    "Surface": "surface.surface",
+    "compare": "run.run",
+    "evaluate": "evaluation.numbers",
+    "fit": "field.fitting",
+    "open_run": "run.run",
+    "predict": "evaluation.prediction",
+    "read_recordings": "run.import_recordings",
+    "reconstruct": "surface.reconstruction",
+    "refine": "surface.reconstruction",
+    "simulate": "simulation.ensemble",
 }
 """Where the public names are; each is imported when it is first asked for."""
 

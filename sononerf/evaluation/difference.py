@@ -26,7 +26,8 @@ class Comparison:
         difference: First without second.
         strongest ((3,) or None, m): Where the difference is greatest; None where it is nowhere
             above zero.
-        score: How great it is at most: part of the common maximum.
+        score: How great it is at most: fraction of the common maximum.
+        poses: At how many poses both were heard.
     """
 
     first: Volume
@@ -34,6 +35,7 @@ class Comparison:
     difference: Volume
     strongest: Floats | None
     score: float
+    poses: int = 0
 
 
 def compare(first: Volume, second: Volume) -> Comparison:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import logging
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,8 @@ from sononerf.array_types import Floats
 from sononerf.echoes.splits import TRAIN
 from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.evaluation.baseline import backprojection
-from sononerf.evaluation.difference import added_part, compare
+from sononerf.evaluation.difference import Comparison, added_part
+from sononerf.evaluation.difference import compare as compare_volumes
 from sononerf.field.fitting import render_poses
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
@@ -23,6 +26,8 @@ from sononerf.run.build import results_folder, true_mesh
 from sononerf.run.fitted import Fitted, all_poses
 from sononerf.run.run_folder import RunFolder, differing_keys
 from sononerf.surface.start.volume import Volume, vti_bytes
+
+logger = logging.getLogger("sononerf")
 
 HEARING = ("air", "ears", "call", "spectrogram")
 """Sections in which two runs must not differ: else what differs is who listens."""
@@ -74,32 +79,13 @@ def compare_runs(
             f"{first} and {second} are the same run; give as the second a run without what is "
             "looked for"
         )
-    differing = [
-        key
-        for key in differing_keys(*(one.settings for one in runs))
-        if key.split(".")[0] in HEARING
-    ]
-    if differing:
-        raise IncompatibleError(
-            f"{first} and {second} hear differently ({', '.join(differing)}); fit both alike"
-        )
+    _check_alike(*runs)
     folder = output or first / f"compare-{second.resolve().name}"
     with run.locked(folder), results_folder(folder):
-        corners = np.array([one.module.field.region.cpu().double().numpy() for one in runs])
-        box = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
-        reference = max(one.module.reference for one in runs)
-        poses = _common_poses(runs)
-        one, other = (_heard(each, poses, reference, *box, accelerator, progress) for each in runs)
-        found = compare(one, other)
+        found = compare_runs_of(*runs, accelerator=accelerator, progress=progress)
         surfaces = [true_mesh(each.settings) for each in runs]
         truth = _added(*surfaces)
         names = first.resolve().name, second.resolve().name
-        missing = -float(found.difference.values.min())
-        if missing > WRONG_WAY * found.score:
-            progress.say(
-                f"{names[1]} has up to {missing:.2f} of the maximum that {names[0]} has not: the "
-                "runs look swapped; pass the run with the target first"
-            )
         for name in ("first", "second", "difference"):
             storage.commit_bytes(folder / f"{name}.vti", vti_bytes(getattr(found, name), "level"))
         for axis, picture in difference_pngs(found, names, truth=truth).items():
@@ -115,7 +101,7 @@ def compare_runs(
             {
                 "first": names[0],
                 "second": names[1],
-                "poses": len(poses.positions),
+                "poses": found.poses,
                 "score": found.score,
                 "strongest_m": None if place is None else place.tolist(),
                 "added_m": None if truth is None else truth.tolist(),
@@ -123,6 +109,46 @@ def compare_runs(
             },
         )
     return folder
+
+
+def compare_runs_of(
+    first: Fitted, second: Fitted, *, accelerator: str = "auto", progress: Progress | None = None
+) -> Comparison:
+    """Compare what two fitted fields send back, see :func:`compare_runs`, whose errors it raises.
+
+    Args:
+        first, second: The difference is the first without the second.
+        accelerator: What to render on.
+        progress: Where to show it; on stderr where None.
+    """
+    progress = progress or Progress()
+    runs = [first, second]
+    _check_alike(first, second)
+    corners = np.array([one.module.field.region.cpu().double().numpy() for one in runs])
+    box = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
+    reference = max(one.module.reference for one in runs)
+    poses = _common_poses(runs)
+    one, other = (_heard(each, poses, reference, *box, accelerator, progress) for each in runs)
+    found = compare_volumes(one, other)
+    missing = -float(found.difference.values.min())
+    if missing > WRONG_WAY * found.score:
+        logger.warning(
+            "the second run has up to %.2f of the maximum that the first has not: the runs look "
+            "swapped; pass the run with the target first",
+            missing,
+        )
+    return replace(found, poses=len(poses))
+
+
+def _check_alike(first: Fitted, second: Fitted) -> None:
+    differing = [
+        key
+        for key in differing_keys(first.settings, second.settings)
+        if key.split(".")[0] in HEARING
+    ]
+    if differing:
+        keys = ", ".join(differing)
+        raise IncompatibleError(f"the two runs hear differently ({keys}); fit both alike")
 
 
 def _common_poses(runs: list[Fitted]) -> Poses:

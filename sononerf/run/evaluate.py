@@ -23,7 +23,7 @@ from sononerf.scene.scene import Scene
 from sononerf.surface.start.volume import Volume
 
 
-class Evaluation:
+class EvaluationWork:
     """An evaluation in other threads, beside other stages; a context that ends them.
 
     The baselines need no surface: they begin at once.
@@ -51,7 +51,7 @@ class Evaluation:
         self._volumes = {name: self._pool.submit(self._volume, name) for name in BASELINES}
         self._parts: dict[str, Future[dict[str, Any] | None]] = {}
 
-    def __enter__(self) -> Evaluation:
+    def __enter__(self) -> EvaluationWork:
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -109,7 +109,7 @@ def evaluate(
     *,
     truth: Path | None = None,
     registration: Kind | None = None,
-    begun: Evaluation | None = None,
+    begun: EvaluationWork | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
     """Compare a reconstruction with the true surface, and the baselines likewise.
@@ -118,7 +118,7 @@ def evaluate(
 
     Args:
         run: A run that was reconstructed.
-        truth, registration: As of :class:`Evaluation`.
+        truth, registration: As of :class:`EvaluationWork`.
         begun: An evaluation of this run that goes on already.
         progress: Where to show it.
 
@@ -133,7 +133,7 @@ def evaluate(
     _ = run.fitted  # a folder that is no run is refused before it is locked
     with run.locked():
         if begun is None:
-            with Evaluation(run, truth, registration) as work:
+            with EvaluationWork(run, truth, registration) as work:
                 if not (run.reconstruction / "mesh.ply").is_file():
                     reconstruct(run, progress=progress)
                 work.begin()

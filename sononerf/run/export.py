@@ -21,6 +21,7 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
 from sononerf.geometry.poses import Poses
 from sononerf.run.run_folder import RunFolder
+from sononerf.surface.mesh_files import support_of
 
 FileType = Literal["mat", "h5", "nc"]
 
@@ -272,11 +273,9 @@ def _volume(source: Path) -> Part:
 
 def _points(source: Path) -> Part:
     mesh = RunFolder(source).mesh()
-    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
-    count = len(mesh.vertices)
-    heard = np.zeros(count, np.int32)
-    if raw is not None and "poses" in (raw.dtype.names or ()) and len(raw) == count:
-        heard = np.asarray(raw["poses"], dtype=np.int32)
+    heard = support_of(mesh)
+    if heard is None:
+        heard = np.zeros(len(mesh.vertices), np.int32)
     return {
         "position": Named(np.asarray(mesh.vertices), ("point", "world"), "m", "vertex of the mesh"),
         "normal": Named(

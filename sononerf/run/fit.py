@@ -31,7 +31,7 @@ from sononerf.field.fitting import require_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.progress import Progress
 from sononerf.run.build import head_of, module_for, with_store
-from sononerf.run.evaluate import Evaluation, evaluate
+from sononerf.run.evaluate import EvaluationWork, evaluate
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
@@ -72,7 +72,7 @@ def finish(
     with run.locked(), ExitStack() as stack:
         evaluation = None
         if not run.is_done("evaluation"):
-            evaluation = stack.enter_context(Evaluation(run))
+            evaluation = stack.enter_context(EvaluationWork(run))
         try:
             if not run.is_done("surface"):
                 reconstruct(run, **shown)

@@ -7,7 +7,7 @@ import hashlib
 import json
 import logging
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from sononerf.progress import Progress
 from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses
 from sononerf.report.pictures.spectrogram_picture import pings_png
 from sononerf.run.understand import Understood, understand
+from sononerf.settings.loading import assignments
 from sononerf.settings.schema import HEAD_SECTIONS, CallSettings
 
 logger = logging.getLogger("sononerf")
@@ -64,28 +65,28 @@ def spectrogram_of(understood: Understood, ping: int) -> Singles:
     return head.analyse(understood.cutter.echo(ping, head.samples)).astype(np.float32)
 
 
-def import_recordings(
-    form: str,
-    source: Path,
-    output: Path,
+def read_recordings(
+    source: Path | str,
+    output: Path | str,
     *,
+    form: str = "recordings",
+    options: Mapping[str, Any] | None = None,
     settings_file: Path | None = None,
-    overrides: Iterable[str] = (),
     progress: Progress | None = None,
-) -> tuple[EnsembleStore, Verdict]:
-    """Make an ensemble of recordings, or open it if it is there already.
+) -> Echoes:
+    """Make echoes of recordings, or open them if they are there already.
 
     Args:
+        source: Folder of WAV files with ``poses.csv``, or a file.
+        output: Folder of the store.
         form: ``recordings``, ``numpy``, ``sonotracelab``, ``sononerf-matlab`` or ``airsas``.
-        source: File or folder.
-        output: The store.
+        options: Sections of the import's settings, such as ``{"air": {"temperature_c": 20},
+            "ears": {"directivity": "omnidirectional"}, "import": {"frame": "ned"}}``.
         settings_file: Settings of the import; ``import.yaml`` beside the recordings where None.
-        overrides: ``KEY=VALUE``.
-        progress: Where to show it.
+        progress: Where to show it; on stderr where None.
 
     Returns:
-        store: Complete; opened for reading.
-        verdict: What the first echoes say of the poses.
+        echoes: Complete. What the first echoes say against the poses is logged as a warning.
 
     Raises:
         SettingsError, InputError: If settings, recordings or poses are no good; nothing is written
@@ -94,14 +95,28 @@ def import_recordings(
         StorageError: If the store cannot be written.
         IncompatibleError: If the folder holds another ensemble.
     """
-    known = understand(form, source, output, settings_file=settings_file, overrides=overrides)
-    return import_understood(known, output, progress=progress)
+    output = Path(output)
+    chosen = assignments(options or {})
+    known = understand(form, Path(source), output, settings_file=settings_file, overrides=chosen)
+    store, found = import_understood(known, output, progress=progress or Progress())
+    if found.message:
+        logger.warning("%s", found.message)
+    return Echoes(store, known.head)
 
 
 def import_understood(
     known: Understood, output: Path, *, progress: Progress | None = None
 ) -> tuple[EnsembleStore, Verdict]:
-    """Write what was understood; see :func:`import_recordings`."""
+    """Write what was understood, and say what the first echoes say of the poses.
+
+    Args:
+        known: What was understood.
+        output: The store.
+        progress: Where to show it.
+
+    Raises:
+        NumericalError, StorageError, IncompatibleError: As :func:`read_recordings`.
+    """
     progress = progress or Progress(quiet=True)
     wanted = echo_hash(known)
     if (output / "zarr.json").is_file():

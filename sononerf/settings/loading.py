@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import difflib
 import importlib.resources
+import json
 import re
 import typing
 from collections.abc import Iterable, Iterator, Mapping
@@ -127,6 +128,27 @@ def apply_override(data: dict[str, Any], assignment: str) -> None:
             raise SettingsError(f"{key}: {part} is a value, not a section")
         node = child
     node[parts[-1]] = _parse_yaml(value, key)
+
+
+def assignments(sections: Mapping[str, Any]) -> list[str]:
+    """Return sections of settings, a dictionary of dictionaries, as ``KEY=VALUE`` assignments.
+
+    Raises:
+        SettingsError: If a section is no dictionary, or a value is no plain data.
+    """
+    found = []
+    for section, keys in sections.items():
+        if not isinstance(keys, Mapping):
+            raise SettingsError(f"{section}: found {keys!r}, expected a dictionary of its keys")
+        for key, value in keys.items():
+            try:
+                text = json.dumps(str(value) if isinstance(value, Path) else value)
+            except (TypeError, ValueError):
+                raise SettingsError(
+                    f"{section}.{key}: found {value!r}, expected numbers, texts and lists"
+                ) from None
+            found.append(f"{section}.{key}={text}")
+    return found
 
 
 def _drop_options_of_another(data: dict[str, Any], assignment: str) -> None:

@@ -70,6 +70,17 @@ def _carry(mesh: trimesh.Trimesh, file_type: MeshFormat, poses: NDArray[Any]) ->
     )
 
 
+def support_of(mesh: trimesh.Trimesh) -> NDArray[np.int32] | None:
+    """Return how many poses heard each vertex (V,) of a mesh that was read from a PLY file.
+
+    None where the file does not say.
+    """
+    raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
+    if raw is None or "poses" not in (raw.dtype.names or ()) or len(raw) != len(mesh.vertices):
+        return None
+    return np.asarray(raw["poses"], dtype=np.int32)
+
+
 # So many poses and more have the brightest colour.
 MANY_POSES = 100
 # Dark grey and bright yellow in OKLab; on the line between the two, equal steps look equal.

@@ -8,7 +8,7 @@ import pytest
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, LockedError, NumericalError
-from sononerf.run.import_recordings import check_before, describe, draw, import_recordings
+from sononerf.run.import_recordings import check_before, describe, draw, import_understood
 from sononerf.run.understand import understand
 from sononerf.storage import lock
 from tests.recordings.recorded import SETTINGS, TARGET, arrays, waveforms
@@ -22,9 +22,9 @@ def brought(tmp_path):
 
     def run(*overrides, output="store", **changes):
         np.savez(tmp_path / "a.npz", **arrays(**changes))
-        return import_recordings(
-            "numpy", tmp_path / "a.npz", tmp_path / output, overrides=[*GIVEN, *overrides]
-        )
+        source, target = tmp_path / "a.npz", tmp_path / output
+        known = understand("numpy", source, target, overrides=[*GIVEN, *overrides])
+        return import_understood(known, target)
 
     return run
 

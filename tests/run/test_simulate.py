@@ -24,7 +24,7 @@ from sononerf.errors import (
 )
 from sononerf.head.decibels import compress
 from sononerf.head.directivity.sofa import write_sofa
-from sononerf.run.import_recordings import import_recordings
+from sononerf.run.import_recordings import read_recordings
 from sononerf.run.simulate import (
     background_path,
     echo_hash,
@@ -385,7 +385,7 @@ def test_a_round_trip_through_wav_and_csv(tiny, tmp_path):
     direct = simulate(settings, output=tmp_path / "direct", workers=1)
     written = write_waveforms(settings, tmp_path / "wav")
     assert [path.name for path in written] == ["poses.csv", "import.yaml", "ping_0000.wav"]
-    back, _ = import_recordings("recordings", tmp_path / "wav", tmp_path / "back")
+    back = read_recordings(tmp_path / "wav", tmp_path / "back").store
     np.testing.assert_allclose(back.positions, direct.positions, atol=1e-12)
     np.testing.assert_allclose(back.rotations, direct.rotations, atol=1e-12)
     np.testing.assert_array_equal(back.split, direct.split)

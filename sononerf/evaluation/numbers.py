@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""Numbers of a surface beside the true one, and of a prediction beside what was measured."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from sononerf.echoes.echoes import Echoes
+from sononerf.errors import InputError
+from sononerf.evaluation.baseline import BASELINES
+from sononerf.evaluation.geometry import Kind, Truth, baseline_volume
+from sononerf.evaluation.prediction import Prediction, prediction_numbers
+from sononerf.progress import Progress
+from sononerf.scene.scene import Scene
+from sononerf.surface.surface import Surface
+
+UNITS = {"_m": (1e3, "mm"), "_db": (1.0, "dB")}
+"""How numbers are shown, by the ending of their name: factor and unit."""
+
+
+class Evaluation(dict[str, Any]):
+    """Numbers by name, as the README explains them; ``print`` shows them with their units."""
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return name and value of each number as text; lists and matrices are left out."""
+        return [(name, text) for name, value in _flat(self) if (text := _shown(name, value))]
+
+    def __str__(self) -> str:
+        rows = self.rows()
+        width = max((len(name) for name, _ in rows), default=0)
+        return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    rows: list[tuple[str, Any]] = []
+    for name, value in values.items():
+        if isinstance(value, dict):
+            rows += _flat(value, f"{prefix}{name} ")
+        else:
+            rows.append((f"{prefix}{name}", value))
+    return rows
+
+
+def _shown(name: str, value: Any) -> str | None:
+    if not isinstance(value, float):
+        return str(value) if isinstance(value, (int, str)) else None
+    factor, unit = next((UNITS[end] for end in UNITS if name.endswith(end)), (1.0, ""))
+    return f"{factor * value:.3g} {unit}".rstrip()
+
+
+def evaluate(
+    surface: Surface | trimesh.Trimesh,
+    truth: Scene | trimesh.Trimesh,
+    echoes: Echoes | None = None,
+    *,
+    registration: Kind = "none",
+    progress: Progress | None = None,
+) -> Evaluation:
+    """Compare a surface with the true one, and with what needs no learning.
+
+    Args:
+        surface: Reconstructed, m.
+        truth: The true surface, m; of a scene with a background also the target alone is compared.
+        echoes: Give the baselines backprojection and voxel fit; left out where None.
+        registration: What lays the reconstruction over the truth first: ``none``, ``rigid`` or
+            ``similarity``.
+        progress: Where to show it; on stderr where None.
+
+    Returns:
+        evaluation: ``chamfer_m``, ``fscore`` and the others of
+            :func:`sononerf.evaluation.metrics.geometry_metrics`; ``baseline`` where echoes are
+            given.
+
+    Raises:
+        InputError: If a surface is none.
+        NumericalError: If one is empty or not finite.
+    """
+    progress = progress or Progress()
+    scene = truth if isinstance(truth, Scene) else None
+    true = truth.mesh if isinstance(truth, Scene) else truth
+    mesh = surface.mesh if isinstance(surface, Surface) else surface
+    for found in (true, mesh):
+        if not isinstance(found, trimesh.Trimesh):
+            raise InputError(
+                f"found a {type(found).__name__}, expected a Surface, a Scene or a trimesh.Trimesh"
+            )
+    laid = Truth(true, mesh, registration)
+    numbers = Evaluation(laid.of_reconstruction(scene))
+    if echoes is not None:
+        lower, upper = np.asarray(echoes.region.box())
+        numbers["baseline"] = {}
+        with progress.task("baselines", len(BASELINES)) as task:
+            for name in BASELINES:
+                volume = baseline_volume(name, echoes, lower, upper, threading.Event())
+                numbers["baseline"][name] = laid.of_volume(volume)
+                task.advance()
+    return numbers
+
+
+def compare_prediction(prediction: Prediction, echoes: Echoes) -> Evaluation:
+    """Compare a prediction with what its poses measured.
+
+    Args:
+        prediction: Of poses of the echoes.
+        echoes: What was measured.
+
+    Returns:
+        evaluation: ``mae_db``, ``rendered_mae_db`` and others, beside ``mean_predictor_mae_db`` and
+            ``noise_floor_mae_db``, see :func:`sononerf.evaluation.prediction.prediction_metrics`.
+
+    Raises:
+        InputError: If a pose is not among those of the echoes.
+    """
+    numbers = echoes.numbers_of(prediction.poses)
+    measured = np.stack([echoes.spectrogram(int(number)) for number in numbers])
+    return Evaluation(prediction_numbers(prediction, echoes, measured))
