@@ -26,6 +26,7 @@ from sononerf.geometry.poses import Poses
 from sononerf.head.attached import attach, attached
 from sononerf.head.head import Head
 from sononerf.settings.schema import HEAD_SECTIONS
+from sononerf.shown import Picture, Shown, picture_of
 
 if TYPE_CHECKING:  # simulation starts without it
     from torch import Tensor
@@ -39,7 +40,7 @@ HELD_BACK = 10
 """Without validation poses, one of this many training poses validates the refinement."""
 
 
-class Echoes:
+class Echoes(Shown):
     """The spectrograms of an ensemble of poses, and the head that heard them.
 
     Make them with :func:`sononerf.simulate`, :func:`sononerf.read_recordings`,
@@ -222,6 +223,19 @@ class Echoes:
             InputError: If there is no such pose, or it is damaged.
         """
         return self.store.read_pose(pose)
+
+    def plot(self, pose: int, prediction: object = None) -> Picture:
+        """Return a picture of what a pose heard, in decibels over range and frequency.
+
+        Args:
+            pose: Its number.
+            prediction: A :class:`sononerf.Prediction` that has this pose; it is drawn beside, with
+                the difference.
+
+        Raises:
+            InputError: If there is no such pose.
+        """
+        return picture_of(self, pose=pose, prediction=prediction)
 
     @property
     def reference(self) -> float:

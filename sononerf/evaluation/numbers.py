@@ -16,13 +16,14 @@ from sononerf.evaluation.geometry import Kind, Truth, baseline_volume
 from sononerf.evaluation.prediction import Prediction, prediction_numbers
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
+from sononerf.shown import Shown
 from sononerf.surface.surface import Surface
 
-UNITS = {"_m": (1e3, "mm"), "_db": (1.0, "dB")}
-"""How numbers are shown, by the ending of their name: factor and unit."""
+UNITS = {"m": (1e3, "mm"), "db": (1.0, "dB"), "s": (1.0, "s")}
+"""How numbers are shown, by a part of their name after the first: factor and unit."""
 
 
-class Evaluation(dict[str, Any]):
+class Evaluation(dict[str, Any], Shown):
     """Numbers by name, as the README explains them; ``print`` shows them with their units."""
 
     def rows(self) -> list[tuple[str, str]]:
@@ -48,7 +49,8 @@ def _flat(values: dict[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
 def _shown(name: str, value: Any) -> str | None:
     if not isinstance(value, float):
         return str(value) if isinstance(value, (int, str)) else None
-    factor, unit = next((UNITS[end] for end in UNITS if name.endswith(end)), (1.0, ""))
+    parts = name.split("_")[1:]
+    factor, unit = next((UNITS[part] for part in parts if part in UNITS), (1.0, ""))
     return f"{factor * value:.3g} {unit}".rstrip()
 
 

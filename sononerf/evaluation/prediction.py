@@ -31,6 +31,7 @@ from sononerf.head.decibels import (
 from sononerf.progress import Progress
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import SimulationSettings
+from sononerf.shown import Shown
 from sononerf.surface.surface import Surface
 
 logger = logging.getLogger("sononerf")
@@ -40,7 +41,7 @@ SSIM_WINDOW = 11
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class Prediction(Shown):
     """Predicted spectrograms of poses, (P, E, R, F) linear magnitude.
 
     Attributes:

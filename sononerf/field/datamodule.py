@@ -11,7 +11,13 @@ import torch
 from torch.utils.data import DataLoader, DistributedSampler
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.field.range_slices import PoseReader, RangeSlices, SliceStream, WholePoses
+from sononerf.field.range_slices import (
+    PoseReader,
+    RangeSlices,
+    SliceStream,
+    WholePoses,
+    one_by_one,
+)
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import DataSettings, FitSettings
@@ -175,6 +181,7 @@ class EchoDataModule(lightning.LightningDataModule):
             stream,
             batch_size=None,
             sampler=EpochSampler(self._epoch_of(stream), done),
+            generator=torch.Generator(),
             num_workers=self.workers,
             # A forked child may hang on the store's threads.
             multiprocessing_context="spawn" if self.workers else None,
@@ -184,11 +191,11 @@ class EchoDataModule(lightning.LightningDataModule):
     def val_dataloader(self) -> DataLoader[RangeSlices] | list[DataLoader[RangeSlices]]:
         """Return the validation poses, or nothing where there are none."""
         whole = self.whole("val")
-        return DataLoader(whole, batch_size=None) if len(whole) else []
+        return one_by_one(whole) if len(whole) else []
 
     def test_dataloader(self) -> DataLoader[RangeSlices]:
         """Return the test poses."""
-        return DataLoader(self.whole("test"), batch_size=None)
+        return one_by_one(self.whole("test"))
 
     def predict_dataloader(self) -> DataLoader[RangeSlices]:
         """Return the test poses."""

@@ -13,7 +13,6 @@ import lightning
 import numpy as np
 import torch
 from lightning.pytorch.loggers import Logger
-from torch.utils.data import DataLoader
 
 from sononerf.array_types import Singles
 from sononerf.echoes.echoes import Echoes
@@ -21,7 +20,7 @@ from sononerf.errors import NumericalError, ResourceError, SettingsError
 from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.module import EchoModule
-from sononerf.field.range_slices import WholePoses
+from sononerf.field.range_slices import WholePoses, one_by_one
 from sononerf.geometry.poses import Poses
 from sononerf.progress import Progress
 from sononerf.settings.schema import FitSettings
@@ -161,5 +160,5 @@ def render_poses(
             enable_progress_bar=False,
             enable_model_summary=False,
         )
-        trainer.predict(model, DataLoader(whole, batch_size=None), return_predictions=False)
+        trainer.predict(model, one_by_one(whole), return_predictions=False)
     return np.concatenate(rendered)

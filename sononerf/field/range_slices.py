@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 from torch import Tensor
-from torch.utils.data import Dataset
+from torch.utils.data import DataLoader, Dataset
 
 from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import SettingsError
@@ -217,3 +217,8 @@ class WholePoses(Dataset[RangeSlices]):
             self.bins,
             measured,
         )
+
+
+def one_by_one(poses: WholePoses) -> DataLoader[RangeSlices]:
+    """Return a loader of whole poses that leaves the caller's random numbers alone."""
+    return DataLoader(poses, batch_size=None, generator=torch.Generator())

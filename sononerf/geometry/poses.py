@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_cap, fibonacci_sphere
+from sononerf.shown import Shown
 from sononerf.tables import number_in, read_rows
 
 ORTHOGONAL = 1e-3
@@ -26,7 +27,7 @@ CSV_COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
 
 
 @dataclass(frozen=True, eq=False)
-class Poses:
+class Poses(Shown):
     """Positions and orientations of the head.
 
     Attributes:

@@ -36,6 +36,7 @@ from sononerf.settings.schema import (
     SpectrogramSettings,
     check_call,
 )
+from sononerf.shown import Shown
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +107,7 @@ def own_top(window: Floats) -> int:
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class Head:
+class Head(Shown):
     """Emitter and receivers in air, the call, and the analysis that makes spectrograms.
 
     Two synthetic ears, an impulse and the analysis of the paper by default. What costs time is

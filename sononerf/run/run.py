@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import html
 import weakref
 from functools import cached_property
 from pathlib import Path
@@ -21,11 +22,12 @@ from sononerf.progress import Progress
 from sononerf.run.compare import compare_runs_of
 from sononerf.run.run_folder import RunFolder
 from sononerf.settings.schema import Settings
+from sononerf.shown import Shown
 from sononerf.surface.mesh_files import support_of
 from sononerf.surface.surface import Surface
 
 
-class Run:
+class Run(Shown):
     """A fitted run, opened for reading with :func:`open_run`; each part is loaded at first use.
 
     Args:
@@ -127,6 +129,9 @@ class Run:
 
     def __repr__(self) -> str:
         return f"Run({str(self.path)!r})"
+
+    def _repr_html_(self) -> str:
+        return f"<b>{html.escape(repr(self))}</b>{self.metrics._repr_html_()}"
 
 
 def open_run(path: Path | str) -> Run:

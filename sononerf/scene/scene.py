@@ -18,6 +18,7 @@ from sononerf.geometry.faults import surface_faults
 from sononerf.scene.material import MATERIALS, RIGID, Material, MaterialName
 from sononerf.settings import plugins
 from sononerf.settings.loading import faults_of
+from sononerf.shown import Shown
 
 __all__ = [
     "MATERIALS",
@@ -50,7 +51,7 @@ class SurfaceSizeError(InputError):
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class Scene(Shown):
     """A surface and its material.
 
     Attributes:

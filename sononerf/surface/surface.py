@@ -21,6 +21,7 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.region import ENOUGH
 from sononerf.errors import InputError
 from sononerf.geometry.raycast import RayCaster
+from sononerf.shown import Shown
 from sononerf.surface.mesh_files import MeshFormat, mesh_bytes
 from sononerf.surface.start.evidence import ALIGNED, poses_that_heard
 from sononerf.surface.start.occupancy import QUIET
@@ -33,7 +34,7 @@ FORMATS: tuple[MeshFormat, ...] = get_args(MeshFormat)
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
+class Surface(Shown):
     """A reconstructed surface, or one of your own: ``Surface(mesh)``.
 
     Attributes:

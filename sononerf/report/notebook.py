@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: MIT
+"""Objects as HTML for notebooks: a table of numbers and a small picture."""
+
+from __future__ import annotations
+
+import base64
+import html
+from functools import singledispatch
+from typing import Any
+
+import numpy as np
+
+from sononerf.echoes.echoes import Echoes
+from sononerf.evaluation.numbers import Evaluation
+from sononerf.evaluation.prediction import Prediction
+from sononerf.geometry.poses import Poses
+from sononerf.head.decibels import compress
+from sononerf.head.head import Head
+from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png
+from sononerf.report.pictures.spectrogram_picture import spectrogram_png
+from sononerf.scene.scene import Scene
+from sononerf.surface.surface import Surface
+
+Rows = list[tuple[str, str]]
+
+
+def html_of(thing: object) -> str:
+    """Return the HTML of an object: its kind, its numbers, and its picture where it has one."""
+    rows = "".join(
+        f"<tr><th style='text-align:left'>{html.escape(name)}</th>"
+        f"<td style='text-align:left'>{html.escape(value)}</td></tr>"
+        for name, value in rows_of(thing)
+    )
+    text = f"<b>{type(thing).__name__}</b><table>{rows}</table>"
+    png = png_of(thing)
+    if png is not None:
+        data = base64.b64encode(png).decode()
+        text += f"<img style='max-width:480px' alt='' src='data:image/png;base64,{data}'>"
+    return text
+
+
+@singledispatch
+def rows_of(thing: object) -> Rows:
+    """Return name and value of an object's numbers, as text."""
+    return [("", repr(thing))]
+
+
+@singledispatch
+def png_of(thing: object, **options: Any) -> bytes | None:
+    """Return the picture of an object as a PNG file; None where it has none.
+
+    Args:
+        thing: Of a scene and a surface the mesh is drawn, of echoes and a prediction the
+            spectrogram of one pose.
+        options: ``pose``, its number; of echoes also ``prediction``, which is drawn beside.
+    """
+    del thing, options
+    return None
+
+
+def _extent(positions: np.ndarray[Any, Any]) -> str:
+    return " x ".join(f"{1e3 * size:.4g}" for size in np.ptp(positions, axis=0)) + " mm"
+
+
+@rows_of.register
+def _(thing: Scene) -> Rows:
+    return [
+        ("triangles", f"{len(thing.mesh.faces):,}"),
+        ("size", _extent(thing.mesh.vertices)),
+        ("materials", str(len(thing.materials))),
+    ]
+
+
+@png_of.register
+def _(thing: Scene, **options: Any) -> bytes | None:
+    del options
+    return mesh_png(thing.mesh)
+
+
+@rows_of.register
+def _(thing: Poses) -> Rows:
+    distance = np.linalg.norm(thing.positions, axis=1)
+    return [
+        ("poses", str(len(thing))),
+        ("distance from the origin", f"{distance.min():.4g} to {distance.max():.4g} m"),
+    ]
+
+
+@rows_of.register
+def _(thing: Head) -> Rows:
+    low, high = thing.frequency[[0, -1]] / 1e3
+    near, far = thing.range[[0, -1]]
+    return [
+        ("receivers", f"{len(thing.receivers)}, {thing.ears.directivity}"),
+        ("call", thing.call.kind),
+        ("frequency", f"{low:.1f} to {high:.1f} kHz, {len(thing.frequency)} bins"),
+        ("range", f"{near:.3f} to {far:.3f} m, {len(thing.range)} slices"),
+        ("range resolution", f"{1e3 * thing.resolution:.2g} mm"),
+        ("speed of sound", f"{thing.speed_of_sound:.1f} m/s"),
+    ]
+
+
+@rows_of.register
+def _(thing: Echoes) -> Rows:
+    train, validation, test = np.bincount(thing.store.split, minlength=3)
+    counts = f"{train} train, {validation} validate, {test} held out"
+    floor = thing.store.attributes.get("noise_floor_mae_db")
+    known = [] if floor is None else [("noise floor", f"{floor:.2g} dB")]
+    return [("poses", f"{len(thing)}: {counts}"), *rows_of(thing.head), *known]
+
+
+@png_of.register
+def _(thing: Echoes, *, pose: int | None = None, prediction: Prediction | None = None) -> bytes:
+    number = int([*thing.store.indices("test"), 0][0]) if pose is None else pose
+    measured = compress(thing.spectrogram(number), thing.reference)
+    levels: tuple[Any, Any] = (None, measured)
+    if prediction is not None:
+        row = thing.numbers_of(prediction.poses).tolist().index(number)
+        levels = (measured, compress(prediction.magnitude[row], thing.reference))
+    return spectrogram_png(*levels, thing.head.range, thing.head.frequency, f"pose {number}")
+
+
+@rows_of.register
+def _(thing: Surface) -> Rows:
+    rows = [
+        ("triangles", f"{len(thing.mesh.faces):,}"),
+        ("size", _extent(thing.mesh.vertices)),
+        ("found as", thing.method),
+        ("refined", "yes" if thing.refined else "no"),
+    ]
+    if thing.error_db is not None:
+        rows.append(("mismatch on validation poses", f"{thing.error_db:.2f} dB"))
+    return rows
+
+
+@png_of.register
+def _(thing: Surface, **options: Any) -> bytes | None:
+    del options
+    seen = thing.support
+    return mesh_png(thing.mesh) if seen is None else confidence_png(thing.mesh, seen)
+
+
+@rows_of.register
+def _(thing: Prediction) -> Rows:
+    rows = [
+        ("poses", str(len(thing.poses))),
+        ("weight of traced echoes", f"{thing.traced_weight:.2f}"),
+    ]
+    return rows if thing.traced_fault is None else [*rows, ("not traced", thing.traced_fault)]
+
+
+@png_of.register
+def _(thing: Prediction, *, pose: int = 0) -> bytes:
+    level = compress(thing.magnitude[pose], thing.reference)
+    return spectrogram_png(None, level, thing.range, thing.frequency, f"pose {pose}")
+
+
+@rows_of.register
+def _(thing: Evaluation) -> Rows:
+    return thing.rows()

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: MIT
+"""A module is made again from its checkpoint alone, and refuses what it cannot be made of."""
+
+from __future__ import annotations
+
+import lightning
+import numpy as np
+import pytest
+import torch
+
+from sononerf.echoes.echoes import Echoes
+from sononerf.errors import InputError, SettingsError
+from sononerf.field.datamodule import EchoDataModule
+from sononerf.field.field import Field
+from sononerf.field.fitting import fit, quiet_lightning
+from sononerf.field.grid import GridField
+from sononerf.field.module import EchoModule
+from sononerf.geometry.poses import Poses
+from sononerf.head.head import Head
+
+HEAD = Head(analysis={"range_min": 0.3, "range_max": 0.36})
+BOX = ((-0.02,) * 3, (0.02,) * 3)
+SMALL = {"field_options": {"finest": 0.01, "levels": 2}, "renderer_options": {"start": 2000}}
+
+
+@pytest.fixture(scope="module")
+def echoes():
+    """Of a wall of noise at one range: enough to step through."""
+    poses = Poses.sphere(12, radius=0.33)
+    heard = np.full((12, 2, len(HEAD.range), len(HEAD.frequency)), 1e-4)
+    heard[:, :, 10:14] = np.random.default_rng(0).uniform(0.5, 1.0, (12, 2, 4, heard.shape[-1]))
+    return Echoes.from_arrays(heard, poses, HEAD, split=["train"] * 8 + ["val"] * 2 + ["test"] * 2)
+
+
+def trained(echoes, folder, **options):
+    quiet_lightning()
+    model = EchoModule.for_echoes(echoes, region=BOX, options=options, **SMALL)
+    trainer = lightning.Trainer(
+        max_steps=2, default_root_dir=folder, logger=False, enable_progress_bar=False,
+        enable_model_summary=False, enable_checkpointing=False,
+    )  # fmt: skip
+    trainer.fit(model, EchoDataModule(echoes))
+    trainer.save_checkpoint(folder / "model.ckpt")
+    return model
+
+
+def test_a_module_is_made_again_from_its_checkpoint(echoes, tmp_path):
+    model = trained(echoes, tmp_path, loss="l2", batch_poses=2, seed=3)
+    again = EchoModule.load_from_checkpoint(tmp_path / "model.ckpt", weights_only=True)
+    assert again.options == model.options
+    assert (again.options.loss, again.reference) == ("l2", echoes.reference)
+    assert again.head.plain() == HEAD.plain()
+    for name, values in model.state_dict().items():
+        assert torch.equal(again.state_dict()[name], values), name
+    plain = torch.load(tmp_path / "model.ckpt", weights_only=True)["hyper_parameters"]
+    assert (plain["field"], plain["options"]["seed"]) == ("grid", 3)
+
+
+def test_data_follow_the_options_of_the_module(echoes, tmp_path):
+    model = trained(echoes, tmp_path, batch_poses=4, steps_per_epoch=7)
+    data = model.trainer.datamodule
+    assert (data.options, data.whole_poses) == (model.options, True)
+    assert data.steps_per_epoch == 2  # all that the trainer takes
+    assert EchoDataModule(echoes, {"steps_per_epoch": 7}).steps_per_epoch == 7
+
+
+def test_a_factory_and_an_object_do_as_well(echoes, tmp_path):
+    made = []
+
+    def mine(region, frequency, *, spacing: float = 0.01) -> Field:
+        made.append(spacing)
+        return GridField(region, frequency, finest=spacing, levels=1)
+
+    model = EchoModule.for_echoes(echoes, mine, region=BOX, field_options={"spacing": 0.02})
+    assert made == [0.02]
+    assert "field" not in model.hparams
+    same = EchoModule.for_echoes(echoes, model.field)
+    assert same.field is model.field
+    np.testing.assert_array_equal(same.renderer.region, model.field.region)
+
+
+def test_random_numbers_of_the_caller_are_left_alone(echoes, tmp_path):
+    torch.manual_seed(7)
+    wanted = torch.rand(3)
+    torch.manual_seed(7)
+    trained(echoes, tmp_path)
+    assert torch.equal(torch.rand(3), wanted)
+
+
+def test_a_fit_without_more_words(echoes):
+    model = fit(echoes, EchoModule.for_echoes(
+        echoes, region=BOX, options={"epochs": 1, "steps_per_epoch": 2}, **SMALL
+    ))  # fmt: skip
+    assert model.global_step == 2
+    with pytest.raises(SettingsError, match="the model has its own"):
+        fit(echoes, model, options={"epochs": 2})
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"field": "gird"}, SettingsError, "unknown field 'gird'; did you mean grid"),
+        ({"field": lambda region, frequency: 3}, InputError, "makes a int, expected a sononerf F"),
+        ({"options": {"epoch": 3}}, SettingsError, r"fit\.epoch: unknown key; did you mean epochs"),
+        ({"options": 3}, SettingsError, "fit: found int, expected keys and values"),
+        ({"region": ((0, 0, 0), (0, 1, 1))}, SettingsError, "region: found .*lower and upper"),
+        ({"region": None}, SettingsError, "region: missing"),
+        ({"head": None}, SettingsError, "head: missing"),
+    ],
+)
+def test_what_cannot_be_made_is_refused(changes, error, message):
+    given = {"field": "grid", "renderer": "profile", "region": BOX, "head": HEAD, "reference": 1.0}
+    with pytest.raises(error, match=message):
+        EchoModule(**{**given, **changes})
