@@ -28,7 +28,7 @@ FLOORS = (
     ("evaluation",),
     ("report",),
     ("callbacks",),
-    ("run",),
+    ("run", "testing"),
     ("cli",),
 )
 """From the ground up. A room may import rooms of lower floors and those before it on its own."""

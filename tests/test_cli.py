@@ -38,8 +38,8 @@ pytestmark = pytest.mark.thorough
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 SMOKE = str(CONFIGS / "smoke.yaml")
 COMMANDS = (
-    "scenes new-scene simulate import fit predict reconstruct evaluate export calibrate compare "
-    "report".split()
+    "scenes new-scene new-field new-renderer simulate import fit predict reconstruct evaluate "
+    "export calibrate compare report".split()
 )
 SHORT = [  # of the smoke settings, so that a fit takes a second
     "poses.count=6",
@@ -394,10 +394,10 @@ def test_a_new_scene_is_written_and_what_to_do_next_is_said(tmp_path, monkeypatc
         "next:",
         "  python -m pip install -e ./tin-drum",
         "  python -m pytest tin-drum",
-        "  sononerf scenes",
-        "  echo 'scene: {name: tin_drum}' > tin_drum.yaml",
-        "  sononerf fit tin_drum.yaml",
+        "  sononerf fit scene.name=tin_drum",
     ]
+    assert "field.kind=net" in done("new-field", "net").err
+    assert "renderer.kind=ears" in done("new-renderer", "ears").err
     assert "--output" in refused(2, "new-scene", "tin-drum")
     assert "sphere" in refused(2, "new-scene", "sphere", "--output", "other")
     assert not Path("other").exists()

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -60,28 +60,52 @@ def scenes(
         typer.echo(line)
 
 
+NewFolder = Annotated[
+    Path | None, typer.Option(help="A new folder; NAME in the working directory by default.")
+]
+
+
 @app.command()
 def new_scene(
     name: Annotated[str, typer.Argument(help="Of the scene, such as my_bar.")],
-    output: Annotated[
-        Path | None, typer.Option(help="A new folder; NAME in the working directory by default.")
-    ] = None,
+    output: NewFolder = None,
 ) -> None:
     """Write a scene of one's own to start from: a plugin of two files, and its test."""
+    _new("scene", name, output)
+
+
+@app.command()
+def new_field(
+    name: Annotated[str, typer.Argument(help="Of the field, such as my_net.")],
+    output: NewFolder = None,
+) -> None:
+    """Write a field of one's own to start from: a plugin of two files, and its test."""
+    _new("field", name, output)
+
+
+@app.command()
+def new_renderer(
+    name: Annotated[str, typer.Argument(help="Of the renderer, such as my_ears.")],
+    output: NewFolder = None,
+) -> None:
+    """Write a renderer of one's own to start from: a plugin of two files, and its test."""
+    _new("renderer", name, output)
+
+
+def _new(kind: Literal["scene", "field", "renderer"], name: str, output: Path | None) -> None:
     import shlex
 
-    from sononerf.run.new_scene import new_scene as write
+    from sononerf.run.new_plugin import new_plugin
 
-    written = write(name, output)
+    written = new_plugin(kind, name, output)
     for path in written:
         say(f"wrote {path}")
-    folder, scene = shlex.quote(str(written[0].parent)), written[1].stem
+    folder, module = shlex.quote(str(written[0].parent)), written[1].stem
+    use = {"scene": f"scene.name={module}", "field": f"three_spheres field.kind={module}"}
     say("next:")
     say(f"  python -m pip install -e {folder if '/' in folder else './' + folder}")
     say(f"  python -m pytest {folder}")
-    say("  sononerf scenes")
-    say(f"  echo 'scene: {{name: {scene}}}' > {scene}.yaml")
-    say(f"  sononerf fit {scene}.yaml")
+    say(f"  sononerf fit {use.get(kind, f'three_spheres renderer.kind={module}')}")
 
 
 @app.command(name="import")

@@ -15,6 +15,7 @@ from sononerf.errors import InputError
 from sononerf.evaluation.difference import Comparison
 from sononerf.evaluation.numbers import Evaluation, compare_prediction
 from sononerf.evaluation.prediction import Prediction, predict
+from sononerf.evaluation.traced import Traced
 from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses
 from sononerf.head.head import Head
@@ -95,9 +96,8 @@ class Run(Shown):
             faults=tuple(known["faults"]),
             echoes=echoes,
         )
-        traced = self._folder.traced()
-        if traced is not None:
-            surface.learned.append((weakref.ref(self.model), traced))
+        if self._traced is not None:
+            surface.learned.append((weakref.ref(self.model), self._traced))
         return surface
 
     @property
@@ -105,13 +105,24 @@ class Run(Shown):
         """What ``metrics.json`` holds: prediction, geometry, baseline, cost."""
         return Evaluation(self._folder.read_metrics())
 
+    @cached_property
+    def _traced(self) -> Traced | None:
+        return self._folder.traced()
+
     def predict(
-        self, poses: Poses, *, accelerator: str = "auto", progress: Progress | None = None
+        self,
+        poses: Poses,
+        *,
+        traced: bool = True,
+        accelerator: str = "auto",
+        progress: Progress | None = None,
     ) -> Prediction:
         """Predict the spectrograms of poses, as the command ``predict`` does.
 
         Args:
             poses: P of them.
+            traced: True also traces echoes off the surface, which takes seconds. The field alone
+                takes some hundredths of a second for each pose.
             accelerator: What to render on: ``auto``, ``cpu`` or ``gpu``.
             progress: Where to show it; on stderr where None.
 
@@ -120,7 +131,7 @@ class Run(Shown):
         """
         return predict(
             self.model,
-            self._folder.traced(),
+            self._traced if traced else None,
             poses,
             options=self.settings.simulation,
             accelerator=accelerator,

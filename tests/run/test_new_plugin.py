@@ -11,7 +11,7 @@ import pytest
 
 from sononerf import storage
 from sononerf.errors import SettingsError, StorageError
-from sononerf.run.new_scene import new_scene
+from sononerf.run.new_plugin import new_plugin
 
 
 def lines(path):
@@ -25,7 +25,7 @@ def home(tmp_path, monkeypatch):
 
 
 def test_three_files_and_twenty_lines(home):
-    written = new_scene("tin-drum")
+    written = new_plugin("scene", "tin-drum")
     assert [str(path) for path in written] == [
         "tin-drum/pyproject.toml",
         "tin-drum/tin_drum.py",
@@ -37,14 +37,15 @@ def test_three_files_and_twenty_lines(home):
 
 def test_it_goes_where_it_is_told_to(home):
     (home / "empty").mkdir()
-    assert new_scene("tin-drum", home / "empty")[1] == home / "empty" / "tin_drum.py"
-    assert new_scene("tin-drum", home / "a" / "b")[1].is_file()
+    assert new_plugin("scene", "tin-drum", home / "empty")[1] == home / "empty" / "tin_drum.py"
+    assert new_plugin("scene", "tin-drum", home / "a" / "b")[1].is_file()
 
 
 @pytest.mark.thorough
-def test_what_is_written_installs_and_passes_its_own_test(tmp_path):
+@pytest.mark.parametrize(("kind", "passed"), [("scene", 6), ("field", 1), ("renderer", 1)])
+def test_what_is_written_installs_and_passes_its_own_test(tmp_path, kind, passed):
     source, target = tmp_path / "tin-drum", tmp_path / "installed"
-    new_scene("tin-drum", source)
+    new_plugin(kind, "tin-drum", source)
     flags = ["--no-deps", "--no-build-isolation", "--no-index", "--disable-pip-version-check"]
     environment = {**os.environ, "PIP_CONFIG_FILE": os.devnull}
     subprocess.run(
@@ -59,7 +60,8 @@ def test_what_is_written_installs_and_passes_its_own_test(tmp_path):
         capture_output=True,
         text=True,
     )
-    assert (done.returncode, "6 passed" in done.stdout) == (0, True), done.stdout + done.stderr
+    good = (done.returncode, f"{passed} passed" in done.stdout)
+    assert good == (0, True), done.stdout + done.stderr
 
 
 @pytest.mark.parametrize(
@@ -87,7 +89,7 @@ def test_what_is_written_installs_and_passes_its_own_test(tmp_path):
 )
 def test_names_that_are_none_or_taken(home, name, words):
     with pytest.raises(SettingsError, match=words) as caught:
-        new_scene(name)
+        new_plugin("scene", name)
     assert "\n" not in str(caught.value)
     assert list(home.iterdir()) == []
 
@@ -100,12 +102,12 @@ def test_folders_that_are_not_free(home, monkeypatch):
     before = sorted(home.rglob("*"))
     for folder, words in (("file", "is a file"), ("full", "is not empty")):
         with pytest.raises(SettingsError, match=words):
-            new_scene("tin-drum", home / folder)
+            new_plugin("scene", "tin-drum", home / folder)
     with pytest.raises(StorageError, match="a part of the path is a file"):
-        new_scene("tin-drum", home / "file" / "bar")
+        new_plugin("scene", "tin-drum", home / "file" / "bar")
     monkeypatch.chdir(home / "empty")
     with pytest.raises(SettingsError, match="is the working directory"):
-        new_scene("tin-drum", home / "empty")
+        new_plugin("scene", "tin-drum", home / "empty")
     assert sorted(home.rglob("*")) == before
 
 
@@ -120,5 +122,5 @@ def test_a_disk_that_fails_half_way_leaves_nothing(home, monkeypatch):
 
     monkeypatch.setattr(storage.os, "fsync", fsync)
     with pytest.raises(StorageError, match="tin-drum: cannot be written: the disk is full"):
-        new_scene("tin-drum")
+        new_plugin("scene", "tin-drum")
     assert list(home.iterdir()) == []

@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: MIT
+"""What holds for every scene, field and renderer: contract tests for the authors of plugins.
+
+Each function raises ``AssertionError`` with what was found and what is expected.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from sononerf.field.factories import FieldFactory, RendererFactory, make_field, make_renderer
+from sononerf.field.field import Field
+from sononerf.field.renderer import Renderer
+from sononerf.geometry.poses import Poses
+from sononerf.head.head import Head
+from sononerf.scene.scene import Scene, load_scene
+from sononerf.settings import plugins
+
+REGION = torch.tensor([[-0.02, -0.02, -0.02], [0.02, 0.02, 0.03]])
+"""Box of the tests, m."""
+HEAD = Head(analysis={"frequency_min": 30e3, "frequency_max": 60e3, "range_min": 0.2,
+                      "range_max": 0.3})  # fmt: skip
+"""Head of the tests: its ranges cover the box from poses at a quarter of a metre."""
+POINTS = 50
+
+
+def check_scene(scene: str | Callable[..., Scene], **options: Any) -> Scene:
+    """Check a scene: a surface of a sensible size, and the same one each time.
+
+    Args:
+        scene: Its name, where its package is installed, or its function.
+        options: Its arguments.
+
+    Returns:
+        scene: What was made.
+    """
+
+    def made() -> Scene:
+        if isinstance(scene, str):
+            return load_scene(scene, options)
+        return scene(**plugins.check_options(scene, options, where="scene.options"))
+
+    first, second = made(), made()
+    _holds(isinstance(first, Scene), f"makes a {type(first).__name__}, expected a sononerf Scene")
+    same = np.array_equal(first.mesh.vertices, second.mesh.vertices)
+    same &= np.array_equal(first.mesh.faces, second.mesh.faces)
+    _holds(same, "two calls with the same options make different meshes; draw from a fixed seed")
+    return first
+
+
+def check_field(field: str | FieldFactory, **options: Any) -> Field:
+    """Check a field: shapes, zero outside the region, gradients, frequencies, weights.
+
+    Args:
+        field: Its name, where its package is installed, or its factory.
+        options: Its keyword arguments.
+
+    Returns:
+        field: What was made.
+    """
+    torch.manual_seed(0)
+    made = make_field(field, REGION, HEAD, options)
+    torch.manual_seed(0)
+    again = make_field(field, REGION, HEAD, options)
+    for (name, one), two in zip(
+        made.state_dict().items(), again.state_dict().values(), strict=True
+    ):
+        _holds(torch.equal(one, two), f"{name} differs between two fields of the same torch seed")
+    _holds(0 < made.resolution < 0.1, f"resolution is {made.resolution} m, expected 0 to 0.1 m")
+    places, directions = _places(POINTS)
+    count = len(made.frequency)
+    found = made(places, directions)
+    _shape(found, (POINTS, count), "the reflectivity of (N, 3) places")
+    _finite(found, "the reflectivity")
+    several = directions.expand(4, POINTS, 3)
+    _shape(made(places.expand(4, POINTS, 3), several), (4, POINTS, count), "of (4, N, 3) places")
+    _shape(made.select(places, several, torch.tensor([0, 2])), (4, POINTS, 2), "select")
+    some = made.select(places, directions, torch.tensor([0, 2]))
+    _close(some, found[:, [0, 2]], "select differs from the reflectivity at these frequencies")
+    alone = torch.cat([made(places[n : n + 1], directions[n : n + 1]) for n in range(5)])
+    _close(alone, found[:5], "a place answers otherwise when it is asked alone")
+    outside = places + 1.0
+    _holds(not bool(made(outside, directions).abs().any()), "it is not zero outside the region")
+    _has_gradients(found, made)
+    energy, axis = made.oriented(places, 20)
+    _shape(energy, (POINTS,), "energy")
+    _shape(axis, (POINTS, 3), "axis")
+    _holds(bool((energy >= 0).all()), "an energy is negative")
+    _shape(made.loudness(places, 20), (POINTS,), "loudness")
+    audible = made.audible(places, places[:3] + 0.3)
+    _shape(audible, (3, POINTS), "audible")
+    response, lead = made.echo(places, directions, torch.tensor([1]))
+    _shape(response, (POINTS, 1), "the response of echo")
+    _shape(lead, (POINTS,), "the lead of echo")
+    _same_after_loading(made, again, lambda part: part(places, directions))
+    return made
+
+
+def check_renderer(
+    renderer: str | RendererFactory, *, field: str | FieldFactory = "grid", **options: Any
+) -> Renderer:
+    """Check a renderer: shapes, silence of a silent field, gradients, slices, frequencies.
+
+    Args:
+        renderer: Its name, where its package is installed, or its factory.
+        field: Of what it renders; needed where it works with some fields alone.
+        options: Its keyword arguments.
+
+    Returns:
+        renderer: What was made.
+    """
+    made = make_renderer(renderer, REGION, HEAD, options)
+    torch.manual_seed(1)
+    heard = make_field(field, REGION, HEAD, {})
+    with torch.no_grad():
+        for parameter in heard.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    poses = Poses.sphere(2, radius=0.25)
+    position, rotation = (
+        torch.as_tensor(part, dtype=torch.float32) for part in (poses.positions, poses.rotations)
+    )
+    slices, count = len(made.range), len(made.frequency)
+    rows = torch.arange(slices).expand(2, -1)
+    made.prepare(heard, None, 0)
+    found = made(heard, position, rotation, rows)
+    _shape(found, (2, len(HEAD.receivers), slices, count), "magnitude (P, E, R, F)")
+    _finite(found, "the magnitude")
+    _holds(bool((found >= 0).all()), "a magnitude is negative")
+    _holds(bool((found > 0).any()), "a field that reflects is silent")
+    bins = torch.tensor([0, 2])
+    some = made(heard, position, rotation, rows, bins)
+    _close(some, found[..., bins], "it differs at these frequencies when they are asked alone")
+    if not made.whole_poses:
+        few = made(heard, position, rotation, rows[:, 3:6])
+        _close(few, found[:, :, 3:6], "it differs at these slices when they are asked alone")
+    _has_gradients(found, heard)
+    before = made(heard, position, rotation, rows).square().sum()
+    made.calibrate(found.detach(), 2 * found.detach())
+    after = made(heard, position, rotation, rows).square().sum()
+    _close(after / before, torch.tensor(4.0), "calibrate does not scale it to what was measured")
+    again = make_renderer(renderer, REGION, HEAD, options)
+    _same_after_loading(made, again, lambda part: part(heard, position, rotation, rows))
+    return made
+
+
+def _places(count: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    share = torch.rand(count, 3, generator=generator)
+    directions = torch.randn(count, 3, generator=generator)
+    places = REGION[0] + share * (REGION[1] - REGION[0])
+    return places, directions / directions.norm(dim=-1, keepdim=True)
+
+
+def _holds(good: bool, fault: str) -> None:
+    if not good:
+        raise AssertionError(fault)
+
+
+def _shape(found: Tensor, wanted: tuple[int, ...], what: str) -> None:
+    shape = tuple(found.shape)
+    _holds(shape == wanted, f"{what}: shape {shape}, expected {wanted}")
+
+
+def _finite(found: Tensor, what: str) -> None:
+    _holds(bool(found.isfinite().all()), f"{what} holds NaN or infinite values")
+
+
+def _close(found: Tensor, wanted: Tensor, fault: str) -> None:
+    found, wanted = found.detach(), wanted.detach()
+    scale = float(wanted.abs().max())
+    _holds(torch.allclose(found, wanted, rtol=1e-3, atol=1e-4 * scale + 1e-12), fault)
+
+
+def _has_gradients(found: Tensor, module: torch.nn.Module) -> None:
+    parameters = [p for p in module.parameters() if p.requires_grad]
+    _holds(bool(parameters), "it has no parameters to learn")
+    gradients = torch.autograd.grad(found.abs().sum(), parameters, allow_unused=True)
+    known = [gradient for gradient in gradients if gradient is not None]
+    _holds(any(bool(gradient.any()) for gradient in known), "no gradient reaches its parameters")
+    for gradient in known:
+        _finite(gradient, "a gradient")
+
+
+def _same_after_loading(
+    first: torch.nn.Module, second: torch.nn.Module, answer: Callable[[Any], Tensor]
+) -> None:
+    second.load_state_dict(copy.deepcopy(first.state_dict()))
+    _close(answer(second), answer(first), "it answers otherwise after its weights were loaded")
