@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from sononerf.array_types import Floats
+from sononerf.errors import InputError
 
 Curve = tuple[float, ...]
 BOUNDS = {
@@ -65,7 +66,7 @@ class Material:
         nodes = np.asarray(self.frequency, dtype=np.float64)
         positive = np.isfinite(nodes) & (nodes > 0.0)
         if len(nodes) < 1 or not positive.all() or not (np.diff(nodes) > 0.0).all():
-            raise ValueError(f"material frequency is {self.frequency}, expected ascending nodes")
+            raise InputError(f"material frequency is {self.frequency}, expected ascending nodes")
         for name, (lowest, highest) in BOUNDS.items():
             curve = getattr(self, name)
             if curve is None:
@@ -75,20 +76,20 @@ class Material:
                 object.__setattr__(self, name, curve)
             values = np.asarray(curve, dtype=np.float64)
             if values.shape != nodes.shape:
-                raise ValueError(
+                raise InputError(
                     f"material {name} has {values.size} values, frequency {nodes.size}"
                 )
             if not (np.isfinite(values) & (values >= lowest) & (values <= highest)).all():
-                raise ValueError(
+                raise InputError(
                     f"material {name} is {values.tolist()}, expected {lowest:g} to {highest:g}"
                 )
         if self.lobe_width is None and self.curved_lobe_width is not None:
-            raise ValueError("material curved_lobe_width is set, lobe_width is not; set both")
+            raise InputError("material curved_lobe_width is set, lobe_width is not; set both")
         for name in ("transition_curvature", "transition_slope"):
             if not getattr(self, name) > 0.0:
-                raise ValueError(f"material {name} is {getattr(self, name)}, expected above 0")
+                raise InputError(f"material {name} is {getattr(self, name)}, expected above 0")
         if math.isinf(self.transition_slope):
-            raise ValueError("material transition_slope is inf, expected a finite number")
+            raise InputError("material transition_slope is inf, expected a finite number")
 
     @property
     def rigid(self) -> bool:

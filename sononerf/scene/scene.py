@@ -62,10 +62,8 @@ class Scene(Shown):
             same.
 
     Raises:
-        ValueError: If materials, parts or background do not fit, or if nothing is left to be the
-            target.
-        InputError: If the mesh has no triangles, a vertex that is no finite number, or an index to
-            no vertex.
+        InputError: If materials, parts or background do not fit, nothing is left to be the target,
+            or the mesh has no triangles, a vertex that is not finite, or an index to no vertex.
         SurfaceSizeError: If it is far too large or too small.
     """
 
@@ -75,18 +73,20 @@ class Scene(Shown):
     background: Bools | None = None
 
     def __post_init__(self) -> None:
+        if not isinstance(self.mesh, trimesh.Trimesh):
+            raise InputError(f"mesh is a {type(self.mesh).__name__}, expected a trimesh.Trimesh")
         several = isinstance(self.material, tuple)
         if several != (self.part is not None):
-            raise ValueError("several materials and the parts they are of are given together")
+            raise InputError("several materials and the parts they are of are given together")
         if self.part is not None:
             part = np.asarray(self.part)
             if part.shape != (len(self.mesh.faces),):
-                raise ValueError(
+                raise InputError(
                     f"part has shape {part.shape}, expected one number for each of the "
                     f"{len(self.mesh.faces)} triangles"
                 )
             if part.dtype.kind not in "iu" or part.min() < 0 or part.max() >= len(self.materials):
-                raise ValueError(f"part names no material, expected 0 to {len(self.materials) - 1}")
+                raise InputError(f"part names no material, expected 0 to {len(self.materials) - 1}")
             object.__setattr__(self, "part", part.astype(np.int64))
         if self.background is not None:
             object.__setattr__(self, "background", self._checked(self.background))
@@ -96,12 +96,12 @@ class Scene(Shown):
     def _checked(self, background: Bools) -> Bools:
         background = np.asarray(background)
         if background.shape != (len(self.mesh.faces),) or background.dtype != np.bool_:
-            raise ValueError(
+            raise InputError(
                 f"background is {background.dtype} of shape {background.shape}, expected one bool "
                 f"for each of the {len(self.mesh.faces)} triangles"
             )
         if len(background) and background.all():
-            raise ValueError("all triangles are background; leave the target out of it")
+            raise InputError("all triangles are background; leave the target out of it")
         return background
 
     @property

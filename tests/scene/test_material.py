@@ -4,6 +4,7 @@ import math
 import numpy as np
 import pytest
 
+from sononerf.errors import InputError
 from sononerf.scene.material import (
     INSECT,
     LEAF,
@@ -95,7 +96,7 @@ def test_no_height_is_no_roughness():
     ],
 )
 def test_materials_that_make_no_sense_are_refused_in_one_line(arguments, match):
-    with pytest.raises(ValueError, match=f"^material .*{match.removeprefix('material ')}") as error:
+    with pytest.raises(InputError, match=f"^material .*{match.removeprefix('material ')}") as error:
         Material(**arguments)
     assert "\n" not in str(error.value)
 

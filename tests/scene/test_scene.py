@@ -93,7 +93,7 @@ def test_open_and_inside_out_meshes_are_told_of(caplog):
     ],
 )
 def test_parts_that_do_not_fit_the_mesh_or_the_materials_are_refused(material, part, match):
-    with pytest.raises(ValueError, match=match) as error:
+    with pytest.raises(InputError, match=match) as error:
         Scene(box(), material, part)
     assert "\n" not in str(error.value)
 
@@ -116,7 +116,7 @@ def test_each_triangle_may_have_its_material():
     ],
 )
 def test_a_background_that_does_not_fit_or_is_all_is_refused(background, match):
-    with pytest.raises(ValueError, match=match) as error:
+    with pytest.raises(InputError, match=match) as error:
         Scene(box(), background=background)
     assert "\n" not in str(error.value)
 
