@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import difflib
+import logging
 from typing import Annotated, Literal
 
+import numpy as np
 import trimesh
 from pydantic import Field
 
@@ -14,6 +16,10 @@ from sononerf.scene import MATERIALS, MaterialName, Scene, SurfaceSizeError, che
 
 from .mesh_file import IN_METRES, kind_of, read_parts, stacked
 
+logger = logging.getLogger("sononerf")
+
+WORTH_A_WORD = 1e-3
+"""Shift over size, no unit, from which on the user is told of it: less is rounding of the file."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 
@@ -75,11 +81,20 @@ def mesh(
         raise InputError(f"{path}: {error}; {hint}") from None
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
-    if centre:
-        vertices = vertices - (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
+    middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0 if centre else np.zeros(3)
+    if np.abs(middle).max() > WORTH_A_WORD * float(np.ptp(vertices, axis=0).max()):
+        logger.warning(
+            "%s: moved by (%.3g, %.3g, %.3g) mm, so that its middle lies at the origin, at which "
+            "poses look; centre=false leaves it where it is",
+            *(path, *(-1e3 * middle)),
+        )
+    vertices = vertices - middle
+    to_original = np.eye(4)
+    to_original[:3, 3] = middle
+    to_original[:3] /= METRES[unit] * scale
     # Merged over parts as well: a group of an OBJ is often but a patch of one body.
     surface = trimesh.Trimesh(vertices, faces)
     if not materials:
-        return Scene(surface, MATERIALS[material])
+        return Scene(surface, MATERIALS[material], to_original=to_original)
     chosen = tuple(MATERIALS[materials.get(name, material)] for name in parts)
-    return Scene(surface, chosen, part)
+    return Scene(surface, chosen, part, to_original=to_original)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import threading
 import time
@@ -15,19 +16,7 @@ from typing import Any
 import lightning
 
 from sononerf.errors import StoppedError
-from sononerf.field.module import EchoModule
 from sononerf.progress import Task
-
-
-def echo_module(module: lightning.LightningModule) -> EchoModule:
-    """Return the module that the callbacks here are made for.
-
-    Raises:
-        TypeError: If it is another one.
-    """
-    if not isinstance(module, EchoModule):
-        raise TypeError(f"{type(module).__name__} is no EchoModule")
-    return module
 
 
 class ProgressCallback(lightning.Callback):
@@ -81,6 +70,7 @@ class CheckpointCallback(lightning.Callback):
         self.stopped_by: int | None = None
         self._saved = self._began = time.monotonic()
         self._earlier = 0.0
+        self._total = math.inf
         self._before: dict[signal.Signals, Callable[..., Any] | int] = {}
 
     @property
@@ -131,34 +121,34 @@ class CheckpointCallback(lightning.Callback):
         trainer.save_checkpoint(self.path)
         self._saved = time.monotonic()
 
-    def _stop(self, module: EchoModule) -> None:
+    def _stop(self, trainer: lightning.Trainer) -> None:
         # Lightning's own way of stopping validates once more first.
         raise StoppedError(
             self.stopped_by or signal.SIGTERM,
-            f"stopped at step {module.global_step} of {module.total_steps}; "
-            "the same command goes on",
+            f"stopped at step {trainer.global_step} of {self._total:.0f}; the same command goes on",
         )
 
-    def _is_asked_to_stop(self, trainer: lightning.Trainer, module: EchoModule) -> bool:
+    def _is_asked_to_stop(self, trainer: lightning.Trainer) -> bool:
         # All devices stop together; a fit that is over has nothing to stop.
         asked = trainer.strategy.reduce_boolean_decision(self.stopped_by is not None, all=False)
-        return asked and module.global_step < module.total_steps
+        return asked and trainer.global_step < self._total
 
     def on_train_start(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
         """Take SIGTERM back from Lightning, which would end with exit code 0."""
-        del trainer, pl_module
+        del pl_module
+        self._total = float(trainer.estimated_stepping_batches)
         self._watch()
 
     def on_train_epoch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
         """Save what the epoch reached, after its validation."""
-        module = echo_module(pl_module)
+        del pl_module
         self._save(trainer)
-        if self._is_asked_to_stop(trainer, module):
-            self._stop(module)
+        if self._is_asked_to_stop(trainer):
+            self._stop(trainer)
 
     def on_train_batch_end(
         self,
@@ -169,15 +159,14 @@ class CheckpointCallback(lightning.Callback):
         batch_idx: int,
     ) -> None:
         """Save when it is time, or when asked to stop."""
-        del outputs, batch, batch_idx
-        module = echo_module(pl_module)
-        if trainer.is_last_batch or module.global_step >= module.total_steps:
+        del pl_module, outputs, batch, batch_idx
+        if trainer.is_last_batch or trainer.global_step >= self._total:
             # Saved after the epoch: Lightning would go on from here without its end, and would
             # count wrongly after another stop.
             return
-        asked = self._is_asked_to_stop(trainer, module)
+        asked = self._is_asked_to_stop(trainer)
         late = time.monotonic() - self._saved >= self.seconds
         if asked or trainer.strategy.reduce_boolean_decision(late, all=False):
             self._save(trainer)
         if asked:
-            self._stop(module)
+            self._stop(trainer)

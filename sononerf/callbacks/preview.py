@@ -11,9 +11,9 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from sononerf import storage
-from sononerf.callbacks.epoch import echo_module
 from sononerf.errors import NumericalError
-from sononerf.field.module import decibels
+from sononerf.field.field import Field
+from sononerf.field.module import EchoModule, decibels
 from sononerf.field.range_slices import WholePoses
 from sononerf.report.pictures.figure import png_from_pixels
 from sononerf.report.pictures.mip_picture import maximum_intensity_projections, mip_image
@@ -43,26 +43,26 @@ class PreviewCallback(lightning.Callback):
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
         """Read the field out coarsely and write what is seen."""
-        module, epoch = echo_module(pl_module), trainer.current_epoch + 1
-        if epoch % self.every_epochs or not trainer.is_global_zero:
+        field, epoch = getattr(pl_module, "field", None), trainer.current_epoch + 1
+        if epoch % self.every_epochs or not trainer.is_global_zero or not isinstance(field, Field):
             return
         target = self.folder / "epochs" / f"{epoch:04d}"
         shown = {k: float(v) for k, v in trainer.callback_metrics.items()}
-        numbers = {**shown, "epoch": epoch, "step": module.global_step}
-        extent = float((module.field.region[1] - module.field.region[0]).max())
-        was_training = module.training
-        module.eval()
+        numbers = {**shown, "epoch": epoch, "step": trainer.global_step}
+        extent = float((field.region[1] - field.region[0]).max())
+        was_training = pl_module.training
+        pl_module.eval()
         try:
             with torch.inference_mode():
-                spacing = max(extent / self.voxels, module.field.resolution / 2)
-                volume = energy_volume(module.field, spacing, self.directions)
+                spacing = max(extent / self.voxels, field.resolution / 2)
+                volume = energy_volume(field, spacing, self.directions)
                 mesh = isosurface(volume, automatic_level(volume))
         except NumericalError as error:
             # An early field may hold no surface yet; that is news, not a fault.
             storage.commit_json(target / "metrics.json", {**numbers, "no_surface": str(error)})
             return
         finally:
-            module.train(was_training)
+            pl_module.train(was_training)
         storage.commit_bytes(target / "mesh.ply", mesh_bytes(mesh, "ply"))
         # Bare pixels: axes and labels would cost more than the rest of the epoch's look.
         pictures = {
@@ -75,7 +75,7 @@ class PreviewCallback(lightning.Callback):
         if isinstance(trainer.logger, TensorBoardLogger):
             for axis, pixels in pictures.items():
                 trainer.logger.experiment.add_image(
-                    f"mip/{axis}", pixels, module.global_step, dataformats="HWC"
+                    f"mip/{axis}", pixels, trainer.global_step, dataformats="HWC"
                 )
 
 
@@ -103,10 +103,10 @@ class SpectrogramImages(lightning.Callback):
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
         """Render one pose and show it."""
-        module = echo_module(pl_module)
+        module = pl_module
         if not trainer.is_global_zero or not isinstance(trainer.logger, TensorBoardLogger):
             return
-        if not len(self.poses):
+        if not len(self.poses) or not isinstance(module, EchoModule):
             return
         started = time.monotonic()
         if started < self.next_at and module.global_step < module.total_steps:

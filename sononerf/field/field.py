@@ -36,6 +36,8 @@ class Field(nn.Module):
     """What Adam starts with where the settings name no rate."""
     costly: bool = False
     """Whether a place asks for so many operations that any number of them is worth threads."""
+    half_precision: bool = False
+    """Whether layers may multiply in half precision; the module sets it."""
 
     def __init__(self, region: Tensor, frequency: Tensor) -> None:
         super().__init__()

@@ -137,7 +137,8 @@ class FourierField(Field):
         positions, directions = positions.expand(shape), directions.expand(shape)
         inside = self.inside(positions)
         first, second = self._embedded(positions[inside], directions[inside])
-        with torch.autocast(positions.device.type, torch.bfloat16, self.precision == "bfloat16"):
+        half = self.half_precision or self.precision == "bfloat16"
+        with torch.autocast(positions.device.type, torch.bfloat16, half):
             hidden = self.middle(self.trunk(self.enter(first)))
             hidden = self.leave(self.branch(torch.cat((hidden, first), dim=-1)))
             answer = self.out(self.head(torch.cat((hidden, second), dim=-1)))

@@ -192,10 +192,17 @@ class EchoModule(lightning.LightningModule):
         )
 
     def forward(self, batch: RangeSlices) -> Tensor:
-        """Render a batch: (P, E, R, B) linear magnitude."""
-        magnitude: Tensor = self.renderer(
-            self.field, batch.position, batch.rotation, batch.rows, batch.bins
-        )
+        """Render a batch: (P, E, R, B) linear magnitude.
+
+        Ranges need single precision. With ``precision="bf16-mixed"`` only the layers of a field
+        that has layers multiply in half precision.
+        """
+        kind = self.device.type
+        self.field.half_precision = torch.is_autocast_enabled(kind)
+        with torch.autocast(kind, enabled=False):
+            magnitude: Tensor = self.renderer(
+                self.field, batch.position, batch.rotation, batch.rows, batch.bins
+            )
         return magnitude
 
     def on_train_start(self) -> None:

@@ -219,7 +219,9 @@ def fit(
                 simulated = time.monotonic() - started
                 run.begin_fit(settings)
                 run.write_provenance(
-                    echo_hash=echoes.store.attributes["echo_hash"], threads=torch.get_num_threads()
+                    echo_hash=echoes.store.attributes["echo_hash"],
+                    to_original=echoes.store.attributes.get("to_original"),
+                    threads=torch.get_num_threads(),
                 )
                 if "simulate_s" not in run.read_metrics().get("cost", {}):
                     run.write_metrics("cost", {"simulate_s": simulated}, merge=True)

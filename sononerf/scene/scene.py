@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
-from sononerf.array_types import Bools, Ints
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.errors import InputError, SettingsError, SonoNerfError
 from sononerf.geometry.faults import surface_faults
 from sononerf.scene.material import MATERIALS, RIGID, Material, MaterialName
@@ -60,6 +60,8 @@ class Scene(Shown):
         part (T,): Which of the materials each triangle is of, where there are several.
         background (T,): True where a triangle is surroundings and not the target. It sounds all the
             same.
+        to_original (4, 4): From the scene's frame, m, to the frame and unit of the file that it was
+            read from; None where it was not read from a file.
 
     Raises:
         InputError: If materials, parts or background do not fit, nothing is left to be the target,
@@ -71,6 +73,7 @@ class Scene(Shown):
     material: Material | tuple[Material, ...] = RIGID
     part: Ints | None = None
     background: Bools | None = None
+    to_original: Floats | None = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.mesh, trimesh.Trimesh):

@@ -159,7 +159,7 @@ def simulate(
         "split": purposes,
         "range": head.range,
         "frequency": head.frequency,
-        "attributes": _attributes(wanted, head, settings, about or {}),
+        "attributes": _attributes(wanted, scene, head, settings, about or {}),
         "receivers": len(head.receivers),
     }
     only = None if shard is None else range(shard.number - 1, len(poses), shard.count)
@@ -236,9 +236,15 @@ def _plain(head: Head, options: SimulationSettings) -> dict[str, Any]:
 
 
 def _attributes(
-    wanted: str, head: Head, options: SimulationSettings, about: Mapping[str, Any]
+    wanted: str,
+    scene: Scene,
+    head: Head,
+    options: SimulationSettings,
+    about: Mapping[str, Any],
 ) -> dict[str, Any]:
     further = dict(about)
+    if scene.to_original is not None:
+        further["to_original"] = scene.to_original.tolist()
     sections = {**further.pop("settings", {}), **_plain(head, options)}
     return {
         "echo_hash": wanted,

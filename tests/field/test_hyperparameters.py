@@ -87,6 +87,29 @@ def test_random_numbers_of_the_caller_are_left_alone(echoes, tmp_path):
     assert torch.equal(torch.rand(3), wanted)
 
 
+@pytest.mark.parametrize("field", ["grid", "fourier"])
+def test_half_precision_leaves_ranges_alone(echoes, tmp_path, field):
+    quiet_lightning()
+    options = SMALL if field == "grid" else {"field_options": {"width": 16, "octaves": 4}}
+    model = EchoModule.for_echoes(echoes, field, region=BOX, **options)
+    seen = []
+    real = model.renderer.forward
+
+    def forward(given, position, rotation, rows, bins=None):
+        seen.append(torch.is_autocast_enabled("cpu") or position.dtype != torch.float32)
+        return real(given, position, rotation, rows, bins)
+
+    model.renderer.forward = forward
+    lightning.Trainer(
+        max_steps=2, precision="bf16-mixed", default_root_dir=tmp_path, logger=False,
+        enable_progress_bar=False, enable_model_summary=False, enable_checkpointing=False,
+    ).fit(model, EchoDataModule(echoes))  # fmt: skip
+    assert len(seen) > 2
+    assert not any(seen)
+    assert model.field.half_precision
+    assert all(p.dtype == torch.float32 and p.isfinite().all() for p in model.parameters())
+
+
 def test_a_fit_without_more_words(echoes):
     model = fit(echoes, EchoModule.for_echoes(
         echoes, region=BOX, options={"epochs": 1, "steps_per_epoch": 2}, **SMALL

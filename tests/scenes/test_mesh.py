@@ -58,6 +58,23 @@ def test_formats_and_units(tmp_path, name):
     )
 
 
+def test_a_mesh_is_moved_with_a_word_and_the_way_back_is_kept(tmp_path, caplog):
+    moved = BOX.copy()
+    moved.apply_translation([5.0, 6.0, 7.0])
+    moved.export(tmp_path / "a.stl")
+    scene = load_scene("mesh", {"path": str(tmp_path / "a.stl"), "unit": "mm", "scale": 2.0})
+    (told,) = caplog.messages
+    assert "moved by (-10, -12, -14) mm" in told
+    assert "centre=false" in told
+    back = scene.mesh.copy().apply_transform(scene.to_original)
+    np.testing.assert_allclose(back.bounds, moved.bounds, atol=1e-5)
+    caplog.clear()
+    kept = load_scene("mesh", {"path": str(tmp_path / "a.stl"), "unit": "mm", "centre": False})
+    assert caplog.messages == []
+    np.testing.assert_allclose(kept.to_original, np.diag([1e3, 1e3, 1e3, 1.0]))
+    np.testing.assert_allclose(kept.mesh.bounds.mean(axis=0), [0.005, 0.006, 0.007], atol=1e-7)
+
+
 def test_glb_and_gltf_are_in_metres(tmp_path):
     BOX.export(tmp_path / "a.glb")
     (tmp_path / "a.gltf").write_bytes(whole_gltf(BOX))
