@@ -92,7 +92,26 @@ class Poses(Shown):
         return _aimed(radius * fibonacci_sphere(count), aim_jitter, generator)
 
     @classmethod
-    def read(cls, path: Path) -> Poses:
+    def looking_at(cls, positions: ArrayLike, target: ArrayLike = (0.0, 0.0, 0.0)) -> Poses:
+        """Return level poses at places that look at a target.
+
+        Args:
+            positions ((P, 3), m): World frame.
+            target ((3,), m): What is looked at.
+
+        Raises:
+            InputError: If shapes do not fit, or a position is the target.
+        """
+        places, aim = np.asarray(positions, np.float64), np.asarray(target, np.float64)
+        if places.ndim != 2 or places.shape[1] != 3 or aim.shape != (3,):
+            raise InputError(
+                f"positions {places.shape} and target {aim.shape}, expected (P, 3) and (3,)"
+            )
+        _refuse(np.asarray((places == aim).all(axis=1)), "are the target itself")
+        return cls(places, look_at(places, aim))
+
+    @classmethod
+    def read(cls, path: Path | str) -> Poses:
         """Read poses from a table with the header ``x,y,z,yaw,pitch,roll`` (m, degrees).
 
         Args:
@@ -102,6 +121,7 @@ class Poses(Shown):
             InputError: If the file cannot be read, or anything in it is no finite number, naming
                 file, line and column.
         """
+        path = Path(path)
         header, rows = read_rows(path)
         if sorted(header) != sorted(CSV_COLUMNS):
             raise InputError(

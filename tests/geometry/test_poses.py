@@ -158,6 +158,16 @@ def test_what_is_no_pose_is_refused(positions, rotations, message):
         Poses(positions, rotations)
 
 
+def test_poses_that_look_at_a_target():
+    poses = Poses.looking_at([[0.3, 0.0, 0.1], [0.0, -0.2, 0.1]], (0.0, 0.0, 0.1))
+    np.testing.assert_allclose(poses.rotations[:, :, 0], [[-1, 0, 0], [0, 1, 0]], atol=1e-12)
+    np.testing.assert_allclose(poses.rotations[:, :, 2], [[0, 0, 1]] * 2, atol=1e-12)
+    with pytest.raises(InputError, match=r"1 of 1 poses \(0\) are the target itself"):
+        Poses.looking_at([[0.0, 0.0, 0.0]])
+    with pytest.raises(InputError, match=r"positions \(3,\) and target"):
+        Poses.looking_at([0.0, 0.0, 1.0])
+
+
 def test_table_comes_back(tmp_path):
     poses = random_sphere_poses(20, radius=0.4, aim_jitter=0.3, generator=np.random.default_rng(0))
     path = tmp_path / "poses.csv"
