@@ -225,10 +225,61 @@ def look_at(positions: ArrayLike, target: ArrayLike) -> Floats:
     return rotation_from_euler(yaw, -np.arctan2(forward[..., 2], level), 0.0)
 
 
-def _aimed(positions: Floats, aim_jitter: float, generator: np.random.Generator) -> Poses:
-    """Look at the origin, then off it by two random turns about the head's own y and z."""
+def cylinder_poses(
+    count: int,
+    *,
+    radius: float,
+    heights: tuple[float, float],
+    aim_jitter: float,
+    generator: np.random.Generator,
+) -> Poses:
+    """Poses on a spiral around the z axis that look level at it, each a little off.
+
+    As of a turntable before a column of sensors. ``heights`` holds the lowest and the highest z, m;
+    the others, and the result, as :meth:`Poses.sphere`.
+    """
+    share = (np.arange(count) + 0.5) / count
+    turn = np.arange(count, dtype=np.float64) * math.pi * (3.0 - math.sqrt(5.0))  # golden angle
+    return _around(radius, heights, share, turn, aim_jitter, generator)
+
+
+def random_cylinder_poses(
+    count: int,
+    *,
+    radius: float,
+    heights: tuple[float, float],
+    aim_jitter: float,
+    generator: np.random.Generator,
+) -> Poses:
+    """Poses at random places of a cylinder; parameters and result as :func:`cylinder_poses`."""
+    share, turn = generator.random((2, count))
+    return _around(radius, heights, share, 2.0 * math.pi * turn, aim_jitter, generator)
+
+
+def _around(
+    radius: float,
+    heights: tuple[float, float],
+    share: Floats,
+    turn: Floats,
+    aim_jitter: float,
+    generator: np.random.Generator,
+) -> Poses:
+    low, high = heights
+    height = low + share * (high - low)
+    axis = np.stack((np.zeros_like(height), np.zeros_like(height), height), axis=1)
+    around = np.stack((np.cos(turn), np.sin(turn), np.zeros_like(turn)), axis=1)
+    return _aimed(axis + radius * around, aim_jitter, generator, axis)
+
+
+def _aimed(
+    positions: Floats,
+    aim_jitter: float,
+    generator: np.random.Generator,
+    targets: ArrayLike = (0.0, 0.0, 0.0),
+) -> Poses:
+    """Look at targets, then off them by two random turns about the head's own y and z."""
     about_y, about_z = aim_jitter * generator.standard_normal((2, len(positions)))
-    turned = look_at(positions, np.zeros(3)) @ rotation_from_euler(about_z, about_y, 0.0)
+    turned = look_at(positions, targets) @ rotation_from_euler(about_z, about_y, 0.0)
     return Poses(positions, look_at(np.zeros_like(positions), turned[:, :, 0]))
 
 

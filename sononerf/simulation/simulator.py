@@ -17,7 +17,14 @@ from numpy.typing import NDArray
 from sononerf.array_types import Floats, Singles
 from sononerf.echoes.splits import TEST, TRAIN, VALIDATION
 from sononerf.errors import InputError
-from sononerf.geometry.poses import Poses, cap_poses, random_poses, random_sphere_poses
+from sononerf.geometry.poses import (
+    Poses,
+    cap_poses,
+    cylinder_poses,
+    random_cylinder_poses,
+    random_poses,
+    random_sphere_poses,
+)
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
@@ -255,6 +262,9 @@ def _arrangement(wanted: PoseSettings) -> tuple[Callable[..., Poses], Callable[.
     radius, axis = wanted.radius, wanted.axis
     if wanted.arrangement == "sphere":
         return partial(Poses.sphere, radius=radius), partial(random_sphere_poses, radius=radius)
+    if wanted.heights is not None:
+        where: dict[str, Any] = {"radius": radius, "heights": wanted.heights}
+        return partial(cylinder_poses, **where), partial(random_cylinder_poses, **where)
     angle = math.pi if wanted.half_angle_deg is None else math.radians(wanted.half_angle_deg)
     distances = radius, wanted.radius_max or radius
     draw = partial(random_poses, radius=distances, axis=axis, half_angle=angle)

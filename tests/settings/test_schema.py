@@ -316,6 +316,9 @@ def test_another_scene_does_not_inherit_the_options_of_the_files_scene(tmp_path)
         ("arrangement: cap", "the arrangement cap needs half_angle_deg"),
         ("arrangement: volume", "the arrangement volume needs radius_max"),
         ("arrangement: path", "the arrangement path needs path"),
+        ("arrangement: cylinder", "the arrangement cylinder needs heights"),
+        ("heights: [0, 1]", "heights is of the arrangement cylinder, not of sphere"),
+        ("{arrangement: cylinder, heights: [1, 0]}", "heights must be the lowest and the highest"),
         ("path: a.csv", "path is of the arrangement path, not of sphere"),
         ("half_angle_deg: 9", "half_angle_deg is of the arrangement cap or volume, not of sphere"),
         (

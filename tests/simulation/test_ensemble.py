@@ -43,6 +43,18 @@ def test_sets_follow_each_other_at_their_radius():
     np.testing.assert_allclose(np.linalg.norm(poses.positions, axis=1), 0.4)
 
 
+def test_poses_of_a_cylinder_look_level_at_its_axis():
+    wanted = {"arrangement": "cylinder", "radius": 0.8, "heights": [0.1, 0.5], "count": 40}
+    poses, split = ensemble_poses(settings(poses={**wanted, "aim_jitter_deg": 0.0}).poses)
+    np.testing.assert_allclose(np.linalg.norm(poses.positions[:, :2], axis=1), 0.8)
+    for number in (0, 1, 2):
+        height = poses.positions[split == number][:, 2]
+        assert 0.1 <= height.min() < 0.2 < 0.4 < height.max() <= 0.5
+    inward = -poses.positions[:, :2] / 0.8
+    np.testing.assert_allclose(poses.rotations[:, :2, 0], inward, atol=1e-12)
+    np.testing.assert_allclose(poses.rotations[:, 2, 2], 1.0)
+
+
 def test_no_set_moves_another_and_the_seed_moves_all():
     def sets(**changes):
         wanted = {"count": 7, "validation": 2, "heldout": 3, **changes}
