@@ -365,7 +365,7 @@ def test_what_a_fit_cost_is_counted_over_its_parts(tiny, tmp_path, interrupt, mo
     with pytest.raises(StoppedError):
         run(tiny(), path)
     first = cost()["simulate_s"]
-    ensemble, load = fit_module.ensemble, DurableCheckpointIO.load_checkpoint
+    ensemble, load = fit_module.open_or_simulate, DurableCheckpointIO.load_checkpoint
 
     def slow(*arguments, **options):
         time.sleep(first + 0.1)
@@ -376,7 +376,7 @@ def test_what_a_fit_cost_is_counted_over_its_parts(tiny, tmp_path, interrupt, mo
         content["callbacks"]["CheckpointCallback"]["elapsed"] += 1000.0
         return content
 
-    monkeypatch.setattr(fit_module, "ensemble", slow)
+    monkeypatch.setattr(fit_module, "open_or_simulate", slow)
     monkeypatch.setattr(DurableCheckpointIO, "load_checkpoint", long_ago)
     run(tiny(), path)
     assert 1000.0 < cost()["fit_s"] < 1100.0

@@ -24,6 +24,7 @@ from sononerf.errors import (
 )
 from sononerf.head.decibels import compress
 from sononerf.head.directivity.sofa import write_sofa
+from sononerf.run import simulate as run_module
 from sononerf.run.import_recordings import read_recordings
 from sononerf.run.simulate import (
     background_path,
@@ -329,7 +330,7 @@ def test_the_scenes_own_background_is_simulated_alone_and_taken_off(tiny, tmp_pa
     monkeypatch.chdir(tmp_path)
     settings = tiny(data={"store": None, "background": "scene"})
     scene = before_a_wall(settings)
-    monkeypatch.setattr(simulate_module, "load_scene", lambda *given, **named: scene)
+    monkeypatch.setattr(run_module, "load_scene", lambda *given, **named: scene)
     left = open_or_simulate(settings, workers=1).store
     whole = simulate(tiny(data={"store": None}), workers=1)
     alone = EnsembleStore.open(background_path(settings))
