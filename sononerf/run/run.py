@@ -15,7 +15,7 @@ from sononerf.errors import InputError
 from sononerf.evaluation.difference import Comparison
 from sononerf.evaluation.numbers import Evaluation, compare_prediction
 from sononerf.evaluation.prediction import Prediction, predict
-from sononerf.evaluation.traced import Traced
+from sononerf.evaluation.traced import Traced, for_single_poses
 from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses
 from sononerf.head.head import Head
@@ -107,7 +107,10 @@ class Run(Shown):
 
     @cached_property
     def _traced(self) -> Traced | None:
-        return self._folder.traced()
+        traced = self._folder.traced()
+        if traced is None:
+            return None
+        return for_single_poses(traced, self.head, self.settings.simulation)
 
     def predict(
         self,
@@ -121,8 +124,8 @@ class Run(Shown):
 
         Args:
             poses: P of them.
-            traced: True also traces echoes off the surface, which takes seconds. The field alone
-                takes some hundredths of a second for each pose.
+            traced: True also traces echoes off the surface: some seconds for the first pose, then
+                some tenths of a second for each. The field alone takes some hundredths.
             accelerator: What to render on: ``auto``, ``cpu`` or ``gpu``.
             progress: Where to show it; on stderr where None.
 

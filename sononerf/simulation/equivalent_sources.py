@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sononerf.array_types import Complexes, Floats
 from sononerf.errors import NumericalError
 from sononerf.geometry.directions import spread_points
+from sononerf.memory import available_memory
 from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing
 from sononerf.simulation.solved import Heads, Solved
@@ -50,11 +51,16 @@ ORDER = 3
 BLOCK = 64
 """Poses that are solved for together. It is fixed, so that the rounding of a pose's result does not
 depend on the other poses."""
+FEW = 8
+"""The same where the equations are kept, for poses that come one by one: a block of one would be
+computed by other routines, one of 64 takes ten times as long."""
 LEAD = 2.5
 """Time kept before the first arrival, over the inverse width of the fall of the band."""
 PATH = 5.0
 """Path that the response lasts for after the first arrival, in radii of a sphere around the scene.
 What comes later wraps around; for ``three_spheres`` it is 60 dB down."""
+KEPT = 0.25
+"""Fraction of the free memory that factorised equations may take where they are kept."""
 LARGEST_KA = 12.0
 """Wavenumber times radius above which rays are as good, see ``docs/simulator.md``."""
 
@@ -86,6 +92,8 @@ class Sources(Solved):
         fall: See :class:`Solved`.
 
     Attributes:
+        keeps: Whether the factorised equations are kept. Further poses are then solved for at once,
+            in blocks of ``FEW``.
         error: Error of the normal velocity on the surface relative to the incident one, root mean
             square over all poses solved for, by frequency in Hz.
 
@@ -116,6 +124,8 @@ class Sources(Solved):
             fall=fall,
         )
         self.error: dict[float, float] = {}
+        self.keeps = False
+        self._kept: dict[float, _System] = {}
         self._surface: tuple[Floats, Floats, Floats] | None = None
 
     @property
@@ -168,21 +178,31 @@ class Sources(Solved):
         incident = _arriving(system.points, system.normals, emitters, complex(wavenumber))
         return system.error(incident, system.solve(incident))
 
+    def _system(self, frequency: float, wavenumber: complex) -> _System:
+        """Return the equations of a frequency, those that were kept where they are there."""
+        if frequency in self._kept:
+            return self._kept[frequency]
+        system = _System(self, frequency, wavenumber)
+        if self.keeps and system.bytes * len(self.frequency) < KEPT * (available_memory() or 0):
+            self._kept[frequency] = system
+        return system
+
     def respond(self, wavenumber: complex, poses: Heads) -> Complexes:
         """Scattered pressure at the ears at one frequency; see :meth:`Solved.respond`."""
         frequency = wavenumber.real * self.hearing.speed_of_sound / (2.0 * math.pi)
-        system = _System(self, frequency, wavenumber)
+        system = self._system(frequency, wavenumber)
         ears, control = poses.ears.shape[1], self.surface[0][:CONTROL]
         points, sources = self._blend[system.chosen].T, self._blend[: len(system.places)].T
         heard = np.zeros((len(poses), ears), dtype=np.complex128)
         squares = []
-        for start in range(0, len(poses), BLOCK):
-            some = poses[np.arange(start, start + BLOCK).clip(max=len(poses) - 1)]
+        block = FEW if self.keeps else BLOCK
+        for start in range(0, len(poses), block):
+            some = poses[np.arange(start, start + block).clip(max=len(poses) - 1)]
             incident = _arriving(system.points, system.normals, some.emitters, wavenumber)
             incident *= (some.beam(control) @ points).T.astype(np.float32)
             strength = system.solve(incident)
             squares.append(np.square(system.error(incident, strength)))
-            count = min(BLOCK, len(poses) - start)
+            count = min(block, len(poses) - start)
             for ear in range(ears):
                 wave = _waves(some.ears[:, ear], system.places, wavenumber, system.axes)
                 wave *= (some.gain(ear, control) @ sources).astype(np.float32)
@@ -193,6 +213,11 @@ class Sources(Solved):
 
 class _System:
     """The equations of one frequency, factorised."""
+
+    @property
+    def bytes(self) -> int:
+        """Memory of the matrices."""
+        return self._adjoint.nbytes + self._factor.nbytes + self._checks.nbytes
 
     def __init__(self, engine: Sources, frequency: float, wavenumber: complex) -> None:
         points, normals, thickness = engine.surface

@@ -33,7 +33,7 @@ from sononerf.settings.schema import PoseSettings, SimulationSettings, Spectrogr
 from sononerf.simulation.audibility import RESOLVED_FREQUENCY, silence_before
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import hearing_of
-from sononerf.simulation.hybrid import hybrid
+from sononerf.simulation.hybrid import Hybrid, hybrid
 from sononerf.simulation.rays import Rays
 from sononerf.simulation.reference.kirchhoff import Kirchhoff
 from sononerf.simulation.solved import TAPER, Solved
@@ -114,6 +114,11 @@ class Simulator:
         """
         wanted = options.model_copy(update={"engine": "hybrid", "rays": rays})
         return cls.of(quiet_scene(mesh), head.without_noise(), wanted)
+
+    def keep_equations(self) -> None:
+        """Keep factorised equations in memory, so that single poses are solved for at once."""
+        if isinstance(self.engine, Hybrid):
+            self.engine.low.keeps = True
 
     def prepare(
         self,

@@ -5,6 +5,7 @@ import trimesh
 
 from sononerf.head.ears import Ears
 from sononerf.scene.scene import Scene
+from sononerf.simulation import equivalent_sources
 from sononerf.simulation.equivalent_sources import Sources, resolved_frequency, sources_worth
 from sononerf.simulation.reference.spheres import Spheres
 from tests.simulation.exact import SPEED, rigid_sphere
@@ -115,3 +116,26 @@ def test_four_times_the_sources_reach_twice_the_frequency():
     assert 2 * np.pi * highest / SPEED * 0.015 == pytest.approx(12.0, rel=0.01)
     both = Scene(trimesh.util.concatenate([ball(0.015), ball(0.015, (0.05, 0.0, 0.0))]))
     assert sources_worth(both) == pytest.approx(2 * most, abs=1)
+
+
+def test_kept_equations_answer_further_poses_alike(monkeypatch):
+    made = []
+    real = equivalent_sources._System
+
+    def counted(*given):
+        made.append(given)
+        return real(*given)
+
+    monkeypatch.setattr(equivalent_sources, "_System", counted)
+    plain, keeping = (sources(ball(0.015), most=200) for _ in range(2))
+    keeping.keeps = True
+    k, poses = wavenumber(20e3), heads(3, 20e3)
+    for pose in range(3):
+        some = poses[slice(pose, pose + 1)]
+        wanted, found = plain.respond(k, some), keeping.respond(k, some)
+        np.testing.assert_allclose(found, wanted, rtol=1e-4)
+    assert len(made) == 3 + 1
+    keeping._kept.clear()
+    monkeypatch.setattr(equivalent_sources, "available_memory", lambda: 1000)
+    keeping.respond(k, poses)
+    assert not keeping._kept  # it has no room
