@@ -6,6 +6,7 @@
 # %%
 import logging
 import subprocess
+import sys
 
 import sononerf as sn
 
@@ -18,10 +19,8 @@ logging.basicConfig()
 # %%
 settings = ["scene.name=sphere", "scene.options.radius=0.03", "poses.count=60"]
 settings += ["poses.validation=5", "poses.heldout=5", "simulation.accuracy_db=0.5"]
-subprocess.run(
-    ["sononerf", "simulate", *settings, "--output", "data/direct", "--waveforms", "recordings"],
-    check=True,
-)
+command = [sys.executable, "-m", "sononerf.cli", "simulate", *settings]
+subprocess.run([*command, "--output", "data/direct", "--waveforms", "recordings"], check=True)
 
 # %% [markdown]
 # ## The import
