@@ -58,3 +58,18 @@ class StoppedError(SonoNerfError):
     def __init__(self, signal_number: int, message: str = "") -> None:
         super().__init__(message or "stopped; the same command goes on where it stopped")
         self.exit_code = 128 + signal_number
+
+
+def expect(value: object, kind: type, name: str) -> None:
+    """Refuse a value of another kind.
+
+    Args:
+        value: What was given.
+        kind: What is expected.
+        name: Of the argument, for the message.
+
+    Raises:
+        InputError: If it is of another kind.
+    """
+    if not isinstance(value, kind):
+        raise InputError(f"{name} is a {type(value).__name__}, expected a {kind.__name__}")

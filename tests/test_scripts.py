@@ -107,6 +107,28 @@ def test_what_does_not_go_together_is_named(made):
         sn.predict(model, None, far, progress=QUIET)
 
 
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda scene, echoes: sn.simulate(scene.mesh, echoes.poses()), "scene is a Trimesh"),
+        (lambda scene, echoes: sn.simulate(scene, [1, 2]), "poses is a list"),
+        (lambda scene, echoes: sn.simulate(scene, echoes.poses(), {}), "head is a dict"),
+        (lambda scene, echoes: sn.Echoes.from_arrays([], [1], echoes.head), "poses is a list"),
+        (lambda scene, echoes: sn.EchoModule.for_echoes(scene), "echoes is a Scene"),
+        (lambda scene, echoes: sn.EchoDataModule(scene), "echoes is a Scene"),
+        (lambda scene, echoes: sn.reconstruct(scene, echoes), "model is a Scene"),
+        (lambda scene, echoes: sn.refine(scene.mesh, echoes), "surface is a Trimesh"),
+        (lambda scene, echoes: sn.predict(3, None, echoes.poses()), "model is a int"),
+        (lambda scene, echoes: sn.Poses.sphere(0, radius=0.4), "count is 0"),
+        (lambda scene, echoes: sn.Poses.sphere(3, radius=0.0), "radius 0.0 m"),
+    ],
+)
+def test_an_argument_of_another_kind_is_named(made, call, message):
+    scene, echoes, _, _ = made
+    with pytest.raises(InputError, match=f"^.*{message}.*expected"):
+        call(scene, echoes)
+
+
 def test_objects_show_themselves_in_a_notebook(made):
     scene, echoes, model, surface = made
     heard = sn.predict(model, None, echoes.poses("test"), progress=QUIET)

@@ -21,7 +21,7 @@ from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
 from sononerf.echoes.splits import repeats, split_of
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import InputError, SettingsError
+from sononerf.errors import InputError, SettingsError, expect
 from sononerf.geometry.poses import Poses
 from sononerf.head.attached import attach, attached
 from sononerf.head.head import Head
@@ -99,6 +99,8 @@ class Echoes(Shown):
             InputError: If shapes do not fit, or a magnitude is negative.
             NumericalError: If a magnitude is NaN or infinite, or all training poses are silent.
         """
+        expect(poses, Poses, "poses")
+        expect(head, Head, "head")
         given = np.asarray(spectrograms)
         axes = len(head.receivers), len(head.range), len(head.frequency)
         if given.shape != (len(poses), *axes):

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.echoes import Echoes
-from sononerf.errors import InputError
+from sononerf.errors import InputError, expect
 from sononerf.evaluation.traced import Traced, learn_traced, mix, trace_poses
 from sononerf.field.fitting import render_poses
 from sononerf.field.module import EchoModule
@@ -99,6 +99,8 @@ def predict(
         ResourceError: If ``gpu`` is asked for and there is none.
     """
     progress = progress or Progress()
+    expect(model, EchoModule, "model")
+    expect(poses, Poses, "poses")
     simulation = checked_section(SimulationSettings, options or {}, "simulation")
     how: dict[str, Any] = {"accelerator": accelerator, "progress": progress}
     renderer, reference = model.renderer, model.reference

@@ -11,6 +11,7 @@ import torch
 from torch.utils.data import DataLoader, DistributedSampler
 
 from sononerf.echoes.echoes import Echoes
+from sononerf.errors import InputError
 from sononerf.field.range_slices import (
     PoseReader,
     RangeSlices,
@@ -93,6 +94,8 @@ class EchoDataModule(lightning.LightningDataModule):
         memory_bytes: int = DataSettings.model_fields["memory_bytes"].default,
     ) -> None:
         super().__init__()
+        if not hasattr(echoes, "store"):
+            raise InputError(f"echoes is a {type(echoes).__name__}, expected an Echoes")
         self.echoes = echoes
         self.store = echoes.store
         self.workers = workers

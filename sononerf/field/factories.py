@@ -59,9 +59,7 @@ def make_field(
     """
     if isinstance(field, Field):
         return field
-    make = plugins.load(plugins.FIELDS, field) if isinstance(field, str) else field
-    given = plugins.check_options(make, options, where="field.options", given=2)
-    made = make(region, tensor(_known(head).frequency), **given)
+    made = _made(field, plugins.FIELDS, region, head, options)
     if not isinstance(made, Field):
         raise InputError(f"{field!r} makes a {type(made).__name__}, expected a sononerf Field")
     return made
@@ -86,9 +84,7 @@ def make_renderer(
     """
     if isinstance(renderer, Renderer):
         return renderer
-    make = plugins.load(plugins.RENDERERS, renderer) if isinstance(renderer, str) else renderer
-    given = plugins.check_options(make, options, where="renderer.options", given=2)
-    made = make(region, _known(head), **given)
+    made = _made(renderer, plugins.RENDERERS, region, head, options)
     if not isinstance(made, Renderer):
         raise InputError(
             f"{renderer!r} makes a {type(made).__name__}, expected a sononerf Renderer"
@@ -96,7 +92,22 @@ def make_renderer(
     return made
 
 
-def _known(head: Head | None) -> Head:
+def _made(
+    given: Callable[..., object] | str,
+    group: str,
+    region: Tensor,
+    head: Head | None,
+    options: Mapping[str, Any],
+) -> object:
+    """Return what the factory of a plugin, or a factory, makes."""
+    what = "field" if group == plugins.FIELDS else "renderer"
+    make = plugins.load(group, given) if isinstance(given, str) else given
+    if not callable(make):
+        raise InputError(
+            f"{what} is a {type(make).__name__}, expected the name of a plugin, a factory or a "
+            f"sononerf {what.capitalize()}"
+        )
     if head is None:
         raise SettingsError("head: missing; give the head that heard the echoes")
-    return head
+    chosen = plugins.check_options(make, options, where=f"{what}.options", given=2)
+    return make(region, tensor(head.frequency) if group == plugins.FIELDS else head, **chosen)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import lightning
@@ -16,7 +17,14 @@ from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torchmetrics import MeanMetric
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.errors import NumericalError, SettingsError
+from sononerf.errors import (
+    IncompatibleError,
+    InputError,
+    NumericalError,
+    SettingsError,
+    SonoNerfError,
+    expect,
+)
 from sononerf.field.factories import (
     FieldFactory,
     RendererFactory,
@@ -169,6 +177,7 @@ class EchoModule(lightning.LightningModule):
             NumericalError: If no pose heard anything, or no more than noise gives.
             SettingsError, InputError: As the class.
         """
+        expect(echoes, Echoes, "echoes")
         if region is None:
             region = field.region if isinstance(field, Field) else echoes.region.box()
         found = echoes.region
@@ -190,6 +199,40 @@ class EchoModule(lightning.LightningModule):
             options=options,
             possible=possible,
         )
+
+    @classmethod
+    def load_from_checkpoint(  # type: ignore[override]  # files are data, never code
+        cls, checkpoint_path: Path | str, map_location: Any = None, **arguments: Any
+    ) -> EchoModule:
+        """Return the module of a checkpoint; runs no code of the file, whatever is asked for.
+
+        Args:
+            checkpoint_path: A checkpoint that a Trainer wrote.
+            map_location: As of ``torch.load``.
+            arguments: Of the class, in place of those that were saved: ``field`` or ``renderer``
+                where these were no names.
+
+        Raises:
+            InputError: If the file is missing or damaged.
+            IncompatibleError: If it is the checkpoint of another class.
+        """
+        arguments.pop("weights_only", None)  # nothing but tensors and plain data is ever read
+        try:
+            return super().load_from_checkpoint(
+                checkpoint_path, map_location, weights_only=True, **arguments
+            )
+        except SonoNerfError:
+            raise  # it says itself what is wrong
+        except OSError as error:
+            raise InputError(f"{checkpoint_path}: cannot be read ({error.strerror})") from None
+        except (TypeError, KeyError, RuntimeError) as error:
+            text = str(error).splitlines()[0]
+            raise IncompatibleError(
+                f"{checkpoint_path}: is no checkpoint of this EchoModule ({text}); a field or a "
+                "renderer that was no name has to be given again, such as field=MyField"
+            ) from None
+        except Exception as error:  # torch's readers raise whatever they met first
+            raise InputError(f"{checkpoint_path}: damaged ({error})") from None
 
     def forward(self, batch: RangeSlices) -> Tensor:
         """Render a batch: (P, E, R, B) linear magnitude.

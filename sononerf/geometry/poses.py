@@ -87,7 +87,14 @@ class Poses(Shown):
             radius (m): Distance from the origin.
             aim_jitter (rad): Standard deviation of the two turns about the head's own y and z axes.
             generator: Draws the turns; one of seed 0 where None.
+
+        Raises:
+            InputError: If there is no pose, or the radius is not above zero.
         """
+        if count < 1 or not (math.isfinite(radius) and radius > 0.0):
+            raise InputError(
+                f"count is {count} and radius {radius} m, expected 1 or more and above 0 m"
+            )
         generator = generator or np.random.default_rng(0)
         return _aimed(radius * fibonacci_sphere(count), aim_jitter, generator)
 

@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 
 from sononerf.array_types import Bools, Floats, Ints
-from sononerf.errors import InputError, SettingsError, SonoNerfError
+from sononerf.errors import InputError, SettingsError, SonoNerfError, expect
 from sononerf.geometry.faults import surface_faults
 from sononerf.scene.material import MATERIALS, RIGID, Material, MaterialName
 from sononerf.settings import plugins
@@ -76,8 +76,7 @@ class Scene(Shown):
     to_original: Floats | None = None
 
     def __post_init__(self) -> None:
-        if not isinstance(self.mesh, trimesh.Trimesh):
-            raise InputError(f"mesh is a {type(self.mesh).__name__}, expected a trimesh.Trimesh")
+        expect(self.mesh, trimesh.Trimesh, "mesh")
         several = isinstance(self.material, tuple)
         if several != (self.part is not None):
             raise InputError("several materials and the parts they are of are given together")

@@ -22,7 +22,7 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
 from sononerf.echoes.splits import split_of
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import IncompatibleError, SettingsError
+from sononerf.errors import IncompatibleError, SettingsError, expect
 from sononerf.geometry.poses import Poses
 from sononerf.head.attached import attach
 from sononerf.head.call import call_content
@@ -117,14 +117,18 @@ def simulate(
         echoes: Complete, or the shard.
 
     Raises:
-        InputError: If a pose is inside the scene, or the poses are too few to split.
+        InputError: If a pose is inside the scene, the poses are too few to split, or an argument
+            is of another kind.
         SettingsError: If an option is not allowed.
         NumericalError: If no pose hears anything.
         StorageError: If the store cannot be written.
         IncompatibleError: If the folder holds another ensemble.
     """
     progress = progress or Progress()
-    head = head or Head()
+    head = Head() if head is None else head
+    expect(scene, Scene, "scene")
+    expect(poses, Poses, "poses")
+    expect(head, Head, "head")
     settings = checked_section(SimulationSettings, options or {}, "simulation")
     purposes = split_of(poses, split)
     wanted = echo_hash(scene, poses, purposes, head, settings)
@@ -132,15 +136,8 @@ def simulate(
     whole = path
     if shard is not None and path is not None:
         path = shard.path(path)
-    if path is not None and (path / "zarr.json").is_file():
-        store = EnsembleStore.open(path)
-        if store.attributes.get("echo_hash") != wanted:
-            raise IncompatibleError(
-                f"{path}: holds echoes of other settings; choose another --output, or leave the "
-                "scene out of the settings to take the echoes as they are"
-            )
-        if "reference" in store.attributes and not store.missing():
-            return Echoes(store, head)
+    if path is not None and (finished := _finished(path, wanted)) is not None:
+        return Echoes(finished, head)
     warn_of_call(head.call, head.analysis)
     simulator = Simulator.of(scene, head, settings)
     check_poses(scene, poses, offsets=np.vstack((head.emitter, head.receivers)))
@@ -177,6 +174,19 @@ def simulate(
             _take_shards(store, whole)
         _fill(store, simulator, poses, settings, only=only, **how)
     return Echoes(EnsembleStore.open(path), head)
+
+
+def _finished(path: Path, wanted: str) -> EnsembleStore | None:
+    """Return the store of a folder if it is complete; refuse one of other echoes."""
+    if not (path / "zarr.json").is_file():
+        return None
+    store = EnsembleStore.open(path)
+    if store.attributes.get("echo_hash") != wanted:
+        raise IncompatibleError(
+            f"{path}: holds echoes of other settings; choose another --output, or leave the scene "
+            "out of the settings to take the echoes as they are"
+        )
+    return store if "reference" in store.attributes and not store.missing() else None
 
 
 def echo_hash(

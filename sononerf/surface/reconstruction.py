@@ -17,7 +17,7 @@ from torch import Tensor
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
-from sononerf.errors import SettingsError
+from sononerf.errors import SettingsError, expect
 from sononerf.field.fitting import quiet_lightning, require_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.progress import Progress
@@ -68,6 +68,7 @@ def reconstruct(
         NumericalError: If the field has no surface.
     """
     progress = progress or Progress()
+    expect(model, EchoModule, "model")
     chosen = checked_section(ReconstructionSettings, options or {}, "reconstruction")
     hull = echoes if isinstance(echoes, EchoHull) else echoes.hull
     heard = None if isinstance(echoes, EchoHull) else echoes
@@ -141,6 +142,8 @@ def refine(
         ResourceError: If ``gpu`` is asked for and there is none.
     """
     progress = progress or Progress()
+    expect(surface, Surface, "surface")
+    expect(echoes, Echoes, "echoes")
     require_accelerator(accelerator)
     simulation = checked_section(SimulationSettings, options or {}, "simulation")
     reading = surface.reading

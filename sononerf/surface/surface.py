@@ -19,7 +19,7 @@ from sononerf.array_types import Bools, Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.region import ENOUGH
-from sononerf.errors import InputError
+from sononerf.errors import InputError, expect
 from sononerf.geometry.raycast import RayCaster
 from sononerf.shown import Shown
 from sononerf.surface.mesh_files import MeshFormat, mesh_bytes
@@ -69,8 +69,7 @@ class Surface(Shown):
     learned: list[tuple[weakref.ref[Any], object]] = field(default_factory=list, repr=False)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.mesh, trimesh.Trimesh):
-            raise InputError(f"mesh is a {type(self.mesh).__name__}, expected a trimesh.Trimesh")
+        expect(self.mesh, trimesh.Trimesh, "mesh")
         if not len(self.mesh.faces) or not np.isfinite(self.mesh.vertices).all():
             raise InputError("the mesh has no triangles, or a vertex is not finite")
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.errors import InputError, SettingsError
+from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.field import Field
 from sononerf.field.fitting import fit, quiet_lightning
@@ -46,7 +46,7 @@ def trained(echoes, folder, **options):
 
 def test_a_module_is_made_again_from_its_checkpoint(echoes, tmp_path):
     model = trained(echoes, tmp_path, loss="l2", batch_poses=2, seed=3)
-    again = EchoModule.load_from_checkpoint(tmp_path / "model.ckpt", weights_only=True)
+    again = EchoModule.load_from_checkpoint(tmp_path / "model.ckpt")
     assert again.options == model.options
     assert (again.options.loss, again.reference) == ("l2", echoes.reference)
     assert again.head.plain() == HEAD.plain()
@@ -54,6 +54,46 @@ def test_a_module_is_made_again_from_its_checkpoint(echoes, tmp_path):
         assert torch.equal(again.state_dict()[name], values), name
     plain = torch.load(tmp_path / "model.ckpt", weights_only=True)["hyper_parameters"]
     assert (plain["field"], plain["options"]["seed"]) == ("grid", 3)
+
+
+class Other(lightning.LightningModule):
+    """A module of somebody else's."""
+
+    def __init__(self):
+        super().__init__()
+        self.layer = torch.nn.Linear(1, 1)
+
+
+class Trap:
+    """Runs code where it is unpickled without care."""
+
+    def __reduce__(self):
+        return print, ("code of the file runs",)
+
+
+def test_what_is_no_checkpoint_of_ours_is_refused(echoes, tmp_path, capsys):
+    plain = {"state_dict": Other().state_dict(), "pytorch-lightning_version": "2.6.0"}
+    torch.save({**plain, "hyper_parameters": {"width": 3}}, tmp_path / "other.ckpt")
+    torch.save({**plain, "hyper_parameters": {"trap": Trap()}}, tmp_path / "trap.ckpt")
+    (tmp_path / "junk.ckpt").write_bytes(b"junk")
+    for name, error, message in (
+        ("other.ckpt", IncompatibleError, "is no checkpoint of this EchoModule"),
+        ("trap.ckpt", InputError, "damaged"),
+        ("junk.ckpt", InputError, "damaged"),
+        ("missing.ckpt", InputError, "cannot be read"),
+    ):
+        with pytest.raises(error, match=message):
+            EchoModule.load_from_checkpoint(tmp_path / name, weights_only=False)
+    assert "code of the file runs" not in capsys.readouterr().out
+    made = EchoModule.for_echoes(echoes, lambda r, f: GridField(r, f, finest=0.01), region=BOX)
+    trainer = lightning.Trainer(
+        max_steps=1, logger=False, enable_progress_bar=False, enable_model_summary=False,
+        enable_checkpointing=False, default_root_dir=tmp_path,
+    )  # fmt: skip
+    trainer.fit(made, EchoDataModule(echoes))
+    trainer.save_checkpoint(tmp_path / "mine.ckpt")
+    with pytest.raises(IncompatibleError, match="has to be given again"):
+        EchoModule.load_from_checkpoint(tmp_path / "mine.ckpt")
 
 
 def test_data_follow_the_options_of_the_module(echoes, tmp_path):
@@ -123,6 +163,7 @@ def test_a_fit_without_more_words(echoes):
     ("changes", "error", "message"),
     [
         ({"field": "gird"}, SettingsError, "unknown field 'gird'; did you mean grid"),
+        ({"field": 3}, InputError, "field is a int, expected the name of a plugin, a factory"),
         ({"field": lambda region, frequency: 3}, InputError, "makes a int, expected a sononerf F"),
         ({"options": {"epoch": 3}}, SettingsError, r"fit\.epoch: unknown key; did you mean epochs"),
         ({"options": 3}, SettingsError, "fit: found int, expected keys and values"),
