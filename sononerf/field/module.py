@@ -17,14 +17,8 @@ from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torchmetrics import MeanMetric
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.errors import (
-    IncompatibleError,
-    InputError,
-    NumericalError,
-    SettingsError,
-    SonoNerfError,
-    expect,
-)
+from sononerf.errors import IncompatibleError, NumericalError, SettingsError, expect
+from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.factories import (
     FieldFactory,
     RendererFactory,
@@ -201,38 +195,34 @@ class EchoModule(lightning.LightningModule):
         )
 
     @classmethod
-    def load_from_checkpoint(  # type: ignore[override]  # files are data, never code
-        cls, checkpoint_path: Path | str, map_location: Any = None, **arguments: Any
+    def load_from_checkpoint(  # type: ignore[override]  # no option of Lightning's runs code here
+        cls, checkpoint_path: Path | str, **arguments: Any
     ) -> EchoModule:
-        """Return the module of a checkpoint; runs no code of the file, whatever is asked for.
+        """Return the module of a checkpoint, on the CPU; no code of the file is run.
 
         Args:
             checkpoint_path: A checkpoint that a Trainer wrote.
-            map_location: As of ``torch.load``.
             arguments: Of the class, in place of those that were saved: ``field`` or ``renderer``
-                where these were no names.
+                where these were no names. Lightning's ``map_location`` and ``weights_only`` change
+                nothing.
 
         Raises:
-            InputError: If the file is missing or damaged.
+            InputError: If the file is missing, damaged, or holds more than plain data.
             IncompatibleError: If it is the checkpoint of another class.
         """
-        arguments.pop("weights_only", None)  # nothing but tensors and plain data is ever read
+        content = DurableCheckpointIO().load_checkpoint(checkpoint_path)
+        for ignored in ("map_location", "weights_only"):
+            arguments.pop(ignored, None)
         try:
-            return super().load_from_checkpoint(
-                checkpoint_path, map_location, weights_only=True, **arguments
-            )
-        except SonoNerfError:
-            raise  # it says itself what is wrong
-        except OSError as error:
-            raise InputError(f"{checkpoint_path}: cannot be read ({error.strerror})") from None
+            module = cls(**{**content.get("hyper_parameters", {}), **arguments})
+            module.load_state_dict(content["state_dict"])
         except (TypeError, KeyError, RuntimeError) as error:
-            text = str(error).splitlines()[0]
             raise IncompatibleError(
-                f"{checkpoint_path}: is no checkpoint of this EchoModule ({text}); a field or a "
-                "renderer that was no name has to be given again, such as field=MyField"
+                f"{checkpoint_path}: is no checkpoint of this EchoModule "
+                f"({str(error).splitlines()[0]}); a field or a renderer that was no name has to be "
+                "given again, such as field=MyField"
             ) from None
-        except Exception as error:  # torch's readers raise whatever they met first
-            raise InputError(f"{checkpoint_path}: damaged ({error})") from None
+        return module
 
     def forward(self, batch: RangeSlices) -> Tensor:
         """Render a batch: (P, E, R, B) linear magnitude.

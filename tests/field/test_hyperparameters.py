@@ -78,9 +78,9 @@ def test_what_is_no_checkpoint_of_ours_is_refused(echoes, tmp_path, capsys):
     (tmp_path / "junk.ckpt").write_bytes(b"junk")
     for name, error, message in (
         ("other.ckpt", IncompatibleError, "is no checkpoint of this EchoModule"),
-        ("trap.ckpt", InputError, "damaged"),
-        ("junk.ckpt", InputError, "damaged"),
-        ("missing.ckpt", InputError, "cannot be read"),
+        ("trap.ckpt", InputError, "no checkpoint of plain data"),
+        ("junk.ckpt", InputError, "start the fit again"),
+        ("missing.ckpt", InputError, "start the fit again"),
     ):
         with pytest.raises(error, match=message):
             EchoModule.load_from_checkpoint(tmp_path / name, weights_only=False)
