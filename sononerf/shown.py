@@ -10,8 +10,8 @@ from typing import Any
 from sononerf import storage
 
 NOTEBOOK = "sononerf.report.notebook"
-"""Module that knows how each kind of object is shown. It is above all that it shows, so it is
-named here and imported when something is shown."""
+"""Module that shows each kind of object. It imports all of them, so that they cannot import it; it
+is imported at first use."""
 
 
 class Picture:

@@ -25,9 +25,14 @@ def run(script, folder):
     return done.stdout
 
 
-def test_all_code_of_the_page_compiles():
+def test_the_page_names_what_there_is():
+    import sononerf
+
     for block in BLOCKS:
         compile(block, "docs/python.md", "exec")
+    named = set(re.findall(r"\bsn\.(\w+)", "".join(BLOCKS)))
+    assert len(named) > 10
+    assert named - set(sononerf.__all__) == set()
 
 
 @pytest.mark.slow

@@ -81,7 +81,7 @@ def simulate(
     from sononerf.run.build import results_folder
     from sononerf.run.scenes import draw_ensemble
     from sononerf.run.simulate import simulate as run
-    from sononerf.simulation.ensemble import Shard
+    from sononerf.simulation.shards import Shard
 
     if shard is not None and (preview is not None or waveforms is not None):
         raise SettingsError("--shard takes no --preview and no --waveforms; give these without it")

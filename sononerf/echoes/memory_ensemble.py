@@ -120,7 +120,7 @@ class Ensemble(ABC):
 
 
 class MemoryEnsemble(Ensemble):
-    """An ensemble in memory, from which no pose is there at first.
+    """An ensemble in memory. At first all its poses are missing.
 
     Args:
         positions ((P, 3), m): Of the head, world frame.

@@ -50,7 +50,7 @@ def attach(head: NamesFiles, folder: Path) -> None:
 
 
 def attached(head: NamesFiles, folder: Path) -> dict[str, Any]:
-    """Return the sections of a head, by name, whose file has a copy in a folder; they name it."""
+    """Return the sections, by name, whose file has a copy in a folder; ``file`` is the copy."""
     found = {}
     for section in FILE_SECTIONS:
         own = getattr(head, section)

@@ -20,7 +20,7 @@ from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
 from sononerf.simulation import ensemble
 from sononerf.simulation.accuracy import settle_rays
-from sononerf.simulation.ensemble import Shard
+from sononerf.simulation.shards import Shard
 from sononerf.simulation.simulator import ensemble_poses, pose_seed
 
 

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""The echoes of a scene at many poses, in memory or on disk, whole or in shards."""
+"""The echoes of a scene at many poses, in memory or on disk."""
 
 from __future__ import annotations
 
-import glob
 import hashlib
 import json
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,7 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
 from sononerf.echoes.splits import split_of
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import IncompatibleError, SettingsError, expect
+from sononerf.errors import IncompatibleError, expect
 from sononerf.geometry.poses import Poses
 from sononerf.head.attached import attach
 from sononerf.head.call import call_content
@@ -35,45 +33,13 @@ from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.accuracy import MOST, settle_rays
 from sononerf.simulation.pose_faults import check_poses, check_reach, deaf
+from sononerf.simulation.shards import Shard, take_shards
 from sononerf.simulation.simulator import VERSION, Simulator, pose_seed
 from sononerf.simulation.workers import SeedOf, simulated
 
 Write = Callable[[int, Singles], None]
 HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")
 """Sections of the settings that the echoes depend on."""
-SHARD = ".shard-"
-"""What follows the name of an ensemble's store in those of its shards."""
-
-
-@dataclass(frozen=True)
-class Shard:
-    """Some poses of an ensemble: every ``count``-th, from the ``number``-th on.
-
-    Attributes:
-        number: From 1 on.
-        count: How many there are.
-    """
-
-    number: int
-    count: int
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.number <= self.count:
-            raise SettingsError(
-                f"--shard: found {self.number}/{self.count}; give I/N with I from 1 to N"
-            )
-
-    @classmethod
-    def of(cls, text: str) -> Shard:
-        """Return the shard of a text ``I/N``."""
-        number, _, count = text.partition("/")
-        if not (number.isdecimal() and count.isdecimal()):
-            raise SettingsError(f"--shard: found {text!r}; give I/N, such as 3/16")
-        return cls(int(number), int(count))
-
-    def path(self, whole: Path) -> Path:
-        """Return the shard's store beside that of the whole ensemble."""
-        return whole.with_name(f"{whole.name}{SHARD}{self.number}-of-{self.count}")
 
 
 def simulate(
@@ -171,7 +137,7 @@ def simulate(
         )
         attach(head, path)
         if shard is None and whole is not None:
-            _take_shards(store, whole)
+            take_shards(store, whole)
         _fill(store, simulator, poses, settings, only=only, **how)
     return Echoes(EnsembleStore.open(path), head)
 
@@ -270,33 +236,6 @@ def _attributes(
         "sononerf": __version__,
         **further,
     }
-
-
-def _take_shards(store: EnsembleStore, path: Path) -> None:
-    """Take what is missing of an ensemble from its shards.
-
-    Raises:
-        InputError: If a shard is damaged.
-        IncompatibleError: If a shard is of other settings, or was traced with other rays.
-    """
-    for folder in sorted(path.parent.glob(f"{glob.escape(path.name)}{SHARD}*")):
-        shard = EnsembleStore.open(folder)
-        there = set(range(len(shard))) - set(shard.missing())
-        if not there:  # it was stopped before its first pose
-            continue
-        rays = shard.attributes.get("rays")
-        for key, known in (
-            ("echo_hash", store.attributes.get("echo_hash")),
-            ("rays", store.attributes.get("rays", rays)),
-        ):
-            if shard.attributes.get(key) != known:
-                raise IncompatibleError(
-                    f"{folder}: is a shard of other echoes ({key} differs); remove it, or simulate "
-                    "it anew"
-                )
-        store.update_attributes(rays=rays)
-        for index in sorted(there & set(store.missing())):
-            store.write_pose(index, shard.read_pose(index))
 
 
 def _fill(

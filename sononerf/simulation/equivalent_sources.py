@@ -52,8 +52,8 @@ BLOCK = 64
 """Poses that are solved for together. It is fixed, so that the rounding of a pose's result does not
 depend on the other poses."""
 FEW = 8
-"""The same where the equations are kept, for poses that come one by one: a block of one would be
-computed by other routines, one of 64 takes ten times as long."""
+"""Poses that are solved for together where the equations are kept and poses come one by one. With
+64 a single pose takes 0.7 s, with 8 or 2 it takes 0.25 s."""
 LEAD = 2.5
 """Time kept before the first arrival, over the inverse width of the fall of the band."""
 PATH = 5.0

@@ -37,7 +37,7 @@ from sononerf.run.simulate import (
 from sononerf.scene.material import LEAF, RIGID
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.simulation import ensemble as simulate_module
-from sononerf.simulation.ensemble import Shard
+from sononerf.simulation.shards import Shard
 from sononerf.storage import lock
 from tests.head.directivity.patterns import pair
 

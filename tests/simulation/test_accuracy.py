@@ -56,7 +56,8 @@ def test_the_accuracy_is_reached_and_costs_rays(few, tmp_path):
 def test_one_worker_is_this_process_in_trials_too(few, tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "WORTH_RAYS", 0)
     monkeypatch.setattr(workers, "in_processes", None)
-    simulate(settings(accuracy_db=2.0), output=tmp_path / "store", workers=1)
+    store = simulate(settings(accuracy_db=2.0), output=tmp_path / "store", workers=1)
+    assert store.missing() == []
 
 
 def test_noise_of_the_ears_asks_for_no_more_rays(few):
