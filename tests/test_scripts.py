@@ -141,3 +141,15 @@ def test_objects_show_themselves_in_a_notebook(made):
     alone, both = echoes.plot(number), echoes.plot(number, heard)
     assert alone._repr_png_()[:4] == b"\x89PNG"
     assert len(both.data) > len(alone.data)
+
+
+def test_the_picture_of_echoes_is_of_what_was_measured(made, monkeypatch):
+    from sononerf.report import notebook
+
+    _, echoes, _, _ = made
+    drawn = []
+    monkeypatch.setattr(notebook, "spectrogram_png", lambda *given: drawn.append(given) or b"")
+    echoes.plot(2)
+    ((measured, predicted, *_),) = drawn
+    assert measured.shape == echoes.spectrogram(2).shape
+    assert predicted is None

@@ -113,7 +113,7 @@ def _(thing: Echoes) -> Rows:
 def _(thing: Echoes, *, pose: int | None = None, prediction: Prediction | None = None) -> bytes:
     number = int([*thing.store.indices("test"), 0][0]) if pose is None else pose
     measured = compress(thing.spectrogram(number), thing.reference)
-    levels: tuple[Any, Any] = (None, measured)
+    levels: tuple[Any, Any] = (measured, None)
     if prediction is not None:
         row = thing.numbers_of(prediction.poses).tolist().index(number)
         levels = (measured, compress(prediction.magnitude[row], thing.reference))

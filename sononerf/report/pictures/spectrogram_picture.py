@@ -28,7 +28,7 @@ KHZ_MARKS = [digit * 10.0**power for power in range(-3, 4) for digit in (1, 2, 5
 
 def spectrogram_png(
     measured_db: ArrayLike | None,
-    predicted_db: ArrayLike,
+    predicted_db: ArrayLike | None,
     range_m: ArrayLike,
     frequency_hz: ArrayLike,
     title: str = "",
@@ -36,9 +36,8 @@ def spectrogram_png(
     """Draw one pose's spectrograms, one row per receiver, of eight at most.
 
     Args:
-        measured_db ((E, R, F) or None, dB): 0 dB is silence; the prediction alone is drawn where
-            None.
-        predicted_db ((E, R, F), dB): The same.
+        measured_db, predicted_db ((E, R, F) or None, dB): 0 dB is silence; where one is None, the
+            other is drawn alone.
         range_m ((R,), m): Range axis, ascending; drawn only around what sounds.
         frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
         title: One line above.
@@ -74,17 +73,17 @@ def sounding_slice(spectrograms: NDArray[np.floating], range_m: Floats) -> slice
 
 def _checked(
     measured_db: ArrayLike | None,
-    predicted_db: ArrayLike,
+    predicted_db: ArrayLike | None,
     range_m: ArrayLike,
     frequency_hz: ArrayLike,
 ) -> tuple[dict[str, Floats], Floats, Floats]:
     ranges, frequencies = (np.asarray(a, dtype=np.float64) for a in (range_m, frequency_hz))
-    given = {} if measured_db is None else {"measured": measured_db}
     levels = {
         name: np.asarray(values, dtype=np.float64)
-        for name, values in {**given, "predicted": predicted_db}.items()
+        for name, values in (("measured", measured_db), ("predicted", predicted_db))
+        if values is not None
     }
-    expected = (len(levels["predicted"]), len(ranges), len(frequencies))
+    expected = (len(next(iter(levels.values()))), len(ranges), len(frequencies))
     if any(values.shape != expected or not values.size for values in levels.values()):
         found = " and ".join(f"{name} {values.shape}" for name, values in levels.items())
         raise ValueError(
@@ -150,7 +149,7 @@ def _round_up(value: float, step: float) -> float:
 
 def _pixels(
     measured_db: ArrayLike | None,
-    predicted_db: ArrayLike,
+    predicted_db: ArrayLike | None,
     range_m: ArrayLike,
     frequency_hz: ArrayLike,
     title: str,
@@ -160,7 +159,7 @@ def _pixels(
     shown = sounding_slice(np.stack([*panels.values()]), ranges)
     panels, ranges = {name: values[:, shown] for name, values in panels.items()}, ranges[shown]
     top = _round_up(max(values.max() for values in panels.values()), 5)
-    chosen, names = drawn_receivers(len(panels["predicted"]))
+    chosen, names = drawn_receivers(len(next(iter(panels.values()))))
     panels = {name: values[chosen] for name, values in panels.items()}
     columns, ears = len(panels), len(chosen)
     if columns == 2:

@@ -133,3 +133,10 @@ def test_a_row_for_each_ping(pings, receivers):
         colours = np.unique(image[top : top + 220, half:].reshape(-1, 3), axis=0)
         assert len(colours) > 60  # a spectrogram is there
     assert picture(0.0)  # silence too
+
+
+def test_a_measurement_alone_is_not_called_a_prediction():
+    measured = spectrogram_png(echo(), None, RANGE, FREQUENCY, "pose 3")
+    predicted = spectrogram_png(None, echo(), RANGE, FREQUENCY, "pose 3")
+    assert measured != predicted  # the same cells under another title
+    assert Image.open(io.BytesIO(measured)).size == Image.open(io.BytesIO(predicted)).size
