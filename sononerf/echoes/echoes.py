@@ -266,6 +266,7 @@ class Echoes(Shown):
             first=onsets.first - head.mean_lag,
             axes=rotations[:, :, 0],
             within=head.row_gains.cone(WITNESS_GAIN),
+            plane=head.plane,
         )
         return weighted(hull, head.resolution)
 
@@ -320,6 +321,8 @@ def stated_head(store: EnsembleStore) -> dict[str, dict[str, Any]]:
         InputError: If the store does not state all of them.
     """
     known = store.attributes.get("settings")
+    if isinstance(known, dict):
+        known = {"support": {}, **known}  # older stores know of no support
     if not isinstance(known, dict) or not all(
         isinstance(known.get(k), dict) for k in HEAD_SECTIONS
     ):

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +23,7 @@ from scipy import sparse
 
 from sononerf.array_types import Bools, Floats
 from sononerf.compiled import compiled
+from sononerf.geometry.plane import Plane
 
 UNDETECTED = 0.05
 """Fraction of the onsets that may be wrong together where a place is judged, and of outliers that
@@ -44,6 +46,7 @@ class EchoHull:
         within: A pose speaks for places towards which the cosine to its axis is at least this.
         weight ((P, E) or None): How far each first echo is trusted, from 0, an outlier that tells
             nothing, to 1; all of them where None.
+        plane: The support, below which nothing is; None where there is none.
     """
 
     emitters: Floats
@@ -52,6 +55,10 @@ class EchoHull:
     axes: Floats
     within: float = -1.0
     weight: Floats | None = None
+    plane: Plane | None = None
+
+    ARRAYS: ClassVar = ("emitters", "receivers", "first", "axes", "within", "weight")
+    """What is numbers, as a run keeps it."""
 
     def __post_init__(self) -> None:
         if self.weight is None:
@@ -95,8 +102,8 @@ class EchoHull:
             points ((N, 3), m): World frame.
 
         Returns:
-            clearance ((N,), m): Negative where a pose says that nothing is there; plus infinity
-                where none speaks. Its slope is at most one. So many poses as :attr:`undetected` may
+            clearance ((N,), m): Negative where a pose says that nothing is there, and below the
+                support; plus infinity where none speaks. Its slope is at most one. So many poses as :attr:`undetected` may
                 say so in vain.
             pose (N,): The pose that says so.
         """
@@ -127,7 +134,10 @@ class EchoHull:
         left = self.behind(points).min(axis=2)
         spare = min(self.undetected, left.shape[1] - 1)
         pose = np.argpartition(left, spare, axis=1)[:, spare] if spare else left.argmin(axis=1)
-        return left[np.arange(len(points)), pose], pose
+        found = left[np.arange(len(points)), pose]
+        if self.plane is not None:
+            found = np.minimum(found, self.plane.height(points))
+        return found, pose
 
 
 @compiled
@@ -330,6 +340,8 @@ def _cells(
     while True:
         reach = float(side * np.sqrt(3) / 2 + error)
         of_wanted = is_wanted.reshape(hull.first.shape)
+        if hull.plane is not None:
+            cells = cells[hull.plane.height(cells) > -reach]
         cells = cells[_possible(cells, *hull._onsets, of_wanted, few, reach)]
         finer = 8.0 * len(cells) * hull.first.size
         if reach <= least + error or finer > MOST_PAIRS or not len(cells):

@@ -36,7 +36,9 @@ class ProfileRenderer(Renderer):
     so both ears hear it at their own time; of a sweep each row hears it by the row's lag farther
     off. Spreading and absorption are known physics and stay out of the field. The kernel
     :math:`W_f` starts as the square of a point echo in its row, the analysis window or what that
-    makes of a sweep, and is learned on; it has two equal sides where the point echoes have.
+    makes of a sweep, and is learned on; it has two equal sides where the point echoes have. On a
+    support each place is also heard by way of the images; the powers of ways of different length
+    add up.
 
     Args:
         region ((2, 3), m): Lower and upper corner of the box that holds the field.
@@ -255,40 +257,72 @@ class ProfileRenderer(Renderer):
         bins: Tensor,
     ) -> tuple[Tensor, range]:
         """Return the power in fine range bins (1, E, B, P, K), and the slices that see them."""
-        emitters = position + rotation @ self.emitter  # (P, 3)
         there = self._there()
         code = field.code_of_lattice(there, which)
         places = there if which is None else there[which]
-        with torch.no_grad():
-            # Ears, vectors and frequencies come first in memory, pairs run along it: see LobeField.
-            if self.may_ask:
-                pair = field.audible(places, emitters, code).reshape(-1).nonzero()[:, 0]
-            else:
-                pair = torch.arange(len(position) * len(places), device=places.device)
-            pose = pair.div(len(places), rounding_mode="floor")
-            place = pair - pose * len(places)
-            # From here on a column for each pair of a pose and a place that answers it.
-            ray = places.T.index_select(1, place) - emitters.T.index_select(1, pose)
-            out = _length(ray)
-            unit = ray / -out
-            # All places in all heads are turned at once: sooner done than pair by pair.
-            turn = rotation.permute(2, 0, 1)  # (3, P, 3), world to head
-            in_head = turn.reshape(-1, 3) @ places.T - (turn * position).sum(-1).reshape(-1, 1)
-            in_head = in_head.reshape(3, -1).index_select(1, pair)
-            known, middle = self._paths(in_head, out, bins)
-            known.square_()
-            if weight is not None:
-                known *= weight.index_select(0, place)
-        response, lead = field.echo(places, unit.T, bins, place, code)  # (M, B), (M,)
-        response = response.T
-        self.points_evaluated += len(place)
-        squared = response.abs().square() if response.is_complex() else response.square()
-        echoes = (squared * known)[None]
-        at = middle - lead / self.bin
-        slices = self._sounding(at)
+        # All places in all heads are turned at once: sooner done than pair by pair.
+        turn = rotation.permute(2, 0, 1)  # (3, P, 3), world to head
+        origin = (turn * position).sum(-1).reshape(-1, 1)
+
+        def in_heads(points: Tensor) -> Tensor:
+            return (turn.reshape(-1, 3) @ points.T - origin).reshape(3, -1)
+
+        # A place and its image; what the image of a head hears of a place is the same.
+        turned = [in_heads(points) for points in self._with_image(places)]
+        echoes, at, poses = [], [], []
+        for emitters, ways in self._ways(position + rotation @ self.emitter):
+            with torch.no_grad():
+                # Ears, vectors and frequencies come first in memory, pairs run along it.
+                if self.may_ask:
+                    pair = field.audible(places, emitters, code).reshape(-1).nonzero()[:, 0]
+                else:
+                    pair = torch.arange(len(position) * len(places), device=places.device)
+                pose = pair.div(len(places), rounding_mode="floor")
+                place = pair - pose * len(places)
+                # From here on a column for each pair of a pose and a place that answers it.
+                ray = emitters.T.index_select(1, pose) - places.T.index_select(1, place)
+                unit = ray / _length(ray)
+                out = turned[ways[0]].index_select(1, pair)
+                back = out if ways[0] == ways[1] else turned[ways[1]].index_select(1, pair)
+                known, middle = self._paths(out, back, bins)
+                known.square_()
+                if weight is not None:
+                    known *= weight.index_select(0, place)
+            response, lead = field.echo(places, unit.T, bins, place, code)  # (M, B), (M,)
+            response = response.T
+            self.points_evaluated += len(place)
+            squared = response.abs().square() if response.is_complex() else response.square()
+            echoes.append((squared * known)[None])
+            at.append(middle - lead / self.bin)
+            poses.append(pose)
+        heard, when, whose = _joined(echoes), _joined(at), _joined(poses)
+        slices = self._sounding(when)
         held = (len(slices) - 1) * self.oversampling + self._taps
-        at = at - slices.start * self.oversampling
-        return Deposit.apply(echoes, at, pose, len(position), held), slices
+        when = when - slices.start * self.oversampling
+        return Deposit.apply(heard, when, whose, len(position), held), slices
+
+    def _with_image(self, places: Tensor) -> tuple[Tensor, ...]:
+        """Return places (N, 3), and on a support their images too."""
+        if self.support is None:
+            return (places,)
+        point, normal = self.support
+        return places, places - 2.0 * ((places - point) @ normal)[:, None] * normal
+
+    def _ways(self, emitters: Tensor) -> list[tuple[Tensor, tuple[int, int]]]:
+        """Return the ways of sound from emitters (P, 3) to places and back.
+
+        Returns:
+            ways: Each with the places (P, 3), m, whose directions from a place the field is told,
+                and whether out and back go directly (0) or by the support (1). The two ways that
+                meet the support once take the same time from one place to another, so they add up
+                in phase: they stand here once, see :meth:`_paths`. The mirror that sends sound from
+                an emitter to the image of an ear beside it looks at their middle.
+        """
+        if self.support is None:
+            return [(emitters, (0, 0))]
+        point, normal = self.support
+        foot = emitters - ((emitters - point) @ normal)[:, None] * normal
+        return [(emitters, (0, 0)), (foot, (0, 1)), (2.0 * foot - emitters, (1, 1))]
 
     def _sounding(self, at: Tensor) -> range:
         """Return the slices that may see one of the bins, counted from the first; never none."""
@@ -303,26 +337,35 @@ class ProfileRenderer(Renderer):
         first = min(max(first, 0), last)
         return range(first, min(max(end, first), last) + 1)
 
-    def _paths(self, in_head: Tensor, out: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
+    def _paths(self, out: Tensor, back: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
         """Return what the way to places and back does to pressure.
 
         Args:
-            in_head ((3, M), m): Places, each in the head of its pose.
-            out ((M,), m): How far they lie from the emitter.
+            out, back ((3, M), m): Places, each in the head of its pose, as the emitter and as the
+                ears hear them: the places or their images. If they differ, sound takes the way
+                where they change roles too, and both add up.
             bins (B,): Which frequencies.
 
         Returns:
             known (E, B, M): By beam, ears, air and spreading.
             middle ((E, 1, M) or (E, B, M)): The bin of the profile that the echo is heard in.
         """
-        ray = in_head - self.ear_positions[..., None]  # (E, 3, M)
+        if out is not back:
+            first, last = (self._way(*pair, bins) for pair in ((out, back), (back, out)))
+            return first[0] + last[0], 0.5 * (first[1] + last[1])
+        return self._way(out, back, bins)
+
+    def _way(self, emitted: Tensor, heard: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
+        """Return what one of the ways does; see :meth:`_paths`."""
+        ray = heard - self.ear_positions[..., None]  # (E, 3, M)
         back = _length(ray)
         head = (ray / back[:, None]).mT
+        ray = emitted - self.emitter[:, None]
+        out = _length(ray)
         way = out + back  # (E, M) m, there and back
         # Each pass over all of it is made once, and in place: memory is what they wait for.
         known = look_up(self.ears.index_select(1, bins), head).mT
-        ray = (in_head - self.emitter[:, None]) / out
-        known *= look_up(self.beam.index_select(0, bins), ray.T).T
+        known *= look_up(self.beam.index_select(0, bins), (ray / out).T).T
         absorption = self.absorption[bins]
         factors = torch.stack((absorption, torch.ones_like(absorption)), dim=1)
         lengths = torch.stack((way, torch.log(out * back)), dim=1)
@@ -331,6 +374,11 @@ class ProfileRenderer(Renderer):
         if self.lag is not None:
             middle = middle + look_up(self.lag.index_select(1, bins), head).mT / self.bin
         return known, middle
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    """Return parts side by side along the last dimension; one alone is not copied."""
+    return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
 
 
 def _length(vectors: Tensor) -> Tensor:

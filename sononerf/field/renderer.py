@@ -58,6 +58,10 @@ class Renderer(nn.Module):
     Args:
         region ((2, 3), m): Lower and upper corner of the box that holds the field.
         head: What heard the spectra.
+
+    Attributes:
+        support (2, 3): Point (m) and unit normal of the plane that mirrors sound; None where there
+            is none. A renderer that does not know images may leave it out.
     """
 
     whole_poses: bool = True
@@ -71,6 +75,7 @@ class Renderer(nn.Module):
     emitter: Tensor
     ear_positions: Tensor
     points_evaluated: Tensor
+    support: Tensor | None
 
     def __init__(self, region: Tensor, head: Head) -> None:
         super().__init__()
@@ -85,6 +90,10 @@ class Renderer(nn.Module):
         ):
             whole = tensor(values).clone(memory_format=torch.contiguous_format)
             self.register_buffer(name, whole)
+        plane = head.plane
+        known = None if plane is None else tensor([plane.point, plane.normal])
+        # Not part of the state: the head says it.
+        self.register_buffer("support", known, persistent=False)
         self.log_gain = nn.Parameter(torch.zeros(()))
         self.register_buffer("points_evaluated", torch.zeros((), dtype=torch.long))
 

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sononerf.array_types import Floats, Singles
 from sononerf.errors import InputError, SettingsError
+from sononerf.geometry.plane import Plane
 from sononerf.head.air import absorption_in, speed_in
 from sononerf.head.call import call_waveform, covered, emit, sweep_delay
 from sononerf.head.call_file import load_call
@@ -28,6 +29,7 @@ from sononerf.head.reception import effective_window, within_band
 from sononerf.head.row_filters import RowFilters, band_mean, band_parts, row_filters
 from sononerf.head.spectrogram import echo_samples, frequency_axis, range_axis, spectrogram
 from sononerf.settings.loading import checked_section
+from sononerf.settings.scene_schema import SupportSettings
 from sononerf.settings.schema import (
     AirSettings,
     CallSettings,
@@ -124,6 +126,8 @@ class Head(Shown):
         analysis: Filters, hop, range limits, Hz and m: section ``spectrogram``, such as
             ``{"frequency_min": 20e3, "frequency_max": 90e3, "range_max": 1.0}``.
         noise: Of the receivers: section ``noise``, such as ``{"snr_db": 20}``.
+        support: A rigid plane that the body stands on, m, world frame: section ``support``, such as
+            ``{"point": (0, 0, -0.05)}``; none by default.
 
     Raises:
         InputError: If a file of the call or of the directivity cannot be used.
@@ -140,6 +144,7 @@ class Head(Shown):
     air: AirSettings
     analysis: SpectrogramSettings
     noise: NoiseSettings
+    support: SupportSettings
 
     def __init__(
         self,
@@ -148,6 +153,7 @@ class Head(Shown):
         air: AirSettings | Mapping[str, Any] | None = None,
         analysis: SpectrogramSettings | Mapping[str, Any] | None = None,
         noise: NoiseSettings | Mapping[str, Any] | None = None,
+        support: SupportSettings | Mapping[str, Any] | None = None,
     ) -> None:
         for name, kind, given in (
             ("ears", EarSettings, ears),
@@ -155,6 +161,7 @@ class Head(Shown):
             ("air", AirSettings, air),
             ("analysis", SpectrogramSettings, analysis),
             ("noise", NoiseSettings, noise),
+            ("support", SupportSettings, support),
         ):
             object.__setattr__(self, name, checked_section(kind, given or {}, name))
         if isinstance(self.noise.snr_db, tuple) and len(self.receivers) != 2:
@@ -174,13 +181,14 @@ class Head(Shown):
         """Return the sections of the settings that describe this head, as plain data."""
         named = {"ears": self.ears, "call": self.call, "air": self.air}
         sections = {**named, "spectrogram": self.analysis, "noise": self.noise}
+        sections["support"] = self.support
         return {name: section.model_dump(mode="json") for name, section in sections.items()}
 
     @classmethod
     def from_plain(cls, sections: Mapping[str, Any]) -> Head:
         """Return the head that :meth:`plain` described."""
         given = {"analysis" if k == "spectrogram" else k: v for k, v in sections.items()}
-        names = ("ears", "call", "air", "analysis", "noise")
+        names = ("ears", "call", "air", "analysis", "noise", "support")
         return cls(**{name: given[name] for name in names if name in given})
 
     def __getstate__(self) -> dict[str, object]:
@@ -192,6 +200,13 @@ class Head(Shown):
         return (
             self if self.noise.snr_db is None else dataclasses.replace(self, noise=NoiseSettings())
         )
+
+    @cached_property
+    def plane(self) -> Plane | None:
+        """The support; None where there is none."""
+        if self.support.point is None:
+            return None
+        return Plane.through(np.asarray(self.support.point), np.asarray(self.support.normal))
 
     @cached_property
     def emitter(self) -> Floats:

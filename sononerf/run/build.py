@@ -87,6 +87,7 @@ def head_of(settings: Settings) -> Head:
         air=settings.air,
         analysis=settings.spectrogram,
         noise=settings.noise,
+        support=settings.support,
     )
 
 

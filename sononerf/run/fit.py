@@ -8,7 +8,6 @@ import resource
 import sys
 import time
 from contextlib import ExitStack
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -314,7 +313,7 @@ def _keep(
     hull = echoes.hull
     state = {f"field.{k}": v for k, v in module.field.state_dict().items()}
     state |= {f"renderer.{k}": v for k, v in module.renderer.state_dict().items()}
-    state |= {f"hull.{f.name}": _double(getattr(hull, f.name)) for f in fields(hull)}
+    state |= {f"hull.{name}": _double(getattr(hull, name)) for name in hull.ARRAYS}
     run.write_metrics(
         "cost",
         {

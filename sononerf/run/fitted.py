@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +82,9 @@ def load_fitted(path: Path) -> Fitted:
             "0; fetch the run again, or repeat the fit with --overwrite"
         )
     settings = with_attached(settings, path)
-    module = module_for(settings, head_of(settings), region, reference)
+    head = head_of(settings)
+    hull = replace(hull, plane=head.plane)
+    module = module_for(settings, head, region, reference)
     for part, prefix in ((module.field, "field."), (module.renderer, "renderer.")):
         own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
         try:
@@ -98,7 +100,7 @@ def load_fitted(path: Path) -> Fitted:
 
 def _hull(state: dict[str, torch.Tensor]) -> EchoHull:
     read: dict[str, Any] = {
-        f.name: state[f"hull.{f.name}"].double().numpy() for f in fields(EchoHull)
+        name: state[f"hull.{name}"].double().numpy() for name in EchoHull.ARRAYS
     }
     return EchoHull(**{**read, "within": float(read["within"])})
 

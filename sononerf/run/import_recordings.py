@@ -46,6 +46,11 @@ def echo_hash(understood: Understood) -> str:
     digest = hashlib.sha256(f"recordings {understood.form}".encode())
     given = understood.wanted.model_dump(mode="json", exclude=set(NOT_HASHED))
     sections = {name: plain[name] for name in HEAD_SECTIONS}
+    # Newer keys that do not apply leave the hash as older versions made it.
+    if understood.head.plane is None:
+        del sections["support"]
+    if given["turntable"] is not None and given["turntable"]["surface"] is None:
+        del given["turntable"]["surface"]
     digest.update(json.dumps([given, sections, understood.calibration], sort_keys=True).encode())
     poses = understood.poses[understood.pings]
     for values in (poses.positions, poses.rotations):

@@ -203,6 +203,10 @@ def _complete(
         own = data.setdefault(section, {})
         if isinstance(own, dict):
             data[section] = {**_mixed(known, wanted), **own}
+    support = data.setdefault("support", {})
+    table = wanted.turntable
+    if table is not None and table.surface is not None and isinstance(support, dict):
+        support.setdefault("point", [0.0, 0.0, table.surface])
     analysis = data.setdefault("spectrogram", {})
     if isinstance(analysis, dict):
         rate = analysis.setdefault("sampling_rate", recording.sampling_rate)

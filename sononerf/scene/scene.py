@@ -15,6 +15,7 @@ import trimesh
 from sononerf.array_types import Bools, Floats, Ints
 from sononerf.errors import InputError, SettingsError, SonoNerfError, expect
 from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.plane import Plane
 from sononerf.scene.material import MATERIALS, RIGID, Material, MaterialName
 from sononerf.settings import plugins
 from sononerf.settings.loading import faults_of
@@ -141,6 +142,23 @@ class Scene(Shown):
         alone = trimesh.Trimesh(self.mesh.vertices, faces, process=False)
         alone.remove_unreferenced_vertices()
         return alone
+
+    def with_image(self, plane: Plane) -> Scene:
+        """Return what is above a plane together with its image.
+
+        Raises:
+            InputError: If nothing is above it, or the scene has several materials and reaches below
+                the plane.
+        """
+        mesh, kept = plane.with_image(self.mesh)
+        if self.part is None:
+            return Scene(mesh, self.material)
+        if kept is None:
+            raise InputError(
+                "the scene reaches below its support and has several materials; cut it at the "
+                "support, or give it one material"
+            )
+        return Scene(mesh, self.material, np.concatenate([self.part[kept], self.part[kept]]))
 
     def surroundings(self) -> Scene | None:
         """Return what is background as a scene of its own; None where nothing is."""

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from sononerf.errors import SettingsError
 from sononerf.settings.loading import describe_faults
-from sononerf.settings.schema import AirSettings, Positive, Seed, Vector
+from sononerf.settings.section import Positive, Section, Seed, Vector
 
 Matrix = tuple[Vector, Vector, Vector]
 Channels = Annotated[
@@ -23,24 +23,22 @@ LENGTHS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 SPLIT_SEED = 0
 
 
-class _Section(BaseModel):
-    model_config = AirSettings.model_config
-
-
-class TurntableSettings(_Section):
+class TurntableSettings(Section):
     """A fixed sensor and an object that turns about a vertical axis, the world's z.
 
     The sensor stands ``radius`` (m) from the axis and looks at it, level. ``turns`` is the sense
     in which growing angles turn the object, seen from above. ``height`` (m) is added to the
-    heights of the table.
+    heights of the table. ``surface`` (m, world frame) is the height of the plate that the object
+    stands on: it becomes ``support.point``. Without it the plate is taken as silent.
     """
 
     radius: Positive
     turns: Literal["counterclockwise", "clockwise"] = "counterclockwise"
     height: float = 0.0
+    surface: float | None = None
 
 
-class ReferenceSettings(_Section):
+class ReferenceSettings(Section):
     """A recording of a rigid sphere straight ahead of the head, for calibration.
 
     ``distance`` (m) is measured from the emitter to the nearest point of the sphere, ``radius``
@@ -53,7 +51,7 @@ class ReferenceSettings(_Section):
     time: float = 0.0
 
 
-class ImportSettings(_Section):
+class ImportSettings(Section):
     """How recordings and poses are to be read; paths are relative to the folder of the source.
 
     Units have no default: the names of columns say them (``x_mm``, ``yaw_deg``), or ``length`` and

@@ -13,85 +13,29 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from sononerf.settings.call_presets import CALL_PRESETS, fft_of, hop_of, window_of
+from sononerf.settings.scene_schema import PoseSettings, SceneSettings, SupportSettings
+from sononerf.settings.section import (
+    Count,
+    Decibels,
+    Level,
+    Name,
+    Positive,
+    Section,
+    Seed,
+    Spacing,
+    Vector,
+)
 
-HEAD_SECTIONS = ("air", "ears", "call", "spectrogram")
+HEAD_SECTIONS = ("air", "ears", "call", "spectrogram", "support")
 """Sections that describe the head: a store and an import state them."""
 FILE_SECTIONS = ("ears", "call")
 """Sections whose key ``file`` names a file."""
-Vector = tuple[float, float, float]
-Name = Annotated[str, Field(min_length=1)]
-Positive = Annotated[float, Field(gt=0)]
-Spacing = Annotated[float, Field(gt=0, le=0.1)]  # m; more were millimetres taken for metres
-Level = Annotated[float, Field(ge=0)]
-Decibels = Annotated[float, Field(ge=-100, le=200)]
-Count = Annotated[int, Field(ge=1)]
-Seed = Annotated[int, Field(ge=0, lt=2**32)]
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(
-        extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False
-    )
-
-
-class SceneSettings(_Section):
-    """What is ensonified: a scene's name and what its factory takes."""
-
-    name: Name
-    options: dict[str, Any] = {}
-
-
-class PoseSettings(_Section):
-    """Where the calls are made from; both test sets are drawn apart from the training poses.
-
-    On a ``sphere`` about the origin, on a ``cap`` of it about an axis, in a ``volume`` between
-    two radii (within the cap, where an angle is set), on a ``cylinder`` about the z axis between
-    two heights (they look level at the axis), or along a ``path``: the rows of a table
-    ``x,y,z,yaw,pitch,roll``, of which some are drawn for validation and test; number, radius, axis
-    and jitter do not apply to it.
-    """
-
-    arrangement: Literal["sphere", "cap", "volume", "cylinder", "path"] = "sphere"
-    count: Count = 400
-    validation: Annotated[int, Field(ge=0)] = 10
-    heldout: Annotated[int, Field(ge=0)] = 20
-    radius: Positive = 0.4
-    radius_max: Positive | None = None
-    axis: Vector = (1.0, 0.0, 0.0)
-    half_angle_deg: Annotated[float, Field(gt=0, le=180)] | None = None
-    heights: tuple[float, float] | None = None  # m
-    path: Path | None = None
-    aim_jitter_deg: Annotated[float, Field(ge=0, le=90)] = 15.0
-    seed: Seed = 0
-
-    @model_validator(mode="after")
-    def _arranged(self) -> PoseSettings:
-        for name, needed, allowed in (
-            ("half_angle_deg", "cap", ("cap", "volume")),
-            ("radius_max", "volume", ("volume",)),
-            ("heights", "cylinder", ("cylinder",)),
-            ("path", "path", ("path",)),
-        ):
-            there = getattr(self, name) is not None
-            if there and self.arrangement not in allowed:
-                where = " or ".join(allowed)
-                fault = f"{name} is of the arrangement {where}, not of {self.arrangement}"
-                raise ValueError(f"{fault}; set arrangement, or leave it out")
-            if not there and self.arrangement == needed:
-                raise ValueError(f"the arrangement {needed} needs {name}")
-        if not 1e-6 <= max(abs(part) for part in self.axis) <= 1e6:
-            raise ValueError("axis gives no direction; expected one such as [1, 0, 0]")
-        if self.radius_max is not None and self.radius >= self.radius_max:
-            raise ValueError("radius must lie below radius_max")
-        if self.heights is not None and self.heights[0] > self.heights[1]:
-            raise ValueError("heights must be the lowest and the highest")
-        return self
-
-
-class SimulationSettings(_Section):
+class SimulationSettings(Section):
     """The echo simulator: accuracy, bounces, and the turn of the pattern of rays.
 
     The number of ``rays`` per pose is set, or as large as ``accuracy_db`` needs: that is the mean
@@ -113,7 +57,7 @@ class SimulationSettings(_Section):
     noise_floor_poses: Annotated[int, Field(ge=0)] = 20
 
 
-class AirSettings(_Section):
+class AirSettings(Section):
     """The medium; the speed of sound is 343 m/s unless a temperature or the speed itself is set."""
 
     speed_of_sound: Annotated[float, Field(ge=100, le=10_000)] | None = None  # m/s
@@ -122,7 +66,7 @@ class AirSettings(_Section):
     pressure_pa: Annotated[float, Field(ge=20_000, le=200_000)] = 101_325.0
 
 
-class EarSettings(_Section):
+class EarSettings(Section):
     """Emitter and receivers in the head frame (x forward, y left, z up).
 
     Two ears by default, at ``left`` and its mirror image. ``receivers`` gives other places, from
@@ -156,7 +100,7 @@ class EarSettings(_Section):
         return self
 
 
-class CallSettings(_Section):
+class CallSettings(Section):
     """What is emitted: an impulse, a sweep of frequency with its harmonics, or a ``file``.
 
     A ``preset`` fills the other keys with those of a published call; what is set beside it wins.
@@ -210,7 +154,7 @@ class CallSettings(_Section):
         return {h: (h * low, h * high) for h, a in enumerate(self.harmonics, start=1) if a > 0.0}
 
 
-class SpectrogramSettings(_Section):
+class SpectrogramSettings(Section):
     """The analysis: filters of equal or of growing width, a hop, and a crop in range.
 
     Of the kind ``stft`` a symmetric Hamming ``window`` and a padded ``fft``; of ``gammatone`` a
@@ -267,7 +211,7 @@ def check_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
         )
 
 
-class NoiseSettings(_Section):
+class NoiseSettings(Section):
     """White noise of the ears; what the ratio is measured by stands in ``acoustics.noise``."""
 
     snr_db: Decibels | tuple[Decibels, Decibels] | None = None  # none, both ears, (left, right)
@@ -276,7 +220,7 @@ class NoiseSettings(_Section):
     target_distance: Positive = 0.4
 
 
-class DataSettings(_Section):
+class DataSettings(Section):
     """Where the ensemble lies and how it is streamed."""
 
     store: Path | None = None
@@ -285,7 +229,7 @@ class DataSettings(_Section):
     memory_bytes: Count = 2_000_000_000
 
 
-class RegionSettings(_Section):
+class RegionSettings(Section):
     """The box that is fitted and read out; found from the echoes where it is not set."""
 
     lower: Vector | None = None
@@ -301,21 +245,21 @@ class RegionSettings(_Section):
         return self
 
 
-class FieldSettings(_Section):
+class FieldSettings(Section):
     """The reflectivity field by the name of its entry point, and what its factory takes."""
 
     kind: Name = "grid"
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = Field(default_factory=dict)
 
 
-class RendererSettings(_Section):
+class RendererSettings(Section):
     """The renderer by the name of its entry point, and what its factory takes."""
 
     kind: Name = "profile"
-    options: dict[str, Any] = {}
+    options: dict[str, Any] = Field(default_factory=dict)
 
 
-class FitSettings(_Section):
+class FitSettings(Section):
     """The fit: how long, on what, how fast."""
 
     epochs: Count = 20
@@ -339,20 +283,20 @@ class FitSettings(_Section):
     checkpoint_seconds: Positive = 60.0
 
 
-class PreviewSettings(_Section):
+class PreviewSettings(Section):
     """The coarse mesh and projections that each epoch leaves."""
 
     every_epochs: Count = 1
     voxels: Annotated[int, Field(ge=8, le=512)] = 48  # along the region's longest side
 
 
-class PredictionSettings(_Section):
+class PredictionSettings(Section):
     """What a prediction is made of, beside the rendered field."""
 
     traced: Literal["auto", "off"] = "auto"  # echoes off the mesh, as far as validation bears out
 
 
-class ReconstructionSettings(_Section):
+class ReconstructionSettings(Section):
     """The read-out of the finished field."""
 
     spacing: Spacing | None = None  # from the field's own resolution where it is not set
@@ -377,7 +321,7 @@ class ReconstructionSettings(_Section):
         return self
 
 
-class EvaluationSettings(_Section):
+class EvaluationSettings(Section):
     """The true surface that a reconstruction is compared with; metrics alone use it.
 
     Without ``truth`` it is the scene's own. A ``rigid`` registration turns and moves the result
@@ -388,7 +332,7 @@ class EvaluationSettings(_Section):
     registration: Literal["none", "rigid", "similarity"] = "none"
 
 
-class Settings(_Section):
+class Settings(Section):
     """One experiment, whole. Echoes come from a scene or from ``data.store``."""
 
     scene: SceneSettings | None = None
@@ -398,6 +342,7 @@ class Settings(_Section):
     ears: EarSettings = EarSettings()
     call: CallSettings = CallSettings()
     spectrogram: SpectrogramSettings = SpectrogramSettings()
+    support: SupportSettings = SupportSettings()
     noise: NoiseSettings = NoiseSettings()
     data: DataSettings = DataSettings()
     region: RegionSettings = RegionSettings()

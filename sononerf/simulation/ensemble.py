@@ -170,6 +170,8 @@ def echo_hash(
     plain = _heard_settings(head, options)
     digest = hashlib.sha256(f"simulator {VERSION}".encode())
     digest.update(json.dumps([plain[name] for name in HASHED_SECTIONS], sort_keys=True).encode())
+    if head.plane is not None:
+        digest.update(repr(head.plane).encode())
     for values in (poses.positions, poses.rotations):
         # The last bits of a sine are the processor's own; adding zero makes -0 the same as 0.
         digest.update((np.round(values, 9) + 0.0).astype("<f8").tobytes())

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from functools import cached_property, lru_cache
 from typing import Any, Protocol
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.array_types import Complexes, Floats, Ints, Singles
+from sononerf.geometry.plane import Plane
 from sononerf.head.ears import beam_gain, ear_gain
 from sononerf.head.head import Head
 from sononerf.simulation.impulse_response import (
@@ -67,7 +69,11 @@ class Hearing:
         ears: Gains at the nodes of the synthesis.
         absorption ((F,), dB/m): Of the air at the nodes.
         speed_of_sound (m/s): Of the air.
+        image: The plane in which the emitter is mirrored, see :meth:`from_image`; None where the
+            emitter itself calls.
     """
+
+    image: Plane | None = None
 
     def __init__(self, head: Head, synthesis: Synthesis) -> None:
         self.head, self.synthesis = head, synthesis
@@ -80,9 +86,17 @@ class Hearing:
         decay = self.absorption * (math.log(10.0) / 20.0) * self.speed_of_sound
         return air_loss(self.synthesis, decay).astype(np.float32)
 
+    @property
+    def from_image(self) -> Hearing:
+        """The same, with the image of the emitter in the support in place of the emitter."""
+        other = copy.copy(self)
+        other.image = self.head.plane
+        return other
+
     def places(self, position: Floats, rotation: Floats) -> tuple[Floats, Floats]:
         """Return the emitter (3,) and the ears (E, 3) of a pose, m, world frame."""
-        return self.head.places(position, rotation)
+        emitter, ears = self.head.places(position, rotation)
+        return emitter if self.image is None else self.image.mirrored(emitter), ears
 
     def silence(self) -> Sound:
         """Return nothing heard yet."""
@@ -90,6 +104,8 @@ class Hearing:
 
     def beam(self, emitted: Floats, rotation: Floats) -> Singles:
         """Return the beam's gain (N, F) towards directions (N, 3) of the world."""
+        if self.image is not None:
+            emitted = emitted @ self.image.turn
         return beam_gain(self.ears, _into_head(emitted, rotation))
 
     def gain(self, ear: int, towards: Floats, rotation: Floats) -> Singles:

@@ -82,7 +82,7 @@ class Rays(Engine):
         band: Floats | None = None,
     ) -> None:
         super().__init__(scene, hearing)
-        self.rays = rays
+        self._rays = rays
         self.bounces = bounces
         vertices = np.asarray(scene.mesh.vertices, dtype=np.float64)
         self._centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2.0
@@ -115,9 +115,36 @@ class Rays(Engine):
         self._diffracts = any(reflection.diffraction.any() for reflection in self.reflections)
         self._diffraction: Diffraction | None = None
         self._outlines: Outlines | None = None
+        self._of_image: Rays | None = None
+        if hearing.head.plane is not None and hearing.image is None:
+            self._of_image = Rays(
+                scene,
+                hearing.from_image,
+                rays=rays,
+                bounces=bounces,
+                diffraction_points=diffraction_points,
+                band=band,
+            )
+
+    @property
+    def rays(self) -> int:
+        """How many are traced per pose, and as many again from the emitter's image."""
+        return self._rays
+
+    @rays.setter
+    def rays(self, count: int) -> None:
+        self._rays = count
+        if self._of_image is not None:
+            self._of_image.rays = count
 
     def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
         """Pressure at both ears; the seed turns and shifts the pattern of rays as a whole."""
+        echo = self._echo(position, rotation, seed=seed)
+        if self._of_image is not None:
+            echo += self._of_image.echo(position, rotation, seed=seed)
+        return echo
+
+    def _echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
         first, second, third = np.random.default_rng(seed).random(3)
         sound, turned = self.hearing.silence(), self.hearing.silence()
         shadows = self._shadows(position, rotation)
@@ -150,6 +177,8 @@ class Rays(Engine):
         paths = self._paths(position, rotation, (first, second), self.bounces)
         for bounce in gathered(bounce for bounce in paths if bounce.number > 1):
             self._hear(sound, sound, bounce, position, rotation, [])
+        if self._of_image is not None:
+            self._of_image.later(sound, position, rotation, seed=seed)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_diffraction": None, "_outlines": None}

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sononerf.array_types import Floats, Singles
 from sononerf.echoes.splits import TEST, TRAIN, VALIDATION
-from sononerf.errors import InputError
+from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import (
     Poses,
     cap_poses,
@@ -29,7 +29,8 @@ from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
-from sononerf.settings.schema import PoseSettings, SimulationSettings, SpectrogramSettings
+from sononerf.settings.scene_schema import PoseSettings
+from sononerf.settings.schema import SimulationSettings, SpectrogramSettings
 from sononerf.simulation.audibility import RESOLVED_FREQUENCY, silence_before
 from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import hearing_of
@@ -67,10 +68,21 @@ class Simulator:
 
         Args:
             scene: What is ensonified.
-            head: What hears.
+            head: What hears. Of a scene on its support the part above it is ensonified together
+                with its image: a rigid plane is exactly that.
             options: The engine and what bounds its work.
+
+        Raises:
+            InputError: If all of the scene lies below the support.
+            SettingsError: If the engine knows no support.
         """
         hearing, analysis = hearing_of(head), head.analysis
+        if head.plane is not None:
+            if options.engine == "kirchhoff":
+                raise SettingsError(
+                    "simulation.engine=kirchhoff knows no support; set simulation.engine=rays"
+                )
+            scene = scene.with_image(head.plane)
         if options.engine in ("spheres", "bem"):
             return cls(
                 _solver(options.engine)(

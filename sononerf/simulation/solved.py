@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from sononerf.array_types import Complexes, Floats, Ints, Singles
 from sononerf.errors import ResourceError
+from sononerf.geometry.plane import Plane
 from sononerf.head.ears import Ears, beam_gain, ear_gain
 from sononerf.memory import available_cores, available_memory
 from sononerf.scene.scene import Scene
@@ -42,35 +43,50 @@ class Heads:
         emitters ((P, 3), m): World frame.
         ears ((P, E, 3), m): World frame.
         rotations (P, 3, 3): Head to world.
+        emitting (P, 3, 3): The same for the emitter; that of an image mirrors too.
         gains: Tables of one frequency.
     """
 
     emitters: Floats
     ears: Floats
     rotations: Floats
+    emitting: Floats
     gains: Ears
 
     def __len__(self) -> int:
         """How many poses there are, P."""
         return len(self.emitters)
 
+    def with_images(self, plane: Plane | None) -> Heads:
+        """Return these and the same ears with emitters mirrored in a plane, (2 P,)."""
+        if plane is None:
+            return self
+        return Heads(
+            np.concatenate([self.emitters, plane.mirrored(self.emitters)]),
+            np.concatenate([self.ears, self.ears]),
+            np.concatenate([self.rotations, self.rotations]),
+            np.concatenate([self.emitting, plane.turn @ self.emitting]),
+            self.gains,
+        )
+
     def __getitem__(self, some: slice | Ints) -> Heads:
         """Return some of the poses."""
-        return Heads(self.emitters[some], self.ears[some], self.rotations[some], self.gains)
+        places = self.emitters[some], self.ears[some]
+        return Heads(*places, self.rotations[some], self.emitting[some], self.gains)
 
     def beam(self, points: Floats) -> Floats:
         """Return the gains (P, N) of the emission towards points (N, 3) of the world, m."""
-        towards = self._towards(points, self.emitters)
+        towards = self._towards(points, self.emitters, self.emitting)
         return _by_pose(beam_gain(self.gains, towards), len(self))
 
     def gain(self, ear: int, points: Floats) -> Floats:
         """Return the gains (P, N) of an ear for sound from points (N, 3) of the world, m."""
-        towards = self._towards(points, self.ears[:, ear])
+        towards = self._towards(points, self.ears[:, ear], self.rotations)
         return _by_pose(ear_gain(self.gains, ear, towards), len(self))
 
-    def _towards(self, points: Floats, places: Floats) -> Floats:
+    def _towards(self, points: Floats, places: Floats, rotations: Floats) -> Floats:
         """Return the ways from places (P, 3) to points in the head frame (P N, 3), m."""
-        ways = (points[None] - places[:, None]) @ self.rotations
+        ways = (points[None] - places[:, None]) @ rotations
         return ways.reshape(-1, 3)
 
 
@@ -195,12 +211,15 @@ class Solved(Engine):
         spectrum = np.zeros((*start.shape, self.period // 2 + 1), dtype=np.complex128)
         absorbed = self.hearing.head.absorption(self.frequency) * (math.log(10.0) / 20.0)
         fall = self.taper(self.frequency)
+        plane = self.hearing.head.plane
 
         def respond(index: int) -> Complexes:
             turn = 2.0 * math.pi * float(self.frequency[index])
             wavenumber = complex(turn / self.hearing.speed_of_sound, -absorbed[index])
             gains = self.hearing.head.tables(self.frequency[index : index + 1])
-            found = self.respond(wavenumber, Heads(emitters, ears, turns, gains))
+            heads = Heads(emitters, ears, turns, turns, gains).with_images(plane)
+            # What the emitter and its image cause adds up.
+            found = self.respond(wavenumber, heads).reshape(-1, *start.shape).sum(axis=0)
             return fall[index] * found * np.exp(1j * turn / rate * start)
 
         with self._in_threads(respond, len(self.frequency)) as found:

@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from sononerf.field.field import Field
+from sononerf.geometry.plane import Plane
 from sononerf.head.head import PointEcho
 
 
@@ -63,6 +64,7 @@ class Listener:
     receivers: torch.Tensor
     resolution: float
     lag: torch.Tensor | None = None
+    plane: Plane | None = None
 
 
 def table(gain):

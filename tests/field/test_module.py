@@ -31,6 +31,7 @@ LISTENER = SimpleNamespace(
     row_absorption=torch.tensor([0.1, 0.2, 0.3]),
     row_gains=SimpleNamespace(beam=torch.ones(3, 5, 9), ears=torch.ones(2, 3, 5, 9)),
     lag=None,
+    plane=None,
     resolution=34 * STEP / 4,
     emitter=torch.zeros(3),
     receivers=torch.tensor([[-0.01, 0.01, 0.0], [-0.01, -0.01, 0.0]]),

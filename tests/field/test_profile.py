@@ -12,6 +12,7 @@ from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.field.hash import HashField
 from sononerf.field.profile import ProfileRenderer
+from sononerf.geometry.plane import Plane
 from sononerf.geometry.poses import look_at, rotation_from_euler
 from sononerf.run.build import head_of, simulator_of
 from sononerf.scene.scene import Scene
@@ -68,6 +69,50 @@ def smooth(places, directions):
     tilt = 1 + directions @ directions.new_tensor([0.2, 0.6, 0.1])
     shape = 1 + places @ places.new_tensor([9.0, -25.0, 5.0])
     return (tilt * shape)[..., None] * places.new_tensor([1.0, 0.7, 0.4])
+
+
+def test_on_a_support_a_place_is_heard_by_way_of_the_images_too(head, listener, formula):
+    """Once directly, once by both ways that meet the support once, and once by both images."""
+    plane = Plane.through(np.array([0.0, 0.0, -0.06]), np.array([0.1, 0.0, 1.0]))
+    place = np.array([0.004, 0.013, -0.006])
+    region = torch.as_tensor(np.stack((place, place + 0.001)))
+    told = []
+
+    def field_of(places, directions):
+        told.append(directions.reshape(-1, 3).numpy())
+        return torch.ones(*directions.shape[:-1], 3, dtype=directions.dtype)
+
+    field = formula(region, listener.frequency, field_of, spacing=0.01)
+    renderer = quiet(ProfileRenderer(region, dataclasses.replace(listener, plane=plane)))
+    renderer.prepare(field, None, 0)
+    told.clear()
+    position, rotation = POSITION[0], ROTATION[0]
+    heard = renderer(field, *tensors(position, rotation), rows()).detach().numpy()[0]
+    emitter, image = position + rotation @ head.emitter, plane.mirrored(place)
+    # The emitter, the middle between it and its image, and the image.
+    foot = emitter - plane.height(emitter) * np.asarray(plane.normal)
+    for directions, seen in zip(told, (emitter, foot, plane.mirrored(emitter)), strict=True):
+        way = (seen - place) / np.linalg.norm(seen - place)
+        np.testing.assert_allclose(directions, way[None], atol=1e-6)
+
+    def level(sent, received, ear):
+        """Level and range of sound that goes out to one place and comes back from another."""
+        out = sent - emitter
+        back = received - position - rotation @ head.ears[ear]
+        d1, d2 = np.linalg.norm(out), np.linalg.norm(back)
+        gain = head.towards(rotation.T @ out)[0] * head.towards(rotation.T @ back)[1][ear]
+        return np.exp(-head.alpha * (d1 + d2)) * gain / (d1 * d2), (d1 + d2) / 2
+
+    for ear in (0, 1):
+        ways = {a + b: level(*pair, ear) for a, b, pair in (
+            ("place", "place", (place, place)), ("image", "image", (image, image)),
+        )}  # fmt: skip
+        once = [level(place, image, ear), level(image, place, ear)]
+        ways["once"] = sum(each[0] for each in once), np.mean([each[1] for each in once])
+        for expected, at in ways.values():
+            near = np.abs(head.range - at) < head.step
+            np.testing.assert_allclose(heard[ear][near].max(axis=0), expected, rtol=0.02)
+        assert ways["placeplace"][1] + 0.01 < ways["once"][1] < ways["imageimage"][1] - 0.01
 
 
 @pytest.fixture

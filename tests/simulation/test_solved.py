@@ -148,7 +148,7 @@ def test_the_head_is_that_of_the_settings():
     gains = engine.hearing.head.tables(np.array([50e3]))
     emitters = position + turns @ gains.emitter
     ears = position[:, None] + np.einsum("pij,ej->pei", turns, gains.positions)
-    heads = Heads(emitters, ears, turns, gains)
+    heads = Heads(emitters, ears, turns, turns, gains)
     points = np.array([[0.0, 0.0, 0.0], [0.01, 0.1, -0.1], [0.0, -0.2, 0.0]])
     for pose in range(2):
         away = (points - emitters[pose]) @ turns[pose]

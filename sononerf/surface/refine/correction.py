@@ -23,13 +23,12 @@ from torch import Tensor
 
 from sononerf.array_types import Ints
 from sononerf.echoes.echoes import Echoes
-from sononerf.geometry.raycast import Occlusion
 from sononerf.simulation.ensemble import spectrograms
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
 from sononerf.surface.refine.objective import on_rows
 from sononerf.surface.refine.optics import Heard, Optics
-from sononerf.surface.refine.visibility import listen
+from sononerf.surface.refine.visibility import listen, sight_of
 
 
 class Correction:
@@ -63,7 +62,7 @@ class Correction:
         self._area = self._operators.areas(self._vertices)
         passes = smoothing_passes(optics.wavelength, self._operators.edge_length(self._vertices))
         self._bending = self._operators.bending(self._vertices, unit(self._area), passes)
-        self._sight = Occlusion(np.asarray(mesh.vertices, dtype=np.float64), faces)
+        self._sight = sight_of(optics, np.asarray(mesh.vertices, dtype=np.float64), faces)
         self._kept: dict[int, tuple[Tensor, Tensor]] = {}
         places = np.asarray(echoes.positions[numbers], dtype=np.float64)
         turns = np.asarray(echoes.rotations[numbers], dtype=np.float64)

@@ -20,7 +20,7 @@ from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
 from sononerf.surface.refine.objective import Level, OnsetRanges, measured, mismatch
 from sononerf.surface.refine.optics import Heard, Optics
-from sononerf.surface.refine.visibility import listen
+from sononerf.surface.refine.visibility import listen, sight_of
 
 POSES = 8
 """Per step."""
@@ -127,6 +127,9 @@ class Descent:
         self.vertices = self.operators.relaxed(self.vertices, normals, TANGENT)
         if self._sides is not None:
             self.vertices = self._sides.apart(self.vertices, normals)
+        if (plane := self.optics.plane) is not None:  # nothing below it is body
+            below = plane.height(self.vertices).clamp_max(0.0)[:, None]
+            self.vertices = self.vertices - below * torch.tensor(plane.normal).to(self.vertices)
         return error
 
     def render(self, numbers: list[int]) -> tuple[Heard | None, Tensor, Tensor]:
@@ -142,7 +145,7 @@ class Descent:
         moved = self._seen is not self.vertices
         if self._sight is None or (moved and self.count % SIGHT == 0):
             self._seen = self.vertices
-            self._sight = Occlusion(self._seen.cpu().numpy(), self.faces)
+            self._sight = sight_of(self.optics, self._seen.cpu().numpy(), self.faces)
         places = torch.as_tensor(self.echoes.positions[numbers]).to(self.vertices)
         turns = torch.as_tensor(self.echoes.rotations[numbers]).to(self.vertices)
         pieces, heads, middle = listen(
@@ -196,7 +199,7 @@ class Descent:
             state[name].to(self.vertices) for name in ("vertices", "seen", "direction", "square")
         )
         self.count = int(state["count"])
-        self._sight = Occlusion(self._seen.cpu().numpy(), self.faces)
+        self._sight = sight_of(self.optics, self._seen.cpu().numpy(), self.faces)
 
 
 def poses_that_hear(mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics) -> Tensor:
@@ -208,15 +211,18 @@ def poses_that_hear(mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics) -> Te
     area = operators.areas(vertices)
     passes = smoothing_passes(optics.wavelength, operators.edge_length(vertices))
     bending = operators.bending(vertices, unit(area), passes)
-    sight = Occlusion(vertices.cpu().numpy(), faces)
+    sight = sight_of(optics, vertices.cpu().numpy(), faces)
     count = torch.zeros(len(area), device=area.device)
     for first in range(0, len(echoes.training), POSES):
         some = echoes.training[first : first + POSES]
         places = torch.as_tensor(echoes.positions[some]).to(area)
         turns = torch.as_tensor(echoes.rotations[some]).to(area)
-        pieces, _, _ = listen(optics, operators, vertices, area, bending, sight, places, turns)
-        near = (pieces.reach.amax(1) > NEAR).float()
-        count.index_add_(0, pieces.vertex, near)
+        pieces, heads, _ = listen(optics, operators, vertices, area, bending, sight, places, turns)
+        near = pieces.reach.amax(1) > NEAR
+        pose = pieces.pose[near] % heads.poses
+        # On a support a pose may see a vertex in several ways.
+        vertex = torch.unique(pieces.vertex[near] * heads.poses + pose) // heads.poses
+        count.index_add_(0, vertex, torch.ones_like(vertex, dtype=count.dtype))
     return count
 
 

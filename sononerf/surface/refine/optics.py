@@ -54,11 +54,37 @@ class Heard:
 
 
 @dataclass(frozen=True, eq=False)
-class Pieces:
-    """What some poses hear of a surface, one row per pose and vertex.
+class Heads:
+    """Where sound comes from and where it is heard. Each pose is there W times, way after way.
+
+    Without a support there is one way, from the emitter to the ears. On a support there are four:
+    emitter and ears stand for themselves or are mirrored.
 
     Attributes:
-        pose, vertex (Q,): Which of the poses, which vertex.
+        emitters ((W P, 3), m): Their places.
+        ears ((W P, E, 3), m): Of the ears.
+        emitting, hearing (W P, 3, 3): Head to world, of emitter and ears; those of images mirror.
+        poses: P.
+    """
+
+    emitters: Tensor
+    ears: Tensor
+    emitting: Tensor
+    hearing: Tensor
+    poses: int
+
+    def about(self, middle: Tensor) -> Heads:
+        """Return them in single precision, counted from a place (3,), m."""
+        emitters, ears = (self.emitters - middle).float(), (self.ears - middle).float()
+        return Heads(emitters, ears, self.emitting.float(), self.hearing.float(), self.poses)
+
+
+@dataclass(frozen=True, eq=False)
+class Pieces:
+    """What some poses hear of a surface, one row per way of a pose and vertex.
+
+    Attributes:
+        pose, vertex (Q,): Which way of which pose, a row of :class:`Heads`; which vertex.
         weight ((Q, E, N) float32): Gains, absorption, spread, fade and visibility at the nodes.
         reach ((Q, E) float32): Fade and spread at the lowest analysed frequency, 0 to 1: how near a
             piece is to its mirror point.
@@ -79,6 +105,7 @@ class Optics(nn.Module):
 
     Attributes:
         head: Without noise.
+        plane: The support; None where there is none.
         wavelength (m): The shortest of the analysed band.
         rows, ears: Range slices of a spectrogram, R, and ears, E.
         kept_nodes (N,): Which of the synthesis' nodes matter for the band.
@@ -87,6 +114,7 @@ class Optics(nn.Module):
     def __init__(self, head: Head, hearing: Hearing | None = None) -> None:
         super().__init__()
         self.head = head.without_noise()
+        self.plane = head.plane
         hearing, analysis = hearing or hearing_of(self.head), head.analysis
         self.analysis = analysis
         self.speed_of_sound = head.speed_of_sound
@@ -123,13 +151,29 @@ class Optics(nn.Module):
             self.register_buffer(name, torch.as_tensor(np.ascontiguousarray(values)).float())
         self._lowest = (turn * lowest, turn * math.hypot(lowest, self._soft))
 
-    def heads(self, positions: Tensor, rotations: Tensor) -> tuple[Tensor, Tensor]:
-        """Return emitters (P, 3) and ears (P, E, 3), m, of heads (P, 3), (P, 3, 3), float64."""
+    def heads(self, positions: Tensor, rotations: Tensor) -> Heads:
+        """Return emitters and ears of poses (P, 3), m, and (P, 3, 3), with their images."""
         emitter = self.get_buffer("emitter").to(positions.dtype)
         places = self.get_buffer("places").to(positions.dtype)
-        return (
-            positions + rotations @ emitter,
-            positions[:, None] + torch.einsum("pij,ej->pei", rotations, places),
+        emitters = positions + rotations @ emitter
+        ears = positions[:, None] + torch.einsum("pij,ej->pei", rotations, places)
+        if (plane := self.plane) is None:
+            return Heads(emitters, ears, rotations, rotations, len(positions))
+        turn = torch.as_tensor(plane.turn).to(positions)
+        normal = torch.tensor(plane.normal).to(positions)
+
+        def both(points: Tensor) -> tuple[Tensor, Tensor]:
+            return points, points - 2.0 * plane.height(points)[..., None] * normal
+
+        from_, to = both(emitters), both(ears)
+        turned = rotations, turn @ rotations
+        ways = ((0, 0), (1, 0), (0, 1), (1, 1))
+        return Heads(
+            torch.cat([from_[one] for one, _ in ways]),
+            torch.cat([to[other] for _, other in ways]),
+            torch.cat([turned[one] for one, _ in ways]),
+            torch.cat([turned[other] for _, other in ways]),
+            len(positions),
         )
 
     def near_mirror(
@@ -213,22 +257,22 @@ class Optics(nn.Module):
         pose: Tensor,
         vertex: Tensor,
         visible: Tensor,
-        heads: tuple[Tensor, Tensor, Tensor],
+        heads: Heads,
     ) -> Pieces:
         """Weigh pieces: everything of the sum but path, obliquity and area.
 
         Args:
             points, area, bending ((V, 3), (V, 3), (V, 6) float32): The surface.
-            pose, vertex (Q,): Which pieces which pose hears.
+            pose, vertex (Q,): Which pieces which way of a pose hears.
             visible ((Q, E) float32): How far emitter and ear see them, 0 to 1.
-            heads (emitters (P, 3), ears (P, E, 3), rotations (P, 3, 3), float32): Of the poses.
+            heads: Of the poses, float32.
         """
-        emitters, ears, rotations = heads
+        emitters, ears = heads.emitters, heads.ears
         place, normal, bent = points[vertex], area[vertex], bending[vertex]
         out = place - emitters[pose]
         out = out / out.norm(dim=1, keepdim=True)
-        turned = rotations[pose]
-        beam = self.gains(torch.zeros_like(pose), out, turned)
+        turned = heads.hearing[pose]
+        beam = self.gains(torch.zeros_like(pose), out, heads.emitting[pose])
         weights, reaches = [], []
         wavenumber, fade, decay = (
             self.get_buffer(name) for name in ("wavenumber", "fade", "decay")
@@ -254,7 +298,7 @@ class Optics(nn.Module):
         points: Tensor,
         area: Tensor,
         pieces: Pieces,
-        heads: tuple[Tensor, Tensor, Tensor],
+        heads: Heads,
         *,
         stretch: Tensor | None = None,
         late: Tensor | None = None,
@@ -263,34 +307,36 @@ class Optics(nn.Module):
 
         The paths of a pose are multiplied by ``stretch`` (P,) and lengthened by ``late`` (P,), m.
         """
-        emitters, ears, _ = heads
+        emitters, ears = heads.emitters, heads.ears
         place, normal = points[pieces.vertex], area[pieces.vertex]
         u = place - emitters[pieces.pose]
         v = place[:, None] - ears[pieces.pose]
         d1, d2 = u.norm(dim=1), v.norm(dim=2)
         both = (u / d1[:, None])[:, None] + v / d2[:, :, None]
+        # What comes by different ways adds up in phase.
+        pose, poses = pieces.pose % heads.poses, heads.poses
         strength = -(both * normal[:, None]).sum(2) * 0.5 / (self.speed_of_sound * d1[:, None] * d2)
         rate = self.analysis.sampling_rate
         path = d1[:, None] + d2
         if stretch is not None:
-            path = path * stretch[pieces.pose][:, None]
+            path = path * stretch[pose][:, None]
         if late is not None:
-            path = path + late[pieces.pose][:, None]
+            path = path + late[pose][:, None]
         path = path * (rate / self.speed_of_sound)  # samples
-        frames, row = self._span(path.detach(), pieces, len(emitters))
+        frames, row = self._span(path.detach(), pose, poses)
         hop = self.analysis.hop
         origin = ((row + self._first) * hop).to(path.dtype)
-        at = path - origin[pieces.pose][:, None]
-        receiver = pieces.pose[:, None] * self.ears + torch.arange(self.ears, device=at.device)
+        at = path - origin[pose][:, None]
+        receiver = pose[:, None] * self.ears + torch.arange(self.ears, device=at.device)
         power = self.bank.power(
             strength.reshape(-1),
             at.reshape(-1),
             pieces.weight.flatten(0, 1),
             receiver.reshape(-1),
-            receivers=len(emitters) * self.ears,
+            receivers=poses * self.ears,
             frames=frames,
         )
-        return Heard(power.unflatten(0, (len(emitters), self.ears)), row)
+        return Heard(power.unflatten(0, (poses, self.ears)), row)
 
     def later_power(
         self, pose: Tensor, ear: Tensor, delay: Tensor, weight: Tensor, like: Heard
@@ -319,13 +365,13 @@ class Optics(nn.Module):
         )
         return power.unflatten(0, (poses, self.ears))
 
-    def _span(self, path: Tensor, pieces: Pieces, poses: int) -> tuple[int, Tensor]:
+    def _span(self, path: Tensor, pose: Tensor, poses: int) -> tuple[int, Tensor]:
         """Return how many frames hold all echoes of any pose, and the first of each pose."""
         hop, window = self.analysis.hop, self._reads
         late, early = path.amax(1), path.amin(1)
         huge = torch.full((poses,), torch.inf, device=path.device, dtype=path.dtype)
-        nearest = huge.scatter_reduce(0, pieces.pose, early, "amin")
-        farthest = (-huge).scatter_reduce(0, pieces.pose, late, "amax")
+        nearest = huge.scatter_reduce(0, pose, early, "amin")
+        farthest = (-huge).scatter_reduce(0, pose, late, "amax")
         empty = torch.isinf(nearest)
         nearest = torch.where(empty, torch.zeros_like(nearest), nearest)
         farthest = torch.where(empty, torch.zeros_like(farthest), farthest)

@@ -28,12 +28,11 @@ from scipy.spatial.transform import Rotation
 
 from sononerf.array_types import Floats, Singles
 from sononerf.echoes.echoes import Echoes
-from sononerf.geometry.raycast import Occlusion
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
 from sononerf.surface.refine.objective import FLOOR_DB, TRUST
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.visibility import listen
+from sononerf.surface.refine.visibility import listen, sight_of
 
 Kind = Literal["gain", "range_offset", "speed_of_sound", "position", "aim"]
 KINDS: tuple[Kind, ...] = ("gain", "range_offset", "speed_of_sound", "position", "aim")
@@ -104,7 +103,7 @@ class Body:
         self.area = self.operators.areas(self.vertices)
         passes = smoothing_passes(optics.wavelength, self.operators.edge_length(self.vertices))
         self.bending = self.operators.bending(self.vertices, unit(self.area), passes)
-        self.sight = Occlusion(self.vertices.cpu().numpy(), faces)
+        self.sight = sight_of(optics, self.vertices.cpu().numpy(), faces)
 
     def render(
         self, positions: Floats, rotations: Floats, stretch: Floats, late: Floats
@@ -137,8 +136,8 @@ class Body:
                 self.area.float(),
                 pieces,
                 heads,
-                stretch=torch.as_tensor(stretch).to(heads[0]),
-                late=torch.as_tensor(late).to(heads[0]),
+                stretch=torch.as_tensor(stretch).to(heads.emitters),
+                late=torch.as_tensor(late).to(heads.emitters),
             )
         magnitude = heard.power.sqrt().cpu().numpy()
         for one, rendered, row in zip(found, magnitude, heard.row.tolist(), strict=True):

@@ -7,10 +7,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sononerf.array_types import Bools, Floats
+from sononerf.array_types import Bools, Floats, Ints
 from sononerf.geometry.raycast import Occlusion
 from sononerf.surface.refine.mesh_operators import MeshOperators
-from sononerf.surface.refine.optics import SILENT, Optics, Pieces
+from sononerf.surface.refine.optics import SILENT, Heads, Optics, Pieces
 
 FREE = 0.25
 """Shortest wavelengths in front of a piece in which nothing hides it: what is so close throws no
@@ -31,6 +31,20 @@ def seen(sight: Occlusion, points: Floats, target: Floats, *, free: float) -> Bo
     return ~sight.blocked(points + part * span, target)
 
 
+def sight_of(optics: Optics, vertices: Floats, faces: Ints) -> Occlusion:
+    """Return what hides places from one another: a surface, on a support with its image.
+
+    Args:
+        optics: Knows the support.
+        vertices ((V, 3), m): Of the surface.
+        faces (T, 3): Its triangles.
+    """
+    if optics.plane is None:
+        return Occlusion(vertices, faces)
+    both = np.concatenate([vertices, optics.plane.mirrored(vertices)])
+    return Occlusion(both, np.concatenate([faces, faces[:, ::-1] + len(vertices)]))
+
+
 def listen(
     optics: Optics,
     operators: MeshOperators,
@@ -40,7 +54,7 @@ def listen(
     sight: Occlusion,
     positions: Tensor,
     rotations: Tensor,
-) -> tuple[Pieces, tuple[Tensor, Tensor, Tensor], Tensor]:
+) -> tuple[Pieces, Heads, Tensor]:
     """Find what poses hear of a surface.
 
     Args:
@@ -48,21 +62,20 @@ def listen(
         operators: Of the surface.
         vertices, area, bending ((V, 3), (V, 3), (V, 6) float64): Places, vector areas and
             curvature.
-        sight: Of the same surface, or of one a little earlier.
+        sight: Of the same surface, or of one a little earlier; see :func:`sight_of`.
         positions, rotations ((P, 3), (P, 3, 3) float64): Of the heads.
 
     Returns:
         pieces: What is heard.
-        heads (emitters (P, 3), ears (P, E, 3), rotations (P, 3, 3), float32): About the middle of
-            the surface, as :meth:`Optics.render` wants them.
+        heads: About the middle of the surface, float32, as :meth:`Optics.render` wants them.
         middle ((3,), m): To be taken off the vertices before they are rendered.
     """
     middle = 0.5 * (vertices.amin(0) + vertices.amax(0))
-    emitters, ears = optics.heads(positions, rotations)
-    heads = ((emitters - middle).float(), (ears - middle).float(), rotations.float())
+    far = optics.heads(positions, rotations)
+    heads = far.about(middle)
     points, areas, bent = (vertices - middle).float(), area.float(), bending.float()
     pose, vertex = _candidates(optics, points, areas, bent, heads)
-    visible = _visible(optics, operators, vertices, sight, pose, vertex, emitters, ears)
+    visible = _visible(optics, operators, vertices, sight, pose, vertex, far.emitters, far.ears)
     kept = visible.amax(1) > 0.0
     pose, vertex, visible = pose[kept], vertex[kept], visible[kept]
     return optics.pieces(points, areas, bent, pose, vertex, visible, heads), heads, middle
@@ -73,10 +86,10 @@ def _candidates(
     points: Tensor,
     area: Tensor,
     bending: Tensor,
-    heads: tuple[Tensor, Tensor, Tensor],
+    heads: Heads,
 ) -> tuple[Tensor, Tensor]:
     """Which poses could hear which vertices (Q,), (Q,), if nothing stood in between."""
-    emitters, middles = heads[0], heads[1].mean(1)
+    emitters, middles = heads.emitters, heads.ears.mean(1)
     towards = 0.5 * (emitters + middles)
     facing = towards @ area.T > (points * area).sum(1)
     pose, vertex = torch.nonzero(facing, as_tuple=True)

@@ -6,12 +6,11 @@ import pytest
 import torch
 import trimesh
 
-from sononerf.geometry.raycast import Occlusion
 from sononerf.run.build import head_of
 from sononerf.simulation.hearing import hearing_of
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.visibility import listen
+from sononerf.surface.refine.visibility import listen, sight_of
 from tests.surface.conftest import RADIUS, given
 
 
@@ -22,7 +21,7 @@ def hear(optics, mesh, poses):
     area = operators.areas(vertices)
     bending = operators.bending(vertices, unit(area), 1)
     places, turns = torch.as_tensor(poses.positions), torch.as_tensor(poses.rotations)
-    sight = Occlusion(vertices.numpy(), faces)
+    sight = sight_of(optics, vertices.numpy(), faces)
     pieces, heads, middle = listen(optics, operators, vertices, area, bending, sight, places, turns)
     return pieces, heads, (vertices - middle).float(), area.float()
 
@@ -41,13 +40,17 @@ def whole(optics, heard, like):
     ("call", "front"),
     [
         ({"kind": "impulse"}, "stft"),
+        ({"kind": "impulse"}, "on a support"),
         ({"kind": "linear"}, "stft"),
         ({"kind": "linear", "frequency_end": 25e3, "harmonics": [1.0, 0.5]}, "stft"),
         ({"kind": "impulse"}, "gammatone"),
     ],
 )
 def test_a_sphere_sounds_as_the_simulator_says(call, front, ball, poses, simulated):
-    settings = given(call=call, spectrogram={"range_min": 0.2, "range_max": 0.4, "kind": front})
+    support = {"point": (0.0, 0.0, -1.5 * RADIUS)} if front == "on a support" else {}
+    kind = "stft" if support else front
+    spectrogram = {"range_min": 0.2, "range_max": 0.4, "kind": kind}
+    settings = given(call=call, spectrogram=spectrogram, support=support)
     optics = Optics(head_of(settings))
     fine = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     wanted = simulated(fine, settings, poses)
