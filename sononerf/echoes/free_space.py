@@ -103,8 +103,8 @@ class EchoHull:
 
         Returns:
             clearance ((N,), m): Negative where a pose says that nothing is there, and below the
-                support; plus infinity where none speaks. Its slope is at most one. So many poses as :attr:`undetected` may
-                say so in vain.
+                support; plus infinity where none speaks. Its slope is at most one. So many poses
+                as :attr:`undetected` may say so in vain.
             pose (N,): The pose that says so.
         """
         where = np.asarray(points, dtype=np.float64)
