@@ -134,6 +134,7 @@ def onsets(
     levels: Levels,
     window: Floats | Callable[[int, int], Floats],
     fineness: float,
+    start: Floats | None = None,
 ) -> Floats:
     """Return where the first echo of each row is, in slices from the first one, (N,).
 
@@ -146,18 +147,21 @@ def onsets(
         window ((W,) float or callable): Power of a point echo over range, its own range in the
             middle; or what gives it for a row and the slice of its echo's greatest power.
         fineness: Spacing of its values in slices.
+        start (N,): Slice before which there is only clutter; none where None.
 
     Returns:
         onset (N,): Minus infinity where nothing was heard, or where the first slice cuts an echo
             that the first whole one does not exceed by the threshold factor.
     """
     found = np.full(len(power), -np.inf)
-    inner = (_is_top(power) & (power > levels.total))[:, 1:-1]
+    start = np.zeros(len(power)) if start is None else start
+    late = np.arange(power.shape[1]) >= start[:, None]
+    inner = (_is_top(power) & (power > levels.total) & late)[:, 1:-1]
     for row in np.flatnonzero(inner.any(axis=1)):
         top = int(inner[row].argmax()) + 1
         echo = power[row, : top + 1] / power[row, top]
         fraction = max(ONSET, float(levels.noise[row, 0]) / power[row, top])
-        before = np.flatnonzero(echo[:top] < fraction)
+        before = np.flatnonzero((echo[:top] < fraction) & late[row, :top])
         if len(before):  # else it began before the first slice
             rising, middle = _flank(window(int(row), top) if callable(window) else window)
             rise = middle - _crossing(rising, fraction)
@@ -226,12 +230,13 @@ def asked_poses(store: Ensemble) -> Ints:
     return np.asarray(train[chosen])
 
 
-def find_onsets(store: Ensemble, echo: PointEcho) -> Onsets:
+def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = None) -> Onsets:
     """Detect the echoes of a sealed ensemble's asked poses.
 
     Args:
         store: The ensemble.
         echo: What the analysis makes of one point.
+        nearest ((P, E), m): What is heard from before is clutter; all ranges count where None.
     """
     poses = asked_poses(store)
     axis = np.asarray(store.range, dtype=np.float64)
@@ -243,6 +248,10 @@ def find_onsets(store: Ensemble, echo: PointEcho) -> Onsets:
     levels = threshold_levels(power, echo.looks)
     step = float(axis[1] - axis[0])
     fineness = echo.spacing / step
+    start = np.zeros(power.shape[:2])
+    if nearest is not None:
+        start = np.ceil((nearest - axis[0]) / step).clip(0, len(axis) - 1)
+    begun = np.arange(len(axis)) >= start[..., None]
     found = []
     for ear in range(power.shape[1]):
 
@@ -251,6 +260,6 @@ def find_onsets(store: Ensemble, echo: PointEcho) -> Onsets:
 
         window = echo.window if echo.rows is None else own_window
         level = Levels(*(each[:, ear] for each in levels))
-        found.append(onsets(power[:, ear], level, window, fineness))
+        found.append(onsets(power[:, ear], level, window, fineness, start[:, ear]))
     first = axis[0] + step * np.stack(found, axis=1)
-    return Onsets(poses, axis, power, power > levels.total, first)
+    return Onsets(poses, axis, power, (power > levels.total) & begun, first)

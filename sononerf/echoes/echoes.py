@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import hashlib
 from functools import cached_property
@@ -14,8 +15,8 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from sononerf import storage
-from sononerf.array_types import Ints, Singles
-from sononerf.echoes.detection import Onsets, find_onsets
+from sononerf.array_types import Floats, Ints, Singles
+from sononerf.echoes.detection import Onsets, asked_poses, find_onsets
 from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
@@ -50,6 +51,7 @@ class Echoes(Shown):
         store: Poses, splits, axes and spectrograms, in memory or on disk.
         head: What heard them.
         hull: The free space, where it is known already; found from the onsets where None.
+        box ((2, 3), m): Lower and upper corner of where the body must be, see :meth:`within`.
 
     Attributes:
         positions ((P, 3), m): Of the head, world frame.
@@ -58,8 +60,14 @@ class Echoes(Shown):
             store has no validation poses, some of its training poses validate.
     """
 
-    def __init__(self, store: Ensemble, head: Head, hull: EchoHull | None = None) -> None:
-        self.store, self.head = store, head
+    def __init__(
+        self,
+        store: Ensemble,
+        head: Head,
+        hull: EchoHull | None = None,
+        box: Floats | None = None,
+    ) -> None:
+        self.store, self.head, self.box = store, head, box
         self.positions, self.rotations = store.positions, store.rotations
         training, validation = store.indices("train"), store.indices("val")
         if not len(validation) and len(training) > 1:
@@ -189,6 +197,21 @@ class Echoes(Shown):
                 written.write_pose(index, mine.read_pose(index))
             written.seal()
 
+    def within(self, box: ArrayLike) -> Echoes:
+        """Return the same echoes of a body that lies within a box.
+
+        What is heard before the box can answer is clutter: no onset. An onset that comes from no
+        place of the box tells nothing.
+
+        Args:
+            box ((2, 3), m): Lower and upper corner, world frame.
+        """
+        other = copy.copy(self)
+        other.box = np.asarray(box, dtype=np.float64)
+        for known in ("onsets", "hull", "region"):
+            other.__dict__.pop(known, None)
+        return other
+
     def __len__(self) -> int:
         return len(self.store)
 
@@ -252,7 +275,14 @@ class Echoes(Shown):
     @cached_property
     def onsets(self) -> Onsets:
         """Echoes that are detected at the training poses."""
-        return find_onsets(self.store, self.head.point_echo)
+        nearest = None
+        if self.box is not None:
+            poses = asked_poses(self.store)
+            emitters, ears = self.head.places(self.positions[poses], self.rotations[poses])
+            off = (emitters[:, None], ears)
+            ways = [np.linalg.norm(p - p.clip(*self.box), axis=-1) for p in off]
+            nearest = sum(ways) / 2.0 - self.head.resolution
+        return find_onsets(self.store, self.head.point_echo, nearest=nearest)
 
     @cached_property
     def hull(self) -> EchoHull:
@@ -268,7 +298,7 @@ class Echoes(Shown):
             within=head.row_gains.cone(WITNESS_GAIN),
             plane=head.plane,
         )
-        return weighted(hull, head.resolution)
+        return weighted(hull, head.resolution, self.box)
 
     @cached_property
     def region(self) -> EchoRegion:

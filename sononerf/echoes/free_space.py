@@ -29,6 +29,10 @@ UNDETECTED = 0.05
 """Fraction of the onsets that may be wrong together where a place is judged, and of outliers that
 are not detected per detected one, no unit. On a thin leaf, where every twelfth onset is late, 0.02
 blames right ones for ruling out what late ones hide."""
+SHARE = 0.5
+"""Onsets that rule a place out over those that lie at its range, no unit, up to which the former
+may all be late. Late onsets are none of their own: they lie at the ranges of many places. A faint
+tip in front of loud parts is heard by most poses at one place, and a fifth of them miss it."""
 AT_ONCE = 6_400_000
 """Points times first echoes, so that memory does not grow with the poses."""
 
@@ -197,6 +201,7 @@ def _possible(
     within: float,
     wanted: Bools,
     few: int,
+    share: float,
     reach: float,
 ) -> Bools:
     """Return the cells (N,) that few onsets rule out and that lie at the range of a wanted one.
@@ -205,12 +210,13 @@ def _possible(
         cells ((N, 3), m): Their middles.
         emitters, receivers, first, axes, within: As of :func:`_behind`.
         wanted (P, E): Which onsets are wanted.
-        few: So many onsets may rule a cell out.
+        few: So many onsets may rule a cell out, or
+        share: this fraction of those at whose range it lies.
         reach (m): How far a cell reaches.
     """
     found = np.zeros(len(cells), np.bool_)
     for n in range(len(cells)):
-        against, meets = 0, False
+        against, agree, meets = 0, 0, False
         for pose in range(len(first)):
             out = _distance(cells[n], emitters[pose])
             if _is_beside(cells[n], emitters[pose], axes[pose], within, out):
@@ -220,11 +226,10 @@ def _possible(
                 behind = 0.5 * (out + back) - first[pose, ear]
                 if behind < -reach:
                     against += 1
-                elif wanted[pose, ear] and behind <= reach:
-                    meets = True
-            if against > few:
-                break
-        found[n] = meets and against <= few
+                elif behind <= reach:
+                    agree += 1
+                    meets = meets or wanted[pose, ear]
+        found[n] = meets and against <= max(few, share * agree)
     return found
 
 
@@ -239,7 +244,7 @@ COARSE, MOST_PAIRS, LEVELS = 24, 1.2e8, 4
 OCTANTS = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def weighted(hull: EchoHull, resolution: float) -> EchoHull:
+def weighted(hull: EchoHull, resolution: float, within: Floats | None = None) -> EchoHull:
     """Return the hull with weight zero for onsets that the others contradict.
 
     A first echo comes from some place at its range that all other poses leave free to hold
@@ -252,14 +257,16 @@ def weighted(hull: EchoHull, resolution: float) -> EchoHull:
     and these, n of them, get a blame of 1/n. An onset is an outlier if its blame reaches the number
     of ears, as if it alone contradicted a whole pose. The most blamed ones, down to half of the
     greatest blame, are removed, and so on until none is left. An onset whose places are all ruled
-    out by more than a few is an outlier itself. Gross outliers go first, at a coarse look at
+    out by more than a few, and by more than half as many as agree on the place (``SHARE``), is an
+    outlier itself. Gross outliers go first, at a coarse look at
     places: fewer are then left to confuse a fine one.
 
     Args:
         hull: What the onsets leave.
         resolution (m): Range resolution.
+        within ((2, 3), m): Box that holds the body; found from the onsets where None.
     """
-    box, ears = _heard_box(hull), hull.first.shape[1]
+    box, ears = _heard_box(hull) if within is None else within, hull.first.shape[1]
     if box is None:
         return hull
     error = ACCURACY * resolution
@@ -267,11 +274,11 @@ def weighted(hull: EchoHull, resolution: float) -> EchoHull:
         reach = error * scale * 2.0 ** (LEVELS - 1)
         weight = np.array(hull.weight).reshape(-1)
         heard = np.flatnonzero(weight)
-        homeless = heard[~_cells(hull, box, heard, 0, error, reach)[1].any(axis=0)]
+        homeless = heard[~_cells(hull, box, heard, 0, 0.0, error, reach)[1].any(axis=0)]
         if len(homeless):
             few = max(int(UNDETECTED * scale * len(heard)), 4 * ears)
-            against, meets = _cells(hull, box, homeless, few, error, reach)
-            _remove(weight, homeless, against, meets, few, float(ears))
+            against, meets = _cells(hull, box, homeless, few, SHARE, error, reach)
+            _remove(weight, homeless, against, meets, float(ears))
             hull = replace(hull, weight=weight.reshape(hull.first.shape))
     return hull
 
@@ -281,15 +288,15 @@ def _remove(
     homeless: NDArray[np.intp],
     against: Bools,
     meets: Bools,
-    few: int,
     enough: float,
 ) -> None:
     """Set the weight of outliers to zero; arrays as of ``_cells``."""
     count = against.sum(axis=1).astype(int)
     blocks = sparse.csr_matrix(against.astype(np.float64))
     while True:
-        least = np.where(meets, count[:, None], few + 1).min(axis=0, initial=few + 1)
-        asks = np.flatnonzero((least > 0) & (least <= few) & (weight[homeless] > 0))
+        nowhere = len(weight) + 1
+        least = np.where(meets, count[:, None], nowhere).min(axis=0, initial=nowhere)
+        asks = np.flatnonzero((least > 0) & (least < nowhere) & (weight[homeless] > 0))
         if not len(asks):
             break
         origins = sparse.csr_matrix(
@@ -303,7 +310,7 @@ def _remove(
             break
         weight[worst] = 0.0
         count -= against[:, worst].sum(axis=1)
-    weight[homeless[least > few]] = 0.0
+    weight[homeless[least == nowhere]] = 0.0
 
 
 def _heard_box(hull: EchoHull) -> Floats | None:
@@ -321,9 +328,15 @@ def _heard_box(hull: EchoHull) -> Floats | None:
 
 
 def _cells(
-    hull: EchoHull, box: Floats, wanted: NDArray[np.intp], few: int, error: float, least: float
+    hull: EchoHull,
+    box: Floats,
+    wanted: NDArray[np.intp],
+    few: int,
+    share: float,
+    error: float,
+    least: float,
 ) -> tuple[Bools, Bools]:
-    """Return cells at the range of wanted onsets that at most a few others rule out.
+    """Return cells at the range of wanted onsets that few others rule out, see ``_possible``.
 
     They are halved until half their diagonal is the least, m.
 
@@ -342,7 +355,7 @@ def _cells(
         of_wanted = is_wanted.reshape(hull.first.shape)
         if hull.plane is not None:
             cells = cells[hull.plane.height(cells) > -reach]
-        cells = cells[_possible(cells, *hull._onsets, of_wanted, few, reach)]
+        cells = cells[_possible(cells, *hull._onsets, of_wanted, few, share, reach)]
         finer = 8.0 * len(cells) * hull.first.size
         if reach <= least + error or finer > MOST_PAIRS or not len(cells):
             break

@@ -174,7 +174,9 @@ class EchoModule(lightning.LightningModule):
         expect(echoes, Echoes, "echoes")
         if region is None:
             region = field.region if isinstance(field, Field) else echoes.region.box()
-        found = echoes.region
+            found = echoes.region
+        else:
+            found = (echoes if echoes.box is not None else echoes.within(region)).region
 
         def possible(places: Tensor, tolerance: float) -> Tensor:
             left = found.possible(places.cpu().double().numpy(), tolerance)

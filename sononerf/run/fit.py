@@ -243,6 +243,8 @@ def _fit(
 ) -> None:
     keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
     lower, upper = settings.region.lower, settings.region.upper
+    if lower is not None and upper is not None:
+        echoes = echoes.within((lower, upper))
     with faults_of(settings.source):
         module = EchoModule.for_echoes(
             echoes,

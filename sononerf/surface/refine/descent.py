@@ -39,6 +39,9 @@ TANGENT = 0.2
 """Part of the way to the neighbours' mean along the surface, each step; keeps triangles even."""
 SIGHT = 4
 """Steps for which the search structure of visibility is kept."""
+STANDS = 0.1
+"""Height over the support up to which a vertex stays on it, edges: surfaces are cut there to a small
+part of an edge."""
 NEAR = 0.5
 """A pose supports a vertex whose fade and spread at the lowest frequency are above this."""
 
@@ -92,6 +95,8 @@ class Descent:
         self._sight: Occlusion | None = None
         self._later, self._correction, self._onsets = later, correction, onsets
         self.rate = rate
+        if optics.plane is not None:  # nothing below it is body, and what stands on it stays there
+            self._stands = optics.plane.height(self.vertices) < STANDS * edge
         self._sides = Sides(mesh, APART * optics.wavelength) if sheet else None
 
     def mesh(self) -> trimesh.Trimesh:
@@ -127,9 +132,10 @@ class Descent:
         self.vertices = self.operators.relaxed(self.vertices, normals, TANGENT)
         if self._sides is not None:
             self.vertices = self._sides.apart(self.vertices, normals)
-        if (plane := self.optics.plane) is not None:  # nothing below it is body
-            below = plane.height(self.vertices).clamp_max(0.0)[:, None]
-            self.vertices = self.vertices - below * torch.tensor(plane.normal).to(self.vertices)
+        if (plane := self.optics.plane) is not None:
+            height = plane.height(self.vertices)
+            off = torch.where(self._stands, height, height.clamp_max(0.0))[:, None]
+            self.vertices = self.vertices - off * torch.tensor(plane.normal).to(self.vertices)
         return error
 
     def render(self, numbers: list[int]) -> tuple[Heard | None, Tensor, Tensor]:

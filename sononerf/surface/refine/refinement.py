@@ -191,8 +191,9 @@ class Refinement:
         if self.way == "sheet":
             return self.starts["sheet"] if self.stage == 0 else self.candidates[-1]
         edge, blur = (SHARP, 0.0) if self.way == "sharp" else (stage.edge, stage.blur)
-        made = remesh(self.candidates[-1], min(edge, stage.edge) * unit, blur * unit)
-        return self.candidates[-1] if made is None else made
+        before, plane = self.candidates[-1], self.optics.plane
+        made = remesh(before, min(edge, stage.edge) * unit, blur * unit, plane)
+        return before if made is None else made
 
     def _finish(self, mismatch: float) -> None:
         """End a stage; the first one is done in each way."""

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from sononerf.array_types import Floats, Singles
 from sononerf.geometry.lattice import level_surface, signed_volume
+from sononerf.geometry.plane import Plane
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
 
 CELL = 1.1
@@ -34,7 +35,9 @@ CHORD = 0.005
 triangles are divided."""
 
 
-def remesh(mesh: trimesh.Trimesh, edge: float, blur: float = 0.0) -> trimesh.Trimesh | None:
+def remesh(
+    mesh: trimesh.Trimesh, edge: float, blur: float = 0.0, plane: Plane | None = None
+) -> trimesh.Trimesh | None:
     """Return a surface with even triangles.
 
     Args:
@@ -42,6 +45,7 @@ def remesh(mesh: trimesh.Trimesh, edge: float, blur: float = 0.0) -> trimesh.Tri
         edge (m): Mean length of the edges.
         blur (m): Standard deviation of a Gaussian over the signed distance; it removes dents, bumps
             and necks of this size.
+        plane: The support: what stands on it keeps standing, for it is blurred with its image.
 
     Returns:
         surface: None where the mesh is open or would lose thin parts, or nothing is left.
@@ -49,9 +53,17 @@ def remesh(mesh: trimesh.Trimesh, edge: float, blur: float = 0.0) -> trimesh.Tri
     if not mesh.is_watertight or not len(mesh.faces):
         return None
     spacing = CELL * edge
-    lower, distance = signed_distance(mesh, spacing, margin=2 * BAND + round(2 * blur / spacing))
+    whole = mesh if plane is None else plane.with_image(mesh)[0]
+    if not whole.is_watertight:
+        return None
+    lower, distance = signed_distance(whole, spacing, margin=2 * BAND + round(2 * blur / spacing))
     if blur:
         distance = ndimage.gaussian_filter(distance, blur / spacing)
+    if plane is not None:
+        places = lower + spacing * np.argwhere(np.ones(distance.shape, dtype=bool))
+        below = -plane.height(places).reshape(distance.shape)
+        distance = np.maximum(distance, below.astype(np.float32))
+        distance = np.where(np.abs(distance) < 1e-3 * spacing, 1e-3 * spacing, distance)
     if not (distance < 0).any():
         return None
     found = level_surface(distance, 0.0, lower, spacing)
