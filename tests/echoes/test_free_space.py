@@ -11,6 +11,7 @@ from scipy.spatial.distance import cdist
 from sononerf.echoes import free_space as hull_module
 from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.geometry.plane import Plane
 
 AHEAD = np.array([1.0, 0.0, 0.0])
 
@@ -336,3 +337,27 @@ def test_a_world_three_times_as_large_has_the_same_outliers(hull):
     np.testing.assert_array_equal(
         weighted(large, 3 * RESOLUTION).weight, weighted(late, RESOLUTION).weight
     )
+
+
+def test_a_tip_that_a_quarter_of_the_poses_miss_is_kept():
+    """A ball with a faint tip: those that miss it hear the ball behind it."""
+    poses, tip, radius = 0.4 * fibonacci_sphere(200), np.array([0.0, 0.0, 0.06]), 0.02
+    ball = np.linalg.norm(poses, axis=1) - radius
+    ahead = np.linalg.norm(poses - tip, axis=1)
+    hears = ahead < ball
+    missing = hears & (np.arange(200) % 4 == 0)
+    assert missing.sum() > 0.05 * 200  # more than are taken for undetected
+    first = np.where(hears & ~missing, ahead, ball)
+    hull = hull_of(poses, poses[:, None], first, -poses / 0.4)
+    found = weighted(hull, RESOLUTION)
+    np.testing.assert_array_equal(found.weight[:, 0] == 0.0, missing)
+    assert found.clearance([tip])[0] > -0.2 * RESOLUTION
+
+
+def test_nothing_is_below_a_support():
+    plane = Plane.through(np.array([0.0, 0.0, -0.01]), AHEAD[[2, 1, 0]])
+    far = hull_of([[0.5, 0.0, 0.5]], [[[0.5, 0.0, 0.5]]], [0.1])
+    found = dataclasses.replace(far, plane=plane)
+    points = np.array([[0.0, 0.0, -0.03], [0.0, 0.0, 0.02]])
+    np.testing.assert_allclose(found.clearance(points)[0], [-0.02, 0.03], atol=1e-12)
+    assert (far.clearance(points)[0] > 0.03).all()

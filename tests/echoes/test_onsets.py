@@ -62,6 +62,17 @@ def test_what_is_not_heard_is_unknown():
     assert not heard.heard[1].any()
 
 
+def test_what_is_heard_before_the_nearest_place_is_clutter():
+    both = [echo(0.26) + echo(0.32, 0.1)] * 2
+    whole = find_onsets(store_of([both, both]), ECHO)
+    np.testing.assert_allclose(whole.first, 0.26, atol=1e-4)
+    nearest = np.array([[0.30, 0.30], [0.20, 0.35]])
+    heard = find_onsets(store_of([both, both]), ECHO, nearest=nearest)
+    np.testing.assert_allclose(heard.first, [[0.32, 0.32], [0.26, -np.inf]], atol=1e-4)
+    assert not heard.heard[0][:, RANGE < 0.30].any()
+    np.testing.assert_array_equal(heard.power, whole.power)
+
+
 def test_only_training_poses_are_asked():
     poses = {1: [echo(0.3)] * 2, 4: [echo(0.35)] * 2}
     heard = find_onsets(store_of(poses, train=[1, 4]), ECHO)

@@ -6,8 +6,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import IncompatibleError, InputError, LockedError, NumericalError
+from sononerf.errors import (
+    IncompatibleError,
+    InputError,
+    LockedError,
+    NumericalError,
+    SettingsError,
+)
 from sononerf.run.import_recordings import check_before, describe, draw, import_understood
 from sononerf.run.understand import understand
 from sononerf.storage import lock
@@ -39,13 +46,30 @@ def test_a_store_knows_all_that_a_fit_needs(brought):
     assert verdict.message == ""
     assert (len(store), store.receivers, store.missing(), store.check()) == (24, 2, [], [])
     assert (known["origin"], known["source"], known["licence"]) == ("recorded", "by formula", "CC0")
-    assert set(known["settings"]) == {"air", "ears", "call", "spectrogram"}
+    assert set(known["settings"]) == {"air", "ears", "call", "spectrogram", "support"}
+    assert Echoes.open(store.path).head.plane is None
     assert known["settings"]["spectrogram"]["sampling_rate"] == 250e3
     assert known["settings"]["call"]["kind"] == "linear"
     assert known["speed_of_sound"] == 343.0
     assert known["noise_floor_mae_db"] is None
     loudest = max(store.read_pose(int(i)).max() for i in store.indices("train"))
     assert known["reference"] == pytest.approx(1e-3 * loudest)
+
+
+def test_a_turntable_is_a_support(brought, tmp_path):
+    """Its height is stated in the import or in a section of its own; the store knows it."""
+    angle = np.arange(24) * 15.0
+    table = {"position_mm": None, "euler_deg": None, "angle_deg": angle, "height_mm": 0 * angle}
+    stated = "import.turntable={radius: 0.3, surface: -0.05}"
+    store, _ = brought(stated, output="one", **table)
+    plane = Echoes.open(store.path).head.plane
+    assert (plane.point, plane.normal) == ((0.0, 0.0, -0.05), (0.0, 0.0, 1.0))
+    own, _ = brought(
+        "import.turntable={radius: 0.3}", "support.point=[0, 0, -0.05]", output="two", **table
+    )
+    assert Echoes.open(own.path).head.plane == plane
+    with pytest.raises(SettingsError, match=r"support: normal gives no direction"):
+        brought("support.normal=[0, 0, 0]", output="three")
 
 
 def test_echoes_are_where_the_target_is(brought):

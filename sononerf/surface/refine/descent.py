@@ -59,6 +59,7 @@ class Descent:
         correction: Of the start, by the simulator.
         onsets: Where the surface must begin.
         sheet: Whether it is a sheet, whose sides are kept apart.
+        band: Of a :class:`Stage`.
         seed: Of poses and rays.
     """
 
@@ -75,6 +76,7 @@ class Descent:
         correction: Correction | None = None,
         onsets: OnsetRanges | None = None,
         sheet: bool = False,
+        band: float = 0.0,
         seed: int,
     ) -> None:
         self.echoes, self.optics, self.level, self.seed = echoes, optics, level, seed
@@ -94,7 +96,7 @@ class Descent:
         self._start = self._seen = self.vertices
         self._sight: Occlusion | None = None
         self._later, self._correction, self._onsets = later, correction, onsets
-        self.rate = rate
+        self.rate, self.band = rate, band
         if optics.plane is not None:  # nothing below it is body, and what stands on it stays there
             self._stands = optics.plane.height(self.vertices) < STANDS * edge
         self._sides = Sides(mesh, APART * optics.wavelength) if sheet else None
@@ -175,7 +177,9 @@ class Descent:
         corrected = None
         if self._correction is not None:
             corrected = self._correction.magnitudes(numbers, heard)
-        errors = mismatch(heard, later, found, self.level, corrected=corrected, learn=True)
+        errors = mismatch(
+            heard, later, found, self.level, corrected=corrected, learn=True, band=self.band
+        )
         errors.mean().backward()
         moved = self.vertices.clone().requires_grad_(True)
         to_points, to_areas = points.grad, areas.grad
@@ -279,6 +283,9 @@ class Stage:
         blur: Of the signed distance before the stage.
         rate: Length of the first steps, smoothing lengths.
         steps: Of descent.
+        band: Over how much of the frequencies power is averaged before it is compared, 0 to 1. A
+            surface that is off by more than a fraction of a wavelength interferes in other ways
+            than the true one; averaged, it shows how much comes from which range.
         beyond: What is added to the first bounce by physical optics: nothing; the power of later
             bounces, traced off the surface that the stage starts from, or those that were traced
             last; or the correction by the simulator, see :mod:`sononerf.surface.refine.correction`.
@@ -290,12 +297,13 @@ class Stage:
     rate: float
     steps: int
     beyond: Literal["none", "trace", "keep", "simulate"]
+    band: float = 0.0
 
 
 STAGES = (
-    Stage(smoothing=2.4, edge=0.8, blur=1.2, rate=0.08, steps=40, beyond="none"),
-    Stage(smoothing=2.4, edge=0.8, blur=0.6, rate=0.08, steps=30, beyond="trace"),
-    Stage(smoothing=2.0, edge=0.8, blur=0.6, rate=0.06, steps=30, beyond="keep"),
+    Stage(smoothing=2.4, edge=0.8, blur=1.2, rate=0.08, steps=40, beyond="none", band=1.0),
+    Stage(smoothing=2.4, edge=0.8, blur=0.6, rate=0.08, steps=30, beyond="trace", band=1.0),
+    Stage(smoothing=2.0, edge=0.8, blur=0.6, rate=0.06, steps=30, beyond="keep", band=0.33),
     Stage(smoothing=1.5, edge=0.7, blur=0.4, rate=0.04, steps=30, beyond="trace"),
     Stage(smoothing=1.0, edge=0.6, blur=0.2, rate=0.02, steps=30, beyond="keep"),
     Stage(smoothing=0.7, edge=0.5, blur=0.0, rate=0.02, steps=40, beyond="simulate"),

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
@@ -102,6 +102,7 @@ def mismatch(
     *,
     corrected: tuple[Tensor, Tensor] | None = None,
     learn: bool,
+    band: float = 0.0,
 ) -> Tensor:
     """Mean absolute difference in compressed decibels over the active cells of each pose (P,).
 
@@ -114,9 +115,14 @@ def mismatch(
             difference in decibels is added to what is rendered. Cells count less, the larger it is;
             the frequencies' weights are not needed then.
         learn: Whether gains and errors are brought up to date.
+        band: Power is averaged over so much of the frequencies first, 0 to 1.
     """
     magnitude, inside, loudest = found
     power = heard.power if later is None else heard.power + later
+    if band:
+        gained = level.gain.mul(2.0).exp()[:, None]
+        power = over_band(power * gained, band) / gained
+        magnitude = over_band(magnitude.square(), band).sqrt()
     tiny = (1e-6 * loudest.clamp_min(1e-30)).square()[:, None, None, None]
     gain = level.gain.exp()[:, None]
     rendered = torch.sqrt(power + tiny) * gain
@@ -137,6 +143,15 @@ def mismatch(
         weight = active * weight
         weight = weight / weight.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
     return ((a - b).abs() * weight).sum((1, 2, 3))
+
+
+def over_band(power: Tensor, part: float) -> Tensor:
+    """Return power (P, E, W, F) averaged over the frequencies around, a part of all of them."""
+    half = round(part * power.shape[3]) // 2
+    if not half:
+        return power
+    rows = nn.functional.pad(power.flatten(0, 1), (half, half), mode="replicate")
+    return nn.functional.avg_pool1d(rows, 2 * half + 1, 1).unflatten(0, power.shape[:2])
 
 
 def _learn(

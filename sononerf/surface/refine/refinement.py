@@ -41,8 +41,9 @@ SIMULATED = 96
 """Training poses for which a surface is simulated; each is drawn about three times."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
 TOLERATED = 1.15
-"""Objectives of validation poses that differ by less than this factor differ by chance. A later
-stage, and a sheet, are preferred up to it."""
+"""Objectives of validation poses that differ by less than this factor differ by chance. Up to it a
+later stage is preferred, and after the first stage a sheet, or else the blurred surface: of two that
+explain as much the smoother one."""
 STATE_VERSION = 2
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
 Way = Literal["blurred", "sharp", "sheet"]
@@ -223,6 +224,8 @@ class Refinement:
         """Go on in the best way; return what the first stage made in it, and its objective."""
         found = [one["objective_db"] for one in self.history]
         best = int(np.argmin(found))
+        if self.ways[0] == "blurred" and found[0] <= TOLERATED * found[best]:
+            best = 0
         if self.ways[-1] == "sheet" and found[-1] <= TOLERATED * found[best]:
             best = len(found) - 1
             if self.start != "sheet":
@@ -282,6 +285,7 @@ class Refinement:
             # The simulator's correction is more exact than the onsets.
             onsets=None if correction is not None else self.onsets,
             sheet=self.way == "sheet",
+            band=stage.band,
             seed=self.seed,
         )
 
