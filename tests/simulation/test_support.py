@@ -20,7 +20,7 @@ TABLE = {"point": (0.0, 0.0, -0.01)}
 OPEN = {"directivity": "omnidirectional", "beam_radius": 0.0}
 PLACE = np.array([0.25, 0.1, 0.2])
 TURN = look_at(PLACE, np.array([0.0, 0.0, 0.01]))
-IMAGE = PLACE * [1.0, 1.0, -1.0] - [0.0, 0.0, 0.02]
+IMAGE = PLACE * np.array([1.0, 1.0, -1.0]) - np.array([0.0, 0.0, 0.02])
 BALL, BELOW = ball(0.012, (0.0, 0.0, 0.01)), ball(0.012, (0.0, 0.0, -0.03))
 
 
@@ -37,7 +37,7 @@ def ears(emitter, *receivers):
 
 
 def test_echoes_are_those_of_the_body_and_its_image_for_the_emitter_and_its_image():
-    ear = PLACE + [0.0, 0.03, 0.02]
+    ear = PLACE + np.array([0.0, 0.03, 0.02])
     on_table = heard(BALL, Head(ears(PLACE, ear), support=TABLE), "spheres")
     two = trimesh.util.concatenate([BALL, BELOW])
     parts = [heard(two, Head(ears(emitter, ear)), "spheres") for emitter in (PLACE, IMAGE)]

@@ -41,6 +41,11 @@ PROCEDURAL = range(100, 120)
 """Seeds of shapes on which nothing was settled."""
 NEW = ("beaker", "cone", "rings", "tower", "blob", "stool", "helix")
 
+ABOVE = ("poses.arrangement=cap", "poses.axis=[0,0,1]", "poses.half_angle_deg=70")
+"""Poses as a hand or a robot reaches above a table."""
+STANDING = {"sphere": -0.015, "cone": -0.045, "rabbit": -0.0603}
+"""Scenes that are heard on a table and without it, and the height of their lowest point, m."""
+
 
 @dataclass(frozen=True)
 class Case:
@@ -50,11 +55,13 @@ class Case:
         name: Of the row, and of its folder up to the seed.
         settings: ``KEY=VALUE``, laid over the defaults.
         repeated: Whether it is fitted with every seed, and not with the first alone.
+        config: File of ``configs/`` that the settings are laid over.
     """
 
     name: str
     settings: tuple[str, ...]
     repeated: bool = False
+    config: str = "three_spheres"
 
 
 CASES = (
@@ -74,6 +81,12 @@ CASES = (
     Case("noisy-rays", (SPHERES, "simulation.engine=rays", "noise.snr_db=20")),
     Case("exact", (SPHERES, "poses.count=100", "spectrogram.frequency_max=80e3")),
     *(Case(name, (f"scene.name={name}",)) for name in NEW),
+    Case("control", (), config="rabbit"),
+    *(
+        Case(f"{name}-{where}", (f"scene.name={name}", *ABOVE, *support))
+        for name, lowest in STANDING.items()
+        for where, support in (("free", ()), ("on-table", (f"support.point=[0,0,{lowest}]",)))
+    ),
 )
 
 
@@ -153,7 +166,12 @@ class _Experiment:
         """Run it, unless it has been run, and return its line."""
         try:
             metrics = run_experiment(
-                self.folder, self.data, self.settings, enough="prediction", store=self._store()
+                self.folder,
+                self.data,
+                self.settings,
+                config=CONFIG.with_name(f"{self.case.config}.yaml"),
+                enough="prediction",
+                store=self._store(),
             )
         except RuntimeError as error:
             return {**self.head, **origin(), "failed": str(error)}
