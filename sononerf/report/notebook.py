@@ -136,7 +136,7 @@ def _(thing: Surface) -> Rows:
 @png_of.register
 def _(thing: Surface, **options: Any) -> bytes | None:
     del options
-    seen = thing.support
+    seen = thing.confidence
     return mesh_png(thing.mesh) if seen is None else confidence_png(thing.mesh, seen)
 
 

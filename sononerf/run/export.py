@@ -21,7 +21,7 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
 from sononerf.geometry.poses import Poses
 from sononerf.run.run_folder import RunFolder
-from sononerf.surface.mesh_files import support_of
+from sononerf.surface.mesh_files import confidence_of
 
 FileType = Literal["mat", "h5", "nc"]
 
@@ -273,7 +273,7 @@ def _volume(source: Path) -> Part:
 
 def _points(source: Path) -> Part:
     mesh = RunFolder(source).mesh()
-    heard = support_of(mesh)
+    heard = confidence_of(mesh)
     if heard is None:
         heard = np.zeros(len(mesh.vertices), np.int32)
     return {

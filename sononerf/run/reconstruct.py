@@ -198,7 +198,7 @@ def _has_echoes(run: RunFolder, progress: Progress) -> bool:
 
 
 def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None) -> None:
-    mesh, seen = surface.mesh, surface.support
+    mesh, seen = surface.mesh, surface.confidence
     assert surface.volume is not None  # it was read out of a field
     for kind in FORMATS:
         storage.commit_bytes(folder / f"mesh.{kind}", surface.file(kind))

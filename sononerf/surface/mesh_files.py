@@ -70,7 +70,7 @@ def _carry(mesh: trimesh.Trimesh, file_type: MeshFormat, poses: NDArray[Any]) ->
     )
 
 
-def support_of(mesh: trimesh.Trimesh) -> NDArray[np.int32] | None:
+def confidence_of(mesh: trimesh.Trimesh) -> NDArray[np.int32] | None:
     """Return how many poses heard each vertex (V,) of a mesh that was read from a PLY file.
 
     None where the file does not say.

@@ -169,7 +169,7 @@ def refine(
         refined.start,
         reading,
         echoes=echoes,
-        support=refined.support.round().astype(np.int32),
+        confidence=refined.confidence.round().astype(np.int32),
         refined=refined.kept,
         error_db=refined.error_db if math.isfinite(refined.error_db) else None,
         faults=refined.faults,

@@ -43,7 +43,7 @@ class Surface(Shown):
         method: How the surface was found, or the start that was refined.
         level: Of an iso-surface, in the unit of the volume; None for other methods.
         openness: What kind of surface it is; None for an iso-surface and for one of your own.
-        support ((V,) int32 or None): How many poses heard the surface around each vertex.
+        confidence ((V,) int32 or None): How many poses heard the surface around each vertex.
         refined: True where the refined mesh explains the validation poses better than its start.
         error_db (dB): Objective of the refinement on validation poses; None without a refinement.
         faults: What went wrong in the refinement, one line each.
@@ -60,7 +60,7 @@ class Surface(Shown):
     method: Method = "filled"
     level: float | None = None
     openness: Openness | None = None
-    support: NDArray[np.int32] | None = None
+    confidence: NDArray[np.int32] | None = None
     refined: bool = False
     error_db: float | None = None
     faults: Sequence[str] = ()
@@ -74,7 +74,7 @@ class Surface(Shown):
             raise InputError("the mesh has no triangles, or a vertex is not finite")
 
     def save(self, path: Path | str) -> None:
-        """Write the mesh, m: PLY (with normals and support), STL or GLB, by the name's ending.
+        """Write the mesh, m: PLY (with normals and confidence), STL or GLB, by the name's ending.
 
         Args:
             path: The file; one that is there is replaced whole.
@@ -91,7 +91,7 @@ class Surface(Shown):
 
     def file(self, kind: MeshFormat) -> bytes:
         """Return the mesh as the bytes of a file, see :meth:`save`."""
-        return mesh_bytes(self.mesh, kind, confidence=self.support)
+        return mesh_bytes(self.mesh, kind, confidence=self.confidence)
 
 
 def finished_surface(
@@ -100,7 +100,7 @@ def finished_surface(
     reading: FieldReading | None,
     *,
     echoes: Echoes | None = None,
-    support: NDArray[np.int32] | None = None,
+    confidence: NDArray[np.int32] | None = None,
     refined: bool = False,
     error_db: float | None = None,
     faults: Sequence[str] = (),
@@ -113,16 +113,17 @@ def finished_surface(
         mesh: A start surface or a refined one, m.
         method: How its start was found.
         reading: Evidence that the start was made of; without it the mesh stays whole.
-        support ((V,) int32): How many poses heard each vertex; counted in the evidence where None.
+        confidence ((V,) int32): How many poses heard each vertex; counted in the evidence where
+            None.
         echoes, refined, error_db, faults: As of :class:`Surface`.
     """
     known: dict[str, Any] = {"echoes": echoes, "reading": reading}
     known |= {"refined": refined, "error_db": error_db, "faults": faults}
     if reading is None:
-        return Surface(mesh, None, method, support=support, **known)
+        return Surface(mesh, None, method, confidence=confidence, **known)
     found = reading.gathered
-    if support is None:
-        support = poses_that_heard(mesh, found.evidence, found.resolution)
+    if confidence is None:
+        confidence = poses_that_heard(mesh, found.evidence, found.resolution)
     openness = judge_openness(mesh, found.hull.sources, resolution=found.resolution)
     if openness.kind == "one-sided":
         reliable = found.evidence.where(found.weight > QUIET)
@@ -132,8 +133,8 @@ def finished_surface(
         if (part & ~openness.unseen).any():
             openness = leaving_out(openness, ~part, mesh.area_faces)
         used = np.unique(mesh.faces[~openness.unseen])
-        mesh, support = without_unseen(mesh, openness), support[used]
-    return Surface(mesh, reading.volume, method, openness=openness, support=support, **known)
+        mesh, confidence = without_unseen(mesh, openness), confidence[used]
+    return Surface(mesh, reading.volume, method, openness=openness, confidence=confidence, **known)
 
 
 FACING = 0.1

@@ -24,7 +24,7 @@ def test_an_opened_run_has_its_parts(run, no_projections):
     assert opened.head is opened.model.head
     assert opened.metrics["prediction"]["poses"] == 2
     assert "prediction mae_db" in str(opened.metrics)
-    assert len(opened.surface.support) == len(opened.surface.mesh.vertices)
+    assert len(opened.surface.confidence) == len(opened.surface.mesh.vertices)
     assert "mae_db" in opened._repr_html_()
     heard = opened.predict(opened.echoes.poses("test"), progress=QUIET)
     stored = np.load(run / "prediction" / "spectrograms.npz")

@@ -49,7 +49,7 @@ def test_echoes_are_those_of_the_body_and_its_image_for_the_emitter_and_its_imag
 def test_the_beam_of_an_image_is_mirrored():
     """What the image sends to a point is what the emitter sends to the image of the point."""
     head = Head({**OPEN, "emitter": (0.01, 0.0, 0.0), "beam_radius": 0.02}, support=TABLE)
-    points = np.random.default_rng(0).uniform(-0.05, 0.05, (20, 3)) + [0.0, 0.0, 0.05]
+    points = np.random.default_rng(0).uniform((-0.05, -0.05, 0.0), (0.05, 0.05, 0.1), (20, 3))
     hearing = hearing_of(head)
     emitter, ears = hearing.places(PLACE, TURN)
     image, same = hearing.from_image.places(PLACE, TURN)

@@ -363,7 +363,7 @@ def test_a_read_out_loses_what_no_pose_can_have_heard(read):
     assert len(found.mesh.faces) == (~found.openness.unseen).sum() < 5120
     assert found.mesh.vertices[:, 0].min() > -0.6 * RADIUS
     # Each vertex keeps its own number of poses.
-    np.testing.assert_array_equal(sphere().vertices[found.support], found.mesh.vertices)
+    np.testing.assert_array_equal(sphere().vertices[found.confidence], found.mesh.vertices)
 
 
 def test_a_wall_of_the_region_is_no_part_of_a_read_out(read, monkeypatch):

@@ -40,8 +40,8 @@ TANGENT = 0.2
 SIGHT = 4
 """Steps for which the search structure of visibility is kept."""
 STANDS = 0.1
-"""Height over the support up to which a vertex stays on it, edges: surfaces are cut there to a small
-part of an edge."""
+"""Height over the support up to which a vertex stays on it, edges: surfaces are cut there to within
+a small part of an edge."""
 NEAR = 0.5
 """A pose supports a vertex whose fade and spread at the lowest frequency are above this."""
 

@@ -42,8 +42,8 @@ SIMULATED = 96
 Simulate = Callable[[trimesh.Trimesh], Simulator]
 TOLERATED = 1.15
 """Objectives of validation poses that differ by less than this factor differ by chance. Up to it a
-later stage is preferred, and after the first stage a sheet, or else the blurred surface: of two that
-explain as much the smoother one."""
+later stage is preferred, and after the first stage a sheet, or else the blurred surface: of two
+that explain as much the smoother one."""
 STATE_VERSION = 2
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
 Way = Literal["blurred", "sharp", "sheet"]
@@ -59,7 +59,7 @@ class Refined:
     Attributes:
         mesh: m.
         gain (E, F): What rendered magnitudes are multiplied by, learned on training poses.
-        support (V,): How many training poses see each vertex near the direction of a mirror.
+        confidence (V,): How many training poses see each vertex near the direction of a mirror.
         start: Name of the start that was refined.
         kept: True where the refined surface explains the validation poses better than the start.
         error_db: Objective on validation poses, see
@@ -72,7 +72,7 @@ class Refined:
 
     mesh: trimesh.Trimesh
     gain: Floats
-    support: Floats
+    confidence: Floats
     start: StartMethod
     kept: bool
     error_db: float
@@ -376,14 +376,14 @@ class Refinement:
         better = [n for n, found in enumerate(self.objectives) if found < self.objectives[0]]
         best = max([n for n in better if self.objectives[n] <= good], default=0)
         mesh = self.candidates[best]
-        support = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
+        confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
         if best:
-            mesh, support = finer(mesh, support, self.optics.wavelength)
+            mesh, confidence = finer(mesh, confidence, self.optics.wavelength)
         gain = self.level.gain.exp().cpu().double().numpy()
         assert self.start is not None
         error = self.objectives[best]
         kept = best > 0
-        return Refined(mesh, gain, support, self.start, kept, error, self.history, self.faults)
+        return Refined(mesh, gain, confidence, self.start, kept, error, self.history, self.faults)
 
 
 def _meshes(state: dict[str, Tensor], name: str) -> list[trimesh.Trimesh]:

@@ -81,7 +81,7 @@ def bumpy():
 def test_a_bumpy_sphere_becomes_round(bumpy, echoes, optics):
     found = refined(bumpy, echoes, optics)
     assert found.kept
-    assert len(found.support) == len(found.mesh.vertices)
+    assert len(found.confidence) == len(found.mesh.vertices)
     assert found.gain.shape == (2, len(optics.frequencies))
     assert [(one["stage"], one["way"]) for one in found.history][:2] == [
         (0, "blurred"),

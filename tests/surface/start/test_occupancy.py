@@ -65,7 +65,7 @@ def hull_of(places, sources):
     return EchoHull(sources, sources[:, None], first, -sources / FAR)
 
 
-def support_of(known, found):
+def confidence_of(known, found):
     return poses_that_heard(found, known.evidence, RESOLUTION)
 
 
@@ -101,8 +101,8 @@ def test_two_spheres_are_two_although_the_onsets_leave_a_bridge(two):
 
 def test_every_vertex_says_how_many_poses_heard_it(two):
     found = estimate_occupancy(two, "open")
-    assert support_of(two, found).shape == (len(found.vertices),)
-    assert np.median(support_of(two, found)) >= 3
+    assert confidence_of(two, found).shape == (len(found.vertices),)
+    assert np.median(confidence_of(two, found)) >= 3
 
 
 def test_a_flat_face_that_nobody_faces_lies_along_the_onsets():
@@ -116,7 +116,7 @@ def test_a_flat_face_that_nobody_faces_lies_along_the_onsets():
     found = estimate_occupancy(known, "filled")
     assert found.body_count == 1
     assert found.volume == pytest.approx(box.volume, rel=0.25)
-    assert (support_of(known, found) == 0).all()
+    assert (confidence_of(known, found) == 0).all()
 
 
 def test_a_sheet_is_one_thin_solid_with_two_sides():
@@ -176,7 +176,7 @@ def test_a_part_that_no_pose_hears_stays_in_the_hull_alone():
     known = gathered(*one, hull=hull_of(both[0], around(600)), sources=around(600))
     hull = estimate_occupancy(known, "hull")
     assert hull.bounds[1, 0] == pytest.approx(0.025 + RADIUS, abs=SPACING)
-    assert (support_of(known, hull)[hull.vertices[:, 0] > 0.025] == 0).all()
+    assert (confidence_of(known, hull)[hull.vertices[:, 0] > 0.025] == 0).all()
 
 
 def test_a_crumb_that_is_full_of_evidence_does_not_remove_the_body():

@@ -113,8 +113,8 @@ def test_the_surface_of_the_occupancy_is_the_sphere_and_says_who_heard_it(method
     assert np.abs(radii(found.mesh) - RADIUS).mean() < 0.8e-3
     assert found.mesh.is_watertight
     assert found.openness.kind == "closed"
-    assert found.support.shape == (len(found.mesh.vertices),)
-    assert found.support.max() > 10
+    assert found.confidence.shape == (len(found.mesh.vertices),)
+    assert found.confidence.max() > 10
 
 
 @pytest.fixture(scope="module")
@@ -148,8 +148,8 @@ def test_where_the_field_is_silent_the_surface_lies_along_the_onsets():
     assert np.abs(radii(found.mesh) - RADIUS)[silent].mean() < SPACING / 4
     back = found.mesh.vertices[:, 0] < float(MIDDLE[0]) - 0.9 * RADIUS
     front = found.mesh.vertices[:, 0] > float(MIDDLE[0]) + 0.9 * RADIUS
-    assert found.support[back].max() == 0
-    assert found.support[front].min() > 0
+    assert found.confidence[back].max() == 0
+    assert found.confidence[front].min() > 0
 
 
 def test_the_hull_is_what_first_echoes_leave_whatever_the_field_says():
@@ -163,7 +163,7 @@ def test_the_hull_is_what_first_echoes_leave_whatever_the_field_says():
     silent = read(mute, method="hull")
     np.testing.assert_array_equal(silent.mesh.vertices, found.mesh.vertices)
     assert silent.volume.values.max() == 0
-    assert not silent.support.any()
+    assert not silent.confidence.any()
 
 
 @pytest.mark.parametrize("method", ["open", "filled", "hull"])
