@@ -165,7 +165,8 @@ class EchoModule(lightning.LightningModule):
         Args:
             echoes: What will be fitted to.
             field, renderer, field_options, renderer_options, options: As of the class.
-            region ((2, 3), m): Lower and upper corner; found from the echoes where None.
+            region ((2, 3), m): Lower and upper corner; where None, the box of the echoes
+                (:meth:`sononerf.Echoes.within`), or found from the echoes.
 
         Raises:
             NumericalError: If no pose heard anything, or no more than noise gives.
@@ -173,10 +174,9 @@ class EchoModule(lightning.LightningModule):
         """
         expect(echoes, Echoes, "echoes")
         if region is None:
-            region = field.region if isinstance(field, Field) else echoes.region.box()
-            found = echoes.region
-        else:
-            found = (echoes if echoes.box is not None else echoes.within(region)).region
+            own = field.region if isinstance(field, Field) else echoes.box
+            region = echoes.region.box() if own is None else own
+        found = echoes.region
 
         def possible(places: Tensor, tolerance: float) -> Tensor:
             left = found.possible(places.cpu().double().numpy(), tolerance)

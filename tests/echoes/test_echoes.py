@@ -6,6 +6,9 @@ import numpy as np
 from sononerf.echoes import echoes as module
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
+from sononerf.field.module import EchoModule
+from sononerf.geometry.poses import Poses
+from sononerf.head.head import Head
 from tests.memory import echoes_of
 
 
@@ -48,6 +51,29 @@ def test_all_training_poses_come_in_turn_and_the_step_alone_decides():
     assert echoes.batch(3, 4, 8).tolist() == drawn[32:].tolist()
     assert echoes.batch(4, 0, 8).tolist() != drawn[:8].tolist()
     assert len(echoes.batch(0, 0, 50)) == 20
+
+
+def test_onsets_before_a_box_are_clutter_and_the_box_is_the_region(tmp_path):
+    """A click in front of a point that 40 poses hear."""
+    head = Head({"receivers": [(0.0, 0.0, 0.0)], "emitter": (0.0, 0.0, 0.0)})
+    poses = Poses.sphere(40, radius=0.4)
+    window = head.point_echo.window
+    offset = (np.arange(len(window)) - (len(window) - 1) / 2) * head.point_echo.spacing
+
+    def echo(at):
+        return np.interp(head.range - at, offset, window, left=0.0, right=0.0)
+
+    clicks = np.linspace(0.30, 0.36, 40)  # a precursor would keep its distance
+    power = np.stack([echo(0.4) + 0.1 * echo(at) + 1e-9 for at in clicks])
+    heard = np.sqrt(power)[:, None, :, None] * np.ones(len(head.frequency))
+    echoes = Echoes.from_arrays(heard, poses, head, split=[0] * 36 + [1, 1, 2, 2])
+    np.testing.assert_allclose(echoes.hull.first[:, 0], clicks[:36], atol=2e-3)
+    box = np.array([[-0.01] * 3, [0.01] * 3])
+    within = echoes.within(box)
+    np.testing.assert_allclose(within.hull.first, 0.4, atol=2e-3)
+    assert (within.hull.weight == 1.0).all()
+    np.testing.assert_allclose(EchoModule.for_echoes(within).field.region, box, atol=1e-7)
+    assert echoes.box is None
 
 
 def test_memory_is_bounded(monkeypatch):

@@ -143,8 +143,10 @@ def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeyp
     heard = np.array([[0.4, 0.41], [-np.inf, 0.39]])
     found = Onsets(np.array([1, 2]), np.ones(3), np.ones((2, 2, 3)), np.ones((2, 2, 3)), heard)
     asked = []
-    monkeypatch.setattr(echoes_module, "find_onsets", lambda *given: asked.append(given) or found)
-    monkeypatch.setattr(echoes_module, "weighted", lambda hull, resolution: hull)
+    monkeypatch.setattr(
+        echoes_module, "find_onsets", lambda *given, **_: asked.append(given) or found
+    )
+    monkeypatch.setattr(echoes_module, "weighted", lambda hull, *_: hull)
     hull = Echoes(store, head).hull
     expected = [[1.0, 2.002, 2.99], [0.002, 0.0, -0.01]]
     np.testing.assert_allclose(hull.emitters, expected, rtol=0, atol=1e-7)
@@ -177,7 +179,7 @@ def test_the_hull_is_weighted_by_the_range_resolution(tiny, echoes, monkeypatch)
         echoes_module, "weighted", lambda *given: asked.append(given) or "the others"
     )
     assert Echoes(EnsembleStore.open(echoes), head_of(tiny())).hull == "the others"
-    ((hull, resolution),) = asked
+    ((hull, resolution, _),) = asked
     assert hull.first.shape == (8, 2)
     assert resolution == head_of(tiny()).resolution == pytest.approx(0.0058, abs=1e-4)
 

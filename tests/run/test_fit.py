@@ -433,10 +433,10 @@ def test_a_run_holds_what_its_training_poses_heard_first(finished, echoes, tiny)
     hull = Echoes(EnsembleStore.open(echoes), head_of(tiny())).hull
     held = safetensors.torch.load_file(finished / "model.safetensors")
     names = {name for name in held if name.startswith("hull.")}
-    assert names == {f"hull.{name}" for name in vars(hull)}
-    for name, value in vars(hull).items():
+    assert names == {f"hull.{name}" for name in hull.ARRAYS}
+    for name in hull.ARRAYS:
         assert held[f"hull.{name}"].dtype == torch.float64
-        np.testing.assert_array_equal(held[f"hull.{name}"], value)
+        np.testing.assert_array_equal(held[f"hull.{name}"], getattr(hull, name))
     # The sphere's front, 20 mm before its middle, within what its echo is not an impulse.
     way = np.linalg.norm(hull.sources, axis=1) - 0.02
     np.testing.assert_allclose(held["hull.first"].mean(dim=1), way, atol=0.0005)

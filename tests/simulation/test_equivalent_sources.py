@@ -34,7 +34,7 @@ def heads(count, frequency):
     places = PLACE + 0.02 * np.random.default_rng(0).standard_normal((count, 3))
     turns = np.tile(np.eye(3), (count, 1, 1))
     ears = places[:, None] + np.array(EARS)
-    return Heads(places, ears, turns, gains(np.array([frequency])))
+    return Heads(places, ears, turns, turns, gains(np.array([frequency])))
 
 
 def wavenumber(frequency):

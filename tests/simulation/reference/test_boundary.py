@@ -257,7 +257,7 @@ def test_the_engine_solves_as_the_equation_says_and_weighs_by_beam_and_ear():
     tables = gains(np.array([18e3]))
     tables.beam[:] = 3.0
     tables.ears[:] = 0.5
-    heads = Heads(source[None], ear[None, None], np.eye(3)[None], tables)
+    heads = Heads(source[None], ear[None, None], np.eye(3)[None], np.eye(3)[None], tables)
     expected = 1.5 * heard(one._operators(wavenumber), wavenumber, source, ear)
     found = one.respond(wavenumber, heads)
     assert abs(found[0, 0] - expected) < 1e-4 * abs(expected)
