@@ -29,7 +29,8 @@ class Everywhere(Heads):
     """Heads that send and hear alike in all directions."""
 
     def __getitem__(self, some):
-        return type(self)(self.emitters[some], self.ears[some], self.rotations[some], self.gains)
+        places, turns = (self.emitters[some], self.ears[some]), self.rotations[some]
+        return type(self)(*places, turns, self.emitting[some], self.gains)
 
     def beam(self, points):
         return np.ones((len(self), len(points)))
@@ -50,7 +51,7 @@ def spheres(*bodies, frequency_max=100e3):
 
 def heard(engine, frequency, emitter, ear):
     """Pressure at one ear of heads without a pattern, in air without loss."""
-    poses = Everywhere(np.array([emitter]), np.array([[ear]]), np.eye(3)[None], None)
+    poses = Everywhere(np.array([emitter]), np.array([[ear]]), *[np.eye(3)[None]] * 2, None)
     return engine.respond(complex(2 * np.pi * frequency / SPEED), poses)[0, 0]
 
 
@@ -163,7 +164,7 @@ def test_beam_and_ears_are_taken_towards_the_centres():
         def gain(self, ear, points):
             return np.where(points[:, 1] > 1.0, 1.0, 0.25)[None]
 
-    poses = Pattern(SOURCE[None], ear[None, None], np.eye(3)[None], None)
+    poses = Pattern(SOURCE[None], ear[None, None], *[np.eye(3)[None]] * 2, None)
     found = engine.respond(complex(2 * np.pi * 30e3 / SPEED), poses)[0, 0]
     one, two = (heard(spheres(body), 30e3, SOURCE, ear) for body in bodies)
     assert abs(found - (0.25 * one + 0.5 * two)) < 1e-4 * abs(found)
@@ -172,7 +173,7 @@ def test_beam_and_ears_are_taken_towards_the_centres():
 def test_poses_do_not_depend_on_their_batch(monkeypatch):
     engine = spheres(*TRIPLE)
     emitters = 0.3 * directions(5)
-    poses = Everywhere(emitters, emitters[:, None] + 0.01, np.stack([np.eye(3)] * 5), None)
+    poses = Everywhere(emitters, emitters[:, None] + 0.01, *[np.stack([np.eye(3)] * 5)] * 2, None)
     wavenumber = complex(2 * np.pi * 20e3 / SPEED)
     together = engine.respond(wavenumber, poses)
     monkeypatch.setattr(spheres_module, "BATCH_BYTES", 1.0)
