@@ -147,7 +147,7 @@ def onsets(
         window ((W,) float or callable): Power of a point echo over range, its own range in the
             middle; or what gives it for a row and the slice of its echo's greatest power.
         fineness: Spacing of its values in slices.
-        start (N,): Slice before which there is only clutter; none where None.
+        start (N,): First slice that may hold an echo; the first of all where None.
 
     Returns:
         onset (N,): Minus infinity where nothing was heard, or where the first slice cuts an echo
@@ -236,7 +236,8 @@ def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = No
     Args:
         store: The ensemble.
         echo: What the analysis makes of one point.
-        nearest ((P, E), m): What is heard from before is clutter; all ranges count where None.
+        nearest ((P, E), m): Least range of a possible echo. What is heard before it is
+            clutter. All ranges count where None.
     """
     poses = asked_poses(store)
     axis = np.asarray(store.range, dtype=np.float64)

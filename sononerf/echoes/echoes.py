@@ -200,14 +200,23 @@ class Echoes(Shown):
     def within(self, box: ArrayLike) -> Echoes:
         """Return the same echoes of a body that lies within a box.
 
-        What is heard before the box can answer is clutter: no onset. An onset that comes from no
-        place of the box tells nothing.
+        Echoes that arrive earlier than any from the box are clutter, and no onsets. An onset whose
+        origin cannot lie in the box is an outlier.
 
         Args:
             box ((2, 3), m): Lower and upper corner, world frame.
+
+        Raises:
+            InputError: If it is no box.
         """
+        corners = np.asarray(box, dtype=np.float64)
+        if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
+            raise InputError(
+                f"box: found {corners.tolist()}, expected a lower and an upper corner of three "
+                "numbers each, m, the lower one below the upper one on every axis"
+            )
         other = copy.copy(self)
-        other.box = np.asarray(box, dtype=np.float64)
+        other.box = corners
         for known in ("onsets", "hull", "region"):
             other.__dict__.pop(known, None)
         return other

@@ -106,7 +106,8 @@ def simulate(
         return Echoes(finished, head)
     warn_of_call(head.call, head.analysis)
     simulator = Simulator.of(scene, head, settings)
-    check_poses(scene, poses, offsets=np.vstack((head.emitter, head.receivers)))
+    offsets = np.vstack((head.emitter, head.receivers))
+    check_poses(scene, poses, offsets=offsets, plane=head.plane)
     check_reach(
         scene,
         poses,

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from sononerf.array_types import Bools, Floats
 from sononerf.errors import InputError, NumericalError
+from sononerf.geometry.plane import Plane
 from sononerf.geometry.poses import Poses
 from sononerf.geometry.raycast import winding_numbers
 from sononerf.scene.scene import Scene
@@ -17,20 +18,31 @@ from sononerf.scene.scene import Scene
 logger = logging.getLogger("sononerf")
 
 
-def check_poses(scene: Scene, poses: Poses, *, offsets: Floats | None = None) -> None:
-    """Refuse poses that lie inside the surface.
+def check_poses(
+    scene: Scene, poses: Poses, *, offsets: Floats | None = None, plane: Plane | None = None
+) -> None:
+    """Refuse poses that lie inside the surface, or not above the support.
 
     Args:
         scene: What is ensonified.
         poses: To be checked.
         offsets ((K, 3), m): Further points of the head that must be outside, such as emitter and
             ears; head frame.
+        plane: The support; None where there is none.
+
+    Raises:
+        InputError: If a pose lies there.
     """
     points = np.zeros((1, 3)) if offsets is None else np.vstack([np.zeros((1, 3)), offsets])
     places = poses.positions[:, None] + np.einsum("pij,kj->pki", poses.rotations, points)
     winding = winding_numbers(scene.mesh.vertices, scene.mesh.faces, places.reshape(-1, 3))
     inside = np.abs(winding.reshape(places.shape[:2])) > 0.5
     _refuse(inside.any(axis=1), "inside the scene's surface")
+    if plane is not None and (low := (plane.height(places) <= 0.0).any(axis=1)).any():
+        raise InputError(
+            f"{_named(low)} not above the support; move them, for example by "
+            "poses.arrangement=cap, or move support.point"
+        )
 
 
 def _refuse(bad: ArrayLike, what: str) -> None:

@@ -2,10 +2,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from sononerf.echoes import echoes as module
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
+from sononerf.errors import InputError
 from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses
 from sononerf.head.head import Head
@@ -74,6 +76,8 @@ def test_onsets_before_a_box_are_clutter_and_the_box_is_the_region(tmp_path):
     assert (within.hull.weight == 1.0).all()
     np.testing.assert_allclose(EchoModule.for_echoes(within).field.region, box, atol=1e-7)
     assert echoes.box is None
+    with pytest.raises(InputError, match=r"box: found .* expected a lower and an upper corner"):
+        echoes.within(box[::-1])
 
 
 def test_memory_is_bounded(monkeypatch):

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.errors import SettingsError
+from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import Poses, look_at
 from sononerf.head.head import Head
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SimulationSettings
-from sononerf.simulation.ensemble import echo_hash
+from sononerf.simulation.ensemble import echo_hash, simulate
 from sononerf.simulation.hearing import hearing_of
 from sononerf.simulation.simulator import Simulator
 from sononerf.simulation.solved import Heads
@@ -115,3 +115,9 @@ def test_a_support_is_part_of_what_echoes_depend_on():
 def test_engines_without_images_say_so():
     with pytest.raises(SettingsError, match="kirchhoff knows no support"):
         heard(BALL, Head(support=TABLE), "kirchhoff")
+
+
+def test_poses_below_the_support_are_refused_at_once():
+    poses = Poses(np.stack([PLACE, IMAGE]), np.stack([TURN, TURN]))
+    with pytest.raises(InputError, match=r"1 of 2 poses \(1\) are not above the support; move"):
+        simulate(Scene(BALL), poses, Head(support=TABLE))
