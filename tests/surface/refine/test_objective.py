@@ -9,7 +9,14 @@ import torch
 import trimesh
 
 from sononerf.echoes.free_space import EchoHull
-from sononerf.surface.refine.objective import SCALE, Level, OnsetRanges, measured, mismatch
+from sononerf.surface.refine.objective import (
+    SCALE,
+    Level,
+    OnsetRanges,
+    measured,
+    mismatch,
+    over_band,
+)
 from sononerf.surface.refine.optics import Heard
 from tests.memory import echoes_of
 
@@ -158,3 +165,12 @@ def test_a_step_draws_its_onsets_by_its_number(box):
     places = vertices_of(box) * 0.97
     assert torch.equal(onsets.gradient(places, 4), onsets.gradient(places, 4))
     assert not torch.equal(onsets.gradient(places, 4), onsets.gradient(places, 5))
+
+
+def test_power_is_averaged_over_a_part_of_the_frequencies():
+    power = torch.rand(2, 1, 5, 14, generator=torch.Generator().manual_seed(0))
+    found = over_band(power, 0.33)  # two frequencies on either side
+    torch.testing.assert_close(found[..., 5], power[..., 3:8].mean(-1))
+    first = (3.0 * power[..., 0] + power[..., 1] + power[..., 2]) / 5.0
+    torch.testing.assert_close(found[..., 0], first)
+    torch.testing.assert_close(over_band(power, 0.0), power)
