@@ -51,8 +51,9 @@ def asked(monkeypatch):
     """Experiments that end at once, as told by the name of their folder."""
     runs, ends = {}, {}
 
-    def run_experiment(folder, data, settings, *, enough, store):
+    def run_experiment(folder, data, settings, *, config, enough, store):
         assert enough == "prediction"  # a run without a surface has a line too
+        load_settings(config, settings)
         runs[folder.name] = (data, list(settings), store)
         end = ends.get(folder.name, METRICS)
         if isinstance(end, BaseException):
@@ -79,7 +80,7 @@ def test_all_that_the_table_asks_for_is_there_and_its_settings_are_known():
     assert {f"procedural-{seed}" for seed in range(100, 120)} < set(names)
     assert len(PROCEDURAL) == 20
     for case in CASES:
-        settings = load_settings(CONFIG, case.settings)
+        settings = load_settings(CONFIG.with_name(f"{case.config}.yaml"), case.settings)
         if not case.name.startswith("procedural"):
             load_scene(settings.scene.name, settings.scene.options)
 
