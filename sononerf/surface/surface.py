@@ -20,6 +20,7 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.region import ENOUGH
 from sononerf.errors import InputError, expect
+from sononerf.geometry.plane import Plane
 from sononerf.geometry.raycast import RayCaster
 from sononerf.shown import Shown
 from sononerf.surface.mesh_files import MeshFormat, mesh_bytes
@@ -124,11 +125,12 @@ def finished_surface(
     found = reading.gathered
     if confidence is None:
         confidence = poses_that_heard(mesh, found.evidence, found.resolution)
-    openness = judge_openness(mesh, found.hull.sources, resolution=found.resolution)
+    hull = found.hull
+    openness = judge_openness(mesh, hull.sources, resolution=found.resolution, plane=hull.plane)
     if openness.kind == "one-sided":
         reliable = found.evidence.where(found.weight > QUIET)
         heard = poses_that_heard(mesh, reliable, found.resolution)
-        part = known_part(mesh, heard, found.hull, resolution=found.resolution)
+        part = known_part(mesh, heard, hull, resolution=found.resolution)
         part &= ~found.lattice.at_wall(mesh.triangles_center)
         if (part & ~openness.unseen).any():
             openness = leaving_out(openness, ~part, mesh.area_faces)
@@ -143,6 +145,9 @@ UNSEEN_SHARE = 0.25
 """Fraction of the area: if more than this cannot have been heard, the surface is one-sided."""
 THIN_SHARE = 0.75
 """Fraction of the area: if more than this is thin, the surface is a sheet."""
+STANDING = 0.5
+"""Height over the support up to which a triangle stands on it, range resolutions: sound does not
+tell such a gap from none."""
 _LIFT = 1e-3  # of the root of a triangle's area: so far inside the search for the other side begins
 _POSES = 12  # tested at a time for whether they see a triangle, those that it faces best first
 _CHUNK = 4096  # triangles at a time, a bound of memory
@@ -171,19 +176,32 @@ class Openness:
         return "sheet" if self.thin_share > THIN_SHARE else "closed"
 
 
-def judge_openness(mesh: trimesh.Trimesh, sources: Floats, *, resolution: float) -> Openness:
+def judge_openness(
+    mesh: trimesh.Trimesh, sources: Floats, *, resolution: float, plane: Plane | None = None
+) -> Openness:
     """Tell a body's skin from an open surface.
+
+    A support mirrors sound, so that poses also hear from their images. A triangle that stands on
+    the support counts as seen: nothing hears it, but the support tells where it is.
 
     Args:
         mesh: A closed reconstruction, normals outward, m.
         sources ((P, 3), m): Where it was heard from.
         resolution (m): Range resolution of the analysis.
+        plane: The support; None where there is none.
     """
     middles = np.asarray(mesh.triangles_center, dtype=np.float64)
     normals = np.asarray(mesh.face_normals, dtype=np.float64)
     areas = np.asarray(mesh.area_faces, dtype=np.float64)
     caster = RayCaster(mesh)
-    unseen = ~_seen(caster, middles, normals, sources)
+    if plane is None:
+        unseen = ~_seen(caster, middles, normals, sources)
+    else:
+        image = trimesh.Trimesh(plane.mirrored(mesh.vertices), mesh.faces[:, ::-1], process=False)
+        both = RayCaster(trimesh.util.concatenate([mesh, image]))
+        heads = np.concatenate([sources, plane.mirrored(sources)])
+        stands = plane.height(np.asarray(mesh.triangles)).max(axis=1) < STANDING * resolution
+        unseen = ~(stands | _seen(both, middles, normals, heads))
     lift = _LIFT * np.sqrt(areas)
     inward = caster.first_hit(middles - lift[:, None] * normals, -normals)
     thin = inward.ray[inward.distance + lift[inward.ray] < THIN * resolution]

@@ -109,9 +109,10 @@ def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, mo
     asked = []
     plain = surface_module.judge_openness
 
-    def judge(mesh, sources, *, resolution):
+    def judge(mesh, sources, *, resolution, plane):
         asked.append(sources)
         assert resolution == load_fitted(run).head.resolution
+        assert plane is None
         return plain(mesh, sources, resolution=resolution)
 
     monkeypatch.setattr(surface_module, "judge_openness", judge)

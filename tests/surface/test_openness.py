@@ -13,6 +13,7 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.field.fourier import FourierField
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.lattice import Lattice
+from sononerf.geometry.plane import Plane
 from sononerf.surface import surface
 from sononerf.surface.start import read_out
 from sononerf.surface.start.evidence import Evidence
@@ -31,8 +32,8 @@ CAP = np.radians(30)
 WALL = 0.05
 
 
-def judge_openness(mesh, sources, resolution=RESOLUTION):
-    return surface.judge_openness(mesh, sources, resolution=resolution)
+def judge_openness(mesh, sources, resolution=RESOLUTION, plane=None):
+    return surface.judge_openness(mesh, sources, resolution=resolution, plane=plane)
 
 
 def sphere():
@@ -109,6 +110,37 @@ def test_of_a_body_heard_from_one_side_the_far_side_is_cut_off():
     assert not cut.is_watertight
     assert cut.area == pytest.approx((1 - found.unseen_share) * mesh.area)
     assert len(mesh.faces) == 5120  # the given one stays whole
+
+
+def from_above(angle=np.radians(70)):
+    """Poses around the z axis, as a hand reaches above a table."""
+    return cap(angle)[:, [2, 1, 0]]
+
+
+def test_what_stands_on_a_support_is_closed():
+    """A low cylinder: its bottom is a third of its area, and no pose hears it."""
+    mesh = trimesh.creation.cylinder(radius=0.02, height=0.02).subdivide_to_size(0.005)
+    bottom = mesh.face_normals[:, 2] < -0.5
+    table = Plane((0.0, 0.0, -0.01), (0.0, 0.0, 1.0))
+    alone = judge_openness(mesh, from_above())
+    assert alone.unseen_share == pytest.approx(0.25, abs=0.01)
+    np.testing.assert_array_equal(alone.unseen, bottom)
+    assert not judge_openness(mesh, from_above(), plane=table).unseen.any()
+    # A gap that sound tells from none is left out; the poses' images see the bottom through it
+    # where the image of the bottom is not in the way.
+    low = Plane((0.0, 0.0, -0.01 - 0.2 * RESOLUTION), (0.0, 0.0, 1.0))
+    assert not judge_openness(mesh, from_above(), plane=low).unseen.any()
+    lower = Plane((0.0, 0.0, -0.01 - 0.6 * RESOLUTION), (0.0, 0.0, 1.0))
+    hidden = judge_openness(mesh, from_above(), plane=lower).unseen
+    assert hidden.any()
+    assert not hidden[~bottom].any()
+
+
+def test_the_underside_is_seen_by_way_of_the_support():
+    ball = sphere()
+    table = Plane((0.0, 0.0, -2 * RADIUS), (0.0, 0.0, 1.0))
+    assert judge_openness(ball, from_above()).unseen_share > 0.05
+    assert judge_openness(ball, from_above(), plane=table).unseen_share < 0.02
 
 
 def test_what_hardly_anyone_missed_is_closed_by_guess():
