@@ -112,9 +112,9 @@ def test_of_a_body_heard_from_one_side_the_far_side_is_cut_off():
     assert len(mesh.faces) == 5120  # the given one stays whole
 
 
-def from_above(angle=np.radians(70)):
+def from_above():
     """Poses around the z axis, as a hand reaches above a table."""
-    return cap(angle)[:, [2, 1, 0]]
+    return cap(np.radians(70))[:, [2, 1, 0]]
 
 
 def test_what_stands_on_a_support_is_closed():
