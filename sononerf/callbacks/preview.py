@@ -3,34 +3,45 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import lightning
+import numpy as np
 import torch
-from lightning.pytorch.loggers import TensorBoardLogger
+import trimesh
+from torch.utils.tensorboard import SummaryWriter
 
 from sononerf import storage
+from sononerf.callbacks.tensorboard import Shown, add_mesh
 from sononerf.errors import NumericalError
+from sononerf.evaluation.metrics import geometry_metrics
+from sononerf.evaluation.solid import Solid
 from sononerf.field.field import Field
 from sononerf.field.module import EchoModule, decibels
 from sononerf.field.range_slices import WholePoses
 from sononerf.report.pictures.figure import png_from_pixels
-from sononerf.report.pictures.mip_picture import maximum_intensity_projections, mip_image
+from sononerf.report.pictures.mip_picture import (
+    maximum_intensity_projections,
+    mip_image,
+    mips_image,
+)
 from sononerf.report.pictures.spectrogram_picture import spectrogram_image
 from sononerf.surface.mesh_files import mesh_bytes
 from sononerf.surface.start.read_out import energy_volume
-from sononerf.surface.start.volume import automatic_level, isosurface
+from sononerf.surface.start.volume import Volume, automatic_level, isosurface
 
 
 class PreviewCallback(lightning.Callback):
-    """Writes ``epochs/0001/`` and shows the projections in TensorBoard.
+    """Writes ``epochs/0001/``: a coarse mesh, three projections and the numbers so far.
 
     Args:
         folder: The run.
         every_epochs: How often.
         voxels: Along the region's longest side.
         directions: Spherical lattice for fields without lobes.
+
+    Attributes:
+        volume, mesh: What was read out last; None where there was nothing.
     """
 
     def __init__(self, folder: Path, *, every_epochs: int, voxels: int, directions: int) -> None:
@@ -38,6 +49,8 @@ class PreviewCallback(lightning.Callback):
         self.every_epochs = every_epochs
         self.voxels = voxels
         self.directions = directions
+        self.volume: Volume | None = None
+        self.mesh: trimesh.Trimesh | None = None
 
     def on_train_epoch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
@@ -52,39 +65,69 @@ class PreviewCallback(lightning.Callback):
         extent = float((field.region[1] - field.region[0]).max())
         was_training = pl_module.training
         pl_module.eval()
+        self.volume = self.mesh = None
         try:
             with torch.inference_mode():
                 spacing = max(extent / self.voxels, field.resolution / 2)
-                volume = energy_volume(field, spacing, self.directions)
-                mesh = isosurface(volume, automatic_level(volume))
+                self.volume = energy_volume(field, spacing, self.directions)
+                self.mesh = isosurface(self.volume, automatic_level(self.volume))
         except NumericalError as error:
             # An early field may hold no surface yet; that is news, not a fault.
             storage.commit_json(target / "metrics.json", {**numbers, "no_surface": str(error)})
             return
         finally:
             pl_module.train(was_training)
-        storage.commit_bytes(target / "mesh.ply", mesh_bytes(mesh, "ply"))
+        storage.commit_bytes(target / "mesh.ply", mesh_bytes(self.mesh, "ply"))
         # Bare pixels: axes and labels would cost more than the rest of the epoch's look.
-        pictures = {
-            axis: mip_image(projection)
-            for axis, projection in maximum_intensity_projections(volume).items()
-        }
-        for axis, pixels in pictures.items():
-            storage.commit_bytes(target / f"mip_{axis}.png", png_from_pixels(pixels))
+        for axis, projection in maximum_intensity_projections(self.volume).items():
+            data = png_from_pixels(mip_image(projection))
+            storage.commit_bytes(target / f"mip_{axis}.png", data)
         storage.commit_json(target / "metrics.json", numbers)
-        if isinstance(trainer.logger, TensorBoardLogger):
-            for axis, pixels in pictures.items():
-                trainer.logger.experiment.add_image(
-                    f"mip/{axis}", pixels, trainer.global_step, dataformats="HWC"
-                )
 
 
-SHARE = 0.05
-"""Part of the time that drawing may take; short epochs may go without a picture, but the last."""
+SAMPLES = 4000
+"""Samples of each surface for the Chamfer distance of a preview: right to some percent."""
 
 
-class SpectrogramImages(lightning.Callback):
-    """Shows the first validation pose.
+class SurfaceImages(Shown):
+    """Shows the preview: projections with axes, the mesh, and its distance from the truth.
+
+    Args:
+        preview: What was read out; it must run before.
+        truth: The true surface, m; None where it is not known.
+    """
+
+    def __init__(self, preview: PreviewCallback, truth: trimesh.Trimesh | None = None) -> None:
+        super().__init__()
+        self.preview, self._truth = preview, truth
+        self._solid: Solid | None = None
+
+    def draw(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        writer: SummaryWriter,
+    ) -> None:
+        """Show the last preview."""
+        del pl_module
+        volume, mesh, step = self.preview.volume, self.preview.mesh, trainer.global_step
+        if volume is not None and volume.values.max() > 0:
+            writer.add_image("projections", mips_image(volume), step, dataformats="HWC")
+        if mesh is None:
+            return
+        add_mesh(writer, "mesh/field", mesh, step)
+        if self._truth is not None:
+            self._solid = self._solid or Solid(self._truth)
+            metrics = geometry_metrics(mesh, self._solid, samples=SAMPLES)
+            writer.add_scalar("Chamfer_mm/field", 1e3 * metrics["chamfer_m"], step)
+
+
+POSES = 3
+"""Validation poses that are shown, evenly chosen; always the same ones."""
+
+
+class SpectrogramImages(Shown):
+    """Shows validation poses: measured, predicted by the field, and the difference.
 
     Args:
         poses: The validation poses.
@@ -94,37 +137,27 @@ class SpectrogramImages(lightning.Callback):
     def __init__(
         self, poses: WholePoses, range_m: torch.Tensor, frequency_hz: torch.Tensor
     ) -> None:
+        super().__init__()
         self.poses = poses
         self.range_m = range_m.double().numpy()
         self.frequency_hz = frequency_hz.double().numpy()
-        self.next_at = 0.0  # of the monotonic clock, s
 
-    def on_train_epoch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    def draw(
+        self,
+        trainer: lightning.Trainer,
+        pl_module: lightning.LightningModule,
+        writer: SummaryWriter,
     ) -> None:
-        """Render one pose and show it."""
-        module = pl_module
-        if not trainer.is_global_zero or not isinstance(trainer.logger, TensorBoardLogger):
+        """Render the poses and show them."""
+        if not isinstance(pl_module, EchoModule):
             return
-        if not len(self.poses) or not isinstance(module, EchoModule):
-            return
-        started = time.monotonic()
-        if started < self.next_at and module.global_step < module.total_steps:
-            return
-        batch = trainer.strategy.batch_to_device(self.poses[0])
-        was_training = module.training
-        module.eval()
-        try:
-            with torch.inference_mode():
-                predicted = decibels(module(batch), module.reference)[0]
-        finally:
-            module.train(was_training)
-        measured = decibels(batch.spectrum, module.reference)[0]
-        picture = spectrogram_image(
-            measured.cpu().numpy(), predicted.cpu().numpy(), self.range_m, self.frequency_hz
-        )
-        trainer.logger.experiment.add_image(
-            "spectrogram", picture, module.global_step, dataformats="HWC"
-        )
-        now = time.monotonic()
-        self.next_at = now + (now - started) / SHARE
+        chosen = np.linspace(0, len(self.poses) - 1, min(POSES, len(self.poses))).astype(int)
+        for number in chosen.tolist():
+            batch = trainer.strategy.batch_to_device(self.poses[number])
+            measured, predicted = (
+                decibels(part, pl_module.reference)[0].cpu().numpy()
+                for part in (batch.spectrum, pl_module(batch))
+            )
+            picture = spectrogram_image(measured, predicted, self.range_m, self.frequency_hz)
+            name = f"spectrogram/validation_pose_{number}"
+            writer.add_image(name, picture, trainer.global_step, dataformats="HWC")

@@ -151,6 +151,12 @@ def fit(
         progress=Progress(),
     )
     if not follows():  # the first process does the rest
+        from sononerf.run.report_runs import PAGE
+        from sononerf.run.report_runs import report as report_runs
+
+        page, numbers = folder / PAGE, folder / "metrics.json"
+        if not page.is_file() or page.stat().st_mtime < numbers.stat().st_mtime:
+            report_runs([folder], progress=Progress())
         _summary(folder, done.read_metrics())
 
 
@@ -193,6 +199,8 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
                 f"backprojection instead: Chamfer {1000 * other['chamfer_m']:.2f} mm, F-score "
                 f"{other['fscore']['0.002']:.2f} at 2 mm and {other['fscore']['0.005']:.2f} at 5 mm"
             )
+    if (folder / "report.html").is_file():
+        say(f"report:      {folder / 'report.html'}")
     say(f"mesh:        {folder / 'reconstruction' / 'mesh.ply'}")
     say(f"pictures:    {folder / 'reconstruction' / 'view.png'}, {folder / 'prediction'}")
     say(f"numbers:     {folder / 'metrics.json'}")
@@ -344,16 +352,36 @@ def compare(
 
 @app.command()
 def report(
-    run: Run,
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs.")],
     paper: Annotated[
         bool, typer.Option("--paper", help="Also draw the counterparts of the paper's figures.")
     ] = False,
     output: Annotated[
-        Path | None, typer.Option(help="Folder of the page; RUN/report where none.")
+        Path | None,
+        typer.Option(help="The page; RUN/report.html of one run, report.html of several."),
     ] = None,
 ) -> None:
-    """Write one page of a run: numbers beside the baselines', pictures, settings."""
+    """Write one page of a run, or of several beside one another: numbers, pictures, settings."""
+    if paper and len(runs) > 1:
+        raise SettingsError("--paper draws the figures of one run; found several")
     from sononerf.progress import Progress
-    from sononerf.run.report_run import report as report_run
+    from sononerf.run.report_runs import report as report_runs
 
-    say(f"wrote {report_run(run, paper=paper, output=output, progress=Progress())}")
+    say(f"wrote {report_runs(runs, paper=paper, output=output, progress=Progress())}")
+
+
+@app.command()
+def table(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs.")],
+    csv: Annotated[
+        Path | None,
+        typer.Option(help="Also write all numbers, in SI units, one line per run."),
+    ] = None,
+) -> None:
+    """Print the numbers of runs beside one another."""
+    from sononerf.run.table import table as table_of_runs
+
+    for line in table_of_runs(runs, csv=csv):
+        typer.echo(line)
+    if csv is not None:
+        say(f"wrote {csv}")

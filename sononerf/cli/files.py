@@ -202,3 +202,16 @@ def calibrate(
     for line in found.warnings:
         say(f"warning: {line}")
     say(f"wrote {found.store.path} ({len(found.store)} poses)")
+
+
+@app.command()
+def doctor(as_json: Json = False) -> None:
+    """Say what this machine has for us, and what would mend each lack."""
+    from sononerf.run.doctor import as_lines, as_plain, examine
+
+    findings = examine()
+    if as_json:
+        print_json(as_plain(findings))
+        return
+    for line in as_lines(findings):
+        typer.echo(line)

@@ -153,6 +153,17 @@ def _closest(
     return before, np.asarray(motion)
 
 
+def signed_error(mesh: trimesh.Trimesh, true: trimesh.Trimesh) -> Floats:
+    """Return how far each vertex lies off the true surface (V,), m: above zero outside of it.
+
+    Of a true surface that is open there is no inside; then all are above zero.
+    """
+    solid = Solid(true)
+    points = np.asarray(mesh.vertices, dtype=np.float64)
+    distance = solid.nearest.distance(points)
+    return np.where(solid.contains(points), -distance, distance) if solid.closed else distance
+
+
 BASELINE_VOXELS = 64
 """Voxels of a baseline along the region's longest side: finer than the window in any scene of
 ours."""

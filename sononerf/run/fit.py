@@ -13,15 +13,16 @@ from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from lightning.fabric.utilities.rank_zero import rank_zero_only
-from lightning.pytorch.loggers import TensorBoardLogger
 
 from sononerf import storage
 from sononerf.callbacks.epoch import CheckpointCallback, ProgressCallback
-from sononerf.callbacks.preview import PreviewCallback, SpectrogramImages
+from sononerf.callbacks.preview import PreviewCallback, SpectrogramImages, SurfaceImages
+from sononerf.callbacks.tensorboard import FLOORS, Pace, RunLogger, log_results
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import NumericalError, ResourceError, StoppedError
+from sononerf.errors import InputError, NumericalError, ResourceError, StoppedError
 from sononerf.evaluation.traced import Traced, learn_traced
 from sononerf.field.checkpoint_io import previous_of, save_weights
 from sononerf.field.datamodule import EchoDataModule
@@ -29,11 +30,11 @@ from sononerf.field.fitting import fit as fit_field
 from sononerf.field.fitting import require_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.progress import Progress
-from sononerf.run.build import head_of, module_for, with_store
+from sononerf.run.build import head_of, module_for, true_mesh, with_store
 from sononerf.run.evaluate import EvaluationWork, evaluate
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run_folder import RunFolder, flat
 from sononerf.run.simulate import (
     background_path,
     open_ensemble,
@@ -87,6 +88,7 @@ def finish(
             raise no_surface
         if not run.is_done("evaluation"):
             evaluate(run, begun=evaluation, progress=progress)
+            log_results(run.path, flat(run.fitted.settings.plain()), run.read_metrics())
     return run.read_metrics()
 
 
@@ -272,6 +274,13 @@ def _fit(
     resumed = _can_resume(run)
     if not resumed and not follows():
         run.clear_previews()
+    preview = PreviewCallback(
+        run.path,
+        every_epochs=settings.preview.every_epochs,
+        voxels=settings.preview.voxels,
+        directions=settings.reconstruction.directions,
+    )
+    attributes = echoes.store.attributes
     with progress.task("fitting", total) as task, keeper.watching():
         fit_field(
             echoes,
@@ -279,16 +288,13 @@ def _fit(
             data,
             callbacks=[
                 ProgressCallback(task),
-                PreviewCallback(
-                    run.path,
-                    every_epochs=settings.preview.every_epochs,
-                    voxels=settings.preview.voxels,
-                    directions=settings.reconstruction.directions,
-                ),
+                Pace(),
+                preview,
+                SurfaceImages(preview, _truth(settings)),
                 SpectrogramImages(data.whole("val"), renderer.range, renderer.frequency),
                 keeper,
             ],
-            logger=TensorBoardLogger(run.path, name="tensorboard", version=""),
+            logger=RunLogger(run.path, {key: attributes.get(key) for key in FLOORS}),
             folder=run.path,
             checkpoint=run.checkpoint if resumed else None,
             **hardware,
@@ -302,6 +308,17 @@ def _fit(
         raise StoppedError(
             keeper.stopped_by, "stopped after the last step; the same command goes on"
         )
+
+
+def _truth(settings: Settings) -> trimesh.Trimesh | None:
+    """Return the true surface for previews; None where it is unknown or has to be registered."""
+    if settings.evaluation.registration != "none":
+        return None
+    try:
+        return true_mesh(settings)
+    except InputError as error:
+        logger.warning("%s", error)
+        return None
 
 
 def _can_resume(run: RunFolder) -> bool:

@@ -14,6 +14,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from sononerf import storage
+from sononerf.callbacks.tensorboard import add_mesh, writing
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.field.checkpoint_io import model_checksum
 from sononerf.progress import Progress
@@ -54,10 +55,17 @@ def refine_surface(
     belongs = {**_version(), "of": f"{model_checksum(run.path)} {digest.hexdigest()}"}
     file = run.path / STATE
     saved = time.monotonic()
+    shown = 0
 
     def after_step(work: Refinement, mismatch: float) -> None:
-        nonlocal saved
+        nonlocal saved, shown
         del mismatch
+        if work.newest is not None and len(work.history) > shown:
+            shown = len(work.history)
+            with writing(run.path) as writer:
+                add_mesh(writer, "mesh/refinement_stages", work.newest, shown)
+                error = work.history[-1]["objective_db"]
+                writer.add_scalar("refinement/validation_error_dB", error, shown)
         if time.monotonic() - saved > settings.fit.checkpoint_seconds and not work.done:
             tensors = {name: p.cpu().clone().contiguous() for name, p in work.state().items()}
             data = safetensors.torch.save(tensors, metadata=belongs)

@@ -43,20 +43,21 @@ the prediction of held-out poses; the comparison with the true surface and the b
 RECORDED = ("torch", "lightning", "numpy", "scipy", "trimesh", "manifold3d", "embreex", "zarr")
 
 
-def _flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
+def flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return nested data by dotted keys."""
+    found: dict[str, Any] = {}
     for key, value in data.items():
         name = f"{prefix}{key}"
         if isinstance(value, dict) and value:
-            flat.update(_flat(value, f"{name}."))
+            found.update(flat(value, f"{name}."))
         else:
-            flat[name] = value
-    return flat
+            found[name] = value
+    return found
 
 
 def differing_keys(old: Settings, new: Settings) -> list[str]:
     """Return the dotted keys in which two experiments differ, without those that move nothing."""
-    first, second = _flat(old.plain()), _flat(new.plain())
+    first, second = flat(old.plain()), flat(new.plain())
     return [
         key
         for key in sorted(first.keys() | second.keys())

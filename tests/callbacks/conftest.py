@@ -7,8 +7,8 @@ from types import SimpleNamespace
 
 import lightning
 import pytest
-from lightning.pytorch.loggers import TensorBoardLogger
 
+from sononerf.callbacks.tensorboard import RunLogger
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.field.checkpoint_io import DurableCheckpointIO
@@ -59,7 +59,7 @@ def training(ensemble, tmp_path):
             max_epochs=steps // PER_EPOCH,
             limit_val_batches=1.0 if validation else 0,
             num_sanity_val_steps=sanity,
-            logger=TensorBoardLogger(tmp_path, name="tensorboard", version="") if logger else False,
+            logger=RunLogger(tmp_path, {"noise_floor_mae_db": 0.25}) if logger else False,
             callbacks=list(callbacks),
             plugins=[DurableCheckpointIO()],
             enable_checkpointing=False,

@@ -7,6 +7,7 @@ import io
 import json
 
 import lightning
+import numpy as np
 import pytest
 import torch
 import trimesh
@@ -14,7 +15,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sononerf.callbacks import preview as preview_module
-from sononerf.callbacks.preview import PreviewCallback
+from sononerf.callbacks.preview import PreviewCallback, SurfaceImages
 from sononerf.errors import NumericalError
 
 
@@ -34,6 +35,12 @@ class Modes(lightning.Callback):
         )
 
 
+def events_of(folder):
+    events = EventAccumulator(str(folder / "tensorboard" / folder.name))
+    events.Reload()
+    return events
+
+
 def loud(module):
     """Put a surface into the field from the first step on."""
     with torch.no_grad():
@@ -47,7 +54,9 @@ def loud(module):
 
 def test_mesh_projections_and_numbers(training, tmp_path):
     modes = Modes()
-    made = training(previews(tmp_path / "run"), modes, logger=True)
+    preview = previews(tmp_path / "run")
+    truth = trimesh.creation.icosphere(radius=0.02)
+    made = training(preview, SurfaceImages(preview, truth), modes, logger=True)
     loud(made.module)
     made.train()
     folders = sorted((tmp_path / "run" / "epochs").iterdir())
@@ -68,12 +77,17 @@ def test_mesh_projections_and_numbers(training, tmp_path):
         assert (numbers["epoch"], numbers["step"]) == (number, 4 * number)
         assert {"train/loss", "val/mae_db"} <= numbers.keys()
     assert modes.seen == [True] * 8
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
-    events.Reload()
-    for axis in "xyz":
-        assert [image.step for image in events.Images(f"mip/{axis}")] == [4, 8]
-    assert [scalar.step for scalar in events.Scalars("val/mae_db")] == [3, 7]
-    assert len(events.Scalars("train/loss")) == 8
+    events = events_of(tmp_path)
+    assert events.Images("projections")[-1].step == 8
+    mesh = trimesh.load_mesh(folders[-1] / "mesh.ply")
+    distance = events.Scalars("Chamfer_mm/field")[-1]
+    assert distance.step == 8
+    # The truth is a sphere about the origin.
+    off = np.abs(
+        np.linalg.norm(trimesh.sample.sample_surface(mesh, 2000, seed=0)[0], axis=1) - 0.02
+    )
+    assert distance.value > 0.3e3 * off.mean()
+    assert {"mesh/field_VERTEX", "mesh/field_FACE"} <= set(events.Tags()["tensors"])
 
 
 def test_training_mode_is_put_back(training, tmp_path):

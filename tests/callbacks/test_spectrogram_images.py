@@ -12,6 +12,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sononerf.callbacks import preview as images_module
+from sononerf.callbacks import tensorboard as tensorboard_module
 from sononerf.callbacks.preview import SpectrogramImages
 
 
@@ -37,10 +38,11 @@ def test_one_picture_per_epoch(training, tmp_path):
     made.trainer.callbacks.append(callback(made))
     made.train()
     assert modes.seen == [True] * 8
-    events = EventAccumulator(str(tmp_path / "tensorboard"))
+    events = EventAccumulator(str(tmp_path / "tensorboard" / tmp_path.name))
     events.Reload()
-    pictures = events.Images("spectrogram")
-    assert [picture.step for picture in pictures] == [4, 8]
+    assert events.Tags()["images"] == [f"spectrogram/validation_pose_{n}" for n in (0, 1)]
+    pictures = events.Images("spectrogram/validation_pose_1")
+    assert pictures[-1].step == 8
     with Image.open(io.BytesIO(pictures[0].encoded_image_string)) as image:
         assert min(image.size) > 100
 
@@ -50,11 +52,11 @@ def test_drawing_takes_no_more_than_its_share_and_the_last_epoch_has_a_picture(
 ):
     clock = [0.0]
     shown = []
-    monkeypatch.setattr(images_module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
+    monkeypatch.setattr(tensorboard_module, "time", SimpleNamespace(monotonic=lambda: clock[0]))
 
     def draw(*given):
         shown.append(clock[0])
-        clock[0] += 1.0  # so long does a picture take, and an epoch three
+        clock[0] += 0.5  # so long does a picture of two take, and an epoch three
         return torch.zeros(2, 2, 3, dtype=torch.uint8).numpy()
 
     class Epochs(lightning.Callback):
@@ -66,10 +68,11 @@ def test_drawing_takes_no_more_than_its_share_and_the_last_epoch_has_a_picture(
     made.trainer.callbacks.append(callback(made))
     made.train()
     # The second comes 20 s after the first was drawn; the twelfth epoch is the last.
-    assert shown == [3.0, 25.0, 38.0]
+    assert shown == [3.0, 3.5, 25.0, 25.5, 38.0, 38.5]
 
 
-def test_what_is_shown_is_the_first_validation_pose(training, monkeypatch):
+def test_the_same_validation_poses_are_shown_each_time(training, monkeypatch):
+    monkeypatch.setattr(tensorboard_module, "SHARE", 1e9)  # no drawing takes too long
     shown = []
 
     def draw(measured, predicted, range_m, frequency_hz):
@@ -81,11 +84,11 @@ def test_what_is_shown_is_the_first_validation_pose(training, monkeypatch):
     made.trainer.callbacks.append(callback(made))
     made.train()
     store = made.data.store
-    first = torch.from_numpy(store.read_pose(int(store.indices("val")[0])))
-    expected = 20 * torch.log10(1 + first / store.attributes["reference"])
-    assert len(shown) == 2
-    for measured, predicted, range_m, frequency_hz in shown:
-        torch.testing.assert_close(torch.from_numpy(measured), expected)
+    heard = [torch.from_numpy(store.read_pose(int(n))) for n in store.indices("val")]
+    expected = [20 * torch.log10(1 + one / store.attributes["reference"]) for one in heard]
+    assert len(shown) == 4
+    for number, (measured, predicted, range_m, frequency_hz) in enumerate(shown):
+        torch.testing.assert_close(torch.from_numpy(measured), expected[number % 2])
         assert predicted.shape == measured.shape == (2, len(range_m), len(frequency_hz))
 
 

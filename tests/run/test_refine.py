@@ -11,6 +11,7 @@ import pytest
 import safetensors.torch
 import torch
 import trimesh
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sononerf.errors import IncompatibleError, ResourceError
 from sononerf.progress import Progress
@@ -76,6 +77,11 @@ def test_a_run_has_its_refined_surface(run, no_projections):
     found = read_json(folder / "read_out.json")
     assert isinstance(found["refined"], bool)
     assert found["validation_error_db"] > 0
+    events = EventAccumulator(str(run / "tensorboard" / run.name))
+    events.Reload()
+    stages_shown = [one.step for one in events.Scalars("refinement/validation_error_dB")]
+    assert stages_shown == [1, 2, 3]  # two ways of the first stage, and the second
+    assert "mesh/refinement_stages_VERTEX" in events.Tags()["tensors"]
     again = reconstruct(run, method="filled", spacing=0.008, accelerator="cpu")
     assert read_json(again / "read_out.json")["validation_error_db"] is None
 

@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
+from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
 from sononerf.report.pictures.figure import png_from_pixels
 from sononerf.report.pictures.shading import (
@@ -100,30 +103,106 @@ def confidence_png(
         raise ValueError(f"counts: shape {np.shape(counts)}, expected one per vertex")
     camera = camera_for(mesh.vertices, size=size, view=view, fill=0.74)
     picture = Image.fromarray(_picture(mesh, camera, confidence_colours(counts)))
-    _draw_colour_bar(picture)
+    _draw_colour_bar(picture, CONFIDENCE_BAR)
     return png_from_pixels(np.asarray(picture))
 
 
-def _draw_colour_bar(picture: Image.Image) -> None:
-    """Draw what the colours of a confidence mean near the lower left corner, in place."""
+@dataclass(frozen=True, eq=False)
+class ColourBar:
+    """What the colours of a mesh mean.
+
+    Attributes:
+        title: What is shown, with its unit.
+        colours: Colours (N, 3), 0 to 1, of places (N,) from 0 to 1 along the bar.
+        marks: Place along the bar, 0 to 1, and what stands there.
+    """
+
+    title: str
+    colours: Callable[[Floats], Floats]
+    marks: tuple[tuple[float, str], ...]
+
+
+CONFIDENCE_BAR = ColourBar(
+    "poses that heard this place",
+    lambda places: confidence_colours(np.expm1(places * np.log1p(MANY_POSES))),
+    tuple(
+        (float(np.log1p(n) / np.log1p(MANY_POSES)), f"{n}+" if n == MANY_POSES else str(n))
+        for n in (0, 3, 10, 30, MANY_POSES)
+    ),
+)
+
+
+def error_bar(limit: float) -> ColourBar:
+    """Return the colour bar of signed errors up to a limit, m: red outside, blue inside."""
+    marks = tuple((0.5 + 0.5 * part, f"{1e3 * part * limit:+.2g}") for part in (-1, -0.5, 0.5, 1))
+    return ColourBar("mm outside (+) or inside (-) of the truth", _diverging, (*marks, (0.5, "0")))
+
+
+def error_colours(error: ArrayLike, limit: float) -> Floats:
+    """Colour signed errors (V,), m, as :func:`error_bar` shows; larger ones like the limit."""
+    return _diverging(0.5 + 0.5 * np.clip(np.asarray(error) / limit, -1, 1))
+
+
+def _diverging(places: Floats) -> Floats:
+    from matplotlib import colormaps
+
+    colours: Floats = colormaps["RdBu_r"](0.08 + 0.84 * np.asarray(places))[:, :3]
+    return colours
+
+
+SIDES = ("front", "left", "back", "right")
+
+
+def sides_png(
+    rows: Sequence[tuple[str, trimesh.Trimesh, ArrayLike, ColourBar | None]],
+    *,
+    size: tuple[int, int] = (380, 340),
+) -> bytes:
+    """Draw meshes from four sides through the same cameras, one mesh per row.
+
+    Args:
+        rows: Of each row a title, the mesh, its colours as of :func:`mesh_png`, and what they mean.
+        size (int, int): Width and height of each view in pixels.
+    """
+    for title, mesh, *_ in rows:
+        _require_drawable(mesh, title)
+    points = np.vstack([mesh.vertices for _, mesh, *_ in rows])
+    font = ImageFont.load_default(15)
+    lines = []
+    for title, mesh, colours, bar in rows:
+        line = []
+        for number, side in enumerate(SIDES):
+            x, y, z = DEFAULT_VIEW
+            view = [(x, y, z), (-y, x, z), (-x, -y, z), (y, -x, z)][number]
+            camera = camera_for(points, size=size, view=view, fill=0.7)
+            cell = Image.fromarray(_picture(mesh, camera, colours))
+            text = f"{title}, from the {side}" if not number else f"from the {side}"
+            ImageDraw.Draw(cell).text((10, 8), text, fill=INK, font=font)
+            if bar is not None and not number:
+                _draw_colour_bar(cell, bar)
+            line.append(np.asarray(cell))
+        lines.append(np.hstack(line))
+    return png_from_pixels(np.vstack(lines))
+
+
+def _draw_colour_bar(picture: Image.Image, bar: ColourBar) -> None:
+    """Draw what colours mean near the lower left corner, in place."""
     width, height = picture.size
-    margin, length, thick = height // 24, width // 4, max(6, height // 55)
+    margin, length, thick = height // 24, max(width // 4, 150), max(6, height // 55)
     left, bottom = margin, height - margin
-    share = np.linspace(0, 1, length)
-    colours = confidence_colours(np.expm1(share * np.log1p(MANY_POSES)))
-    bar = np.broadcast_to(np.round(255 * colours).astype(np.uint8), (thick, length, 3))
+    strip = np.round(255 * bar.colours(np.linspace(0, 1, length))).astype(np.uint8)
+    strip = np.ascontiguousarray(np.broadcast_to(strip, (thick, length, 3)))
     draw = ImageDraw.Draw(picture)
     font = ImageFont.load_default(max(11, height // 40))
     line = round(1.3 * font.getbbox("0")[3])
     top = bottom - line - thick
-    picture.paste(Image.fromarray(np.ascontiguousarray(bar)), (left, top))
+    picture.paste(Image.fromarray(strip), (left, top))
     draw.rectangle([(left, top), (left + length - 1, top + thick - 1)], outline=INK)
-    for poses in (0, 3, 10, 30, MANY_POSES):
-        x = left + np.log1p(poses) / np.log1p(MANY_POSES) * (length - 1)
+    for place, text in bar.marks:
+        x = left + place * (length - 1)
         draw.line([(x, top + thick), (x, top + thick + 4)], fill=INK, width=1)
-        text = f"{poses}+" if poses == MANY_POSES else str(poses)
         draw.text((x, bottom), text, fill=INK, font=font, anchor="ms")
-    draw.text((left, top - 6), "poses that heard this place", fill=INK, font=font, anchor="ls")
+    draw.text((left, top - 6), bar.title, fill=INK, font=font, anchor="ls")
 
 
 def _require_drawable(mesh: trimesh.Trimesh, name: str) -> None:

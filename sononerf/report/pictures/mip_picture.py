@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Iterator
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import zoom
 
 from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
@@ -76,14 +78,7 @@ def mip_png(
     width, height = max(1.4, wide * inch) + 1.6, max(2.2, tall * inch) + 0.9
     with figure(width, height, 130, layout="compressed") as drawn:
         axes = drawn.subplots()
-        picture = axes.imshow(
-            values.T,
-            cmap=COLOUR_MAP,
-            vmin=low,
-            vmax=high,
-            extent=[1e3 * edge for edge in (left, right, bottom, top)],
-            aspect="equal",
-        )
+        picture = _draw(axes, values, extents, (low, high))
         axes.set_xlabel(f"{labels[0]} (mm)")
         axes.set_ylabel(f"{labels[1]} (mm)")
         if title:
@@ -98,35 +93,69 @@ def mip_image(
 ) -> NDArray[np.uint8]:
     """Return one projection as pixels (H, W, 3), second axis upwards, without axes or labels.
 
-    Voxels are repeated a whole number of times, so that the longer side comes near ``longest``.
+    Values between voxels are interpolated, so that the longer side comes near ``longest``.
     """
     from matplotlib import colormaps
 
     values = _scaled(projection, scale)
     low, high = _limits(values, scale)
-    colours = colormaps[COLOUR_MAP]((values.T[::-1] - low) / (high - low), bytes=True)[..., :3]
     repeat = max(1, longest // max(values.shape))
-    pixels: NDArray[np.uint8] = colours.repeat(repeat, axis=0).repeat(repeat, axis=1)
-    return pixels
+    fine = zoom(values.T[::-1], repeat, order=1, grid_mode=True, mode="nearest")
+    pixels: NDArray[np.uint8] = colormaps[COLOUR_MAP]((fine - low) / (high - low), bytes=True)
+    return pixels[..., :3]
 
 
-def mip_pngs(volume: Volume, *, scale: Scale = "db") -> dict[str, bytes]:
-    """Draw a volume's three projections, named by the axis looked along: "x", "y" and "z"."""
+def _panels(volume: Volume) -> Iterator[tuple[str, Floats, Extents, tuple[str, str]]]:
+    """Yield the axis looked along, the projection, its outer edges (m), and names of its axes."""
     edges = [
         (float(axis[0] - volume.spacing / 2), float(axis[-1] + volume.spacing / 2))
         for axis in volume.axes()
     ]
-    pictures = {}
     for name, projection in maximum_intensity_projections(volume).items():
         first, second = (axis for axis in range(3) if "xyz"[axis] != name)
-        pictures[name] = mip_png(
-            projection,
-            (edges[first], edges[second]),
-            ("xyz"[first], "xyz"[second]),
-            title=f"maximum along {name}",
-            scale=scale,
-        )
-    return pictures
+        extents = edges[first], edges[second]
+        yield name, np.asarray(projection), extents, ("xyz"[first], "xyz"[second])
+
+
+def mip_pngs(volume: Volume, *, scale: Scale = "db") -> dict[str, bytes]:
+    """Draw a volume's three projections, named by the axis looked along: "x", "y" and "z"."""
+    return {
+        name: mip_png(projection, extents, labels, title=f"maximum along {name}", scale=scale)
+        for name, projection, extents, labels in _panels(volume)
+    }
+
+
+def mips_image(volume: Volume) -> NDArray[np.uint8]:
+    """Return the three projections beside one another as pixels (H, W, 3), with axes in mm.
+
+    All parts have fixed places: finding a layout would take twice as long as drawing.
+    """
+    top = float(volume.values.max())
+    with figure(10.5, 3.3, 90, layout=None) as drawn:
+        for number, (name, projection, extents, labels) in enumerate(_panels(volume)):
+            axes = drawn.add_axes((0.06 + 0.3 * number, 0.16, 0.235, 0.74))
+            levels = 10 * np.log10(np.maximum(projection / top, 10 ** (-RANGE_DB / 10)))
+            picture = _draw(axes, levels, extents, (-RANGE_DB, 0.0))
+            axes.set_xlabel(f"{labels[0]} (mm)")
+            axes.set_ylabel(f"{labels[1]} (mm)", labelpad=1)
+            axes.set_title(f"maximum along {name}")
+        bar = drawn.add_axes((0.925, 0.16, 0.014, 0.74))
+        drawn.colorbar(picture, cax=bar, label="dB below the maximum")
+        return pixels_from_figure(drawn)
+
+
+def _draw(axes: Any, values: Floats, extents: Extents, limits: tuple[float, float]) -> Any:
+    """Draw values (A, B) over millimetres and return the picture."""
+    (left, right), (bottom, top) = extents
+    return axes.imshow(
+        values.T,
+        cmap=COLOUR_MAP,
+        vmin=limits[0],
+        vmax=limits[1],
+        extent=[1e3 * edge for edge in (left, right, bottom, top)],
+        aspect="equal",
+        interpolation="bilinear",
+    )
 
 
 def maximum_intensity_projections(volume: Volume) -> dict[str, NDArray[np.floating]]:

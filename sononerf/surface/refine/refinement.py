@@ -132,6 +132,11 @@ class Refinement:
         simulate: Makes the simulator of a surface, for the stages that are corrected by it.
         seed: Of the order of poses and of traced rays.
         stages: From coarse to fine; ``STAGES`` where None.
+
+    Attributes:
+        history: As of :class:`Refined`, so far.
+        newest: The surface that the last entry of the history tells of; None before the first, and
+            after a state was taken over.
     """
 
     def __init__(
@@ -159,6 +164,7 @@ class Refinement:
         self.way = self.ways[0]
         self.history: list[dict[str, Any]] = []
         self.faults: list[str] = []
+        self.newest: trimesh.Trimesh | None = None
         self._rivals: list[trimesh.Trimesh] = []  # what the first stage made in each way
         self._descent: Descent | None = None
         self._later: LaterBounces | None = None
@@ -209,6 +215,7 @@ class Refinement:
                 "objective_db": objective,
             }
         )
+        self.newest = mesh
         if self.stage == 0:
             self._rivals.append(mesh)
             if len(self._rivals) < len(self.ways):

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: MIT
-"""One page of a run: what is there is shown, what is not is named with its command."""
+"""One page of runs: what is there is shown, what is not is named with its command."""
 
 from __future__ import annotations
 
+import base64
+import html
 import json
 import re
 import shutil
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,8 +16,11 @@ import pytest
 import trimesh
 
 from sononerf.errors import InputError, NumericalError
-from sononerf.run import report_run as report_module
-from sononerf.run.report_run import report
+from sononerf.report.surface_views import SurfaceViews
+from sononerf.run import report_runs as report_module
+from sononerf.run.report_runs import report as report_runs
+from sononerf.run.table import table
+from sononerf.surface.mesh_files import mesh_bytes
 
 METRICS = {
     "schema": 1,
@@ -71,77 +77,173 @@ def finished(run):
     (run / "reconstruction").mkdir()
     for name in ("view", "mip_x", "mip_y", "mip_z"):
         (run / "reconstruction" / f"{name}.png").write_bytes(name.encode())
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.021)
+    data = mesh_bytes(mesh, "ply", confidence=np.arange(len(mesh.vertices)))
+    (run / "reconstruction" / "mesh.ply").write_bytes(data)
+    (run / "reconstruction" / "read_out.json").write_text("{}")
     return run
+
+
+def report(run, **options):
+    return report_runs([run], **options)
+
+
+def plain(page):
+    """The page's text, without pictures and scripts."""
+    text = re.sub(r"<(script|style).*?</\1>", "", page.read_text(), flags=re.DOTALL)
+    return html.unescape(re.sub(r"<[^>]*>", "", text))
 
 
 def rows_of(page):
     """The page's tables by the name of their rows."""
-    lines = [line for line in page.read_text().splitlines() if line.startswith("| ")]
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    rows = re.findall(r"<tr>(.*?)</tr>", page.read_text())
+    cells = [re.findall(r"<t[dh]>(.*?)</t[dh]>", row) for row in rows]
     return {first: rest for first, *rest in cells}
 
 
 def pictures_of(page):
-    return re.findall(r"!\[[^]]*\]\(([^)]*)\)", page.read_text())
+    """The page's pictures by their captions."""
+    found = re.findall(r'<img src="data:image/png;base64,([^"]*)" alt="([^"]*)"', page.read_text())
+    return {html.unescape(caption): base64.b64decode(data) for data, caption in found}
 
 
 def test_numbers_stand_beside_those_of_the_baselines(finished):
     page = report(finished)
-    assert page == finished / "report" / "report.md"
+    assert page == finished / "report.html"
     rows = rows_of(page)
-    assert rows["all cells"] == ["0.29", "2.22", "-", "0.82"]
-    assert rows["active cells"] == ["1.28", "9.22", "-", "-"]
+    assert rows["all cells"] == ["0.29", "0.82", "2.22", "-"]
+    assert rows["active cells"] == ["1.28", "-", "9.22", "-"]
     assert rows["F-score at 5 mm"] == ["0.95", "0.74", "-"]
     assert rows["F-score at 1 mm"] == ["0.90", "-", "-"]
     assert rows["Chamfer distance, mm"] == ["3.14", "4.60", "-"]
     assert rows["thickness bias, mm"] == ["-0.72", "-", "-"]
     assert rows["parts"] == ["2", "-", "-"]
-    text = page.read_text()
-    assert text.startswith("# leaf-7\n")
+    assert rows["parts in truth"] == ["3", "-", "-"]
+    assert rows["fit, s"] == ["61"]
+    text = plain(page)
+    assert "<title>leaf-7</title>" in page.read_text()
     assert "12 steps, 61 s of fit on cpu, 0.7 GB of memory" in text
     assert "Mean over 5 poses that were never trained on" in text
     assert "F-score of the target alone, without its background: 0.61 at 5 mm." in text
-    assert "In truth there are 3 parts." in text
     assert "radius: 0.02" in text  # the settings
 
 
 def test_best_median_and_worst_pose_are_shown(finished):
     page = report(finished)
-    found = re.findall(r"Pose (\d+), the (\w+) of 5: ([\d.]+) dB", page.read_text())
+    found = re.findall(r"Pose (\d+), the (\w+) of 5: ([\d.]+) dB", plain(page))
     assert [(int(n), name) for n, name, _ in found] == [(41, "best"), (44, "median"), (42, "worst")]
     # 20 log10 of the factor, for all is far above the reference.
     expected = [0.0, 20 * np.log10(1.2), 20 * np.log10(3.0)]
     np.testing.assert_allclose([float(db) for *_, db in found], expected, atol=0.03)
-    assert (page.parent / "pose_0042.png").read_bytes() == b"pose 42"
+    shown = {caption[:8]: picture for caption, picture in pictures_of(page).items()}
+    assert shown["Pose 42,"] == b"pose 42"
 
 
-def test_the_page_can_be_moved_with_its_pictures(finished, tmp_path):
-    page = report(finished, output=tmp_path / "page")
-    shown = pictures_of(page)
-    assert len(shown) == 7
-    assert {p.name for p in page.parent.iterdir()} == {"report.md", *shown}
-    assert (page.parent / "mip_y.png").read_bytes() == b"mip_y"
+def test_the_page_holds_all_that_it_shows(finished, tmp_path):
+    page = report(finished, output=tmp_path / "elsewhere" / "page.html")
+    assert [p.name for p in page.parent.iterdir()] == ["page.html"]
+    assert pictures_of(page)["Reflectivity, the largest along y."] == b"mip_y"
+    # Nothing is asked for: neither sources nor links lead out of the page.
+    outside = re.findall(r"""(?:src|href)=["'](?!data:)[^"']*""", page.read_text())
+    assert not outside
+
+
+def test_the_mesh_stands_beside_the_truth_and_can_be_turned(finished):
+    text = report(finished).read_text()
+    assert re.findall(r'<option value="([^"]*)"', text) == [
+        "reconstruction, coloured by its error",
+        "reconstruction, coloured by how many poses heard it",
+        "truth",
+    ]
+    shapes = json.loads(re.search(r"shapes = (\{.*?\});", text).group(1))
+    for data in shapes.values():
+        assert base64.b64decode(data).startswith(b"glTF")
+    assert text.count("<iframe") == 1
+    sides = pictures_of(finished / "report.html")["Four sides; colours are explained at the left."]
+    assert sides.startswith(b"\x89PNG")
+
+
+def test_colours_tell_outside_from_inside(finished):
+    """A mesh moved along x is red where it sticks out of the truth and blue at the other end."""
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
+    truth = mesh.copy()
+    mesh.apply_translation([0.002, 0.0, 0.0])
+    shown = SurfaceViews(mesh, None, truth, limit=0.002).meshes()
+    coloured = shown["reconstruction, coloured by its error"]
+    red, _, blue, _ = coloured.visual.vertex_colors.T.astype(int)
+    out = coloured.vertices[:, 0] - 0.002
+    assert (red > blue + 50)[out > 0.015].all()
+    assert (blue > red + 50)[out < -0.015].all()
+
+
+def test_an_interrupted_fit_has_a_page_of_what_it_has(run):
+    (run / "model.json").unlink()
+    (run / "metrics.json").write_text(json.dumps({"schema": 1, "cost": {"simulate_s": 3.0}}))
+    for epoch in (1, 2):
+        (run / "epochs" / f"{epoch:04d}").mkdir(parents=True)
+        told = {"epoch": epoch, "step": 10 * epoch, "val/mae_db": 1.0 / epoch}
+        (run / "epochs" / f"{epoch:04d}" / "metrics.json").write_text(json.dumps(told))
+    page = report(run)
+    assert "The fit has not come to its end; sononerf fit" in plain(page)
+    assert list(pictures_of(page)) == ["The field alone on validation poses."]
+
+
+def test_several_runs_stand_side_by_side(finished, tmp_path, monkeypatch):
+    other = shutil.copytree(finished, tmp_path / "other")
+    numbers = {**METRICS, "prediction": {**METRICS["prediction"], "mae_db": 0.5}}
+    (other / "metrics.json").write_text(json.dumps(numbers))
+    config = (other / "config.yaml").read_text()
+    assert "learning_rate: " in config
+    (other / "config.yaml").write_text(
+        re.sub(r"learning_rate: .*", "learning_rate: 0.007", config, count=1)
+    )
+    monkeypatch.chdir(tmp_path)
+    page = report_runs([finished, other])
+    assert page == Path("report.html")
+    rows = rows_of(page)
+    assert rows[""] == ["leaf-7", "other"]
+    assert rows["held-out error, all cells, dB"] == ["0.29", "0.50"]
+    assert rows["fit.learning_rate"][1] == "0.007"
+    assert "fit.epochs" not in rows
+    assert "noise floor, all cells, dB" not in rows  # no run has one
+    assert page.read_text().count('alt="other"') == 4  # view and three projections
+
+
+def test_a_table_has_a_column_per_run_and_a_line_of_csv(finished, tmp_path):
+    other = shutil.copytree(finished, tmp_path / "other")
+    (other / "metrics.json").write_text(json.dumps({"schema": 1}))
+    lines = table([finished, other], csv=tmp_path / "t.csv")
+    assert lines[0].split() == ["leaf-7", "other"]
+    (chamfer,) = (line for line in lines if line.startswith("Chamfer"))
+    assert chamfer.split()[-2:] == ["3.14", "-"]
+    first, *rest = (tmp_path / "t.csv").read_text().splitlines()
+    values = dict(zip(first.split(","), rest[0].split(","), strict=True))
+    assert (values["run"], values["geometry.chamfer_m"]) == ("leaf-7", "0.00314")
+    assert rest[1].startswith("other,,")
+    (other / "metrics.json").write_text(json.dumps({"prediction": {"mae_db": "much"}}))
+    with pytest.raises(InputError, match=r"metrics\.json: damaged"):
+        table([finished, other])
 
 
 def test_what_is_not_there_yet_is_named_with_its_command(run):
-    text = report(run).read_text()
+    text = plain(report(run))
     for command in ("predict", "evaluate", "reconstruct"):
-        assert f"`sononerf {command} {run}`" in text
-    assert not pictures_of(run / "report" / "report.md")
+        assert f"sononerf {command} {run}" in text
+    assert not pictures_of(run / "report.html")
 
 
 def test_a_missing_picture_is_named(finished):
     (finished / "reconstruction" / "mip_y.png").unlink()
     page = report(finished)
-    assert f"mip_y.png is missing; `sononerf reconstruct {finished}` makes it" in page.read_text()
-    assert "mip_y.png" not in pictures_of(page)
+    assert f"mip_y.png is missing; sononerf reconstruct {finished} makes it" in plain(page)
+    assert "Reflectivity, the largest along y." not in pictures_of(page)
 
 
 def test_without_held_out_poses_nothing_is_asked_for(run):
     description = json.loads((run / "model.json").read_text())
     description["settings"]["poses"]["heldout"] = 0
     (run / "model.json").write_text(json.dumps(description))
-    text = report(run).read_text()
+    text = plain(report(run))
     assert "No pose was held out" in text
     assert "sononerf predict" not in text
 
@@ -154,22 +256,22 @@ def test_the_papers_figures_have_their_counterparts(finished, monkeypatch):
     (other / "comparison.json").write_text(json.dumps(told))
     (other / "mip_x.png").write_bytes(b"difference")
     drawn = []
-    plain = report_module.scene_png
+    real = report_module.scene_png
 
     def scene_png(mesh, positions, forward, *, split):
         drawn.append((len(positions), np.bincount(split).tolist()))
-        return plain(mesh, positions, forward, split=split)
+        return real(mesh, positions, forward, split=split)
 
     monkeypatch.setattr(report_module, "scene_png", scene_png)
     page = report(finished, paper=True)
     assert drawn == [(12, [8, 2, 2])]
-    shown = pictures_of(page)
-    assert shown[-3:] == ["scene.png", "isosurface.png", "compare-empty-mip_x.png"]
-    for name in ("scene.png", "isosurface.png"):
-        assert (page.parent / name).read_bytes().startswith(b"\x89PNG")
-    assert (page.parent / "compare-empty-mip_x.png").read_bytes() == b"difference"
-    text = page.read_text()
-    assert "Beside `empty` the strongest difference is 0.55 of the common maximum, 6.3 mm" in text
+    *_, scene, isosurface, difference = pictures_of(page).items()
+    assert (scene[0], isosurface[0][:19]) == ("The scene.", "Sum over 100 direct")
+    for _, picture in (scene, isosurface):
+        assert picture.startswith(b"\x89PNG")
+    assert difference == ("mip_x", b"difference")
+    text = plain(page)
+    assert "Beside empty the strongest difference is 0.55 of the common maximum, 6.3 mm" in text
     assert "Sum over 100 directions" in text
 
 
@@ -178,16 +280,16 @@ def test_without_a_surface_the_page_says_so(finished, monkeypatch):
         raise NumericalError("no surface: the field is silent everywhere")
 
     monkeypatch.setattr(report_module, "read_isosurface", nothing)
-    text = report(finished, paper=True).read_text()
+    text = plain(report(finished, paper=True))
     assert "None: no surface: the field is silent everywhere." in text
-    assert f"`sononerf compare {finished} OTHER`" in text
+    assert f"sononerf compare {finished} OTHER" in text
 
 
 def test_a_damaged_prediction_is_named(finished):
     (finished / "prediction" / "spectrograms.npz").write_bytes(b"PK\x03\x04 cut off")
     with pytest.raises(InputError, match=r"spectrograms\.npz: damaged .*sononerf predict"):
         report(finished)
-    assert not (finished / "report").exists()
+    assert not (finished / "report.html").exists()
 
 
 @pytest.mark.parametrize(
@@ -216,7 +318,7 @@ def test_a_damaged_comparison_is_told_before_the_long_work(finished, monkeypatch
     )
     with pytest.raises(InputError, match=r"comparison\.json"):
         report(finished, paper=True)
-    assert not (finished / "report").exists()  # nor pictures without a page
+    assert not (finished / "report.html").exists()  # nor pictures without a page
 
 
 @pytest.mark.parametrize(
@@ -242,7 +344,7 @@ def test_the_isosurface_is_drawn_as_the_settings_say(finished, monkeypatch, meth
         return mesh, volume, 2.5
 
     monkeypatch.setattr(report_module, "read_isosurface", read_out)
-    assert said in report(finished, paper=True).read_text()
+    assert said in plain(report(finished, paper=True))
     assert asked["level"] == level
     assert (asked["spacing"], asked["directions"]) == (0.005, 12)
     assert asked["smoothing"] == own.get("smoothing", 0.0)
@@ -250,14 +352,14 @@ def test_the_isosurface_is_drawn_as_the_settings_say(finished, monkeypatch, meth
 
 def test_commands_can_be_copied_whatever_the_run_is_called(run):
     odd = run.rename(run.with_name("my leaf"))
-    assert f"`sononerf predict '{odd}'`" in report(odd).read_text()
+    assert f"sononerf predict '{odd}'" in plain(report(odd))
 
 
-def test_a_run_is_no_place_for_a_page(finished):
-    with pytest.raises(InputError, match="is the folder of a run"):
+def test_a_page_needs_the_name_of_a_page(finished):
+    with pytest.raises(InputError, match=r"expected a file whose name ends in \.html"):
         report(finished, output=finished)
 
 
 def test_what_is_no_run_is_refused(tmp_path):
-    with pytest.raises(InputError, match="no fitted run"):
+    with pytest.raises(InputError, match="no run"):
         report(tmp_path)

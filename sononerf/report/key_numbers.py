@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: MIT
+"""The numbers of a run that people ask for first, with their units, as text."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+Rows = list[tuple[str, ...]]
+NONE = "-"
+"""Stands where a number does not apply, or is not known yet."""
+
+
+@dataclass(frozen=True)
+class KeyNumber:
+    """A number of ``metrics.json``.
+
+    Attributes:
+        label: What it is, with its unit.
+        key: Where it stands; parts are separated by a slash.
+        factor: From the file's unit to the label's.
+        form: How it is written.
+    """
+
+    label: str
+    key: str
+    factor: float = 1.0
+    form: str = ".2f"
+
+    def text(self, metrics: Mapping[str, Any]) -> str:
+        """Return the number of a run as text.
+
+        Raises:
+            TypeError, ValueError: If something else stands in its place.
+        """
+        value: Any = metrics
+        for part in self.key.split("/"):
+            value = (value or {}).get(part)
+        return NONE if value is None else format(self.factor * value, self.form)
+
+
+PREDICTION = (
+    KeyNumber("held-out error, all cells, dB", "prediction/mae_db"),
+    KeyNumber("held-out error, active cells, dB", "prediction/mae_db_active"),
+    KeyNumber("field alone, all cells, dB", "prediction/rendered_mae_db"),
+    KeyNumber("field alone, active cells, dB", "prediction/rendered_mae_db_active"),
+    KeyNumber("mean spectrogram, all cells, dB", "prediction/mean_predictor_mae_db"),
+    KeyNumber("mean spectrogram, active cells, dB", "prediction/mean_predictor_mae_db_active"),
+    KeyNumber("noise floor, all cells, dB", "prediction/noise_floor_mae_db"),
+    KeyNumber("noise floor, active cells, dB", "prediction/noise_floor_mae_db_active"),
+)
+SHAPE = (
+    KeyNumber("Chamfer distance, mm", "chamfer_m", 1e3),
+    KeyNumber("thickness bias, mm", "thickness_bias_m", 1e3, "+.2f"),
+    KeyNumber("volume over true volume", "volume_ratio"),
+    KeyNumber("intersection over union", "iou"),
+    KeyNumber("normal consistency", "normal_consistency"),
+    KeyNumber("parts", "components", form=".0f"),
+    KeyNumber("parts in truth", "components_true", form=".0f"),
+)
+COST = (
+    KeyNumber("steps", "cost/steps", form=".0f"),
+    KeyNumber("fit, s", "cost/fit_s", form=".0f"),
+    KeyNumber("surface, s", "cost/reconstruct_s", form=".0f"),
+    KeyNumber("memory at most, GB", "cost/peak_memory_bytes", 1e-9, ".1f"),
+    KeyNumber("parameters", "cost/parameters", form=".0f"),
+)
+
+
+def limits(columns: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the distances of F-scores, as the files name them, that any geometry knows."""
+    known = {limit for column in columns for limit in column.get("fscore") or {}}
+    return sorted(known, key=float)
+
+
+def shape_rows(columns: Sequence[Mapping[str, Any]]) -> Rows:
+    """Return label and one text per geometry: F-scores first, then the other numbers."""
+    rows: Rows = []
+    for limit in limits(columns):
+        number = KeyNumber(f"F-score at {1e3 * float(limit):g} mm", f"fscore/{limit}")
+        rows.append((number.label, *(number.text(column) for column in columns)))
+    return rows + [(n.label, *(n.text(column) for column in columns)) for n in SHAPE]
+
+
+def run_rows(runs: Sequence[Mapping[str, Any]]) -> Rows:
+    """Return label and one text per run's metrics; rows that no run has are left out."""
+    rows = [(n.label, *(n.text(run) for run in runs)) for n in PREDICTION]
+    rows += shape_rows([run.get("geometry") or {} for run in runs])
+    rows += [(n.label, *(n.text(run) for run in runs)) for n in COST]
+    return [row for row in rows if set(row[1:]) != {NONE}]

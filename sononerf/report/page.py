@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: MIT
+"""One page of HTML with all that it shows inside: it opens offline, and can be mailed."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+import re
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import trimesh
+
+from sononerf.array_types import Floats
+from sononerf.report.pictures.shading import camera_for
+
+STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, sans-serif; color: #222a33; background: #fff;
+       max-width: 76rem; margin: 0 auto; padding: 1rem; }
+h1 { font-size: 1.7rem; margin: 0.5rem 0; } h2 { font-size: 1.25rem; margin: 2rem 0 0.5rem; }
+h3 { font-size: 1.05rem; margin: 1.2rem 0 0.3rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; margin: 0.5rem 0; font-size: 0.92rem; }
+th, td { padding: 0.25rem 0.8rem; border-bottom: 1px solid #d5dae0; text-align: right;
+         font-variant-numeric: tabular-nums; vertical-align: top; }
+th:first-child, td:first-child { text-align: left; } thead th { border-bottom: 2px solid #8a94a0; }
+img { max-width: 100%; height: auto; } figure { margin: 0.6rem 0; }
+figcaption { font-size: 0.9rem; color: #55606c; }
+.side { display: flex; flex-wrap: wrap; gap: 0.8rem; align-items: flex-start; }
+.side figure { flex: 1 1 18rem; margin: 0; min-width: 0; }
+.view { height: min(70vh, 34rem); width: 100%; border: 1px solid #d5dae0; box-sizing: border-box; }
+pre { overflow-x: auto; background: #f4f6f8; padding: 0.8rem; font-size: 0.85rem; }
+code { background: #f4f6f8; padding: 0 0.2rem; overflow-wrap: anywhere; }
+select { font: inherit; margin: 0.3rem 0; }
+"""
+
+SWITCH = """
+const page = %s, shapes = %s;
+const frame = document.getElementById("view"), choice = document.getElementById("shape");
+const show = () => { frame.srcdoc = page.replace("$SHAPE", () => shapes[choice.value]); };
+choice.addEventListener("change", show);
+show();
+"""
+
+
+class Page:
+    """A page that grows from top to bottom.
+
+    Args:
+        title: Its first heading.
+
+    Attributes:
+        parts: HTML, one part after the other.
+    """
+
+    def __init__(self, title: str) -> None:
+        self.title = title
+        self.parts = [f"<h1>{html.escape(title)}</h1>"]
+
+    def heading(self, text: str, level: int = 2) -> None:
+        """Begin a section; the page's title has level 1."""
+        self.parts.append(f"<h{level}>{html.escape(text)}</h{level}>")
+
+    def say(self, text: str) -> None:
+        """Add a paragraph; what stands between backticks is shown as code."""
+        self.parts.append(f"<p>{_inline(text)}</p>")
+
+    def code(self, text: str) -> None:
+        """Add lines as they are."""
+        self.parts.append(f"<pre>{html.escape(text)}</pre>")
+
+    def table(self, rows: Sequence[Sequence[str]]) -> None:
+        """Add a table; its first row has the heads of the columns."""
+        head, *body = ["".join(f"<td>{_inline(cell)}</td>" for cell in row) for row in rows]
+        head = head.replace("td>", "th>")
+        lines = "".join(f"<tr>{row}</tr>" for row in body)
+        self.parts.append(
+            f'<div class="wide"><table><thead><tr>{head}</tr></thead>'
+            f"<tbody>{lines}</tbody></table></div>"
+        )
+
+    def pictures(self, pictures: Mapping[str, bytes]) -> None:
+        """Add PNG files by their captions, side by side where there is room."""
+        figures = "".join(
+            f'<figure><img src="data:image/png;base64,{base64.b64encode(png).decode()}" '
+            f'alt="{html.escape(caption)}"><figcaption>{_inline(caption)}</figcaption></figure>'
+            for caption, png in pictures.items()
+        )
+        self.parts.append(f'<div class="side">{figures}</div>')
+
+    def view(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
+        """Add meshes with their colours in a view that turns by mouse and touch, once in a page.
+
+        Args:
+            meshes: By what a reader chooses them by; the first one is shown first.
+        """
+        from trimesh.viewer.notebook import scene_to_html
+
+        turned = {name: mesh.copy() for name, mesh in meshes.items()}
+        for mesh in turned.values():
+            mesh.apply_transform(_camera_frame())
+        scenes = {name: trimesh.Scene([mesh]) for name, mesh in turned.items()}
+        shapes = {
+            name: base64.b64encode(scene.export(file_type="glb")).decode()
+            for name, scene in scenes.items()
+        }
+        first = next(iter(shapes))
+        viewer = scene_to_html(scenes[first]).replace(shapes[first], "$SHAPE")
+        options = "".join(
+            f'<option value="{html.escape(name)}">{html.escape(name)}</option>' for name in shapes
+        )
+        script = SWITCH % tuple(json.dumps(one).replace("</", "<\\/") for one in (viewer, shapes))
+        self.parts.append(
+            f'<label>Show <select id="shape">{options}</select></label>'
+            f'<iframe class="view" id="view" title="mesh in three dimensions"></iframe>'
+            f"<script>{script}</script>"
+        )
+
+    def html(self) -> str:
+        """Return the whole page."""
+        return (
+            '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+            '<meta name="viewport" content="width=device-width, initial-scale=1">'
+            f"<title>{html.escape(self.title)}</title>"
+            '<link rel="icon" href="data:,">'
+            f"<style>{STYLE}</style></head><body>\n" + "\n".join(self.parts) + "\n</body></html>\n"
+        )
+
+
+def _camera_frame() -> Floats:
+    """Return what turns the world so that a camera on the z axis, y up, looks at its front."""
+    towards, right, up = camera_for(np.eye(3), size=(1, 1)).axes
+    frame = np.eye(4)
+    frame[:3, :3] = right, up, towards
+    return frame
+
+
+def _inline(text: str) -> str:
+    return re.sub("`([^`]*)`", r"<code>\1</code>", html.escape(text))

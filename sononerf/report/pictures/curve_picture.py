@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: MIT
+"""Curves of a fit: errors over steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
+
+
+def curves_png(
+    curves: Mapping[str, tuple[Sequence[float], Sequence[float]]],
+    *,
+    floors: Mapping[str, float] | None = None,
+) -> bytes:
+    """Draw errors over steps on a logarithmic axis.
+
+    Args:
+        curves: Steps and errors, dB, by their names.
+        floors: Errors, dB, that no prediction can fall below, by their names.
+    """
+    with figure(6.4, 3.4, 130) as drawn:
+        axes = drawn.subplots()
+        for number, (name, (steps, errors)) in enumerate(curves.items()):
+            axes.plot(steps, errors, "o-", markersize=2.5, color=f"C{number}", label=name)
+        for number, (name, floor) in enumerate((floors or {}).items()):
+            axes.axhline(floor, linestyle="--", linewidth=1, color=f"C{number}", label=name)
+        axes.set_yscale("log")
+        axes.set_xlabel("step")
+        axes.set_ylabel("error on validation poses (dB)")
+        axes.grid(which="both", linewidth=0.3, alpha=0.6)
+        axes.legend(fontsize=8)
+        return png_from_pixels(pixels_from_figure(drawn))

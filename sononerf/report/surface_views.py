@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: MIT
+"""A surface beside the truth, coloured by its error and by its confidence: pictures and meshes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from sononerf.array_types import Floats
+from sononerf.evaluation.geometry import signed_error
+from sononerf.report.pictures.mesh_picture import (
+    CLAY,
+    CONFIDENCE_BAR,
+    STEEL,
+    ColourBar,
+    error_bar,
+    error_colours,
+    sides_png,
+)
+from sononerf.surface.mesh_files import confidence_colours, linear_light
+
+MOST_TRIANGLES = 60_000
+"""Of a mesh in a page; a larger one is decimated to this, so that a page stays below 15 MB."""
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceViews:
+    """What there is to see of a surface.
+
+    Args:
+        mesh: The reconstruction, m.
+        confidence ((V,) int32 or None): How many poses heard each vertex.
+        truth: The true surface in the frame of the reconstruction, m; None where it is not known.
+        limit (m): Error of the strongest colour.
+    """
+
+    mesh: trimesh.Trimesh
+    confidence: NDArray[np.int32] | None
+    truth: trimesh.Trimesh | None
+    limit: float
+
+    def _rows(self) -> list[tuple[str, trimesh.Trimesh, Floats, ColourBar | None]]:
+        rows: list[tuple[str, trimesh.Trimesh, Floats, ColourBar | None]] = []
+        if self.truth is not None:
+            error = error_colours(signed_error(self.mesh, self.truth), self.limit)
+            rows.append(("truth", self.truth, np.array(STEEL), None))
+            rows.append(("error", self.mesh, error, error_bar(self.limit)))
+        if self.confidence is not None:
+            colours = confidence_colours(self.confidence)
+            rows.append(("confidence", self.mesh, colours, CONFIDENCE_BAR))
+        return rows or [("reconstruction", self.mesh, np.array(CLAY), None)]
+
+    def png(self) -> bytes:
+        """Draw all of it from four sides, one row for each."""
+        return sides_png(self._rows())
+
+    def meshes(self) -> dict[str, trimesh.Trimesh]:
+        """Return coloured meshes by name, the reconstruction first, for a view that turns."""
+        names = {
+            "error": "reconstruction, coloured by its error",
+            "confidence": "reconstruction, coloured by how many poses heard it",
+        }
+        rows = self._rows()
+        ordered = [row for row in rows if row[0] != "truth"]
+        ordered += [row for row in rows if row[0] == "truth"]
+        return {names.get(name, name): _coloured(mesh, c) for name, mesh, c, _ in ordered}
+
+
+def _coloured(mesh: trimesh.Trimesh, colours: Floats) -> trimesh.Trimesh:
+    """Return a bare mesh with colours in linear light, as glTF has them."""
+    small = decimated(mesh, MOST_TRIANGLES)
+    if colours.ndim == 2:
+        colours = colours[cKDTree(mesh.vertices).query(small.vertices)[1]]
+    light = np.broadcast_to(linear_light(colours), (len(small.vertices), 3))
+    small.visual = trimesh.visual.ColorVisuals(
+        small, vertex_colors=np.round(255 * light).astype(np.uint8)
+    )
+    return small
+
+
+def decimated(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
+    """Return a bare copy of a mesh with at most so many triangles, or nearly so."""
+    if len(mesh.faces) > triangles:
+        import pyvista
+
+        reduced = pyvista.wrap(mesh).decimate(1.0 - triangles / len(mesh.faces))
+        return trimesh.Trimesh(reduced.points, reduced.regular_faces, process=False)
+    return trimesh.Trimesh(mesh.vertices.copy(), mesh.faces.copy(), process=False, validate=False)

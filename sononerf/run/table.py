@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: MIT
+"""The numbers of several runs as lines of text, and as a CSV file."""
+
+from __future__ import annotations
+
+import csv as csv_format
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from sononerf import storage
+from sononerf.errors import InputError
+from sononerf.report.key_numbers import run_rows
+from sononerf.run.report_runs import names_of
+from sononerf.run.run_folder import RunFolder, flat
+
+
+def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
+    """Return the numbers of runs as lines: a row per number, a column per run.
+
+    Args:
+        paths: Runs.
+        csv: Where all numbers of ``metrics.json`` go, one line per run, in its units.
+
+    Raises:
+        InputError: If one is no run, or its numbers are damaged.
+        StorageError: If the CSV file cannot be written.
+    """
+    runs = [RunFolder(path) for path in paths]
+    found = []
+    for run in runs:
+        run.open()
+        found.append(run.read_metrics())
+        try:
+            run_rows(found[-1:])
+        except (TypeError, ValueError, AttributeError) as error:
+            raise InputError(
+                f"{run.metrics}: damaged ({error}); remove it and evaluate again"
+            ) from None
+    names = names_of(runs)
+    rows = [("", *names), *run_rows(found)]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    if csv is not None:
+        values = [flat(metrics) for metrics in found]
+        keys = sorted({key for one in values for key in one} - {"schema"})
+        text = io.StringIO()
+        writer = csv_format.writer(text, lineterminator="\n")
+        writer.writerow(["run", *keys])
+        for name, one in zip(names, values, strict=True):
+            writer.writerow([name, *("" if one.get(key) is None else one[key] for key in keys)])
+        storage.commit_text(csv, text.getvalue())
+    return [
+        "  ".join(
+            cell.ljust(width) if not column else cell.rjust(width)
+            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in rows
+    ]
