@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ import trimesh
 from lightning.pytorch.loggers import TensorBoardLogger
 from torch.utils.tensorboard import SummaryWriter
 
+from sononerf.errors import ResourceError
 from sononerf.report.surface_views import decimated
 
 FOLDER = "tensorboard"
@@ -194,3 +196,26 @@ def log_results(run: Path, settings: Mapping[str, Any], metrics: Mapping[str, An
 
 def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else factor * value
+
+
+def serve(run: Path) -> str:
+    """Start TensorBoard on a run, for this machine alone, until this process ends.
+
+    Returns:
+        url: Where it is.
+
+    Raises:
+        ResourceError: If it cannot be started.
+    """
+    from tensorboard import program
+
+    board = program.TensorBoard()
+    board.configure(
+        argv=[None, "--logdir", str(run / FOLDER), "--host", "127.0.0.1", "--load_fast", "false"]
+    )
+    logging.getLogger("tensorboard").setLevel(logging.ERROR)
+    logging.getLogger("werkzeug").setLevel(logging.ERROR)
+    try:
+        return str(board.launch())
+    except (program.TensorBoardServerException, OSError) as error:
+        raise ResourceError(f"TensorBoard does not start: {error}") from None

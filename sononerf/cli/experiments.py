@@ -124,6 +124,9 @@ def fit(
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Move a run that is there aside.")
     ] = False,
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Serve TensorBoard on this machine meanwhile.")
+    ] = False,
 ) -> None:
     """Simulate where needed, fit, reconstruct, predict the test poses and evaluate.
 
@@ -139,6 +142,10 @@ def fit(
     from sononerf.run.fit import follows
 
     folder = output or Path("runs") / _name(settings, config)
+    if tensorboard and not follows():
+        from sononerf.callbacks.tensorboard import serve
+
+        say(f"TensorBoard until the end of this command: {serve(folder)}")
     done = run(
         settings,
         folder,

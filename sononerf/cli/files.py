@@ -215,3 +215,18 @@ def doctor(as_json: Json = False) -> None:
         return
     for line in as_lines(findings):
         typer.echo(line)
+
+
+@app.command()
+def view(
+    source: Annotated[Path, typer.Argument(help="Folder of a run, or a store.")],
+    port: Annotated[
+        int, typer.Option(min=1, max=65535, help="Where the page is; the next free one if taken.")
+    ] = 8080,
+) -> None:
+    """Show a run or a store in the browser: mesh, volume, poses, echoes, a head to drag."""
+    from sononerf.run.view import View
+
+    shown = View(source, port=port)
+    say(f"open {shown.viewer.url}; Ctrl-C ends it")
+    shown.follow()

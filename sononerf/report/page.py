@@ -33,7 +33,7 @@ figcaption { font-size: 0.9rem; color: #55606c; }
 .view { height: min(70vh, 34rem); width: 100%; border: 1px solid #d5dae0; box-sizing: border-box; }
 pre { overflow-x: auto; background: #f4f6f8; padding: 0.8rem; font-size: 0.85rem; }
 code { background: #f4f6f8; padding: 0 0.2rem; overflow-wrap: anywhere; }
-select { font: inherit; margin: 0.3rem 0; }
+select { font: inherit; margin: 0.3rem 0; max-width: 100%; }
 """
 
 SWITCH = """
@@ -102,6 +102,8 @@ class Page:
         for mesh in turned.values():
             mesh.apply_transform(_camera_frame())
         scenes = {name: trimesh.Scene([mesh]) for name, mesh in turned.items()}
+        for scene in scenes.values():
+            _ = scene.camera  # made at first use, and part of what is exported
         shapes = {
             name: base64.b64encode(scene.export(file_type="glb")).decode()
             for name, scene in scenes.items()

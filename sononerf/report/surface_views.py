@@ -54,12 +54,12 @@ class SurfaceViews:
             rows.append(("confidence", self.mesh, colours, CONFIDENCE_BAR))
         return rows or [("reconstruction", self.mesh, np.array(CLAY), None)]
 
-    def png(self) -> bytes:
-        """Draw all of it from four sides, one row for each."""
-        return sides_png(self._rows())
+    def png(self, size: tuple[int, int] = (380, 340)) -> bytes:
+        """Draw all of it from four sides, one row for each; views of so many pixels."""
+        return sides_png(self._rows(), size=size)
 
     def meshes(self) -> dict[str, trimesh.Trimesh]:
-        """Return coloured meshes by name, the reconstruction first, for a view that turns."""
+        """Return coloured meshes by name, the reconstruction first; of glTF's linear colours."""
         names = {
             "error": "reconstruction, coloured by its error",
             "confidence": "reconstruction, coloured by how many poses heard it",
@@ -71,7 +71,6 @@ class SurfaceViews:
 
 
 def _coloured(mesh: trimesh.Trimesh, colours: Floats) -> trimesh.Trimesh:
-    """Return a bare mesh with colours in linear light, as glTF has them."""
     small = decimated(mesh, MOST_TRIANGLES)
     if colours.ndim == 2:
         colours = colours[cKDTree(mesh.vertices).query(small.vertices)[1]]

@@ -22,6 +22,7 @@ from sononerf.errors import InputError, ResourceError, SettingsError
 from sononerf.geometry.poses import Poses
 from sononerf.run.run_folder import RunFolder
 from sononerf.surface.mesh_files import confidence_of
+from sononerf.surface.start.volume import Volume
 
 FileType = Literal["mat", "h5", "nc"]
 
@@ -252,23 +253,30 @@ def _prediction(source: Path) -> Part:
         raise InputError(f"{file}: damaged ({error}); predict again") from error
 
 
-def _volume(source: Path) -> Part:
+def read_volume(source: Path) -> Volume:
+    """Return the volume of a run's reconstruction.
+
+    Raises:
+        InputError: If there is none, or it is damaged.
+    """
     file = _reconstructed(source, "volume.vti")
     try:
         image = pyvista.ImageData(file)
-        size = image.dimensions
         flat = np.asarray(image.point_data["reflectivity"], dtype=np.float32)
-        values = flat.reshape(size, order="F")
+        values = flat.reshape(image.dimensions, order="F")
+        return Volume(values, np.asarray(image.origin), float(image.spacing[0]))
     except (KeyError, ValueError, TypeError) as error:
         raise InputError(f"{file}: damaged ({error}); reconstruct again") from error
+
+
+def _volume(source: Path) -> Part:
+    volume = read_volume(source)
     axes = {
-        name: Named(
-            start + step * np.arange(count), (name,), "m", f"centre of the voxel along {name}"
-        )
-        for name, start, step, count in zip("xyz", image.origin, image.spacing, size, strict=True)
+        name: Named(axis, (name,), "m", f"centre of the voxel along {name}")
+        for name, axis in zip("xyz", volume.axes(), strict=True)
     }
     meaning = "reflectivity summed over directions and frequencies"
-    return {"reflectivity": Named(values, ("x", "y", "z"), "1", meaning), **axes}, {}
+    return {"reflectivity": Named(volume.values, ("x", "y", "z"), "1", meaning), **axes}, {}
 
 
 def _points(source: Path) -> Part:

@@ -34,6 +34,8 @@ from sononerf.surface.mesh_files import confidence_of
 from sononerf.surface.start.read_out import read_isosurface
 
 PAGE = "report.html"
+SIDES = (380, 340)
+"""Width and height of the views of a surface, pixels: four fit into the page's width."""
 
 
 def report(
@@ -239,7 +241,7 @@ def _surface(page: Page, run: RunFolder, settings: Settings) -> None:
         run.fitted.head.resolution / 2,
     )
     page.view(views.meshes())
-    page.pictures({"Four sides; colours are explained at the left.": views.png()})
+    page.pictures({"Four sides; colours are explained at the left.": views.png(SIDES)})
     page.heading("Maximum-intensity projections", 3)
     found = {}
     for axis in "xyz":

@@ -5,15 +5,18 @@ from __future__ import annotations
 
 import base64
 import html
+import io
 import json
 import re
 import shutil
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
+from PIL import Image
 
 from sononerf.errors import InputError, NumericalError
 from sononerf.report.surface_views import SurfaceViews
@@ -21,6 +24,7 @@ from sononerf.run import report_runs as report_module
 from sononerf.run.report_runs import report as report_runs
 from sononerf.run.table import table
 from sononerf.surface.mesh_files import mesh_bytes
+from tests.browser import CHROMIUM, browser
 
 METRICS = {
     "schema": 1,
@@ -61,7 +65,7 @@ def run(fitted_run, tmp_path):
 
 
 @pytest.fixture
-def finished(run):
+def finished(run, monkeypatch):
     (run / "metrics.json").write_text(json.dumps(METRICS))
     (run / "prediction").mkdir()
     measured = np.full((5, 2, 3, 4), MEASURED)
@@ -78,9 +82,11 @@ def finished(run):
     for name in ("view", "mip_x", "mip_y", "mip_z"):
         (run / "reconstruction" / f"{name}.png").write_bytes(name.encode())
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.021)
+    mesh.apply_scale([1.0, 1.0, 1.5])
     data = mesh_bytes(mesh, "ply", confidence=np.arange(len(mesh.vertices)))
     (run / "reconstruction" / "mesh.ply").write_bytes(data)
     (run / "reconstruction" / "read_out.json").write_text("{}")
+    monkeypatch.setattr(report_module, "SIDES", (90, 80))
     return run
 
 
@@ -158,7 +164,7 @@ def test_the_mesh_stands_beside_the_truth_and_can_be_turned(finished):
     shapes = json.loads(re.search(r"shapes = (\{.*?\});", text).group(1))
     for data in shapes.values():
         assert base64.b64decode(data).startswith(b"glTF")
-    assert text.count("<iframe") == 1
+    assert text.count("<iframe") == text.count("$SHAPE") - 1 == 1  # one viewer for all shapes
     sides = pictures_of(finished / "report.html")["Four sides; colours are explained at the left."]
     assert sides.startswith(b"\x89PNG")
 
@@ -223,6 +229,52 @@ def test_a_table_has_a_column_per_run_and_a_line_of_csv(finished, tmp_path):
     (other / "metrics.json").write_text(json.dumps({"prediction": {"mae_db": "much"}}))
     with pytest.raises(InputError, match=r"metrics\.json: damaged"):
         table([finished, other])
+
+
+@pytest.mark.slow  # a browser
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium")
+@pytest.mark.parametrize("width", [1400, 400])
+def test_the_page_opens_offline_and_its_mesh_turns(finished, tmp_path, width):
+    page_file = report(finished)
+    with browser(tmp_path / "profile") as page:
+        page.size(width, 900)
+        page.call("Network.emulateNetworkConditions", offline=True, latency=0,
+                  downloadThroughput=0, uploadThroughput=0)  # fmt: skip
+        page.open(page_file.as_uri())
+        page.until("document.querySelector('#view') !== null")
+        assert page.value("document.documentElement.scrollWidth") <= width
+        page.value("document.querySelector('#view').scrollIntoView()")
+        box = page.value(
+            "(r => [r.x, r.y, r.width, r.height])"
+            "(document.querySelector('#view').getBoundingClientRect())"
+        )
+        middle = box[0] + box[2] / 2, box[1] + box[3] / 2
+
+        def pixels():
+            x, y, width, height = box
+            with Image.open(io.BytesIO(page.picture())) as picture:
+                part = picture.convert("RGB").crop((x + 2, y + 2, x + width - 2, y + height - 2))
+            return np.asarray(part).astype(int)
+
+        def coloured():
+            """The fraction of the view that is neither white nor grey."""
+            return np.mean(np.ptp(pixels(), axis=2) > 8)
+
+        end = time.monotonic() + 30
+        while coloured() < 0.02:
+            assert time.monotonic() < end
+            time.sleep(0.2)
+        before = pixels()
+        assert coloured() < 0.9
+        page.drag(middle, (middle[0] + 80, middle[1] + 40))
+        time.sleep(1)
+        assert np.mean(np.abs(pixels() - before).max(axis=2) > 8) > 0.01
+        page.value("document.querySelector('#shape').value = 'truth'")
+        page.value("document.querySelector('#shape').dispatchEvent(new Event('change'))")
+        time.sleep(3)
+        assert np.mean(np.abs(pixels() - before).max(axis=2) > 8) > 0.01
+        assert not page.faults
+        assert not page.outside()
 
 
 def test_what_is_not_there_yet_is_named_with_its_command(run):

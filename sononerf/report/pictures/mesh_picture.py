@@ -156,7 +156,7 @@ SIDES = ("front", "left", "back", "right")
 def sides_png(
     rows: Sequence[tuple[str, trimesh.Trimesh, ArrayLike, ColourBar | None]],
     *,
-    size: tuple[int, int] = (380, 340),
+    size: tuple[int, int],
 ) -> bytes:
     """Draw meshes from four sides through the same cameras, one mesh per row.
 

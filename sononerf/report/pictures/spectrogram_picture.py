@@ -46,14 +46,54 @@ def spectrogram_png(
 
 
 def spectrogram_image(
-    measured_db: ArrayLike,
-    predicted_db: ArrayLike,
+    measured_db: ArrayLike | None,
+    predicted_db: ArrayLike | None,
     range_m: ArrayLike,
     frequency_hz: ArrayLike,
     title: str = "",
 ) -> NDArray[np.uint8]:
     """Return the picture of :func:`spectrogram_png` as pixels (H, W, 3), smaller."""
     return _pixels(measured_db, predicted_db, range_m, frequency_hz, title, 90)
+
+
+CELL = (380, 150)
+"""Width and height of a receiver's spectrogram in :func:`live_image`, pixels."""
+LIVE_DB = 50.0
+"""Level of the brightest colour in :func:`live_image`, dB; fixed, so that poses can be compared."""
+
+
+def live_image(
+    level_db: ArrayLike, range_m: ArrayLike, frequency_hz: ArrayLike
+) -> NDArray[np.uint8]:
+    """Return one pose's spectrograms as pixels (H, W, 3), drawn in milliseconds.
+
+    A row per receiver, of four at most, with the ends of the axes alone.
+
+    Args:
+        level_db ((E, R, F), dB): 0 dB is silence.
+        range_m, frequency_hz ((R,), m; (F,), Hz): Axes, ascending.
+    """
+    from matplotlib import colormaps
+    from PIL import Image, ImageDraw, ImageFont
+
+    levels = np.asarray(level_db, dtype=np.float64)
+    ranges, frequencies = np.asarray(range_m), np.asarray(frequency_hz) / 1e3
+    chosen, names = drawn_receivers(len(levels), 4)
+    colours = colormaps[LEVEL_MAP](np.clip(levels[chosen] / LIVE_DB, 0, 1), bytes=True)[..., :3]
+    (width, height), left, line = CELL, 56, 18
+    picture = Image.new("RGB", (left + width, len(chosen) * (height + line) + line), "white")
+    draw, font = ImageDraw.Draw(picture), ImageFont.load_default(12)
+    for row, (pixels, name) in enumerate(zip(colours, names, strict=True)):
+        top = row * (height + line)
+        cell = Image.fromarray(np.ascontiguousarray(pixels.transpose(1, 0, 2)[::-1]))
+        draw.text((left, top + 1), f"{name}, 0 to {LIVE_DB:.0f} dB", fill="black", font=font)
+        picture.paste(cell.resize(CELL, Image.Resampling.BILINEAR), (left, top + line))
+        for y, value in ((top + line, frequencies[-1]), (top + line + height - 14, frequencies[0])):
+            draw.text((left - 4, y), f"{value:.0f} kHz", fill="black", font=font, anchor="ra")
+    bottom = picture.height - line + 2
+    draw.text((left, bottom), f"{ranges[0]:.3f} m", fill="black", font=font)
+    draw.text((left + width, bottom), f"{ranges[-1]:.3f} m", fill="black", font=font, anchor="ra")
+    return np.asarray(picture)
 
 
 def sounding_slice(spectrograms: NDArray[np.floating], range_m: Floats) -> slice:

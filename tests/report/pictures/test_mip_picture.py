@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from sononerf.errors import NumericalError
-from sononerf.report.pictures.mip_picture import mip_image, mip_png, mip_pngs
+from sononerf.report.pictures.mip_picture import mip_image, mip_png, mip_pngs, mips_image
 from sononerf.surface.start.volume import Volume
 
 EXTENTS = ((-0.05, 0.05), (0.0, 0.06))
@@ -59,3 +59,18 @@ def test_wrong_input_is_refused():
         mip_image(np.zeros((2, 2, 2)))
     with pytest.raises(NumericalError, match="not finite"):
         mip_png([[np.nan]], EXTENTS, ("y", "z"))
+
+
+def test_three_projections_in_one_picture_have_their_places():
+    """A bright corner at great y and small z is at the left below along x and y, not along z."""
+    values = np.full((20, 20, 20), 1e-4)
+    values[:, 14:, :6] = 1.0
+    pixels = mips_image(Volume(values, np.zeros(3), 0.001)).astype(int)
+    bright = (pixels[..., 0] > 240) & (pixels[..., 2] > 120) & (pixels[..., 2] < 220)
+    third = pixels.shape[1] // 3
+    along_x, along_y, along_z = (bright[:, n * third : (n + 1) * third - 60] for n in range(3))
+    rows, columns = np.nonzero(along_x)
+    assert rows.min() > pixels.shape[0] / 2  # z upwards
+    assert columns.min() > third / 2  # y to the right
+    assert np.nonzero(along_y)[0].min() > pixels.shape[0] / 2
+    assert np.nonzero(along_z)[0].max() < pixels.shape[0] / 2  # y upwards

@@ -12,6 +12,8 @@ from PIL import Image
 from sononerf.errors import NumericalError
 from sononerf.geometry.poses import Poses
 from sononerf.report.pictures.spectrogram_picture import (
+    LIVE_DB,
+    live_image,
     pings_png,
     sounding_slice,
     spectrogram_image,
@@ -140,3 +142,15 @@ def test_a_measurement_alone_is_not_called_a_prediction():
     predicted = spectrogram_png(None, echo(), RANGE, FREQUENCY, "pose 3")
     assert measured != predicted  # the same cells under another title
     assert Image.open(io.BytesIO(measured)).size == Image.open(io.BytesIO(predicted)).size
+
+
+def test_the_live_picture_has_range_to_the_right_and_frequency_upwards():
+    level = np.zeros((2, 100, 30))
+    level[1, 60:, 20:] = LIVE_DB  # of the right ear: far, and of high frequency
+    pixels = live_image(level, 0.3 + 0.001 * np.arange(100), 1e3 * np.linspace(10, 80, 30))
+    height, width = pixels.shape[0], pixels.shape[1]
+    bright = (pixels.astype(int).sum(axis=2) > 600) & (np.ptp(pixels, axis=2) > 30)
+    rows, columns = np.nonzero(bright)
+    assert rows.min() > height / 2
+    assert rows.max() < 0.75 * height
+    assert columns.min() > 0.6 * width

@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: MIT
+"""Spectrograms as sound that people can hear."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.io import wavfile
+
+STRETCH = 10.0
+"""How much longer, and lower in pitch, an echo is played: ultrasound of bats becomes audible."""
+RATE = 44_100
+"""Sampling rate, Hz, that every player knows."""
+PAUSE = 0.25
+"""Silence before and after, s: players cut the first milliseconds."""
+LOUDEST = 0.8
+"""Greatest sample, of full scale."""
+
+
+def echo_wav(
+    magnitude: ArrayLike, range_m: ArrayLike, frequency_hz: ArrayLike, speed_of_sound: float
+) -> bytes:
+    """Return what a pose heard as a WAV file, ten times longer and lower.
+
+    A spectrogram has no phase: each frequency sounds with the magnitude that it has over time and
+    with a phase of its own, always the same. Of two ears the left one is on the left.
+
+    Args:
+        magnitude (E, R, F): Linear; of more than two receivers the first two sound.
+        range_m ((R,), m): Range axis.
+        frequency_hz ((F,), Hz): Frequency axis.
+        speed_of_sound (m/s): Of the echoes.
+    """
+    heard = np.asarray(magnitude, dtype=np.float64)[:2]
+    ranges, frequencies = np.asarray(range_m, dtype=float), np.asarray(frequency_hz, dtype=float)
+    arrival = STRETCH * 2.0 * (ranges - ranges[0]) / speed_of_sound
+    time = np.arange(int(arrival[-1] * RATE) + 1) / RATE
+    low = frequencies / STRETCH
+    audible = low < RATE / 2
+    phase = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, len(low))
+    tones = np.cos(2.0 * np.pi * low * time[:, None] + phase) * audible
+    place = np.interp(time, arrival, np.arange(len(ranges)))
+    before = np.minimum(place.astype(int), max(len(ranges) - 2, 0))
+    after, part = np.minimum(before + 1, len(ranges) - 1), (place - before)[:, None]
+    waves = np.stack(
+        [(tones * ((1 - part) * one[before] + part * one[after])).sum(axis=1) for one in heard],
+        axis=1,
+    )
+    top = np.abs(waves).max()
+    silence = np.zeros((int(PAUSE * RATE), waves.shape[1]))
+    samples = np.concatenate([silence, waves * (LOUDEST / top if top > 0 else 0.0), silence])
+    file = io.BytesIO()
+    wavfile.write(file, RATE, (samples * 32767).astype(np.int16))
+    return file.getvalue()

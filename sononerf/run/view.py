@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: MIT
+"""Show a run or a store in a browser, and follow a run that grows."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import trimesh
+
+from sononerf import storage
+from sononerf.echoes.echoes import Echoes
+from sononerf.errors import InputError, SonoNerfError
+from sononerf.progress import Progress
+from sononerf.report.surface_views import SurfaceViews
+from sononerf.report.viewer import Viewer
+from sononerf.run.build import true_mesh
+from sononerf.run.export import read_volume
+from sononerf.run.run import open_run
+from sononerf.run.run_folder import RunFolder
+from sononerf.run.simulate import store_path
+from sononerf.surface.mesh_files import confidence_of
+
+WAIT = 2.0
+"""How often a run's folder is looked at, s."""
+
+
+class View:
+    """A viewer of one folder; :meth:`refresh` shows what has come since.
+
+    Args:
+        path: A run, finished or not, or a store.
+        port: Where the page is served; the next free one where it is taken.
+
+    Raises:
+        InputError: If it is neither.
+        ResourceError: If the extra ``view`` is not installed.
+    """
+
+    def __init__(self, path: Path, *, port: int = 8080) -> None:
+        self.run = RunFolder(path)
+        is_run = self.run.config.is_file()
+        if not is_run and not (path / "zarr.json").is_file():
+            raise InputError(f"{path}: neither a run nor a store; give the folder of one")
+        echoes = None if is_run else Echoes.open(path)
+        self.viewer = Viewer(path.resolve().name, port=port)
+        self._has_echoes = False
+        self._seen: dict[str, object] = {}
+        if echoes is not None:
+            self._show(echoes)
+        else:
+            self.refresh()
+
+    def _show(self, echoes: Echoes) -> None:
+        self.viewer.show_echoes(echoes)
+        self._has_echoes = True
+
+    def refresh(self) -> None:
+        """Show what is new in the run: echoes, the mesh of the last epoch, model, and surface."""
+        if not self.run.config.is_file():
+            return
+        if not self._has_echoes:
+            try:
+                self._show(self._echoes())
+            except SonoNerfError as error:
+                self._say(f"no echoes to show: {error}")
+        if self._is_new("model", self.run.path / "model.json"):
+            opened = open_run(self.run.path)
+            quiet = Progress(quiet=True)
+            self.viewer.show_model(
+                opened.model, lambda poses: opened.predict(poses, progress=quiet)
+            )
+        if self.run.is_done("surface"):
+            if self._is_new("surface", self.run.reconstruction / "read_out.json"):
+                self._show_surface()
+            return
+        previews = sorted(self.run.path.glob("epochs/*/mesh.ply"))
+        if previews and self._is_new("preview", previews[-1]):
+            self.viewer.show_preview(trimesh.load_mesh(previews[-1], file_type="ply"))
+            self._say(f"epoch {int(previews[-1].parent.name)}; the fit goes on")
+
+    def _echoes(self) -> Echoes:
+        if self.run.is_done("fit"):
+            return self.run.echoes
+        return Echoes.open(store_path(self.run.open(), None, None))
+
+    def _show_surface(self) -> None:
+        settings, mesh = self.run.open(), self.run.mesh()
+        try:
+            truth = true_mesh(settings) if settings.evaluation.registration == "none" else None
+        except InputError as error:
+            self._say(str(error))
+            truth = None
+        limit = self.run.fitted.head.resolution / 2
+        self.viewer.show_surface(SurfaceViews(mesh, confidence_of(mesh), truth, limit))
+        if (self.run.reconstruction / "volume.vti").is_file():
+            self.viewer.show_volume(read_volume(self.run.path))
+        told = storage.read_json(self.run.reconstruction / "read_out.json")
+        self._say(f"surface found as {told.get('method')}, refined: {told.get('refined')}")
+
+    def _say(self, text: str) -> None:
+        self.viewer.say(f"**{self.run.path.resolve().name}**: {text}.")
+
+    def _is_new(self, name: str, file: Path) -> bool:
+        """Tell whether a file has come or changed since the last look."""
+        if not file.is_file():
+            return False
+        state = (str(file), file.stat().st_mtime_ns)
+        changed = self._seen.get(name) != state
+        self._seen[name] = state
+        return changed
+
+    def follow(self) -> None:
+        """Refresh again and again, until the process is stopped."""
+        while True:
+            time.sleep(WAIT)
+            try:
+                self.refresh()
+            except SonoNerfError as error:
+                self._say(str(error))
