@@ -132,7 +132,7 @@ def browser(folder):
                 break
         with urlopen(f"http://127.0.0.1:{port}/json/list") as answer:
             tab = next(one for one in json.load(answer) if one["type"] == "page")
-        with connect(tab["webSocketDebuggerUrl"], max_size=2**28) as socket:
+        with connect(tab["webSocketDebuggerUrl"], max_size=2**28, ping_interval=None) as socket:
             yield Page(socket)
     finally:
         process.kill()

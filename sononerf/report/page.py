@@ -8,6 +8,7 @@ import html
 import json
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -30,7 +31,7 @@ img { max-width: 100%; height: auto; } figure { margin: 0.6rem 0; }
 figcaption { font-size: 0.9rem; color: #55606c; }
 .side { display: flex; flex-wrap: wrap; gap: 0.8rem; align-items: flex-start; }
 .side figure { flex: 1 1 18rem; margin: 0; min-width: 0; }
-.view { height: min(70vh, 34rem); width: 100%; border: 1px solid #d5dae0; box-sizing: border-box; }
+.view { height: min(92vw, 34rem); width: 100%; border: 1px solid #d5dae0; box-sizing: border-box; }
 pre { overflow-x: auto; background: #f4f6f8; padding: 0.8rem; font-size: 0.85rem; }
 code { background: #f4f6f8; padding: 0 0.2rem; overflow-wrap: anywhere; }
 select { font: inherit; margin: 0.3rem 0; max-width: 100%; }
@@ -96,20 +97,21 @@ class Page:
         Args:
             meshes: By what a reader chooses them by; the first one is shown first.
         """
+        from trimesh.exchange.gltf import export_glb
         from trimesh.viewer.notebook import scene_to_html
 
         turned = {name: mesh.copy() for name, mesh in meshes.items()}
         for mesh in turned.values():
             mesh.apply_transform(_camera_frame())
         scenes = {name: trimesh.Scene([mesh]) for name, mesh in turned.items()}
-        for scene in scenes.values():
-            _ = scene.camera  # made at first use, and part of what is exported
+        first = next(iter(scenes.values()))
+        _ = first.camera  # made at first use, and part of what is exported
+        plain = base64.b64encode(first.export(file_type="glb")).decode()
+        viewer = scene_to_html(first).replace(plain, "$SHAPE")
         shapes = {
-            name: base64.b64encode(scene.export(file_type="glb")).decode()
+            name: base64.b64encode(export_glb(scene, tree_postprocessor=_matt)).decode()
             for name, scene in scenes.items()
         }
-        first = next(iter(shapes))
-        viewer = scene_to_html(scenes[first]).replace(shapes[first], "$SHAPE")
         options = "".join(
             f'<option value="{html.escape(name)}">{html.escape(name)}</option>' for name in shapes
         )
@@ -129,6 +131,19 @@ class Page:
             '<link rel="icon" href="data:,">'
             f"<style>{STYLE}</style></head><body>\n" + "\n".join(self.parts) + "\n</body></html>\n"
         )
+
+
+def _matt(tree: dict[str, Any]) -> None:
+    """Give all that a glTF file shows a matt material; without one it counts as metal.
+
+    The viewer's light is so strong that half of each colour is enough.
+    """
+    half = [0.5, 0.5, 0.5, 1.0]
+    surface = {"metallicFactor": 0.0, "roughnessFactor": 0.9, "baseColorFactor": half}
+    tree["materials"] = [{"pbrMetallicRoughness": surface, "doubleSided": True}]
+    for mesh in tree["meshes"]:
+        for part in mesh["primitives"]:
+            part["material"] = 0
 
 
 def _camera_frame() -> Floats:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import trimesh
@@ -43,6 +44,7 @@ class SurfaceViews:
     truth: trimesh.Trimesh | None
     limit: float
 
+    @cached_property
     def _rows(self) -> list[tuple[str, trimesh.Trimesh, Floats, ColourBar | None]]:
         rows: list[tuple[str, trimesh.Trimesh, Floats, ColourBar | None]] = []
         if self.truth is not None:
@@ -56,7 +58,7 @@ class SurfaceViews:
 
     def png(self, size: tuple[int, int] = (380, 340)) -> bytes:
         """Draw all of it from four sides, one row for each; views of so many pixels."""
-        return sides_png(self._rows(), size=size)
+        return sides_png(self._rows, size=size)
 
     def meshes(self) -> dict[str, trimesh.Trimesh]:
         """Return coloured meshes by name, the reconstruction first; of glTF's linear colours."""
@@ -64,7 +66,7 @@ class SurfaceViews:
             "error": "reconstruction, coloured by its error",
             "confidence": "reconstruction, coloured by how many poses heard it",
         }
-        rows = self._rows()
+        rows = self._rows
         ordered = [row for row in rows if row[0] != "truth"]
         ordered += [row for row in rows if row[0] == "truth"]
         return {names.get(name, name): _coloured(mesh, c) for name, mesh, c, _ in ordered}
