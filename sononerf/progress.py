@@ -7,11 +7,13 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import ClassVar
 
 from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
+    ProgressColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -19,7 +21,9 @@ from rich.progress import (
 from rich.progress import Progress as Bars
 
 LINE_SECONDS = 10.0
-"""Plain lines come at most this often."""
+"""Shortest time between two plain lines, s."""
+WIDE = 80
+"""Columns of a terminal from which on a bar with all its numbers fits into one line."""
 
 
 class Task:
@@ -46,7 +50,11 @@ class Task:
             return
         self._last = time.monotonic()
         seconds = self._last - self._started
-        text = f"{self.what}: {self.done} of {self.total}, {seconds:.0f} s {self.note}"
+        text = f"{self.what}: {self.done} of {self.total}, {seconds:.0f} s"
+        if 0 < self.done < self.total:
+            rate = self.done / max(seconds, 1e-9)
+            text += f", {rate:.2g}/s, {(self.total - self.done) / rate:.0f} s left"
+        text += f" {self.note}"
         print(text.rstrip(), file=sys.stderr, flush=True)  # noqa: T201
 
     def finish(self) -> None:
@@ -60,10 +68,15 @@ class Progress:
 
     Args:
         quiet: Show nothing, as inside libraries and tests.
+
+    Attributes:
+        silenced: True makes all that come after quiet, as the command line's ``--quiet`` does.
     """
 
+    silenced: ClassVar[bool] = False
+
     def __init__(self, *, quiet: bool = False) -> None:
-        self.quiet = quiet
+        self.quiet = quiet or Progress.silenced
         self.console = Console(stderr=True, highlight=False)
 
     def say(self, text: str) -> None:
@@ -79,13 +92,12 @@ class Progress:
             yield task
             task.finish()
             return
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            TextColumn("{task.fields[note]}"),
-        )
+        columns: list[ProgressColumn] = [TextColumn("{task.description}"), MofNCompleteColumn()]
+        if self.console.width >= WIDE:
+            columns[1:1] = [BarColumn()]
+            columns += [TimeElapsedColumn(), TimeRemainingColumn()]
+            columns += [TextColumn("{task.fields[note]}")]
+        else:
+            columns += [TimeRemainingColumn()]
         with Bars(*columns, console=self.console) as bars:
             yield Task(what, total, bars, quiet=False)

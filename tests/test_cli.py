@@ -749,8 +749,17 @@ def test_nothing_and_nonsense_are_wrong_usage():
     assert result.code == 2
     assert "Commands:" in result.err
     assert "no such command 'frobnicate'" in refused(2, "frobnicate")
+    assert "did you mean 'fit'" in refused(2, "fti")
     assert "missing argument" in refused(2, "fit")
     assert done("--version").out.startswith("sononerf ")
+
+
+def test_quiet_leaves_results_and_errors(clean):
+    assert done("--quiet", "new-scene", "my_bar").err == ""
+    assert (clean / "my_bar").is_dir()
+    assert done("--quiet", "scenes", "--json").out.startswith("{")
+    assert "my_bar" in refused(3, "--quiet", "new-scene", "my_bar")
+    assert "wrote" in done("new-scene", "my_bat").err
 
 
 # Signals.

@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: MIT
+import re
 from types import SimpleNamespace
 
 import pytest
@@ -23,7 +24,8 @@ def test_plain_lines_come_now_and_then(clock, capsys):
     out, err = capsys.readouterr()
     assert out == ""
     lines = err.splitlines()
-    assert lines[0] == "fitting: 10 of 50, 10 s loss 9"
+    assert lines[0] == "fitting: 10 of 50, 10 s, 1/s, 40 s left loss 9"
+    assert lines[-1] == "fitting: 50 of 50, 50 s loss 49"
     # One per ten seconds, and one at the end: once, where both fall together.
     assert [line.split(",")[0] for line in lines] == [
         f"fitting: {n} of 50" for n in (10, 20, 30, 40, 50)
@@ -56,8 +58,20 @@ def test_a_saying_is_one_line_as_it_is(capsys):
     assert capsys.readouterr() == ("", text + "\n")
 
 
+def test_a_narrow_terminal_gets_the_count_alone(monkeypatch, capsys):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "40")
+    with Progress().task("fitting", 4) as task:
+        task.advance(3, note="a note that is longer than the line")
+    err = re.sub("\x1b[^a-zA-Z]*[a-zA-Z]", "", capsys.readouterr().err)
+    assert "3/4" in err
+    assert max(len(line.rstrip()) for line in re.split("[\r\n]", err)) <= 40
+
+
 def test_a_terminal_gets_a_bar(monkeypatch, capsys):
     monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.setenv("FORCE_COLOR", "1")  # what makes rich take any stream for a terminal
     shown = Progress()
     with shown.task("fitting", 4) as task:

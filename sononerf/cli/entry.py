@@ -17,6 +17,7 @@ from sononerf import __version__
 from sononerf.cli import experiments, files
 from sononerf.cli.options import app, say
 from sononerf.errors import SettingsError, SonoNerfError, StoppedError
+from sononerf.progress import Progress
 
 __all__ = ["app", "experiments", "files", "main"]
 
@@ -33,8 +34,12 @@ def _root(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Show the version.")
     ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Print results, warnings and errors alone.")
+    ] = False,
 ) -> None:
     del version
+    Progress.silenced = quiet
     if context.invoked_subcommand is None:
         say(context.get_help())
         raise typer.Exit(SettingsError.exit_code)
@@ -77,6 +82,7 @@ def _run() -> int:
     except typer.TyperException as error:
         where = getattr(getattr(error, "ctx", None), "command_path", "sononerf")
         text = error.format_message().rstrip(".").replace("Value error, ", "")
+        text = text.replace(". Did you mean", "; did you mean").rstrip("?")
         fault = SettingsError(f"{text[:1].lower()}{text[1:]}; see `{where} --help`")
     except _SignalledError as error:
         fault = StoppedError(error.number)

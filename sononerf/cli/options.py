@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from sononerf.progress import Progress
+
 app = typer.Typer(
     name="sononerf",
     help="Three-dimensional hearing: simulate echoes, fit a reflectivity field, predict, "
@@ -40,8 +42,9 @@ OnWhat = Annotated[Accelerator, typer.Option(help="What to compute on.")]
 
 
 def say(text: str) -> None:
-    """Print a line for people, on standard error."""
-    typer.echo(text, err=True)
+    """Print a line for people, on standard error; not under ``--quiet``."""
+    if not Progress.silenced:
+        typer.echo(text, err=True)
 
 
 def print_json(data: Any) -> None:
