@@ -148,7 +148,7 @@ def test_the_picture_of_echoes_is_of_what_was_measured(made, monkeypatch):
 
     _, echoes, _, _ = made
     drawn = []
-    monkeypatch.setattr(notebook, "spectrogram_png", lambda *given: drawn.append(given) or b"")
+    monkeypatch.setattr(notebook, "spectrogram_picture", lambda *given: drawn.append(given) or b"")
     echoes.plot(2)
     ((measured, predicted, *_),) = drawn
     assert measured.shape == echoes.spectrogram(2).shape

@@ -12,6 +12,7 @@ import typer
 
 from sononerf.cli.options import (
     Config,
+    Figures,
     Json,
     OnWhat,
     Overrides,
@@ -363,18 +364,25 @@ def report(
     paper: Annotated[
         bool, typer.Option("--paper", help="Also draw the counterparts of the paper's figures.")
     ] = False,
+    figures: Annotated[
+        Figures | None,
+        typer.Option("--format", help="Also write figures of this kind, for a paper."),
+    ] = None,
     output: Annotated[
         Path | None,
         typer.Option(help="The page; RUN/report.html of one run, report.html of several."),
     ] = None,
 ) -> None:
     """Write one page of a run, or of several beside one another: numbers, pictures, settings."""
-    if paper and len(runs) > 1:
-        raise SettingsError("--paper draws the figures of one run; found several")
+    if (paper or figures) and len(runs) > 1:
+        raise SettingsError("--paper and --format draw the figures of one run; found several")
     from sononerf.progress import Progress
     from sononerf.run.report_runs import report as report_runs
 
-    say(f"wrote {report_runs(runs, paper=paper, output=output, progress=Progress())}")
+    page = report_runs(runs, paper=paper, figures=figures, output=output, progress=Progress())
+    say(f"wrote {page}")
+    if figures is not None:
+        say(f"wrote {page.parent / 'figures'}")
 
 
 @app.command()

@@ -25,6 +25,7 @@ Accelerator = Literal["auto", "cpu", "gpu"]
 SurfaceMethod = Literal["auto", "open", "filled", "hull", "sheet", "isosurface"]
 Registration = Literal["none", "rigid", "similarity"]
 Exported = Literal["auto", "echoes", "prediction", "volume", "points"]
+Figures = Literal["svg", "pdf"]
 Split = Literal["test", "val", "train"]
 Config = Annotated[
     Path,

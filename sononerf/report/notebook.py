@@ -17,7 +17,7 @@ from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.head.head import Head
 from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png
-from sononerf.report.pictures.spectrogram_picture import spectrogram_png
+from sononerf.report.pictures.spectrogram_picture import spectrogram_picture
 from sononerf.scene.scene import Scene
 from sononerf.surface.surface import Surface
 
@@ -117,7 +117,7 @@ def _(thing: Echoes, *, pose: int | None = None, prediction: Prediction | None =
     if prediction is not None:
         row = thing.numbers_of(prediction.poses).tolist().index(number)
         levels = (measured, compress(prediction.magnitude[row], thing.reference))
-    return spectrogram_png(*levels, thing.head.range, thing.head.frequency, f"pose {number}")
+    return spectrogram_picture(*levels, thing.head.range, thing.head.frequency, f"pose {number}")
 
 
 @rows_of.register
@@ -152,7 +152,7 @@ def _(thing: Prediction) -> Rows:
 @png_of.register
 def _(thing: Prediction, *, pose: int = 0) -> bytes:
     level = compress(thing.magnitude[pose], thing.reference)
-    return spectrogram_png(None, level, thing.range, thing.frequency, f"pose {pose}")
+    return spectrogram_picture(None, level, thing.range, thing.frequency, f"pose {pose}")
 
 
 @rows_of.register

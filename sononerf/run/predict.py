@@ -29,7 +29,7 @@ from sononerf.evaluation.traced import Traced
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
-from sononerf.report.pictures.spectrogram_picture import spectrogram_png
+from sononerf.report.pictures.spectrogram_picture import spectrogram_picture
 from sononerf.run.build import results_folder
 from sononerf.run.fitted import NAME as TRACED_NAME
 from sononerf.run.run_folder import RunFolder
@@ -160,7 +160,7 @@ def _pictures(
     with progress.task("drawing", len(rows)) as task:
         for row in rows:
             number = int(numbers[row])
-            picture = spectrogram_png(
+            picture = spectrogram_picture(
                 None if measured is None else measured[row],
                 predicted[row],
                 found.range,

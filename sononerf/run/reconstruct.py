@@ -19,7 +19,7 @@ from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.field.checkpoint_io import model_checksum
 from sononerf.progress import Progress
 from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png, side_by_side_png
-from sononerf.report.pictures.mip_picture import mip_pngs
+from sononerf.report.pictures.mip_picture import mip_pictures
 from sononerf.run.build import results_folder, true_mesh
 from sononerf.run.run_folder import RunFolder
 from sononerf.surface import reconstruction
@@ -213,7 +213,7 @@ def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None) -> Non
     if seen is not None:
         storage.commit_bytes(folder / "confidence.png", confidence_png(mesh, seen))
     storage.commit_bytes(folder / "volume.vti", vti_bytes(surface.volume))
-    for axis, picture in mip_pngs(surface.volume).items():
+    for axis, picture in mip_pictures(surface.volume).items():
         storage.commit_bytes(folder / f"mip_{axis}.png", picture)
     view = mesh_png(mesh) if truth is None else side_by_side_png(truth, mesh)
     storage.commit_bytes(folder / "view.png", view)

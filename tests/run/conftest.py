@@ -99,4 +99,4 @@ def run(fitted, tmp_path):
 @pytest.fixture
 def no_projections(monkeypatch):
     """Projections take most of a tiny read-out."""
-    monkeypatch.setattr(reconstruct_module, "mip_pngs", lambda volume: {})
+    monkeypatch.setattr(reconstruct_module, "mip_pictures", lambda volume: {})

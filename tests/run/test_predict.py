@@ -45,7 +45,7 @@ def run(fitted, tmp_path):
 
 @pytest.fixture
 def no_pictures(monkeypatch):
-    monkeypatch.setattr(predict_module, "spectrogram_png", lambda *given: b"")
+    monkeypatch.setattr(predict_module, "spectrogram_picture", lambda *given: b"")
 
 
 def arrays_of(folder):
@@ -143,7 +143,7 @@ def test_best_median_and_worst_are_drawn(run):
 def test_what_was_not_measured_is_not_drawn(run, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(
-        predict_module, "spectrogram_png", lambda measured, *_: drawn.append(measured) or b""
+        predict_module, "spectrogram_picture", lambda measured, *_: drawn.append(measured) or b""
     )
     (tmp_path / "poses.csv").write_text(CSV)
     predict(run, poses_csv=tmp_path / "poses.csv", accelerator="cpu")

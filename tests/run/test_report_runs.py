@@ -20,7 +20,7 @@ from PIL import Image
 
 from sononerf.errors import InputError, NumericalError
 from sononerf.report.surface_views import SurfaceViews
-from sononerf.run import report_runs as report_module
+from sononerf.run import run_page as report_module
 from sononerf.run.report_runs import report as report_runs
 from sononerf.run.table import table
 from sononerf.surface.mesh_files import mesh_bytes
@@ -53,6 +53,7 @@ MEASURED = 0.5
 # Louder than measured by more from the first to the last, but not in this order.
 FACTORS = (1.4, 1.0, 3.0, 1.1, 1.2)
 NUMBERS = (40, 41, 42, 43, 44)
+POSES = ("pose_0041", "pose_0042", "pose_0044")  # best, worst and median
 
 
 @pytest.fixture
@@ -74,6 +75,8 @@ def finished(run, monkeypatch):
         measured=measured,
         predicted=measured * np.reshape(FACTORS, (5, 1, 1, 1)),
         pose=np.array(NUMBERS),
+        range_m=np.array([0.3, 0.31, 0.32]),
+        frequency_hz=np.array([2e4, 4e4, 6e4, 8e4]),
         reference=np.asarray(1e-3),
     )
     for number in NUMBERS:
@@ -180,6 +183,19 @@ def test_colours_tell_outside_from_inside(finished):
     out = coloured.vertices[:, 0] - 0.002
     assert (red > blue + 50)[out > 0.015].all()
     assert (blue > red + 50)[out < -0.015].all()
+
+
+@pytest.mark.parametrize(("kind", "begins"), [("svg", b"<?xml"), ("pdf", b"%PDF")])
+def test_figures_for_a_paper_are_the_same_each_time(finished, kind, begins):
+    (finished / "epochs" / "0001").mkdir(parents=True)
+    told = {"epoch": 1, "step": 10, "val/mae_db": 1.5}
+    (finished / "epochs" / "0001" / "metrics.json").write_text(json.dumps(told))
+    report(finished, figures=kind)
+    files = {file.name: file.read_bytes() for file in (finished / "figures").iterdir()}
+    assert files.keys() == {f"{name}.{kind}" for name in ("curves", *POSES)}
+    assert all(data.startswith(begins) for data in files.values())
+    report(finished, figures=kind)
+    assert files == {file.name: file.read_bytes() for file in (finished / "figures").iterdir()}
 
 
 def test_an_interrupted_fit_has_a_page_of_what_it_has(run):

@@ -61,7 +61,7 @@ def reconstruct_as(path, mesh):
 def run(fitted_run, tmp_path, monkeypatch):
     """A run that was hardly fitted, yet whose reconstruction is the true surface."""
     monkeypatch.setattr(traced_module, "RAYS", 500)
-    monkeypatch.setattr(predict_module, "spectrogram_png", lambda *given: b"")
+    monkeypatch.setattr(predict_module, "spectrogram_picture", lambda *given: b"")
     path = tmp_path / "run"
     path.mkdir()
     for name in ("model.safetensors", "model.json"):

@@ -5,19 +5,21 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
+from sononerf.report.pictures.figure import PictureFormat, figure, picture_bytes
 
 
-def curves_png(
+def curves_picture(
     curves: Mapping[str, tuple[Sequence[float], Sequence[float]]],
     *,
     floors: Mapping[str, float] | None = None,
+    kind: PictureFormat = "png",
 ) -> bytes:
     """Draw errors over steps on a logarithmic axis.
 
     Args:
         curves: Steps and errors, dB, by their names.
         floors: Errors, dB, that no prediction can fall below, by their names.
+        kind: Of the file.
     """
     with figure(6.4, 3.4, 130) as drawn:
         axes = drawn.subplots()
@@ -30,4 +32,4 @@ def curves_png(
         axes.set_ylabel("error on validation poses (dB)")
         axes.grid(which="both", linewidth=0.3, alpha=0.6)
         axes.legend(fontsize=8)
-        return png_from_pixels(pixels_from_figure(drawn))
+        return picture_bytes(drawn, kind)

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
-from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
+from sononerf.report.pictures.figure import figure, picture_bytes
 from sononerf.report.pictures.mesh_picture import INK, draw_scale_bar, oversampled
 from sononerf.report.pictures.scene_picture import draw_axes
 from sononerf.report.pictures.shading import (
@@ -121,7 +121,7 @@ def echo_png(
         _add_time_axis(axes[0], speed_of_sound)
         if title:
             drawn.suptitle(title, fontsize=11)
-        return png_from_pixels(pixels_from_figure(drawn))
+        return picture_bytes(drawn)
 
 
 def _draw_view(part: Any, view: NDArray[np.uint8], count: int, drawn: int, unhit: str) -> None:

@@ -22,6 +22,12 @@ STYLE = {
     "ytick.labelsize": 8,
     "image.interpolation": "nearest",
     "image.origin": "lower",
+    "svg.hashsalt": "sononerf",  # the same names of parts each time
+}
+PictureFormat = Literal["png", "svg", "pdf"]
+_UNDATED: dict[PictureFormat, dict[str, None]] = {
+    "svg": {"Date": None},
+    "pdf": {"CreationDate": None},
 }
 
 
@@ -52,6 +58,15 @@ def figure(
         drawn = Figure(figsize=(width, height), dpi=dpi, layout=layout, facecolor="white")
         FigureCanvasAgg(drawn)
         yield drawn
+
+
+def picture_bytes(drawn: Any, kind: PictureFormat = "png") -> bytes:
+    """Return a figure as a file: pixels, or lines and letters for a paper (SVG, PDF)."""
+    if kind == "png":
+        return png_from_pixels(pixels_from_figure(drawn))
+    buffer = io.BytesIO()
+    drawn.savefig(buffer, format=kind, metadata=_UNDATED[kind])
+    return buffer.getvalue()
 
 
 def pixels_from_figure(drawn: Any) -> NDArray[np.uint8]:

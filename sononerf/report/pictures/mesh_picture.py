@@ -234,11 +234,15 @@ def oversampled(camera: Camera) -> Camera:
     )
 
 
+def round_length(longest: float) -> float:
+    """Return the greatest length of 1, 2 or 5 times a power of ten up to the longest."""
+    power = float(10 ** np.floor(np.log10(longest)))
+    return max(step for step in (power, 2 * power, 5 * power) if step <= longest)
+
+
 def draw_scale_bar(picture: Image.Image, camera: Camera) -> None:
     """Draw a bar of a round length near the lower right corner, in place."""
-    longest = 0.25 * camera.width / camera.scale
-    power = 10 ** np.floor(np.log10(longest))
-    length = max(step for step in (power, 2 * power, 5 * power) if step <= longest)
+    length = round_length(0.25 * camera.width / camera.scale)
     pixels = length * camera.scale
     margin = camera.height // 24
     right, bottom = camera.width - margin, camera.height - margin

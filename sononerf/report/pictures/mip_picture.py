@@ -14,8 +14,13 @@ from scipy.ndimage import zoom
 from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
 from sononerf.evaluation.difference import Comparison
-from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
-from sononerf.report.pictures.mesh_picture import mesh_png
+from sononerf.report.pictures.figure import (
+    PictureFormat,
+    figure,
+    picture_bytes,
+    pixels_from_figure,
+)
+from sononerf.report.pictures.mesh_picture import mesh_png, round_length
 from sononerf.report.pictures.shading import DEFAULT_VIEW
 from sononerf.surface.start.volume import Volume, require_finite
 
@@ -51,13 +56,14 @@ def _limits(values: Floats, scale: Scale) -> tuple[float, float]:
     return 0.0, top if top > 0 else 1.0
 
 
-def mip_png(
+def mip_picture(
     projection: ArrayLike,
     extents: Extents,
     labels: tuple[str, str],
     *,
     title: str = "",
     scale: Scale = "db",
+    kind: PictureFormat = "png",
 ) -> bytes:
     """Draw one projection in millimetres.
 
@@ -68,6 +74,7 @@ def mip_png(
         labels (str, str): Names of the two axes.
         title: One line above.
         scale: Decibels below the greatest value (10 log10, 40 dB shown), or linear from zero.
+        kind: Of the file.
     """
     values = _scaled(projection, scale)
     low, high = _limits(values, scale)
@@ -85,7 +92,7 @@ def mip_png(
             axes.set_title(title)
         label = "dB below the maximum" if scale == "db" else "value"
         drawn.colorbar(picture, ax=axes, label=label, pad=0.02)
-        return png_from_pixels(pixels_from_figure(drawn))
+        return picture_bytes(drawn, kind)
 
 
 def mip_image(
@@ -117,10 +124,14 @@ def _panels(volume: Volume) -> Iterator[tuple[str, Floats, Extents, tuple[str, s
         yield name, np.asarray(projection), extents, ("xyz"[first], "xyz"[second])
 
 
-def mip_pngs(volume: Volume, *, scale: Scale = "db") -> dict[str, bytes]:
+def mip_pictures(
+    volume: Volume, *, scale: Scale = "db", kind: PictureFormat = "png"
+) -> dict[str, bytes]:
     """Draw a volume's three projections, named by the axis looked along: "x", "y" and "z"."""
     return {
-        name: mip_png(projection, extents, labels, title=f"maximum along {name}", scale=scale)
+        name: mip_picture(
+            projection, extents, labels, title=f"maximum along {name}", scale=scale, kind=kind
+        )
         for name, projection, extents, labels in _panels(volume)
     }
 
@@ -147,6 +158,11 @@ def mips_image(volume: Volume) -> NDArray[np.uint8]:
 def _draw(axes: Any, values: Floats, extents: Extents, limits: tuple[float, float]) -> Any:
     """Draw values (A, B) over millimetres and return the picture."""
     (left, right), (bottom, top) = extents
+    length = round_length(0.3 * (right - left))
+    end, height = right - 0.05 * (right - left), bottom + 0.06 * (top - bottom)
+    axes.plot([1e3 * (end - length), 1e3 * end], [1e3 * height] * 2, color="white", linewidth=2)
+    place = 1e3 * (end - length / 2), 1e3 * (height + 0.015 * (top - bottom))
+    axes.text(*place, f"{1e3 * length:g} mm", color="white", fontsize=7, ha="center", va="bottom")
     return axes.imshow(
         values.T,
         cmap=COLOUR_MAP,
@@ -231,7 +247,7 @@ def difference_pngs(
                 panels[2].plot(real[across], real[up], "k+", ms=10, label="true")
             if panels[2].get_legend_handles_labels()[1]:
                 panels[2].legend(loc="best", fontsize=7)
-            pictures[name] = png_from_pixels(pixels_from_figure(drawn))
+            pictures[name] = picture_bytes(drawn)
     return pictures
 
 

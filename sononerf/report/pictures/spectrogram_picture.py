@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,12 @@ from sononerf.array_types import Floats, Ints
 from sononerf.errors import NumericalError
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import ACTIVE_DB
-from sononerf.report.pictures.figure import figure, pixels_from_figure, png_from_pixels
+from sononerf.report.pictures.figure import (
+    PictureFormat,
+    figure,
+    picture_bytes,
+    pixels_from_figure,
+)
 
 MARGIN = 0.02
 """Range that is shown before the first and after the last active cell, m."""
@@ -26,12 +32,14 @@ BAR, BAR_GAP, BAR_WIDTH = 0.82, 0.08, 0.19
 KHZ_MARKS = [digit * 10.0**power for power in range(-3, 4) for digit in (1, 2, 5)]
 
 
-def spectrogram_png(
+def spectrogram_picture(
     measured_db: ArrayLike | None,
     predicted_db: ArrayLike | None,
     range_m: ArrayLike,
     frequency_hz: ArrayLike,
     title: str = "",
+    *,
+    kind: PictureFormat = "png",
 ) -> bytes:
     """Draw one pose's spectrograms, one row per receiver, of eight at most.
 
@@ -41,8 +49,11 @@ def spectrogram_png(
         range_m ((R,), m): Range axis, ascending; drawn only around what sounds.
         frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
         title: One line above.
+        kind: Of the file.
     """
-    return png_from_pixels(_pixels(measured_db, predicted_db, range_m, frequency_hz, title, 130))
+    given = (measured_db, predicted_db, range_m, frequency_hz)
+    with _drawn(*given, title, 130) as drawn:
+        return picture_bytes(drawn, kind)
 
 
 def spectrogram_image(
@@ -52,8 +63,9 @@ def spectrogram_image(
     frequency_hz: ArrayLike,
     title: str = "",
 ) -> NDArray[np.uint8]:
-    """Return the picture of :func:`spectrogram_png` as pixels (H, W, 3), smaller."""
-    return _pixels(measured_db, predicted_db, range_m, frequency_hz, title, 90)
+    """Return the picture of :func:`spectrogram_picture` as pixels (H, W, 3), smaller."""
+    with _drawn(measured_db, predicted_db, range_m, frequency_hz, title, 90) as drawn:
+        return pixels_from_figure(drawn)
 
 
 CELL = (380, 150)
@@ -187,14 +199,15 @@ def _round_up(value: float, step: float) -> float:
     return max(step, step * float(np.ceil(value / step - 1e-9)))
 
 
-def _pixels(
+@contextmanager
+def _drawn(
     measured_db: ArrayLike | None,
     predicted_db: ArrayLike | None,
     range_m: ArrayLike,
     frequency_hz: ArrayLike,
     title: str,
     dpi: int,
-) -> NDArray[np.uint8]:
+) -> Iterator[Any]:
     panels, ranges, frequencies = _checked(measured_db, predicted_db, range_m, frequency_hz)
     shown = sounding_slice(np.stack([*panels.values()]), ranges)
     panels, ranges = {name: values[:, shown] for name, values in panels.items()}, ranges[shown]
@@ -225,7 +238,7 @@ def _pixels(
             row[0].set_ylabel(f"{name}\nfrequency (kHz)")
         if title:
             drawn.suptitle(title, fontsize=10, y=1 - 0.06 / height, va="top")
-        return pixels_from_figure(drawn)
+        yield drawn
 
 
 def _axes(
@@ -306,7 +319,7 @@ def pings_png(
             axes.set_ylabel("frequency (kHz)")
         grid[-1][0].set_xlabel("time after the emission (ms)")
         grid[-1][1].set_xlabel(f"range (m), receiver 0, {SHOWN_DB:.0f} dB")
-        return png_from_pixels(pixels_from_figure(drawn))
+        return picture_bytes(drawn)
 
 
 def _poses(axes: Any, poses: Poses, shown: tuple[int, int], marked: int) -> None:

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from sononerf.errors import NumericalError
-from sononerf.report.pictures.mip_picture import mip_image, mip_png, mip_pngs, mips_image
+from sononerf.report.pictures.mip_picture import mip_image, mip_picture, mip_pictures, mips_image
 from sononerf.surface.start.volume import Volume
 
 EXTENTS = ((-0.05, 0.05), (0.0, 0.06))
@@ -33,8 +33,8 @@ def test_decibels_show_what_linear_hides():
 
 def test_a_picture_is_a_png_and_always_the_same():
     projection = np.random.default_rng(0).random((20, 12))
-    data = mip_png(projection, EXTENTS, ("y", "z"), title="maximum along x")
-    assert data == mip_png(projection, EXTENTS, ("y", "z"), title="maximum along x")
+    data = mip_picture(projection, EXTENTS, ("y", "z"), title="maximum along x")
+    assert data == mip_picture(projection, EXTENTS, ("y", "z"), title="maximum along x")
     width, height = Image.open(io.BytesIO(data)).size
     assert width > height > 200
 
@@ -42,13 +42,13 @@ def test_a_picture_is_a_png_and_always_the_same():
 @pytest.mark.parametrize("value", [0.0, 1.0, -2.0])
 @pytest.mark.parametrize("scale", ["db", "linear"])
 def test_a_constant_projection_is_drawn(value, scale):
-    mip_png(np.full((3, 4), value), EXTENTS, ("y", "z"), scale=scale)
+    mip_picture(np.full((3, 4), value), EXTENTS, ("y", "z"), scale=scale)
     assert mip_image(np.full((3, 4), value), scale=scale).shape[2] == 3
 
 
 def test_a_volume_gives_three_pictures():
     volume = Volume(np.random.default_rng(0).random((4, 30, 12)), np.zeros(3), 0.005)
-    sizes = {name: Image.open(io.BytesIO(data)).size for name, data in mip_pngs(volume).items()}
+    sizes = {name: Image.open(io.BytesIO(data)).size for name, data in mip_pictures(volume).items()}
     assert set(sizes) == {"x", "y", "z"}
     assert sizes["x"][0] > sizes["x"][1]
     assert sizes["z"][0] < sizes["z"][1]
@@ -58,7 +58,7 @@ def test_wrong_input_is_refused():
     with pytest.raises(ValueError, match="two axes"):
         mip_image(np.zeros((2, 2, 2)))
     with pytest.raises(NumericalError, match="not finite"):
-        mip_png([[np.nan]], EXTENTS, ("y", "z"))
+        mip_picture([[np.nan]], EXTENTS, ("y", "z"))
 
 
 def test_three_projections_in_one_picture_have_their_places():

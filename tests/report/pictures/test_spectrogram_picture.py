@@ -17,7 +17,7 @@ from sononerf.report.pictures.spectrogram_picture import (
     pings_png,
     sounding_slice,
     spectrogram_image,
-    spectrogram_png,
+    spectrogram_picture,
 )
 
 RANGE = np.linspace(0.15, 0.75, 121)
@@ -30,8 +30,8 @@ def echo(ears=2):
 
 
 def test_a_picture_is_a_png_and_always_the_same():
-    first = spectrogram_png(echo(), 0.9 * echo(), RANGE, FREQUENCY, "pose 3")
-    assert first == spectrogram_png(echo(), 0.9 * echo(), RANGE, FREQUENCY, "pose 3")
+    first = spectrogram_picture(echo(), 0.9 * echo(), RANGE, FREQUENCY, "pose 3")
+    assert first == spectrogram_picture(echo(), 0.9 * echo(), RANGE, FREQUENCY, "pose 3")
     assert Image.open(io.BytesIO(first)).size == (1365, 715)
 
 
@@ -78,7 +78,7 @@ def test_a_prediction_alone_has_one_panel():
     assert 0.3 < pixels.shape[1] / both.shape[1] < 0.5
     middle = pixels[pixels.shape[0] // 2, pixels.shape[1] // 2].astype(int)
     np.testing.assert_allclose(middle, [252, 253, 191], atol=24)  # the top of the scale
-    assert spectrogram_png(None, echo(), RANGE, FREQUENCY)
+    assert spectrogram_picture(None, echo(), RANGE, FREQUENCY)
 
 
 def test_a_difference_shows():
@@ -90,9 +90,9 @@ def test_a_difference_shows():
 
 def test_wrong_input_is_refused():
     with pytest.raises(ValueError, match=r"R = 121 and F = 47"):
-        spectrogram_png(echo()[:, :-1], echo()[:, :-1], RANGE, FREQUENCY)
+        spectrogram_picture(echo()[:, :-1], echo()[:, :-1], RANGE, FREQUENCY)
     with pytest.raises(NumericalError, match="predicted"):
-        spectrogram_png(echo(), echo() * np.nan, RANGE, FREQUENCY)
+        spectrogram_picture(echo(), echo() * np.nan, RANGE, FREQUENCY)
 
 
 def test_a_logarithmic_axis_is_drawn_as_one():
@@ -138,8 +138,8 @@ def test_a_row_for_each_ping(pings, receivers):
 
 
 def test_a_measurement_alone_is_not_called_a_prediction():
-    measured = spectrogram_png(echo(), None, RANGE, FREQUENCY, "pose 3")
-    predicted = spectrogram_png(None, echo(), RANGE, FREQUENCY, "pose 3")
+    measured = spectrogram_picture(echo(), None, RANGE, FREQUENCY, "pose 3")
+    predicted = spectrogram_picture(None, echo(), RANGE, FREQUENCY, "pose 3")
     assert measured != predicted  # the same cells under another title
     assert Image.open(io.BytesIO(measured)).size == Image.open(io.BytesIO(predicted)).size
 

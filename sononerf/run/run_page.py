@@ -1,0 +1,378 @@
+# SPDX-License-Identifier: MIT
+"""What a run's page shows: numbers, curves, surface, spectrograms, settings, the paper's figures."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+import torch
+import trimesh
+
+from sononerf import storage
+from sononerf.array_types import Floats, Ints
+from sononerf.errors import InputError, NumericalError, SonoNerfError
+from sononerf.evaluation.prediction import evenly, ranked
+from sononerf.head.decibels import compress, mae_db
+from sononerf.progress import Progress
+from sononerf.report.key_numbers import COST, NONE, KeyNumber, shape_rows
+from sononerf.report.page import Page
+from sononerf.report.pictures.curve_picture import curves_picture
+from sononerf.report.pictures.mesh_picture import mesh_png
+from sononerf.report.pictures.scene_picture import scene_png
+from sononerf.report.surface_views import SurfaceViews
+from sononerf.run.build import true_mesh
+from sononerf.run.fitted import Fitted, all_poses
+from sononerf.run.run_folder import RunFolder, flat
+from sononerf.settings.loading import dump_yaml
+from sononerf.settings.schema import Settings
+from sononerf.surface.mesh_files import confidence_of
+from sononerf.surface.start.read_out import read_isosurface
+
+SIDES = (380, 340)
+"""Width and height of the views of a surface, pixels: four fit into the page's width."""
+
+
+@contextmanager
+def damage_named(file: Path) -> Iterator[None]:
+    """Name a JSON file that holds something else than numbers where these should be."""
+    try:
+        yield
+    except (TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{file}: damaged ({error}); remove it and repeat the command that wrote it"
+        ) from None
+
+
+def page_of(run: RunFolder, settings: Settings, paper: bool, progress: Progress) -> Page:
+    """Return the page of a run; see :func:`sononerf.run.report_runs.report`."""
+    page = Page(run.path.resolve().name)
+    with damage_named(run.metrics):
+        _made(page, run, settings)
+        _numbers(page, run)
+    _curves(page, run)
+    if run.is_done("fit"):
+        _surface(page, run, settings)
+        if run.has_heldout:
+            _predictions(page, run.path)
+        if paper:
+            _figures(page, run.path, run.fitted, progress)
+    page.heading("Settings")
+    page.code(dump_yaml(settings).rstrip())
+    _provenance(page, run.path)
+    return page
+
+
+def _made(page: Page, run: RunFolder, settings: Settings) -> None:
+    cost = run.read_metrics().get("cost") or {}
+    echoes = (
+        f"Recorded echoes of `{settings.data.store}`"
+        if settings.scene is None
+        else f"Scene `{settings.scene.name}`, {settings.poses.count} poses for training"
+    )
+    said = [f"{echoes}; field `{settings.field.kind}` through renderer `{settings.renderer.kind}`"]
+    if cost.get("steps") is not None:
+        said.append(f"{cost['steps']} steps")
+    if cost.get("fit_s") is not None:
+        said.append(f"{cost['fit_s']:.0f} s of fit on {cost.get('device', 'an unknown device')}")
+    if cost.get("peak_memory_bytes") is not None:
+        said.append(f"{cost['peak_memory_bytes'] / 1e9:.1f} GB of memory at most")
+    page.say(", ".join(said) + ".")
+    if not run.is_done("fit"):
+        page.say(
+            f"The fit has not come to its end; `sononerf fit {shlex.quote(str(run.config))} "
+            f"--output {shlex.quote(str(run.path))}` goes on."
+        )
+
+
+HELD_OUT = (
+    ("all cells", "mae_db", "mean_predictor_mae_db", "noise_floor_mae_db", "rendered_mae_db"),
+    (
+        "active cells",
+        "mae_db_active",
+        "mean_predictor_mae_db_active",
+        "noise_floor_mae_db_active",
+        "rendered_mae_db_active",
+    ),
+)
+
+
+def _numbers(page: Page, run: RunFolder) -> None:
+    metrics = run.read_metrics()
+    prediction, geometry = metrics.get("prediction") or {}, metrics.get("geometry") or {}
+    page.heading("Numbers")
+    if not run.is_done("fit"):
+        page.say("None yet.")
+        return
+    if prediction:
+        heads = ("held-out error, dB", "this run", "field alone", "mean spectrogram", "noise floor")
+        page.table(
+            [heads]
+            + [
+                (name, *(KeyNumber("", key).text(prediction) for key in (ours, alone, mean, floor)))
+                for name, ours, mean, floor, alone in HELD_OUT
+            ]
+        )
+        page.say(
+            f"Mean over {prediction.get('poses')} poses that were never trained on, in decibels "
+            "above 60 dB below the loudest training echo. Active cells: measured or predicted is "
+            "3 dB or more. Field alone: without the echoes that are traced off the run's own mesh. "
+            "Mean spectrogram: what the mean of the training poses predicts for every pose."
+            + (
+                ""
+                if prediction.get("noise_floor_mae_db") is None
+                else " Noise floor: the same echoes simulated with other rays."
+            )
+        )
+    elif run.has_heldout:
+        page.say(f"No numbers of held-out poses yet: {_command('predict', run.path)}.")
+    else:
+        page.say("No pose was held out (`poses.heldout: 0`), so nothing is predicted.")
+    if not geometry:
+        page.say(
+            f"No geometry yet: {_command('evaluate', run.path)}; it needs the true mesh, and that "
+            "the field has a surface."
+        )
+    else:
+        baseline = metrics.get("baseline") or {}
+        columns = [geometry, *((baseline.get(name) or {}) for name in ("backprojection", "voxels"))]
+        page.table(
+            [("geometry", "this run", "backprojection", "voxel fit"), *_known(shape_rows(columns))]
+        )
+        target = (geometry.get("target") or {}).get("fscore") or {}
+        if target:
+            alone = (f"{score:.2f} at {1e3 * float(limit):g} mm" for limit, score in target.items())
+            page.say(f"F-score of the target alone, without its background: {', '.join(alone)}.")
+        page.say("The baselines are given the best of several levels, chosen with the truth.")
+    page.table([("cost", "this run"), *_known([(n.label, n.text(metrics)) for n in COST])])
+
+
+def _known(rows: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    return [row for row in rows if set(row[1:]) != {NONE}]
+
+
+CURVES = {"all cells": "val/mae_db", "active cells": "val/mae_db_active"}
+
+
+Curves = dict[str, tuple[list[float], list[float]]]
+
+
+def curves_of(run: RunFolder) -> tuple[Curves, dict[str, float]]:
+    """Return the errors on validation poses, as the previews kept them, and the noise floors."""
+    curves: Curves = {name: ([], []) for name in CURVES}
+    for file in sorted(run.path.glob("epochs/*/metrics.json")):
+        with damage_named(file):
+            told = storage.read_json(file)
+            for name, key in CURVES.items():
+                if told.get(key) is not None and float(told[key]) > 0:
+                    curves[name][0].append(float(told["step"]))
+                    curves[name][1].append(float(told[key]))
+    prediction = run.read_metrics().get("prediction") or {}
+    floors = {
+        f"noise floor, {name}": prediction.get(key)
+        for name, key in zip(
+            CURVES, ("noise_floor_mae_db", "noise_floor_mae_db_active"), strict=True
+        )
+    }
+    return (
+        {name: points for name, points in curves.items() if points[0]},
+        {name: value for name, value in floors.items() if value},
+    )
+
+
+def _curves(page: Page, run: RunFolder) -> None:
+    curves, floors = curves_of(run)
+    if curves:
+        page.heading("Learning curves")
+        picture = curves_picture(curves, floors=floors)
+        page.pictures({"The field alone on validation poses.": picture})
+
+
+def _surface(page: Page, run: RunFolder, settings: Settings) -> None:
+    page.heading("Surface")
+    source, command = run.reconstruction, _command("reconstruct", run.path)
+    if not run.is_done("surface"):
+        page.say(f"None yet: {command}.")
+        return
+    mesh = run.mesh()
+    views = SurfaceViews(
+        mesh,
+        confidence_of(mesh),
+        _truth_beside(page, run, settings),
+        run.fitted.head.resolution / 2,
+    )
+    page.view(views.meshes())
+    page.pictures({"Four sides; colours are explained at the left.": views.png(SIDES)})
+    page.heading("Maximum-intensity projections", 3)
+    found = {}
+    for axis in "xyz":
+        file = source / f"mip_{axis}.png"
+        if file.is_file():
+            found[f"Reflectivity, the largest along {axis}."] = file.read_bytes()
+        else:
+            page.say(f"{file} is missing; {command} makes it.")
+    page.pictures(found)
+
+
+def _truth_beside(page: Page, run: RunFolder, settings: Settings) -> trimesh.Trimesh | None:
+    """Return the true surface in the frame of the reconstruction; None where it is not known."""
+    try:
+        true = true_mesh(settings)
+    except SonoNerfError as error:
+        page.say(f"The true surface is not shown: {error}.")
+        return None
+    with damage_named(run.metrics):
+        geometry = run.read_metrics().get("geometry") or {}
+        motion = (geometry.get("registration") or {}).get("matrix")
+        if true is not None and motion is not None:
+            true = true.copy()
+            true.apply_transform(np.linalg.inv(np.asarray(motion, dtype=np.float64)))
+    return true
+
+
+@dataclass(frozen=True, eq=False)
+class _Predicted:
+    """Held-out poses as ``spectrograms.npz`` has them; levels (P, E, R, F) in dB."""
+
+    measured: Floats
+    predicted: Floats
+    numbers: Ints
+    range: Floats
+    frequency: Floats
+
+    def chosen(self) -> list[tuple[str, int]]:
+        """Return the rows of the best, the median and the worst predicted pose."""
+        rows = evenly(ranked(self.measured, self.predicted), 3)
+        return list(zip(("best", "median", "worst"), rows.tolist(), strict=True))
+
+
+def read_predictions(path: Path) -> _Predicted | None:
+    """Return what a run predicted for its held-out poses; None where it has not yet.
+
+    Raises:
+        InputError: If the file is damaged.
+    """
+    file = path / "prediction" / "spectrograms.npz"
+    if not file.is_file():
+        return None
+    try:
+        with file.open("rb") as opened, np.load(opened, allow_pickle=False) as arrays:
+            reference = float(arrays["reference"])
+            return _Predicted(
+                compress(arrays["measured"], reference),
+                compress(arrays["predicted"], reference),
+                arrays["pose"].astype(np.int64),
+                arrays["range_m"],
+                arrays["frequency_hz"],
+            )
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
+        raise InputError(
+            f"{file}: damaged ({error}); {_command('predict', path)} makes it anew"
+        ) from None
+
+
+def _predictions(page: Page, path: Path) -> None:
+    """Show the best, the median and the worst predicted of the held-out poses."""
+    page.heading("Spectrograms of poses that were never heard")
+    found = read_predictions(path)
+    if found is None:
+        page.say(f"None yet: {_command('predict', path)}.")
+        return
+    for name, row in found.chosen():
+        number = found.numbers[row]
+        picture = path / "prediction" / f"pose_{number:04d}.png"
+        error_db = mae_db(found.measured[row], found.predicted[row])
+        said = f"Pose {number}, the {name} of {len(found.numbers)}: {error_db:.2f} dB, all cells."
+        if picture.is_file():
+            page.pictures({said: picture.read_bytes()})
+        else:
+            page.say(f"{said} {picture} is missing; {_command('predict', path)} makes it.")
+
+
+def _command(name: str, run: Path, rest: str = "") -> str:
+    return f"`sononerf {name} {shlex.quote(str(run))}{rest}`"
+
+
+def _provenance(page: Page, path: Path) -> None:
+    file = path / "provenance.json"
+    if file.is_file():
+        page.heading("Made with")
+        with damage_named(file):
+            facts = flat(storage.read_json(file)).items()
+            rows = [(name, str(value)) for name, value in facts if value is not None]
+        page.table([("what", "value"), *rows])
+
+
+def _figures(page: Page, path: Path, fitted: Fitted, progress: Progress) -> None:
+    page.heading("As in the paper")
+    page.heading("Scene and poses (figures 4 to 6)", 3)
+    mesh = true_mesh(fitted.settings)
+    if mesh is None:
+        page.say("The true surface is not known here: no scene or `evaluation.truth` can be read.")
+    else:
+        poses, split = all_poses(fitted)
+        looks = poses.rotations[:, :, 0]
+        page.pictures({"The scene.": scene_png(mesh, poses.positions, looks, split=split)})
+    # Read before the long work, for they may be damaged.
+    compared = list(_comparisons(path))
+    page.heading("Iso-surface of the summed reflectivity (figures 4 to 6)", 3)
+    _isosurface(page, fitted, progress)
+    page.heading("What was heard here and not there (figures 7 and 8)", 3)
+    if not compared:
+        page.say(f"Not compared with another run yet: {_command('compare', path, ' OTHER')}.")
+    for said, pictures in compared:
+        page.say(said)
+        page.pictures(pictures)
+
+
+def _isosurface(page: Page, fitted: Fitted, progress: Progress) -> None:
+    options = fitted.settings.reconstruction
+    level = options.level
+    try:
+        with progress.task("reading out", 1000) as task, torch.inference_mode():
+            mesh, volume, found = read_isosurface(
+                fitted.module.field,
+                spacing=options.spacing,
+                level=level,
+                directions=options.directions,
+                smoothing=options.smoothing,
+                progress=lambda done, total: task.advance(1000 * done // total - task.done),
+            )
+        picture = mesh_png(mesh)
+    except NumericalError as error:
+        page.say(f"None: {error}.")
+        return
+    said = (
+        f"Sum over {options.directions} directions, voxels of "
+        f"{1e3 * volume.spacing:.3g} mm, level "
+        + ("by Otsu's rule" if level == "auto" else "as set")
+        + f": {found:.3g}."
+    )
+    page.pictures({said: picture})
+
+
+def _comparisons(path: Path) -> Iterator[tuple[str, dict[str, bytes]]]:
+    for file in sorted(path.glob("*/comparison.json")):
+        with damage_named(file):
+            told: dict[str, Any] = storage.read_json(file)
+            away, score = told.get("distance_m"), told.get("score")
+            said = (
+                f"Beside `{told.get('second')}` the strongest difference is "
+                + (NONE if score is None else f"{score:.2f}")
+                + " of the common maximum"
+                + (
+                    ""
+                    if away is None
+                    else f", {1e3 * away:.1f} mm from the middle of what was added"
+                )
+            )
+        names = {name: file.with_name(f"{name}.png") for name in ("mip_x", "mip_y", "mip_z")}
+        names["overlay"] = file.with_name("overlay.png")  # not without a true surface
+        found = {n: picture.read_bytes() for n, picture in names.items() if picture.is_file()}
+        yield f"{said}.", found
