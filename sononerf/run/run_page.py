@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a run's page shows: numbers, curves, surface, spectrograms, settings, the paper's figures."""
+"""What the page of a run shows: numbers, curves, surface, spectrograms, settings."""
 
 from __future__ import annotations
 
