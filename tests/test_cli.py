@@ -287,6 +287,7 @@ def test_predict_poses_of_ones_own(at_home, tmp_path):
     assert sorted(p.name for p in elsewhere.iterdir()) == ["model.json", "model.safetensors"]
 
 
+@pytest.mark.slow
 def test_reconstruct_with_spacing_and_level(at_home, tmp_path):
     before = tree(at_home.run)
     options = ("--spacing", "0.012", "--level", "0.4", "--output", tmp_path / "coarse")
@@ -316,6 +317,7 @@ def test_a_comparison_is_told_in_millimetres(tmp_path, monkeypatch):
     assert "at (7.1, 13.0, -60.0) mm, 0.52 of the maximum; 4.8 mm from the middle of what" in said
 
 
+@pytest.mark.slow
 def test_two_runs_are_compared(at_home, tmp_path):
     state, description = load_weights(at_home.run)
     state["renderer.log_gain"] -= 0.5
@@ -344,6 +346,7 @@ def fit_alone(monkeypatch):
     return called
 
 
+@pytest.mark.slow
 def test_overwrite_moves_the_old_run_aside(fit_alone, clean):
     command = ("fit", SMOKE, *SHORT, "--accelerator", "cpu", "--output", "run")
     done(*command)
@@ -354,6 +357,7 @@ def test_overwrite_moves_the_old_run_aside(fit_alone, clean):
     assert (clean / "run" / "model.safetensors").read_bytes() != first
 
 
+@pytest.mark.slow
 def test_what_follows_the_fit_is_made_up_for(fit_alone, clean):
     command = ("fit", SMOKE, *SHORT, "--accelerator", "cpu", "--output", "run")
     done(*command)
@@ -363,6 +367,7 @@ def test_what_follows_the_fit_is_made_up_for(fit_alone, clean):
     assert (clean / "run" / "model.json").stat() == model
 
 
+@pytest.mark.slow
 def test_a_plugins_scene_goes_the_whole_way(plugin, quick, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     listed = {row["name"]: row for row in json.loads(done("scenes", "--json").out)["scenes"]}
@@ -376,6 +381,7 @@ def test_a_plugins_scene_goes_the_whole_way(plugin, quick, tmp_path, monkeypatch
     assert (tmp_path / "bar" / "reconstruction" / "view.png").is_file()
 
 
+@pytest.mark.slow
 def test_scenes_are_listed_for_people_and_for_programs():
     text = done("scenes")
     assert text.err == ""
@@ -525,6 +531,7 @@ def test_poses_inside_the_scene(clean):
     assert tree(clean) == {}
 
 
+@pytest.mark.slow
 def test_a_broken_plugin_hurts_only_who_asks_for_it(clean, tmp_path, monkeypatch):
     folder = tmp_path / "plugins"
     info = folder / "broken-2.0.dist-info"
@@ -786,6 +793,7 @@ def test_signals_outside_the_fit_unwind_and_say_so(monkeypatch, number):
     assert after == before
 
 
+@pytest.mark.slow
 def test_sigterm_stops_a_fit_in_time_and_the_same_command_goes_on(clean, fit_alone, monkeypatch):
     arguments = [
         *("fit", SMOKE, *SHORT, "fit.epochs=20", "fit.steps_per_epoch=10"),

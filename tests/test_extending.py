@@ -59,6 +59,7 @@ def echoes():
     return sn.Echoes.from_arrays(heard, poses, head)
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize(("kind", "left"), [("siren", 0.95), ("splats", 0.9)])
 def test_they_learn(kind, left, echoes, splats, tmp_path):

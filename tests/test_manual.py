@@ -53,6 +53,7 @@ def test_a_notebook_runs(notebook, tmp_path):
     assert "mae_db" in run(notebook.name, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_users_script_is_typed():
     done = subprocess.run(

@@ -133,6 +133,7 @@ def test_nothing_but_noise_is_one_clear_line():
         region_of(positions, rotations, heard).box()
 
 
+@pytest.mark.slow
 def test_as_few_onsets_as_noise_gives_are_one_clear_line():
     """Two poses confirm each other, but among 2,000 ears noise gives as many."""
     positions, rotations = around(1000)

@@ -448,6 +448,7 @@ def test_what_contradicts_the_store_is_refused_and_what_agrees_is_not(alone):
     assert wider.spectrogram.dynamic_range_db == 50.0
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_fit_of_a_store_needs_no_scene(alone, tmp_path):
     run = tmp_path / "run"

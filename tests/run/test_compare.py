@@ -47,6 +47,7 @@ def numbers(folder):
     return json.loads((folder / "comparison.json").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_run_does_not_differ_from_its_copy(run):
     one = run("one")
@@ -79,6 +80,7 @@ def test_what_only_the_first_hears_is_found(run, tmp_path):
         assert (folder / name).stat().st_size > 1000
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_runs_that_look_turned_round_are_said_to_be(run, tmp_path, caplog):
     one, silent = run("one"), run("silent", gain=1e-6)
@@ -96,6 +98,7 @@ def test_runs_that_look_turned_round_are_said_to_be(run, tmp_path, caplog):
             assert "runs look swapped" in said
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_poses_of_both_runs_are_listened_from(run):
     other = run("other", poses={"seed": 5})

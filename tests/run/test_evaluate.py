@@ -55,6 +55,7 @@ def test_what_is_evaluated(run, few_samples):
         assert metrics["baseline"][name].keys() == GEOMETRY, name
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_another_mesh_takes_the_numbers_of_the_last_one_away(
     run, tmp_path, few_samples, no_projections
@@ -126,6 +127,7 @@ def test_a_damaged_mesh_is_told(run, content, no_projections):
         evaluate(run)
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_true_surface_from_a_file_replaces_the_scene(run, few_samples, no_projections, tmp_path):
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
@@ -135,6 +137,7 @@ def test_a_true_surface_from_a_file_replaces_the_scene(run, few_samples, no_proj
     assert larger > plain + 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_registered_surface_is_judged_in_the_frame_of_the_truth(
     run, few_samples, no_projections, tmp_path

@@ -274,6 +274,7 @@ def test_a_finished_run_is_left_as_it_is(tiny, finished):
     assert files(finished) == before
 
 
+@pytest.mark.slow
 def test_more_epochs_go_on_and_the_stages_after_them_are_done_again(tiny, tmp_path):
     path = tmp_path / "run"
     run(tiny(), path)
@@ -483,6 +484,7 @@ def line(count):
     return [[0.0, 0.03 * (n - (count - 1) / 2), 0.0] for n in range(count)]
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize(
     ("count", "directivity"), [(1, "omnidirectional"), (8, "omnidirectional"), (3, "file")]

@@ -51,6 +51,7 @@ def test_every_file_is_there_and_readable(run):
     assert json.loads((run / "metrics.json").read_text())["cost"]["reconstruct_s"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
     coarse = reconstruct(run, spacing=0.012, output=tmp_path / "coarse")

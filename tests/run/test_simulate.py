@@ -267,6 +267,7 @@ def test_what_is_no_shard_is_refused(text):
         Shard.of(text)
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_killed_worker_costs_nothing(tiny, tmp_path, monkeypatch):
     settings = tiny(poses={"count": 20}, simulation={"rays": 4000})

@@ -46,6 +46,7 @@ def test_it_is_turned_with_the_leaf():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_placement_seed_draws_where_it_sits():
     first, again, other = prey(placement_seed=1), prey(placement_seed=1), prey(placement_seed=2)

@@ -43,6 +43,7 @@ def few(monkeypatch):
     monkeypatch.setattr(accuracy, "FIRST", 500)
 
 
+@pytest.mark.slow
 def test_the_accuracy_is_reached_and_costs_rays(few, tmp_path):
     rays = []
     for wanted in (2.0, 1.0):
@@ -94,6 +95,7 @@ def test_a_store_records_the_number_and_goes_on_with_it(few, tmp_path, monkeypat
     assert [again.read_pose(index).tobytes() for index in range(len(again))] == whole
 
 
+@pytest.mark.slow
 def test_a_number_that_a_damaged_store_names_is_not_taken(few, tmp_path):
     wanted = settings(accuracy_db=3.0)
     store = simulate(wanted, output=tmp_path / "store", workers=1)

@@ -262,6 +262,7 @@ class Deadly:
         return np.full((1, 1, 1), position[0], dtype=np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize("times", [3, 99])
 def test_a_pose_is_not_blamed_for_its_workers(tmp_path, caplog, times):
@@ -332,6 +333,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_ctrl_c_is_for_us_and_not_for_our_workers():
     done = subprocess.run(

@@ -27,6 +27,7 @@ def levels(found):
     return 20 * np.log10(np.maximum(magnitude, 1e-3 * magnitude.max()))
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_it_is_the_default_and_closer_to_the_truth_than_rays_at_low_frequencies():
     """A sphere half behind another: creeping, shadow, and sound back and forth."""

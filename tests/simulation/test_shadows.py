@@ -41,6 +41,7 @@ def bat(mesh, engine):
 SLOW = [pytest.param(offset, marks=pytest.mark.slow) for offset in (0.015, 0.018, 0.021)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset", [0.012, 0.03, *SLOW])
 def test_a_ball_fades_behind_another_as_multiple_scattering_says(offset):
     front, behind = both(offset)
@@ -52,6 +53,7 @@ def test_a_ball_fades_behind_another_as_multiple_scattering_says(offset):
     assert abs(found - expected) < 1.5
 
 
+@pytest.mark.slow
 def test_the_level_falls_smoothly_through_the_border():
     steps = np.linspace(0.012, 0.024, 13)
     levels = []

@@ -36,6 +36,7 @@ def ears(emitter, *receivers):
     return {**OPEN, "emitter": inside[0], "receivers": inside[1:]}
 
 
+@pytest.mark.slow
 def test_echoes_are_those_of_the_body_and_its_image_for_the_emitter_and_its_image():
     ear = PLACE + np.array([0.0, 0.03, 0.02])
     on_table = heard(BALL, Head(ears(PLACE, ear), support=TABLE), "spheres")
@@ -97,6 +98,7 @@ def test_the_wave_equation_knows_the_image():
     assert error_of(BALL, TABLE, "hybrid", 20e3, 30e3) < 0.3
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_rays_are_as_exact_on_a_support_as_off_the_body_and_its_image():
     two = trimesh.util.concatenate([BALL, BELOW])

@@ -55,6 +55,7 @@ def test_many_poses_without_rays_are_simulated_in_other_processes(monkeypatch, p
     assert simulated(Plain(), places, list(range(poses)), lambda index: index) == processes
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_workers_that_are_stopped_while_they_answer_keep_nobody_waiting():
     done = subprocess.run(

@@ -46,6 +46,7 @@ def test_a_fine_mesh_is_made_coarser_and_keeps_its_shape(edge):
     assert found.volume == pytest.approx(fine.volume, rel=0.01)
 
 
+@pytest.mark.slow
 def test_a_thin_plate_keeps_both_sides_when_it_is_made_coarser():
     found = suited(closed_bodies(halved(PLATE, 0.0006)), 0.003)
     assert found.is_watertight

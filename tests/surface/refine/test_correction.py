@@ -83,6 +83,7 @@ def test_on_the_surface_itself_the_corrected_echo_is_the_simulated_one(
     assert float(plain.detach().min()) > 0.1
 
 
+@pytest.mark.slow
 def test_a_simulator_of_another_level_moves_nothing(optics, sphere, simulator, echoes, level):
     """If the measured echoes are the simulator's own, the surface is right as it is."""
     double = Shifted(simulator)
