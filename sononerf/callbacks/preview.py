@@ -14,7 +14,7 @@ from torch.utils.tensorboard import SummaryWriter
 from sononerf import storage
 from sononerf.callbacks.tensorboard import Shown, add_mesh
 from sononerf.errors import NumericalError
-from sononerf.evaluation.metrics import geometry_metrics
+from sononerf.evaluation.metrics import chamfer_distance
 from sononerf.evaluation.solid import Solid
 from sononerf.field.field import Field
 from sononerf.field.module import EchoModule, decibels
@@ -25,7 +25,7 @@ from sononerf.report.pictures.mip_picture import (
     mip_image,
     mips_image,
 )
-from sononerf.report.pictures.spectrogram_picture import spectrogram_image
+from sononerf.report.pictures.spectrogram_picture import quick_image, sounding_slice
 from sononerf.surface.mesh_files import mesh_bytes
 from sononerf.surface.start.read_out import energy_volume
 from sononerf.surface.start.volume import Volume, automatic_level, isosurface
@@ -118,8 +118,8 @@ class SurfaceImages(Shown):
         add_mesh(writer, "mesh/field", mesh, step)
         if self._truth is not None:
             self._solid = self._solid or Solid(self._truth)
-            metrics = geometry_metrics(mesh, self._solid, samples=SAMPLES)
-            writer.add_scalar("Chamfer_mm/field", 1e3 * metrics["chamfer_m"], step)
+            distance = chamfer_distance(mesh, self._solid, samples=SAMPLES)
+            writer.add_scalar("Chamfer_mm/field", 1e3 * distance, step)
 
 
 POSES = 3
@@ -158,6 +158,8 @@ class SpectrogramImages(Shown):
                 decibels(part, pl_module.reference)[0].cpu().numpy()
                 for part in (batch.spectrum, pl_module(batch))
             )
-            picture = spectrogram_image(measured, predicted, self.range_m, self.frequency_hz)
+            shown = sounding_slice(np.stack([measured, predicted]), self.range_m)
+            levels = {"measured": measured[:, shown], "predicted": predicted[:, shown]}
+            picture = quick_image(levels, self.range_m[shown], self.frequency_hz)
             name = f"spectrogram/validation_pose_{number}"
             writer.add_image(name, picture, trainer.global_step, dataformats="HWC")

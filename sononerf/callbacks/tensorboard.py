@@ -43,8 +43,8 @@ LAYOUT = {
 }
 TRIANGLES = 10_000
 """Of a mesh in TensorBoard; a larger one is decimated to this: 0.2 MB each."""
-SHARE = 0.05
-"""Part of the time of a fit that drawing for TensorBoard may take."""
+SHARE, FIRST = 0.02, 10.0
+"""Part of the time of a fit that each kind of drawing may take, and when the first comes, s."""
 
 
 def event_folder(run: Path) -> Path:
@@ -84,6 +84,13 @@ class Shown(lightning.Callback):
 
     def __init__(self) -> None:
         self.next_at = 0.0  # of the monotonic clock, s
+
+    def on_train_start(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
+    ) -> None:
+        """Leave out the first epochs, in which there is little to see."""
+        del trainer, pl_module
+        self.next_at = time.monotonic() + FIRST
 
     def on_train_epoch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule

@@ -27,7 +27,7 @@ from sononerf.head.decibels import compress
 from sononerf.report.echo_sound import STRETCH, echo_wav
 from sononerf.report.pictures.mesh_picture import CLAY, STEEL
 from sononerf.report.pictures.shading import DEFAULT_VIEW
-from sononerf.report.pictures.spectrogram_picture import live_image, spectrogram_image
+from sononerf.report.pictures.spectrogram_picture import quick_image, spectrogram_image
 from sononerf.report.surface_views import SurfaceViews
 from sononerf.surface.start.volume import Volume, isosurface
 
@@ -272,7 +272,7 @@ class Viewer:
         place = np.asarray(self.head.position, dtype=np.float64)
         turn = trimesh.transformations.quaternion_matrix(self.head.wxyz)[:3, :3]
         level, ranges, frequencies = self._rendered(Poses(place[None], turn[None]))
-        self._live_image.image = live_image(level, ranges, frequencies)
+        self._live_image.image = quick_image({"predicted": level}, ranges, frequencies)
         self.seconds = time.monotonic() - began
         x, y, z = 1e3 * place
         self._live_text.content = (

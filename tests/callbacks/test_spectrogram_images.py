@@ -63,23 +63,25 @@ def test_drawing_takes_no_more_than_its_share_and_the_last_epoch_has_a_picture(
         def on_train_batch_end(self, trainer, pl_module, *rest):
             clock[0] += 3.0 if pl_module.global_step % 4 == 0 else 0.0
 
-    monkeypatch.setattr(images_module, "spectrogram_image", draw)
+    monkeypatch.setattr(images_module, "quick_image", draw)
     made = training(Epochs(), logger=True, validation=False, steps=48)
     made.trainer.callbacks.append(callback(made))
     made.train()
-    # The second comes 20 s after the first was drawn; the twelfth epoch is the last.
-    assert shown == [3.0, 3.5, 25.0, 25.5, 38.0, 38.5]
+    # The first comes after 10 s, the next one not before 50 s more; the twelfth epoch is the last.
+    assert shown == [12.0, 12.5, 37.0, 37.5]
 
 
 def test_the_same_validation_poses_are_shown_each_time(training, monkeypatch):
     monkeypatch.setattr(tensorboard_module, "SHARE", 1e9)  # no drawing takes too long
+    monkeypatch.setattr(tensorboard_module, "FIRST", 0.0)
+    monkeypatch.setattr(images_module, "sounding_slice", lambda *given: slice(None))
     shown = []
 
-    def draw(measured, predicted, range_m, frequency_hz):
-        shown.append((measured, predicted, range_m, frequency_hz))
+    def draw(levels, range_m, frequency_hz):
+        shown.append((levels["measured"], levels["predicted"], range_m, frequency_hz))
         return torch.zeros(2, 2, 3, dtype=torch.uint8).numpy()
 
-    monkeypatch.setattr(images_module, "spectrogram_image", draw)
+    monkeypatch.setattr(images_module, "quick_image", draw)
     made = training(logger=True)
     made.trainer.callbacks.append(callback(made))
     made.train()
@@ -94,7 +96,7 @@ def test_the_same_validation_poses_are_shown_each_time(training, monkeypatch):
 
 def test_nothing_without_poses_or_without_tensorboard(training, monkeypatch):
     drawn = []
-    monkeypatch.setattr(images_module, "spectrogram_image", lambda *given: drawn.append(given))
+    monkeypatch.setattr(images_module, "quick_image", lambda *given: drawn.append(given))
     made = training(logger=True)
     made.trainer.callbacks.append(callback(made, poses=[]))
     made.train()

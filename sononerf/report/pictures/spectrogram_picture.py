@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -68,43 +68,60 @@ def spectrogram_image(
         return pixels_from_figure(drawn)
 
 
-CELL = (380, 150)
-"""Width and height of a receiver's spectrogram in :func:`live_image`, pixels."""
-LIVE_DB = 50.0
-"""Level of the brightest colour in :func:`live_image`, dB; fixed, so that poses can be compared."""
+CELL, CELL_GAP = (380, 150), 12
+"""Width and height of a receiver's spectrogram in :func:`quick_image`, and between two, pixels."""
+LIVE_DB, LIVE_DIFFERENCE_DB = 50.0, 12.0
+"""Ends of the colours in :func:`quick_image`, dB; fixed, so that pictures can be compared."""
 
 
-def live_image(
-    level_db: ArrayLike, range_m: ArrayLike, frequency_hz: ArrayLike
+def quick_image(
+    levels_db: Mapping[str, ArrayLike], range_m: ArrayLike, frequency_hz: ArrayLike
 ) -> NDArray[np.uint8]:
     """Return one pose's spectrograms as pixels (H, W, 3), drawn in milliseconds.
 
-    A row per receiver, of four at most, with the ends of the axes alone.
+    A row per receiver, of four at most; a column per kind of level, and of two the second minus the
+    first; of the axes the ends alone.
 
     Args:
-        level_db ((E, R, F), dB): 0 dB is silence.
-        range_m, frequency_hz ((R,), m; (F,), Hz): Axes, ascending.
+        levels_db ((E, R, F), dB): By their names; 0 dB is silence.
+        range_m ((R,), m): Range axis, ascending.
+        frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
     """
     from matplotlib import colormaps
     from PIL import Image, ImageDraw, ImageFont
 
-    levels = np.asarray(level_db, dtype=np.float64)
     ranges, frequencies = np.asarray(range_m), np.asarray(frequency_hz) / 1e3
-    chosen, names = drawn_receivers(len(levels), 4)
-    colours = colormaps[LEVEL_MAP](np.clip(levels[chosen] / LIVE_DB, 0, 1), bytes=True)[..., :3]
+    parts = {name: np.asarray(level, dtype=np.float64) for name, level in levels_db.items()}
+    chosen, ears = drawn_receivers(len(next(iter(parts.values()))), 4)
+    columns = {
+        f"{name}, 0 to {LIVE_DB:.0f} dB": colormaps[LEVEL_MAP](level[chosen] / LIVE_DB, bytes=True)
+        for name, level in parts.items()
+    }
+    if len(parts) == 2:
+        (_, first), (_, second) = parts.items()
+        place = 0.5 + 0.5 * (second - first)[chosen] / LIVE_DIFFERENCE_DB
+        title = f"difference, -{LIVE_DIFFERENCE_DB:.0f} to {LIVE_DIFFERENCE_DB:.0f} dB"
+        columns[title] = colormaps[DIFFERENCE_MAP](place, bytes=True)
     (width, height), left, line = CELL, 56, 18
-    picture = Image.new("RGB", (left + width, len(chosen) * (height + line) + line), "white")
+    size = left + len(columns) * (width + CELL_GAP), len(chosen) * (height + line) + line
+    picture = Image.new("RGB", size, "white")
     draw, font = ImageDraw.Draw(picture), ImageFont.load_default(12)
-    for row, (pixels, name) in enumerate(zip(colours, names, strict=True)):
-        top = row * (height + line)
-        cell = Image.fromarray(np.ascontiguousarray(pixels.transpose(1, 0, 2)[::-1]))
-        draw.text((left, top + 1), f"{name}, 0 to {LIVE_DB:.0f} dB", fill="black", font=font)
-        picture.paste(cell.resize(CELL, Image.Resampling.BILINEAR), (left, top + line))
-        for y, value in ((top + line, frequencies[-1]), (top + line + height - 14, frequencies[0])):
-            draw.text((left - 4, y), f"{value:.0f} kHz", fill="black", font=font, anchor="ra")
-    bottom = picture.height - line + 2
-    draw.text((left, bottom), f"{ranges[0]:.3f} m", fill="black", font=font)
-    draw.text((left + width, bottom), f"{ranges[-1]:.3f} m", fill="black", font=font, anchor="ra")
+
+    def write(x: float, y: float, text: str, anchor: str = "la") -> None:
+        draw.text((x, y), text, fill="black", font=font, anchor=anchor)
+
+    for row, ear in enumerate(ears):
+        top = row * (height + line) + line
+        write(left - 4, top, f"{frequencies[-1]:.0f} kHz", "ra")
+        write(left - 4, top + height - 14, f"{frequencies[0]:.0f} kHz", "ra")
+        for column, (title, colours) in enumerate(columns.items()):
+            x = left + column * (width + CELL_GAP)
+            pixels = np.ascontiguousarray(colours[row, ..., :3].transpose(1, 0, 2)[::-1])
+            cell = Image.fromarray(pixels).resize(CELL, Image.Resampling.BILINEAR)
+            picture.paste(cell, (x, top))
+            write(x, top - line + 1, f"{ear}: {title}")
+            write(x, size[1] - line + 2, f"{ranges[0]:.3f} m")
+            write(x + width, size[1] - line + 2, f"{ranges[-1]:.3f} m", "ra")
     return np.asarray(picture)
 
 

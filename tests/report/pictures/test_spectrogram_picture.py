@@ -13,8 +13,8 @@ from sononerf.errors import NumericalError
 from sononerf.geometry.poses import Poses
 from sononerf.report.pictures.spectrogram_picture import (
     LIVE_DB,
-    live_image,
     pings_png,
+    quick_image,
     sounding_slice,
     spectrogram_image,
     spectrogram_picture,
@@ -144,13 +144,22 @@ def test_a_measurement_alone_is_not_called_a_prediction():
     assert Image.open(io.BytesIO(measured)).size == Image.open(io.BytesIO(predicted)).size
 
 
-def test_the_live_picture_has_range_to_the_right_and_frequency_upwards():
+def test_the_quick_picture_has_range_to_the_right_and_frequency_upwards():
     level = np.zeros((2, 100, 30))
     level[1, 60:, 20:] = LIVE_DB  # of the right ear: far, and of high frequency
-    pixels = live_image(level, 0.3 + 0.001 * np.arange(100), 1e3 * np.linspace(10, 80, 30))
-    height, width = pixels.shape[0], pixels.shape[1]
-    bright = (pixels.astype(int).sum(axis=2) > 600) & (np.ptp(pixels, axis=2) > 30)
+    axes = 0.3 + 0.001 * np.arange(100), 1e3 * np.linspace(10, 80, 30)
+    alone = quick_image({"predicted": level}, *axes)
+    height, width = alone.shape[0], alone.shape[1]
+    bright = (alone.astype(int).sum(axis=2) > 600) & (np.ptp(alone, axis=2) > 30)
     rows, columns = np.nonzero(bright)
     assert rows.min() > height / 2
     assert rows.max() < 0.75 * height
     assert columns.min() > 0.6 * width
+    # Beside what was measured, twice as loud, the difference is blue there.
+    both = quick_image({"measured": 2 * level, "predicted": level}, *axes).astype(int)
+    assert both.shape[1] > 2.5 * width
+    red, green, blue = both[:, 2 * both.shape[1] // 3 :].transpose(2, 0, 1)
+    rows, _ = np.nonzero((blue > red + 60) & (blue > green + 20))
+    assert len(rows)
+    assert height / 2 < rows.min()
+    assert rows.max() < 0.75 * height
