@@ -225,8 +225,16 @@ def view(
     ] = 8080,
 ) -> None:
     """Show a run or a store in the browser: mesh, volume, poses, echoes, a head to drag."""
+    import signal
+
     from sononerf.run.view import View
 
     shown = View(source, port=port)
     say(f"open {shown.viewer.url}; Ctrl-C ends it")
-    shown.follow()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # here it is no interruption
+    try:
+        shown.follow()
+    except KeyboardInterrupt:
+        pass
+    finally:
+        shown.viewer.close()

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -261,7 +262,8 @@ def read_volume(source: Path) -> Volume:
     """
     file = _reconstructed(source, "volume.vti")
     try:
-        image = pyvista.ImageData(file)
+        with warnings.catch_warnings(action="ignore"):  # VTK's own words on a damaged file
+            image = pyvista.ImageData(file)
         flat = np.asarray(image.point_data["reflectivity"], dtype=np.float32)
         values = flat.reshape(image.dimensions, order="F")
         return Volume(values, np.asarray(image.origin), float(image.spacing[0]))

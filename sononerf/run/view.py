@@ -46,10 +46,14 @@ class View:
         self.viewer = Viewer(path.resolve().name, port=port)
         self._has_echoes = False
         self._seen: dict[str, object] = {}
-        if echoes is not None:
-            self._show(echoes)
-        else:
-            self.refresh()
+        try:
+            if echoes is not None:
+                self._show(echoes)
+            else:
+                self.refresh()
+        except BaseException:
+            self.viewer.close()
+            raise
 
     def _show(self, echoes: Echoes) -> None:
         self.viewer.show_echoes(echoes)

@@ -6,10 +6,12 @@ from __future__ import annotations
 import io
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
 import wave
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -97,6 +99,24 @@ def test_a_run_that_grows_is_followed(run, shown):
     view.refresh()
     assert "surface found as filled" in view.viewer._status.content
     assert {"surface", "truth", "volume", "poses"} <= view.viewer._boxes.keys()
+
+
+def test_a_port_in_use_is_left_to_the_other_and_the_url_says_which_is_taken(run, shown):
+    one, two = shown(run), shown(run)
+    assert one.viewer.url != two.viewer.url
+    with urlopen(two.viewer.url) as page:
+        assert b"<html" in page.read().lower()
+
+
+def test_ctrl_c_ends_it_without_a_word(run, tmp_path):
+    command = [sys.executable, "-m", "sononerf.cli", "view", str(run), "--port", "8400"]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    line = process.stderr.readline()
+    assert re.fullmatch(r"open http://127\.0\.0\.1:\d+; Ctrl-C ends it\n", line)
+    time.sleep(1)
+    process.send_signal(signal.SIGINT)
+    assert process.communicate(timeout=20) == ("", "")
+    assert process.returncode == 0
 
 
 def test_what_is_neither_run_nor_store_is_refused(tmp_path):
