@@ -20,6 +20,7 @@ from sononerf.cli.options import (
     Run,
     Split,
     SurfaceMethod,
+    Unit,
     app,
     optional,
     print_json,
@@ -314,6 +315,9 @@ def evaluate(
             help="Lays the mesh over the truth: none, rigid, or with one scale (similarity)."
         ),
     ] = None,
+    unit: Annotated[
+        Unit | None, typer.Option(help="Of the numbers in the truth's file; m by default.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Compare a run's mesh with the true surface, and show all its numbers."""
@@ -324,6 +328,7 @@ def evaluate(
         run,
         truth=truth,
         registration=registration,
+        unit=unit,
         progress=Progress(quiet=as_json),
     )
     if as_json:

@@ -26,6 +26,7 @@ SurfaceMethod = Literal["auto", "open", "filled", "hull", "sheet", "isosurface"]
 Registration = Literal["none", "rigid", "similarity"]
 Exported = Literal["auto", "echoes", "prediction", "volume", "points"]
 Figures = Literal["svg", "pdf"]
+Unit = Literal["m", "cm", "mm"]
 Split = Literal["test", "val", "train"]
 Config = Annotated[
     Path,

@@ -15,7 +15,7 @@ from trimesh.registration import procrustes
 
 from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
-from sononerf.errors import NumericalError
+from sononerf.errors import InputError, NumericalError
 from sononerf.evaluation.baseline import best_level_surface, volume_of
 from sononerf.evaluation.metrics import geometry_metrics, target_metrics
 from sononerf.evaluation.solid import Solid
@@ -151,6 +151,38 @@ def _closest(
         pairs = np.concatenate([points, points[origin]]), np.concatenate([target[near], target])
         motion = procrustes(*pairs, reflection=False, scale=scaled, return_cost=False)
     return before, np.asarray(motion)
+
+
+MOST_TIMES = 30.0
+"""By how much truth and reconstruction may differ in size: less than metres and inches do."""
+
+
+def check_truth(found: trimesh.Trimesh, true: trimesh.Trimesh, kind: Kind, name: str) -> None:
+    """Refuse a true surface that is of another size, or elsewhere, before any work.
+
+    Args:
+        found: Reconstruction, m.
+        true: True surface, m.
+        kind: What will lay the reconstruction over it: a similarity has any size, and a motion
+            any place.
+        name: Of the true surface, for the message.
+
+    Raises:
+        InputError: If the sizes differ by more than ``MOST_TIMES``, or the two boxes do not meet.
+    """
+    sizes = [float(np.linalg.norm(mesh.extents)) for mesh in (found, true)]
+    times = max(sizes) / max(min(sizes), 1e-12)
+    if kind != "similarity" and times > MOST_TIMES:
+        raise InputError(
+            f"{name}: {sizes[1]:.3g} m across, and the reconstruction {sizes[0]:.3g} m; give the "
+            "unit of its numbers (--unit mm, or evaluation.unit), or --registration similarity"
+        )
+    apart = np.maximum(true.bounds[0] - found.bounds[1], found.bounds[0] - true.bounds[1])
+    if kind == "none" and (apart > 0).any():
+        raise InputError(
+            f"{name}: lies {np.linalg.norm(apart.clip(0)):.3g} m away from the reconstruction; "
+            "move it there, or give --registration rigid"
+        )
 
 
 def signed_error(mesh: trimesh.Trimesh, true: trimesh.Trimesh) -> Floats:

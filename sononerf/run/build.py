@@ -7,6 +7,7 @@ import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import trimesh
@@ -20,6 +21,7 @@ from sononerf.field.module import EchoModule
 from sononerf.head.attached import attached
 from sononerf.head.head import Head
 from sononerf.scene.scene import Scene, load_scene
+from sononerf.settings.import_schema import LENGTHS
 from sononerf.settings.loading import faults_of, validate_settings
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
 from sononerf.simulation.simulator import Simulator
@@ -144,6 +146,7 @@ logger = logging.getLogger("sononerf")
 
 MOST_BYTES = 2_000_000_000
 """A larger file is refused before it is read."""
+Unit = Literal["m", "cm", "mm"]
 KINDS = (".ply", ".stl", ".obj", ".off", ".glb")
 
 
@@ -167,13 +170,17 @@ def true_mesh(settings: Settings) -> trimesh.Trimesh | None:
         InputError: If the file of ``evaluation.truth`` is no mesh.
     """
     if settings.evaluation.truth is not None:
-        return read_truth(settings.evaluation.truth)
+        return read_truth(settings.evaluation.truth, settings.evaluation.unit)
     scene = true_scene(settings)
     return None if scene is None else scene.mesh
 
 
-def read_truth(path: Path) -> trimesh.Trimesh:
-    """Read a true surface from a file.
+def read_truth(path: Path, unit: Unit = "m") -> trimesh.Trimesh:
+    """Read a true surface from a file; return it in metres.
+
+    Args:
+        path: PLY, STL, OBJ, OFF or GLB.
+        unit: Of its numbers.
 
     Raises:
         InputError: If it is missing, of another kind, damaged, empty or not finite.
@@ -194,4 +201,5 @@ def read_truth(path: Path) -> trimesh.Trimesh:
         raise InputError(f"{path}: evaluation.truth: damaged ({error})") from error
     if not good:
         raise InputError(f"{path}: evaluation.truth: holds no surface of finite triangles")
+    mesh.apply_scale(LENGTHS[unit])
     return mesh

@@ -14,9 +14,9 @@ import trimesh
 from sononerf import storage
 from sononerf.errors import InputError
 from sononerf.evaluation.baseline import BASELINES
-from sononerf.evaluation.geometry import Kind, Truth, baseline_volume
+from sononerf.evaluation.geometry import Kind, Truth, baseline_volume, check_truth
 from sononerf.progress import Progress
-from sononerf.run.build import read_truth, true_scene
+from sononerf.run.build import Unit, read_truth, true_scene
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder
 from sononerf.scene.scene import Scene
@@ -34,15 +34,21 @@ class EvaluationWork:
             else the surface of its scene.
         registration: What lays the reconstruction over the truth; ``evaluation.registration`` where
             None.
+        unit: Of the numbers in the file; ``evaluation.unit`` where None.
     """
 
     def __init__(
-        self, run: RunFolder, truth: Path | None = None, registration: Kind | None = None
+        self,
+        run: RunFolder,
+        truth: Path | None = None,
+        registration: Kind | None = None,
+        unit: Unit | None = None,
     ) -> None:
         settings = run.fitted.settings
         self._run = run
         self._file = truth or settings.evaluation.truth
         self._kind: Kind = registration or settings.evaluation.registration
+        self._unit: Unit = unit or settings.evaluation.unit
         self._stop = threading.Event()
         with suppress(InputError):  # raised again by the part that needs the echoes
             _ = run.echoes  # loaded once, before other threads ask for them
@@ -78,7 +84,7 @@ class EvaluationWork:
     def _truth(self) -> tuple[Scene | None, trimesh.Trimesh | None]:
         """Return the scene, where that gives the true surface, and the surface."""
         if self._file:
-            return None, read_truth(self._file)
+            return None, read_truth(self._file, self._unit)
         scene = true_scene(self._run.fitted.settings)
         return scene, None if scene is None else scene.mesh
 
@@ -90,7 +96,12 @@ class EvaluationWork:
 
     def _laid(self) -> Truth | None:
         true = self._true.result()[1]
-        return None if true is None else Truth(true, self._run.mesh(), self._kind)
+        if true is None:
+            return None
+        mesh = self._run.mesh()
+        if self._file:
+            check_truth(mesh, true, self._kind, str(self._file))
+        return Truth(true, mesh, self._kind)
 
     def _geometry(self, laid: Future[Truth | None]) -> dict[str, Any] | None:
         truth = laid.result()
@@ -109,6 +120,7 @@ def evaluate(
     *,
     truth: Path | None = None,
     registration: Kind | None = None,
+    unit: Unit | None = None,
     begun: EvaluationWork | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -118,7 +130,7 @@ def evaluate(
 
     Args:
         run: A run that was reconstructed.
-        truth, registration: As of :class:`EvaluationWork`.
+        truth, registration, unit: As of :class:`EvaluationWork`.
         begun: An evaluation of this run that goes on already.
         progress: Where to show it.
 
@@ -133,7 +145,7 @@ def evaluate(
     _ = run.fitted  # a folder that is no run is refused before it is locked
     with run.locked():
         if begun is None:
-            with EvaluationWork(run, truth, registration) as work:
+            with EvaluationWork(run, truth, registration, unit) as work:
                 if not (run.reconstruction / "mesh.ply").is_file():
                     reconstruct(run, progress=progress)
                 work.begin()

@@ -329,6 +329,7 @@ class EvaluationSettings(Section):
     """
 
     truth: Path | None = None
+    unit: Literal["m", "cm", "mm"] = "m"  # of the numbers in the file of the truth
     registration: Literal["none", "rigid", "similarity"] = "none"
 
 

@@ -147,9 +147,26 @@ def test_a_registered_surface_is_judged_in_the_frame_of_the_truth(
     true.apply_scale((2.0, 2.0, 2.0))
     true.apply_translation((0.3, 0.0, 0.0))
     true.export(tmp_path / "true.ply")
-    apart = evaluate(run, truth=tmp_path / "true.ply")["geometry"]
     found = evaluate(run, truth=tmp_path / "true.ply", registration="similarity")["geometry"]
-    assert apart["chamfer_m"] > 0.1
     assert found["chamfer_m"] < 0.001
     assert found["registration"]["scale"] == pytest.approx(2.0, rel=0.02)
     assert found["registration"]["kind"] == "similarity"
+
+
+@pytest.mark.thorough
+def test_a_truth_in_other_units_or_elsewhere_is_refused_before_the_work(
+    run, few_samples, no_projections, tmp_path
+):
+    evaluate(run)
+    before = (run / "metrics.json").read_bytes()
+    sphere = trimesh.creation.icosphere(subdivisions=3, radius=20.0)
+    sphere.export(tmp_path / "true.stl")
+    with pytest.raises(InputError, match=r"true\.stl: .* across, .*--unit mm"):
+        evaluate(run, truth=tmp_path / "true.stl")
+    assert (run / "metrics.json").read_bytes() == before
+    found = evaluate(run, truth=tmp_path / "true.stl", unit="mm")["geometry"]
+    assert found["chamfer_m"] < 0.01
+    sphere.apply_translation([300.0, 0.0, 0.0])
+    sphere.export(tmp_path / "true.stl")
+    with pytest.raises(InputError, match=r"true\.stl: lies 0\.2\d* m away .*--registration rigid"):
+        evaluate(run, truth=tmp_path / "true.stl", unit="mm")
