@@ -24,7 +24,7 @@ from sononerf.errors import IncompatibleError
 from sononerf.head.attached import attach
 from sononerf.head.reception import warn_of_call
 from sononerf.progress import Progress
-from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses
+from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses, shifted
 from sononerf.report.pictures.spectrogram_picture import pings_png
 from sononerf.run.understand import Understood, understand
 from sononerf.settings.loading import assignments
@@ -185,11 +185,12 @@ def _attributes(known: Understood, wanted: str) -> dict[str, Any]:
 def verdict(known: Understood, store: EnsembleStore) -> Verdict:
     """Return what the first echoes of the training poses say of the conventions of poses."""
     heard = Echoes(store, known.head).onsets
-    columns = known.recording.columns.take(known.pings[heard.poses])
+    table, pings = known.recording.columns, known.pings[heard.poses]
+    others = alternatives(table.take(pings), known.wanted)
     return check_poses(
         heard.first,
         known.poses[known.pings[heard.poses]],
-        alternatives(columns, known.wanted),
+        others | shifted(table, pings, known.wanted),
         emitter=known.head.emitter,
         receivers=known.head.receivers,
         resolution=known.head.resolution,

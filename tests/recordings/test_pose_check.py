@@ -3,13 +3,15 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
 from sononerf.geometry.poses import Poses
 from sononerf.recordings.columns import Columns
 from sononerf.recordings.conventions import to_poses
-from sononerf.recordings.pose_check import alternatives, check_poses, mirrored
+from sononerf.recordings.pose_check import alternatives, check_poses, mirrored, shifted
 from sononerf.settings.import_schema import ImportSettings
 from tests.recordings.bodies import EARS, EMITTER, body, first_echoes, poses_of, table
 
@@ -25,11 +27,15 @@ def scaled(columns, names, factor):
     return Columns("t", values, {}, None, columns.units)
 
 
+def poses_parts(poses):
+    return poses.positions, poses.rotations
+
+
 def verdict(columns, first, *, ears=EARS, settings=PLAIN):
     return check_poses(
         first,
         to_poses(columns, settings),
-        alternatives(columns, settings),
+        alternatives(columns, settings) | shifted(columns, np.arange(len(columns)), settings),
         emitter=EMITTER,
         receivers=ears,
         resolution=RESOLUTION,
@@ -83,6 +89,30 @@ def test_distortions_are_named(fault, seed):
     assert found.name == expected
     assert found.message
     assert "\n" not in found.message
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize(("step", "name"), [(1, "the row after"), (-1, "the row before")])
+def test_pings_off_by_one_are_named(seed, step, name):
+    rng = np.random.default_rng(200 + seed)
+    poses = poses_of(rng, KINDS[seed % 3])
+    first = first_echoes(rng, poses, body(rng))
+    columns = table(Poses(*(np.roll(part, step, axis=0) for part in poses_parts(poses))))
+    found = verdict(columns, first)
+    assert found.name == name
+    assert "off by one" in found.message
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_shuffled_table_is_named(seed):
+    rng = np.random.default_rng(300 + seed)
+    poses = poses_of(rng, KINDS[seed % 3])
+    first = first_echoes(rng, poses, body(rng))
+    order = rng.permutation(len(poses))
+    columns = table(Poses(poses.positions[order], poses.rotations[order]))
+    found = verdict(columns, first)
+    assert found.name == "shuffled table"
+    assert re.match(r"\d+ of \d+ first echoes contradict the others", found.message)
 
 
 def test_a_turntable_of_the_table_is_reversed_by_its_setting():
