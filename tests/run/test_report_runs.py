@@ -185,6 +185,7 @@ def test_colours_tell_outside_from_inside(finished):
     assert (blue > red + 50)[out < -0.015].all()
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize(("kind", "begins"), [("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_figures_for_a_paper_are_the_same_each_time(finished, kind, begins):
     (finished / "epochs" / "0001").mkdir(parents=True)
