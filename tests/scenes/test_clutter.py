@@ -23,6 +23,7 @@ def halves(scene):
 SLOW = pytest.mark.slow
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=SLOW) for seed in (1, 2, 3))])
 def test_nothing_touches_the_target_nor_comes_near_the_poses(seed):
@@ -37,6 +38,7 @@ def test_nothing_touches_the_target_nor_comes_near_the_poses(seed):
     assert surface_faults(scene.mesh.vertices, scene.mesh.faces) == []
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_the_target_is_itself_and_comes_first():
     alone = load_scene("leaf_dragonfly", {"seed": 2})

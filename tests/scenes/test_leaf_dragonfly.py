@@ -39,6 +39,7 @@ def prey(**options):
     return np.asarray(mesh.vertices)[count:]
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_it_is_turned_with_the_leaf():
     np.testing.assert_allclose(

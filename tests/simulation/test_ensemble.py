@@ -164,6 +164,7 @@ def test_poses_out_of_reach_are_told_of(caplog):
         reach(far, near)
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_poses_are_checked_fast_in_a_million_triangles():
     scene = Scene(trimesh.creation.icosphere(subdivisions=8, radius=1.0))
@@ -287,6 +288,7 @@ class Slow:
         return np.ones((1, 1, 1), dtype=np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_a_fault_of_the_writer_ends_the_workers_at_once():
     def full(index, spectrogram):

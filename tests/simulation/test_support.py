@@ -93,6 +93,7 @@ def error_of(mesh, support, engine, low, high, **options):
     return np.abs(exact - found)[exact > exact.max() - 20].mean()
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_the_wave_equation_knows_the_image():
     assert error_of(BALL, TABLE, "hybrid", 20e3, 30e3) < 0.3

@@ -131,6 +131,7 @@ def thin_disc(radius, thickness, edge):
     return halved(mesh, edge)
 
 
+@pytest.mark.slow
 def test_a_thin_disc_has_its_limit_at_low_frequency():
     """The added mass of a disc is 8/3 a^3 times the density (H. Lamb, 1932, section 102).
 
@@ -161,6 +162,7 @@ def test_a_thin_disc_reflects_as_physical_optics_says_at_high_frequency():
         assert abs(echo - optics) < 0.15 * abs(optics)
 
 
+@pytest.mark.slow
 def test_the_engine_hears_a_sphere_as_the_series_does():
     head = hearing(ears=((0.0, 0.02, 0.0), (0.0, -0.02, 0.0)))
     one = Boundary(
