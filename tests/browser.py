@@ -51,7 +51,9 @@ class Page:
         elif method == "Network.webSocketCreated":
             self.requests.append(given["url"])
         elif method == "Runtime.exceptionThrown":
-            self.faults.append(given["exceptionDetails"].get("text", "exception"))
+            details = given["exceptionDetails"]
+            found = details.get("exception", {}).get("description", "")
+            self.faults.append(f"{details.get('text')} {found}".strip())
         elif method == "Runtime.consoleAPICalled" and given["type"] == "error":
             self.faults.append(" ".join(str(a.get("value", a)) for a in given["args"]))
         elif method == "Log.entryAdded" and given["entry"]["level"] == "error":

@@ -104,8 +104,9 @@ class Page:
         for mesh in turned.values():
             mesh.apply_transform(_camera_frame())
         scenes = {name: trimesh.Scene([mesh]) for name, mesh in turned.items()}
+        for scene in scenes.values():
+            _ = scene.camera  # made at first use; the viewer needs the one in the file
         first = next(iter(scenes.values()))
-        _ = first.camera  # made at first use, and part of what is exported
         plain = base64.b64encode(first.export(file_type="glb")).decode()
         viewer = scene_to_html(first).replace(plain, "$SHAPE")
         shapes = {
