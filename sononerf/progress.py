@@ -23,7 +23,7 @@ from rich.progress import Progress as Bars
 LINE_SECONDS = 10.0
 """Shortest time between two plain lines, s."""
 WIDE = 80
-"""Columns of a terminal from which on a bar with all its numbers fits into one line."""
+"""Least width of a terminal, columns, for a bar with all its numbers in one line."""
 
 
 class Task:
@@ -70,7 +70,7 @@ class Progress:
         quiet: Show nothing, as inside libraries and tests.
 
     Attributes:
-        silenced: True makes all that come after quiet, as the command line's ``--quiet`` does.
+        silenced: If True, every new Progress is quiet; ``--quiet`` of the command line sets it.
     """
 
     silenced: ClassVar[bool] = False

@@ -52,6 +52,16 @@ def test_quiet_says_nothing(clock, capsys):
     assert capsys.readouterr() == ("", "")
 
 
+def test_silenced_makes_each_new_one_quiet(clock, monkeypatch, capsys):
+    monkeypatch.setattr(Progress, "silenced", True)
+    shown = Progress()
+    shown.say("hello")
+    with shown.task("fitting", 2) as task:
+        clock.now += 60.0
+        task.advance()
+    assert capsys.readouterr() == ("", "")
+
+
 def test_a_saying_is_one_line_as_it_is(capsys):
     text = "region [-1, 2] mm " + "long " * 60 + "[red]end[/red]"
     Progress().say(text)

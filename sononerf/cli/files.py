@@ -206,7 +206,7 @@ def calibrate(
 
 @app.command()
 def doctor(as_json: Json = False) -> None:
-    """Say what this machine has for us, and what would mend each lack."""
+    """Check this machine: versions, memory, GPU, disk; and say how each problem is solved."""
     from sononerf.run.doctor import as_lines, as_plain, examine
 
     findings = examine()
@@ -226,15 +226,12 @@ def view(
 ) -> None:
     """Show a run or a store in the browser: mesh, volume, poses, echoes, a head to drag."""
     import signal
+    from contextlib import closing, suppress
 
     from sononerf.run.view import View
 
     shown = View(source, port=port)
     say(f"open {shown.viewer.url}; Ctrl-C ends it")
     signal.signal(signal.SIGINT, signal.default_int_handler)  # here it is no interruption
-    try:
+    with closing(shown.viewer), suppress(KeyboardInterrupt):
         shown.follow()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        shown.viewer.close()

@@ -47,12 +47,14 @@ FAR_APART, CLOSE = 100.0, 0.01
 """Spread of the poses over the median range beyond which a unit is wrong, no unit. A flight of a
 hundred metres past things one metre away is still right."""
 CONTRADICTS = 1.0
-"""Error of a range, range resolutions, from which on a first echo contradicts the others."""
+"""A first echo contradicts the others if its range differs by more than this from the range that
+they predict, in range resolutions. Sound sets differ by 0.1 to 0.6 in the median."""
 SHUFFLED = 0.6
-"""Gain in log-likelihood per ping over random orders of the poses below which the stated order is
-none. Of 40 shuffled sets 0.33 was the most; right poses gain 2 and more."""
+"""A table counts as shuffled if its gain over random orders of the poses is below this, in
+log-likelihood per ping. The largest gain of 40 shuffled sets was 0.33; right poses gain 2 or
+more."""
 ORDERS = 4
-"""Random orders of the poses that the stated one is compared with."""
+"""Number of random orders that the stated order of the poses is compared with."""
 AIM_FLOOR = np.radians(20.0)
 """Heads that look closer to the body than this do so equally well, rad."""
 AROUND = 0.15
@@ -115,15 +117,15 @@ def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]
 
 
 def shifted(columns: Columns, pings: Ints, settings: ImportSettings) -> dict[str, Poses]:
-    """Return the poses of pings if each belongs to the row after or before its own.
+    """Return the poses of pings if each ping belongs to the next or to the previous row.
 
     Args:
         columns: The whole table.
-        pings (P,): Rows of those that are asked.
+        pings (P,): Rows of the pings that are checked.
         settings: As stated.
 
     Returns:
-        poses: By name; at an end of the table the ping keeps its row.
+        poses: By name. The first or the last ping of the table keeps its row.
     """
     last = len(columns) - 1
     return {
@@ -217,9 +219,10 @@ def check_poses(
 
 
 def _order(head: _Head, poses: Poses, ranges: Floats, own: _Misfit) -> Verdict:
-    """Return how much better the poses explain the echoes than in other orders.
+    """Return by how much the poses explain the echoes better than the same poses in other orders.
 
-    Of echoes that are explained well as it is nothing is asked.
+    The verdict is empty if few echoes contradict the others, because then the order is right, or
+    it makes no difference.
     """
     error = np.abs(own.prediction.residual)
     known = np.isfinite(error).any(axis=1)
@@ -231,8 +234,8 @@ def _order(head: _Head, poses: Poses, ranges: Floats, own: _Misfit) -> Verdict:
     gain = float(np.mean([head.misfit(one, ranges).total for one in turned])) - own.total
     return Verdict(
         "shuffled table",
-        f"{count} of {len(poses)} first echoes contradict the others, as if the poses were in any "
-        "other order: do the rows of the table belong to these pings?",
+        f"{count} of {len(poses)} first echoes contradict the others, and the poses in random "
+        "order explain them as well: check that row n of the table belongs to ping n",
         gain,
     )
 

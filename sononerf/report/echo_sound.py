@@ -10,22 +10,23 @@ from numpy.typing import ArrayLike
 from scipy.io import wavfile
 
 STRETCH = 10.0
-"""How much longer, and lower in pitch, an echo is played: ultrasound of bats becomes audible."""
+"""Factor by which an echo is longer and lower in pitch: 20 to 100 kHz become 2 to 10 kHz."""
 RATE = 44_100
-"""Sampling rate, Hz, that every player knows."""
+"""Sampling rate, Hz; every player supports it."""
 PAUSE = 0.25
-"""Silence before and after, s: players cut the first milliseconds."""
+"""Silence before and after the echo, s, because some players cut off the first milliseconds."""
 LOUDEST = 0.8
-"""Greatest sample, of full scale."""
+"""Largest sample, as a fraction of full scale, so that nothing clips."""
 
 
 def echo_wav(
     magnitude: ArrayLike, range_m: ArrayLike, frequency_hz: ArrayLike, speed_of_sound: float
 ) -> bytes:
-    """Return what a pose heard as a WAV file, ten times longer and lower.
+    """Return the echo of a pose as a WAV file, ten times longer and lower.
 
-    A spectrogram has no phase: each frequency sounds with the magnitude that it has over time and
-    with a phase of its own, always the same. Of two ears the left one is on the left.
+    A spectrogram has no phase. The sound is a sum of one tone per frequency; each tone has the
+    magnitude of the spectrogram over time, and a random phase that is the same in every call. The
+    left channel is the left ear.
 
     Args:
         magnitude (E, R, F): Linear; of more than two receivers the first two sound.

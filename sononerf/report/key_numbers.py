@@ -9,7 +9,7 @@ from typing import Any
 
 Rows = list[tuple[str, ...]]
 NONE = "-"
-"""Stands where a number does not apply, or is not known yet."""
+"""Text for a number that does not apply or is not known yet."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class KeyNumber:
 
     Attributes:
         label: What it is, with its unit.
-        key: Where it stands; parts are separated by a slash.
+        key: Its keys in the file, from the outside in, separated by slashes.
         factor: From the file's unit to the label's.
         form: How it is written.
     """
@@ -69,7 +69,7 @@ COST = (
 
 
 def limits(columns: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the distances of F-scores, as the files name them, that any geometry knows."""
+    """Return the thresholds of all F-scores in these geometries, m, as text."""
     known = {limit for column in columns for limit in column.get("fscore") or {}}
     return sorted(known, key=float)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One page of HTML with all that it shows inside: it opens offline, and can be mailed."""
+"""One page of HTML that contains its pictures and meshes: it opens offline and can be mailed."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ show();
 
 
 class Page:
-    """A page that grows from top to bottom.
+    """A page; each method adds a part at its end.
 
     Args:
         title: Its first heading.
@@ -92,10 +92,10 @@ class Page:
         self.parts.append(f'<div class="side">{figures}</div>')
 
     def view(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
-        """Add meshes with their colours in a view that turns by mouse and touch, once in a page.
+        """Add a 3D view of coloured meshes that turns by mouse and touch; once per page.
 
         Args:
-            meshes: By what a reader chooses them by; the first one is shown first.
+            meshes: By the name that the reader chooses; the first one is shown at first.
         """
         from trimesh.exchange.gltf import export_glb
         from trimesh.viewer.notebook import scene_to_html
@@ -135,9 +135,9 @@ class Page:
 
 
 def _matt(tree: dict[str, Any]) -> None:
-    """Give all that a glTF file shows a matt material; without one it counts as metal.
+    """Give all meshes of a glTF file a matt material, because the default material is metal.
 
-    The viewer's light is so strong that half of each colour is enough.
+    Colours are halved, because the viewer's light is too strong.
     """
     half = [0.5, 0.5, 0.5, 1.0]
     surface = {"metallicFactor": 0.0, "roughnessFactor": 0.9, "baseColorFactor": half}
@@ -148,7 +148,7 @@ def _matt(tree: dict[str, Any]) -> None:
 
 
 def _camera_frame() -> Floats:
-    """Return what turns the world so that a camera on the z axis, y up, looks at its front."""
+    """Return the rotation (4, 4) after which a camera on the z axis, y up, sees the front."""
     towards, right, up = camera_for(np.eye(3), size=(1, 1)).axes
     frame = np.eye(4)
     frame[:3, :3] = right, up, towards

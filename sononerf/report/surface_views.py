@@ -25,12 +25,13 @@ from sononerf.report.pictures.mesh_picture import (
 from sononerf.surface.mesh_files import confidence_colours, linear_light
 
 MOST_TRIANGLES = 60_000
-"""Of a mesh in a page; a larger one is decimated to this, so that a page stays below 15 MB."""
+"""Largest number of triangles of a mesh in a page: three such meshes take about 6 MB of the 15 MB
+that a page may have. Larger meshes are decimated."""
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceViews:
-    """What there is to see of a surface.
+    """Pictures and coloured meshes of a surface.
 
     Args:
         mesh: The reconstruction, m.
@@ -57,7 +58,7 @@ class SurfaceViews:
         return rows or [("reconstruction", self.mesh, np.array(CLAY), None)]
 
     def png(self, size: tuple[int, int] = (380, 340)) -> bytes:
-        """Draw all of it from four sides, one row for each; views of so many pixels."""
+        """Draw truth, error and confidence from four sides, one row each; ``size`` is of a view."""
         return sides_png(self._rows, size=size)
 
     def meshes(self) -> dict[str, trimesh.Trimesh]:
@@ -84,7 +85,7 @@ def _coloured(mesh: trimesh.Trimesh, colours: Floats) -> trimesh.Trimesh:
 
 
 def decimated(mesh: trimesh.Trimesh, triangles: int) -> trimesh.Trimesh:
-    """Return a bare copy of a mesh with at most so many triangles, or nearly so."""
+    """Return a copy of a mesh, without colours, with at most about this number of triangles."""
     if len(mesh.faces) > triangles:
         import pyvista
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What this machine has for us, and what would mend each lack."""
+"""Check the machine: versions, memory, GPU, graphics, disk; and say how each problem is solved."""
 
 from __future__ import annotations
 

@@ -96,6 +96,9 @@ def test_a_run_that_grows_is_followed(run, shown):
     view.refresh()
     assert "epoch 1; the fit goes on" in view.viewer._status.content
     assert "surface" in view.viewer._boxes
+    shutil.copytree(place, place.with_name("0002"))
+    view.refresh()
+    assert "epoch 2; the fit goes on" in view.viewer._status.content
     description.rename(run / "model.json")
     given_a_surface(run)
     view.refresh()
