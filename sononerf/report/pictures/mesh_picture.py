@@ -189,7 +189,7 @@ def _draw_colour_bar(picture: Image.Image, bar: ColourBar) -> None:
     """Draw what colours mean near the lower left corner, in place."""
     width, height = picture.size
     margin, length, thick = height // 24, max(width // 4, 150), max(6, height // 55)
-    left, bottom = margin, height - margin
+    left, bottom = max(margin, 22), height - margin  # half of the first mark stands to the left
     strip = np.round(255 * bar.colours(np.linspace(0, 1, length))).astype(np.uint8)
     strip = np.ascontiguousarray(np.broadcast_to(strip, (thick, length, 3)))
     draw = ImageDraw.Draw(picture)
