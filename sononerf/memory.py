@@ -4,7 +4,14 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+from sononerf.errors import ResourceError
+
+DRIVERS = (Path("/dev/nvidiactl"), Path("/dev/kfd"))
+"""Device files of GPUs whose drivers reserve more data than there is memory."""
 
 
 def available_cores() -> int:
@@ -34,3 +41,63 @@ def available_memory() -> int | None:
         if bound != "max":
             free.append(int(bound) - int(used.read_text(encoding="ascii")))
     return max(0, min(free)) if free else None
+
+
+def require_memory(needed: float, what: str, remedy: str) -> None:
+    """Refuse work that needs more memory than is free, before it begins.
+
+    Args:
+        needed: Bytes.
+        what: The work, for the message.
+        remedy: What the user can do.
+
+    Raises:
+        ResourceError: With the memory needed and the memory free.
+    """
+    free = available_memory()
+    if free is not None and needed > free:
+        raise ResourceError(
+            f"{what} needs about {gigabytes(needed)} of memory, and {gigabytes(free)} are free; "
+            f"{remedy}"
+        )
+
+
+def gigabytes(count: float) -> str:
+    """Return a number of bytes as text."""
+    return f"{count / 1e9:.2g} GB" if count < 10e9 else f"{count / 1e9:,.0f} GB"
+
+
+@contextmanager
+def memory_limited() -> Iterator[None]:
+    """Let an allocation that exceeds the free memory fail with one line.
+
+    Without the limit Linux grants every allocation and kills the process once its memory is used.
+    The limit holds for the rest of the process. Other systems, and machines with a GPU, have none.
+
+    Raises:
+        ResourceError: In place of the errors of NumPy and torch.
+    """
+    free = available_memory()
+    status = Path("/proc/self/status")
+    if free is not None and status.is_file() and not any(path.exists() for path in DRIVERS):
+        import resource
+
+        lines = status.read_text(encoding="ascii").splitlines()
+        used = sum(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmData:"))
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        wanted = used + free
+        if hard == resource.RLIM_INFINITY or wanted < hard:
+            resource.setrlimit(resource.RLIMIT_DATA, (wanted, hard))
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        said = str(error)
+        full = ("allocate memory", "not enough memory", "out of memory")  # torch has no own class
+        if not isinstance(error, MemoryError) and not any(word in said for word in full):
+            raise
+        amount = f", of which {gigabytes(free)} were free at the start" if free is not None else ""
+        raise ResourceError(
+            f"this needs more memory than there is{amount}; use smaller batches (fit.batch_poses), "
+            "a smaller region, a coarser field or spectrogram, fewer poses at once, or a larger "
+            "machine"
+        ) from error

@@ -26,6 +26,14 @@ WIDE = 80
 """Least width of a terminal, columns, for a bar with all its numbers in one line."""
 
 
+def duration(seconds: float) -> str:
+    """Return a duration as text, in the largest unit of which there are two or more."""
+    for unit, length in (("days", 86_400.0), ("h", 3_600.0), ("min", 60.0)):
+        if seconds >= 2.0 * length:
+            return f"{seconds / length:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
 class Task:
     """One piece of work that is counted."""
 

@@ -1,7 +1,59 @@
 # SPDX-License-Identifier: MIT
-from sononerf.memory import available_memory
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sononerf.errors import ResourceError
+from sononerf.memory import available_memory, require_memory
 
 
 def test_available_memory_is_plausible():
     free = available_memory()
     assert free is None or 10_000_000 < free < 10**15
+
+
+def run(code):
+    """Run Python in a process of its own and return what it says."""
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    return found.stdout + found.stderr
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="Linux alone has such a limit")
+@pytest.mark.parametrize(
+    "allocation", ["numpy.ones(free // 4)", "torch.ones(free // 2, dtype=torch.float32)"]
+)
+def test_more_memory_than_there_is_gives_one_line(allocation):
+    """NumPy and torch fail where the system would else kill the process."""
+    said = run(
+        "import numpy, torch\n"
+        "from sononerf.errors import ResourceError\n"
+        "from sononerf.memory import available_memory, memory_limited\n"
+        "free = available_memory()\n"
+        "try:\n"
+        "    with memory_limited():\n"
+        f"        {allocation}\n"
+        "except ResourceError as error:\n"
+        "    print(error, error.exit_code)\n"
+    )
+    assert re.match(r"this needs more memory than there is, of which [\d.]+ GB were free", said)
+    assert said.strip().endswith(" 6")
+
+
+def test_other_faults_stay_what_they_are():
+    said = run(
+        "from sononerf.memory import memory_limited\n"
+        "with memory_limited():\n"
+        "    raise RuntimeError('no memory of it')\n"
+    )
+    assert said.strip().endswith("RuntimeError: no memory of it")
+
+
+def test_work_that_needs_too_much_is_refused_with_the_figure():
+    require_memory(1e6, "a small thing", "nothing")
+    with pytest.raises(ResourceError, match=r"a fit needs about 1,000,000 GB of memory, and .* GB"):
+        require_memory(1e15, "a fit", "make it smaller")

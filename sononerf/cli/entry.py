@@ -17,6 +17,7 @@ from sononerf import __version__
 from sononerf.cli import experiments, files
 from sononerf.cli.options import app, say
 from sononerf.errors import SettingsError, SonoNerfError, StoppedError
+from sononerf.memory import memory_limited
 from sononerf.progress import Progress
 
 __all__ = ["app", "experiments", "files", "main"]
@@ -75,7 +76,7 @@ def _signals_unwind() -> Iterator[None]:
 
 def _run() -> int:
     try:
-        with _signals_unwind():
+        with _signals_unwind(), memory_limited():
             return app(prog_name="sononerf", standalone_mode=False) or 0
     except SonoNerfError as error:
         fault = error

@@ -143,7 +143,14 @@ def import_(
     )
     from sononerf.run.understand import understand
 
-    known = understand(form, source, output, settings_file=settings, overrides=overrides or ())
+    known = understand(
+        form,
+        source,
+        output,
+        settings_file=settings,
+        overrides=overrides or (),
+        progress=Progress(),
+    )
     for line in describe(known):
         say(line)
     if dry_run and preview is None:

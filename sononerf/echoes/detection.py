@@ -98,10 +98,16 @@ def threshold_levels(power: Floats, looks: float) -> Levels:
     precursors = factor * _precursors(power.reshape(-1, power.shape[-1]))
     own = precursors >= 1.0
     guard = int(own.argmin()) if not own.all() else len(own)
-    tops = np.where(_is_top(power), power, 0.0)
-    for lag, ratio in enumerate(precursors[guard:], start=guard + 1):
-        if ratio > 0.0:
-            np.maximum(total[..., :-lag], tops[..., lag:] * ratio, out=total[..., :-lag])
+    behind = precursors[guard:]
+    if len(behind):
+        # A fainter top raises no level above that of noise.
+        telling = _is_top(power) & (power * behind.max() > noise)
+        for *row, slice_ in np.argwhere(telling).tolist():
+            last = slice_ - guard
+            if last > 0:
+                part = total[tuple(row)][max(last - len(behind), 0) : last]
+                level = power[(*row, slice_)] * behind[: len(part)][::-1]
+                np.maximum(part, level, out=part)
     ahead = power[..., :1]
     return Levels(noise, np.where(ahead > total[..., :1], np.maximum(total, factor * ahead), total))
 

@@ -158,6 +158,8 @@ class Recording:
         labels: What each of the P pings is called in messages.
         emission ((P,), s): When the call of each ping left, counted from the first sample that
             :attr:`read` gives. Negative where the recording began later.
+        until ((P,) or None, s): When the next call in the same file left; infinite where there is
+            none. None if each file holds one call.
         read: Takes the number of a ping and returns its samples (E, S) as they are on disk:
             integers reach from one end of their type to the other, floats have the user's unit.
         columns: Poses as in the table, in its own frame.
@@ -174,6 +176,7 @@ class Recording:
     columns: Columns
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    until: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.labels)

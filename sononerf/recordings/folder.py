@@ -8,12 +8,15 @@ two hold ``waveform`` (E, S) and ``sampling_rate``.
 
 from __future__ import annotations
 
+import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.recordings import arrays, audio
 from sononerf.recordings.audio import Recording
@@ -46,12 +49,13 @@ def read_sound(path: Path, settings: ImportSettings) -> tuple[float, NDArray[Any
     return rate, samples
 
 
-def read_folder(source: Path, settings: ImportSettings) -> Recording:
+def read_folder(source: Path, settings: ImportSettings, apart: Collection[Path] = ()) -> Recording:
     """Read the format ``recordings``.
 
     Args:
         source: The folder, or the table of poses in it.
         settings: Where the table is, and its units.
+        apart: Further files of the folder that hold no pings, such as the call's.
 
     Raises:
         InputError: If files or poses are missing, or files differ in rate or channels.
@@ -61,8 +65,9 @@ def read_folder(source: Path, settings: ImportSettings) -> Recording:
         raise InputError(f"{table}: no table of poses; write one line per ping")
     folder = table.parent if source.is_file() else source
     columns = read_table(table, settings)
-    files = _files(folder, columns, settings)
-    keep = _present(folder, files, columns, settings)
+    apart = {(folder / path).resolve() for path in (*_others(settings), *apart)}
+    files = _files(folder, columns, settings, apart)
+    keep, further = _present(folder, files, columns, settings, apart)
     dropped = len(columns) - len(keep)
     columns = columns.take(keep)
     files = [files[row] for row in keep]
@@ -85,6 +90,10 @@ def read_folder(source: Path, settings: ImportSettings) -> Recording:
     def read(index: int) -> NDArray[Any]:
         return read_sound(files[index], settings)[1]
 
+    notes = [f"{dropped} poses without a recording are left out"] if dropped else []
+    if further:
+        listed = ", ".join(path.name for path in further[:3])
+        notes.append(f"{listed}{' ...' if len(further) > 3 else ''}: no pings, as their names say")
     single = len(set(files)) == len(files) and len(files) > 1
     names = [
         path.name if single else f"{path.name}, row {row + 1}"
@@ -97,8 +106,27 @@ def read_folder(source: Path, settings: ImportSettings) -> Recording:
         emission=np.zeros(len(files)) if times is None else times,
         read=read,
         columns=columns,
-        notes=(f"{dropped} poses without a recording are left out",) if dropped else (),
+        notes=tuple(notes),
+        until=None if times is None else _next_call(table, files, times, keep),
     )
+
+
+def _next_call(table: Path, files: list[Path], times: Floats, rows: list[int]) -> Floats:
+    """Return when the next call of the same file left, (P,) s; infinite where there is none."""
+    until = np.full(len(files), np.inf)
+    for path in dict.fromkeys(files):
+        inside = np.array([row for row, other in enumerate(files) if other == path])
+        order = inside[np.argsort(times[inside], kind="stable")]
+        apart = np.diff(times[order])
+        if (apart == 0.0).any():
+            first = int(np.flatnonzero(apart == 0.0)[0])
+            one, other = sorted(rows[i] + 1 for i in order[first : first + 2])
+            raise InputError(
+                f"{table}: rows {one} and {other} have the same time of emission in {path.name}; "
+                "each call has a time of its own"
+            )
+        until[order[:-1]] = times[order[1:]]
+    return until
 
 
 def _others(settings: ImportSettings) -> set[Path]:
@@ -107,7 +135,9 @@ def _others(settings: ImportSettings) -> set[Path]:
     return {path for path in (settings.background, *reference) if path is not None}
 
 
-def _files(folder: Path, columns: Columns, settings: ImportSettings) -> list[Path]:
+def _files(
+    folder: Path, columns: Columns, settings: ImportSettings, apart: Collection[Path]
+) -> list[Path]:
     """Return the file of each row."""
     if "file" in columns.texts:
         empty = [row for row, name in enumerate(columns.texts["file"]) if not name]
@@ -116,7 +146,7 @@ def _files(folder: Path, columns: Columns, settings: ImportSettings) -> list[Pat
         return [folder / name for name in columns.texts["file"]]
     if settings.file is not None:
         return [folder / settings.file] * len(columns)
-    found = _sounds(folder, settings)
+    found = _sounds(folder, apart)
     if len(found) == 1:
         return found * len(columns)
     raise InputError(
@@ -125,8 +155,7 @@ def _files(folder: Path, columns: Columns, settings: ImportSettings) -> list[Pat
     )
 
 
-def _sounds(folder: Path, settings: ImportSettings) -> list[Path]:
-    apart = {(folder / path).resolve() for path in _others(settings)}
+def _sounds(folder: Path, apart: Collection[Path]) -> list[Path]:
     return [
         path
         for path in sorted(folder.iterdir())
@@ -134,15 +163,28 @@ def _sounds(folder: Path, settings: ImportSettings) -> list[Path]:
     ]
 
 
+def _pattern(path: Path) -> str:
+    """Return a file's name with a mark in place of its numbers: pings differ in these alone."""
+    return re.sub(r"\d+", "#", path.name)
+
+
 def _present(
-    folder: Path, files: list[Path], columns: Columns, settings: ImportSettings
-) -> list[int]:
-    """Return the rows whose file is there; a row without one is refused or skipped, as set."""
+    folder: Path,
+    files: list[Path],
+    columns: Columns,
+    settings: ImportSettings,
+    apart: Collection[Path],
+) -> tuple[list[int], list[Path]]:
+    """Return the rows whose file is there, and the recordings that are no pings.
+
+    A row without a file is refused or skipped, as set. A recording without a row is refused if it
+    is named like a ping.
+    """
     keep = [row for row, path in enumerate(files) if path.is_file()]
     if settings.missing == "skip":
         if not keep:
             raise InputError(f"{columns.where}: none of its {len(files)} recordings is there")
-        return keep
+        return keep, []
     way_out = "correct the table, or set import.missing=skip"
     lost = [path for path in dict.fromkeys(files) if not path.is_file()]
     if lost:
@@ -152,9 +194,11 @@ def _present(
         )
     used = {path.resolve() for path in files}
     folders = {path.parent for path in files}
-    unused = [p for place in folders for p in _sounds(place, settings) if p.resolve() not in used]
+    rest = [p for place in folders for p in _sounds(place, apart) if p.resolve() not in used]
+    patterns = {_pattern(path) for path in files}
+    unused = [path for path in rest if _pattern(path) in patterns]
     if unused:
         raise InputError(
             f"{folder}: {len(unused)} recordings have no pose, such as {unused[0].name}; {way_out}"
         )
-    return keep
+    return keep, rest

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,8 @@ from sononerf.head.call import call_waveform, covered, sweep_delay
 from sononerf.head.ears import beam_gain, ear_gain
 from sononerf.head.head import Head
 from sononerf.head.spectrogram import frequency_axis, range_axis, spectrogram
+from sononerf.memory import require_memory
+from sononerf.progress import Progress
 from sononerf.recordings.audio import Recording
 from sononerf.recordings.folder import read_sound
 from sononerf.recordings.pings import Cutter, cut, mix
@@ -140,12 +143,21 @@ def _peak(axis: Floats, power: Floats, top: NDArray[np.intp]) -> Floats:
     return axis[top] + shift.clip(-1, 1) * (axis[1] - axis[0])
 
 
+INAUDIBLE_DB = 140.0
+"""Absorption there and back beyond which nothing is looked for, dB: 24 bits record 144 dB."""
+SHORT = 0.1
+"""Up to this fraction of the pings may be shorter than the range that is looked at; they are named
+if echoes of the others come later."""
 ASKED = 64
 """So many pings, evenly over all, are asked for ranges and noise."""
 
 
 def found_ranges(
-    head: Head, cutter: Cutter, recording: Recording, given: Collection[str]
+    head: Head,
+    cutter: Cutter,
+    recording: Recording,
+    given: Collection[str],
+    progress: Progress,
 ) -> tuple[dict[str, float], Floats]:
     """Find range limits that are left out from the echoes.
 
@@ -155,6 +167,7 @@ def found_ranges(
         recording: All pings.
         given: Keys of the analysis that are set; limits that are not among them follow from the
             echoes.
+        progress: Where to show it.
 
     Returns:
         limits: ``range_min`` and ``range_max``, m.
@@ -162,14 +175,18 @@ def found_ranges(
 
     Raises:
         InputError: If the recordings are too short, or begin too late, for limits that are set.
+        ResourceError: If there is too little memory for so long a range.
     """
     analysis, speed = head.analysis, head.speed_of_sound
     rate = analysis.sampling_rate
-    count = min(cutter.samples(index) for index in range(len(recording)))
+    lengths = np.array([cutter.samples(index) for index in range(len(recording))])
+    count = int(np.quantile(lengths, SHORT, method="lower"))
     begins = max(cutter.begins(index) for index in range(len(recording)))
     metre = speed / 2.0 / rate  # of a sample
     longest = float(head.delay.max())
-    whole = _widest(analysis.window, count, longest * rate, metre)
+    loss = 2.0 * float(head.absorption(head.frequency).min())  # dB/m, there and back
+    audible = INAUDIBLE_DB / loss if loss > 0.0 else math.inf
+    whole = min(_widest(analysis.window, count, longest * rate, metre), audible)
     apart = np.linalg.norm(head.receivers - head.emitter, axis=1)
     # The call itself comes first, as long as a window smears it.
     dead = float(apart.max()) / 2.0 + 2.0 * analysis.window * metre
@@ -182,9 +199,11 @@ def found_ranges(
             "it, or leave it out"
         )
     if not low < high:
+        what = "the recordings end" if recording.until is None else "the next call leaves"
         raise InputError(
-            f"{recording.path}: the recordings end {whole:.3g} m after the emission, before "
-            f"anything can be heard from {low:.3g} m on; check column time and its unit"
+            f"{recording.path}: {what} {1e3 * count / rate:.3g} ms after the emission, before "
+            f"anything can be heard from {low:.3g} m on ({2e3 * low / speed:.3g} ms); check column "
+            "time and its unit"
         )
     chosen = {"range_min": low, "range_max": high}
     wide = dataclasses.replace(head, analysis=analysis.model_copy(update=chosen))
@@ -193,19 +212,27 @@ def found_ranges(
             f"{recording.path}: the recordings end {whole:.4g} m after the emission, before "
             f"spectrogram.range_max ({high:g} m); lower it, or leave it out"
         )
-    pings = np.linspace(0, len(recording) - 1, min(ASKED, len(recording))).round().astype(int)
-    power = np.stack(
-        [
-            np.square(wide.analyse(cutter.echo(int(i), wide.samples))).mean(axis=-1)
-            for i in np.unique(pings)
-        ]
+    long_enough = np.flatnonzero(lengths >= count)
+    asked = np.linspace(0, len(long_enough) - 1, min(ASKED, len(long_enough))).round().astype(int)
+    pings = long_enough[np.unique(asked)]
+    values = analysis.window + 4 * len(head.frequency)  # per frame: samples and products
+    require_memory(
+        8.0 * len(head.receivers) * len(wide.range) * (values + 6 * len(pings)),
+        f"{recording.path}: the analysis of {high:.3g} m of range",
+        "set spectrogram.range_max",
     )
-    found = echo_extent(power, wide.range, head.point_echo.looks, 2.0 * head.resolution)
+    power = []
+    with progress.task("searching for echoes", len(pings)) as task:
+        for number in pings.tolist():
+            heard = wide.analyse(cutter.echo(number, wide.samples))
+            power.append(np.square(heard).mean(axis=-1))
+            task.advance()
+    found = echo_extent(np.stack(power), wide.range, head.point_echo.looks, 2.0 * head.resolution)
     limits = {
         "range_min": low if "range_min" in given else round(found[0], 4),
         "range_max": high if "range_max" in given else round(found[1], 4),
     }
-    return limits, power
+    return limits, np.stack(power)
 
 
 def _widest(window: int, count: int, delay: float, metre: float) -> float:

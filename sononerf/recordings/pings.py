@@ -18,6 +18,7 @@ from sononerf.array_types import Bools, Floats, Ints
 from sononerf.errors import InputError
 from sononerf.head.call import inverse_filter
 from sononerf.recordings.audio import Recording, as_float
+from sononerf.settings.import_schema import Channels
 
 GUARD = 64
 """Samples on both sides of a cut that take up what a shift by part of a sample leaks."""
@@ -58,7 +59,7 @@ def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -
     return np.fft.irfft(spectrum, size)[:, guard : guard + count]
 
 
-def mix(samples: Floats, channels: tuple[int | tuple[int, ...], ...] | None) -> Floats:
+def mix(samples: NDArray[Any], channels: Channels | None) -> NDArray[Any]:
     """Return the chosen channels (E, S); those that stand together are averaged.
 
     Raises:
@@ -91,15 +92,20 @@ class Cutter:
     """
 
     recording: Recording
-    channels: tuple[int | tuple[int, ...], ...] | None = None
+    channels: Channels | None = None
     delay: float = 0.0
     gain: ArrayLike = 1.0
     background: Floats | None = None
     call: Floats | None = None
 
     def samples(self, index: int) -> int:
-        """Return how many samples a ping has from the emission on; less than one if none."""
-        there = self.recording.read(index).shape[1]
+        """Return how many samples a ping has from the emission on; less than one if none.
+
+        It ends with the file, or when the next call leaves.
+        """
+        there = float(self.recording.read(index).shape[1])
+        if self.recording.until is not None:
+            there = min(there, self._sample(float(self.recording.until[index])))
         return int(np.floor(there - self._emission(index)))
 
     def begins(self, index: int) -> int:
@@ -107,8 +113,12 @@ class Cutter:
         return max(int(np.ceil(-self._emission(index))), 0)
 
     def _emission(self, index: int) -> float:
-        time = float(self.recording.emission[index]) + self.delay
-        return round(time * self.recording.sampling_rate, 6)
+        return self._sample(float(self.recording.emission[index]))
+
+    def _sample(self, time: float) -> float:
+        # Later sums stay finite where no further call follows.
+        seconds = min(time + self.delay, 1e12)
+        return round(seconds * self.recording.sampling_rate, 6)
 
     def echo(self, index: int, count: int, *, first: int = 0) -> Floats:
         """Return what the receivers of a ping heard, (E, N), calibrated.
@@ -223,9 +233,12 @@ def check_numbers(recording: Recording, cutter: Cutter, last: int) -> None:
         "the time of the emission lies after the end of the recording; check its column time, its "
         "unit and import.time_offset",
     )
+    short = [index for index in pings if there[index] < last]
+    held = f"has {there[short[0]]} samples after the emission" if short else ""
     refuse(
-        [index for index in pings if there[index] < last],
-        "the recording ends before the last range; lower spectrogram.range_max, or leave it out",
+        short,
+        f"{held}, the last range needs {last}; is it cut off? Leave its row out, or lower "
+        "spectrogram.range_max",
     )
     floats = recording.read(0).dtype.kind == "f"
     if floats:

@@ -21,8 +21,10 @@ and every ping agrees), and a mirrored world as heard by one microphone beside i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -53,6 +55,12 @@ SHUFFLED = 0.6
 """A table counts as shuffled if its gain over random orders of the poses is below this, in
 log-likelihood per ping. The largest gain of 40 shuffled sets was 0.33; right poses gain 2 or
 more."""
+MOST_CHANNELS = 8
+"""So many channels, at most, are swapped in pairs: 28 pairs take some seconds."""
+RANGE_FACTORS = tuple(float(f) for f in np.exp(np.linspace(-0.6, 0.6, 13)) if abs(f - 1.0) > 0.01)
+"""Factors of all ranges, 10 % apart: those of a wrong sampling rate or speed of sound."""
+RANGES_CLEARLY = 0.5
+"""The same as CLEARLY for such a factor: of 120 sound sets two gained 0.3, and the others less."""
 ORDERS = 4
 """Number of random orders that the stated order of the poses is compared with."""
 AIM_FLOOR = np.radians(20.0)
@@ -195,18 +203,28 @@ def check_poses(
         return unit
     head = _Head(emitter, receivers, resolution)
     own = head.misfit(stated[asked], ranges)
+    scaled = _scaled_ranges(head, stated[asked], ranges, own)
     late = _late(stated[asked], own.prediction, resolution)
     if late.name:
-        return late
+        return scaled if scaled.name else late
     gains = {
         name: own.total - head.misfit(poses[asked], ranges).total for name, poses in others.items()
     }
+    for one, other in combinations(range(min(ranges.shape[1], MOST_CHANNELS)), 2):
+        swapped = np.arange(ranges.shape[1])
+        swapped[[one, other]] = other, one
+        name = f"channels {one} and {other} swapped"
+        # Two ears that are swapped hear as a left-handed frame does; that is named first.
+        found = head.misfit(stated[asked], ranges[:, swapped])
+        gains[name] = EQUAL * (own.total - found.total)
     best = max(gains, key=gains.__getitem__, default="")
     enough = max(AT_LEAST, CLEARLY * len(asked))
     order = _order(head, stated[asked], ranges, own)
     better = order.gain + max(gains.get(best, 0.0), 0.0)
     if order.name and better < SHUFFLED * len(asked):
         return order
+    if scaled.name and scaled.gain > gains.get(best, 0.0):
+        return scaled
     if not best or gains[best] < enough:
         return Verdict()
     equal = [name for name in gains if name != best and gains[name] >= EQUAL * gains[best]]
@@ -216,6 +234,29 @@ def check_poses(
         for name in (best, *equal)
     ]
     return Verdict(named[0], _message(named), gains[best])
+
+
+def _scaled_ranges(head: _Head, poses: Poses, ranges: Floats, own: _Misfit) -> Verdict:
+    """Tell whether all ranges times a factor fit the poses clearly better.
+
+    Poses at one distance from the body fit ranges of any scale.
+    """
+    gains = {}
+    for factor in RANGE_FACTORS:
+        # Longer ranges have longer errors.
+        found = _Head(head.emitter, head.receivers, factor * head.resolution).misfit(
+            poses, factor * ranges
+        )
+        gains[factor] = own.total - found.total + found.count * math.log(factor)
+    best = max(gains, key=gains.__getitem__)
+    if gains[best] < RANGES_CLEARLY * len(poses):
+        return Verdict()
+    return Verdict(
+        "scale of ranges",
+        f"the poses fit ranges that are {best:.2f} times those of the first echoes: check the "
+        "sampling rate (import.sampling_rate) and the speed of sound (air)",
+        gains[best],
+    )
 
 
 def _order(head: _Head, poses: Poses, ranges: Floats, own: _Misfit) -> Verdict:
@@ -243,6 +284,7 @@ def _order(head: _Head, poses: Poses, ranges: Floats, own: _Misfit) -> Verdict:
 @dataclass(frozen=True, eq=False)
 class _Misfit:
     total: float
+    count: float
     prediction: Prediction
 
 
@@ -261,17 +303,19 @@ class _Head:
         floor = 0.1 * self.resolution
         both = np.isfinite(found.residual).sum(axis=1) > 1
         common = np.nanmean(found.residual[np.isfinite(found.residual).any(axis=1)], axis=1)
-        total = len(common) * np.log(_scale(common, floor)) if len(common) else 0.0
+        count = float(len(common))
+        total = count * np.log(_scale(common, floor)) if count else 0.0
         if both.any():
             rest = found.residual[both]
             apart = rest - np.nanmean(rest, axis=1, keepdims=True)
             apart = apart[np.isfinite(apart)]
             freedom = len(apart) * (1.0 - 1.0 / rest.shape[1])
             total += freedom * np.log(_scale(apart, floor / 2.0))
+            count += freedom
         if self._hears_direction():
             angle = _off_axis(poses, found.centre, float(np.nanmedian(first)))
             total += len(angle) * np.log(max(float(np.median(angle)), AIM_FLOOR))
-        return _Misfit(float(total), found)
+        return _Misfit(float(total), count, found)
 
     def _hears_direction(self) -> bool:
         """Tell whether it matters which way the head looks."""
@@ -350,7 +394,7 @@ HINTS = {
     "the row before": "each ping belongs to the pose one row earlier; pings and poses are off "
     "by one",
     "left-handed frame": "left and right are mixed up; is the frame left-handed, or does z point "
-    "down (import.frame)?",
+    "down (import.frame), or are channels swapped (import.channels)?",
     "reversed turntable": "the turntable turns the other way (import.turntable.turns)",
     "degrees for radians": "angles are in degrees, not in radians (import.angle)",
     "radians for degrees": "angles are in radians, not in degrees (import.angle)",
@@ -367,6 +411,8 @@ def _hint(name: str) -> str:
     if name.startswith("swapped axes"):
         order = name.removeprefix("swapped axes, ")[:3]
         return "x, y and z stand in the columns {}, {} and {}".format(*order)
+    if name.startswith("channels"):
+        return f"{name} (import.channels, ears.receivers)"
     if name.startswith("sign of"):
         return f"the {name} is the opposite one"
     return HINTS[name]

@@ -29,7 +29,9 @@ from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import fit as fit_field
 from sononerf.field.fitting import require_accelerator
 from sononerf.field.module import EchoModule
-from sononerf.progress import Progress
+from sononerf.field.step_cost import StepCost, step_cost
+from sononerf.memory import gigabytes, require_memory
+from sononerf.progress import Progress, duration
 from sononerf.run.build import head_of, module_for, true_mesh, with_store
 from sononerf.run.evaluate import EvaluationWork, evaluate
 from sononerf.run.predict import predict
@@ -271,6 +273,7 @@ def _fit(
     )
     total = data.steps_per_epoch * settings.fit.epochs
     total = min(total, settings.fit.max_steps or total)
+    _announce(step_cost(module, data), echoes, settings, total, progress)
     resumed = _can_resume(run)
     if not resumed and not follows():
         run.clear_previews()
@@ -308,6 +311,29 @@ def _fit(
         raise StoppedError(
             keeper.stopped_by, "stopped after the last step; the same command goes on"
         )
+
+
+def _announce(
+    cost: StepCost, echoes: Echoes, settings: Settings, steps: int, progress: Progress
+) -> None:
+    """Say what the fit needs, and refuse it if it needs more memory than there is.
+
+    Raises:
+        ResourceError: With the memory needed and the memory free.
+    """
+    store = echoes.store
+    each = 4 * store.receivers * len(store.range) * len(store.frequency)
+    kept = min(len(store) * each, settings.data.memory_bytes)
+    batch = min(settings.fit.batch_poses, len(store))
+    progress.say(
+        f"fit: about {gigabytes(peak_memory_bytes() + cost.memory + kept)} of memory and "
+        f"{duration(steps * cost.seconds)} for {steps} steps, without the surface"
+    )
+    require_memory(
+        cost.memory + kept,
+        f"a step of {batch} poses",
+        "lower fit.batch_poses, the size of the field, or data.memory_bytes",
+    )
 
 
 def _truth(settings: Settings) -> trimesh.Trimesh | None:

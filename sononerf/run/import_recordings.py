@@ -24,6 +24,7 @@ from sononerf.errors import IncompatibleError
 from sononerf.head.attached import attach
 from sononerf.head.reception import warn_of_call
 from sononerf.progress import Progress
+from sononerf.recordings.channel_check import faults_of_channels
 from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses, shifted
 from sononerf.report.pictures.spectrogram_picture import pings_png
 from sononerf.run.understand import Understood, understand
@@ -102,8 +103,16 @@ def read_recordings(
     """
     output = Path(output)
     chosen = assignments(options or {})
-    known = understand(form, Path(source), output, settings_file=settings_file, overrides=chosen)
-    store, found = import_understood(known, output, progress=progress or Progress())
+    progress = progress or Progress()
+    known = understand(
+        form,
+        Path(source),
+        output,
+        settings_file=settings_file,
+        overrides=chosen,
+        progress=progress,
+    )
+    store, found = import_understood(known, output, progress=progress)
     if found.message:
         logger.warning("%s", found.message)
     return Echoes(store, known.head)
@@ -223,9 +232,12 @@ def describe(known: Understood) -> list[str]:
     call = settings.call
     bands = ", ".join(f"{a / 1e3:g} to {b / 1e3:g} kHz" for a, b in call.bands.values())
     frame = "turntable" if known.wanted.turntable is not None else known.wanted.frame
+    shortest, longest = (f"{1e3 * each:.4g}" for each in known.lengths)
+    lengths = f"{shortest} ms" if shortest == longest else f"{shortest} to {longest} ms"
     lines = [
         f"source:     {known.recording.path} ({known.form}), {known.recording.sampling_rate:g} Hz",
-        f"pings:      {len(known.recording)} read, {known.clipped} clipped and rejected; "
+        f"pings:      {len(known.recording)} read, {lengths} each, {known.clipped} clipped and "
+        "rejected; "
         f"{counts[0]} train, {counts[1]} validation, {counts[2]} test",
         f"receivers:  {len(known.head.receivers)}, {settings.ears.directivity}",
         f"poses:      frame {frame}{'; ' + said if said else ''}; x {lower[0]:.3f} to "
@@ -238,8 +250,12 @@ def describe(known: Understood) -> list[str]:
         f"{1e3 * (axis[1] - axis[0]) if len(axis) > 1 else 0.0:.2f} mm",
         f"frequency:  {frequency[0] / 1e3:.1f} to {frequency[-1] / 1e3:.1f} kHz in "
         f"{len(frequency)} bins (window {analysis.window}, hop {analysis.hop}, fft {analysis.fft})",
-        f"noise:      the loudest echo of a ping is {known.level_db:.0f} dB above the quietest "
-        "tenth of its ranges",
+        *(
+            f"channel {number}:  loudest echo {channel.level_db + 0.0:.1f} dB, noise "
+            f"{-channel.noise_db:.0f} dB below it; echoes in {channel.heard} of {channel.asked} "
+            "pings"
+            for number, channel in enumerate(known.channels)
+        ),
     ]
     of_impulse = replace(known.head, call=CallSettings())
     here, there = (1e3 * head.resolution for head in (known.head, of_impulse))
@@ -251,7 +267,8 @@ def describe(known: Understood) -> list[str]:
     applied = {k: v for k, v in known.calibration.items() if v not in (0.0, 1.0)}
     if applied:
         lines.append(f"calibration: {json.dumps(applied)}")
-    return [*lines, *(f"note:       {note}" for note in known.notes)]
+    faults = [f"warning:    {fault}" for fault in faults_of_channels(known.channels)]
+    return [*lines, *(f"note:       {note}" for note in known.notes), *faults]
 
 
 def _kinds(units: dict[str, str]) -> dict[str, str]:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.array_types import Ints
-from sononerf.echoes.detection import RANK
 from sononerf.echoes.splits import draw_split, split_of
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import Poses
@@ -20,9 +19,11 @@ from sononerf.head.call import call_content, call_waveform
 from sononerf.head.head import Head
 from sononerf.head.reception import warn_of_band
 from sononerf.head.spectrogram import echo_samples
+from sononerf.progress import Progress
 from sononerf.recordings.airsas import read_airsas
 from sononerf.recordings.arrays import read_numpy
 from sononerf.recordings.audio import Recording
+from sononerf.recordings.channel_check import Channel, channels_of, check_channels
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.folder import read_folder
 from sononerf.recordings.import_ranges import calibrated, found_ranges
@@ -33,8 +34,9 @@ from sononerf.settings.import_schema import ImportSettings, read_import_settings
 from sononerf.settings.loading import apply_override, read_yaml, validate_settings
 from sononerf.settings.schema import FILE_SECTIONS, HEAD_SECTIONS, CallSettings, Settings
 
+FOLDER = "recordings"
 READERS: dict[str, Callable[[Path, ImportSettings], Recording]] = {
-    "recordings": read_folder,
+    FOLDER: read_folder,
     "numpy": read_numpy,
     "sonotracelab": read_sonotracelab,
     "sononerf-matlab": read_sononerf_matlab,
@@ -58,8 +60,8 @@ class Understood:
         poses: Of all pings of the recording.
         split ((P,) int8): Of the kept pings.
         clipped: How many pings are rejected.
-        level_db (dB): Loudest echo over the noise, power averaged over frequency; the middle ping
-            of those asked.
+        channels: What each receiver's channel holds.
+        lengths ((N,), s): Shortest and longest ping, from the emission on.
         calibration: What was applied, as plain data.
         notes: What may surprise.
     """
@@ -74,7 +76,8 @@ class Understood:
     poses: Poses
     split: NDArray[np.int8]
     clipped: int
-    level_db: float
+    channels: list[Channel]
+    lengths: tuple[float, float]
     calibration: dict[str, Any]
     notes: tuple[str, ...]
 
@@ -86,6 +89,7 @@ def understand(
     *,
     settings_file: Path | None = None,
     overrides: Iterable[str] = (),
+    progress: Progress | None = None,
 ) -> Understood:
     """Read recordings and settings, and complete each by the other.
 
@@ -96,6 +100,7 @@ def understand(
         settings_file: Sections ``import``, ``air``, ``ears``, ``call``, ``spectrogram``;
             ``import.yaml`` beside the recordings where None, if it is there.
         overrides: ``KEY=VALUE``.
+        progress: Where to show it.
 
     Raises:
         SettingsError: If a key or value is not allowed, or settings and recordings contradict one
@@ -111,7 +116,11 @@ def understand(
     folder = source if source.is_dir() else source.parent
     where, data = _settings_data(folder, settings_file, overrides)
     wanted = read_import_settings(data.pop("import", None) or {}, where)
-    recording = READERS[form](source, wanted)
+    progress = progress or Progress(quiet=True)
+    if form == FOLDER:
+        recording = read_folder(source, wanted, _named_files(data))
+    else:
+        recording = READERS[form](source, wanted)
     settings = _complete(data, recording, wanted, output, where)
     head = head_of(settings)
     receivers = len(head.receivers)
@@ -125,6 +134,7 @@ def understand(
     poses = to_poses(recording.columns, wanted)
     if len(poses) != len(recording):
         raise InputError(f"{recording.path}: {len(recording)} pings and {len(poses)} poses")
+    check_channels(recording, wanted.channels)
     cutter, calibration = calibrated(recording, wanted, head, folder)
     if wanted.compress:
         warn_of_band(settings.call, settings.spectrogram)
@@ -132,7 +142,9 @@ def understand(
         calibration["compressed"] = call_content(settings.call)
         settings = settings.model_copy(update={"call": CallSettings()})
     check_numbers(recording, cutter, 0)
-    limits, power = found_ranges(head_of(settings), cutter, recording, data.get("spectrogram", {}))
+    limits, power = found_ranges(
+        head_of(settings), cutter, recording, data.get("spectrogram", {}), progress
+    )
     plain = settings.plain()
     plain["spectrogram"] |= limits
     settings = validate_settings(plain, settings.source or "import")
@@ -150,8 +162,7 @@ def understand(
             seed=wanted.seed,
             where=where,
         )
-    noise = np.quantile(power, RANK, axis=-1)
-    ratio = power.max(axis=-1) / np.maximum(noise, 1e-300)
+    there = [cutter.samples(index) / recording.sampling_rate for index in range(len(recording))]
     return Understood(
         form=form,
         recording=recording,
@@ -163,10 +174,18 @@ def understand(
         poses=poses,
         split=split,
         clipped=clipped,
-        level_db=float(10.0 * np.log10(max(np.median(ratio), 1e-30))),
+        channels=channels_of(power, head.point_echo.looks),
+        lengths=(min(there), max(there)),
         calibration=calibration,
         notes=recording.notes,
     )
+
+
+def _named_files(data: dict[str, Any]) -> list[Path]:
+    """Return the files that sections of the head name, such as the recording of the call."""
+    sections = [data.get(name) for name in FILE_SECTIONS]
+    named = [each.get("file") for each in sections if isinstance(each, dict)]
+    return [Path(str(file)).absolute() for file in named if file]
 
 
 def _settings_data(

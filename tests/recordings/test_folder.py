@@ -10,6 +10,7 @@ from scipy.io import wavfile
 
 from sononerf.errors import InputError
 from sononerf.recordings.folder import read_folder
+from sononerf.recordings.pings import Cutter
 from sononerf.settings.import_schema import ImportSettings
 
 RATE = 100_000
@@ -68,26 +69,49 @@ def test_a_rate_may_be_corrected(folder):
     assert read_folder(folder, ImportSettings(sampling_rate=1e6)).sampling_rate == 1e6
 
 
-def test_background_and_reference_are_no_pings(folder):
+def test_files_that_are_named_unlike_pings_are_none(folder):
+    """The call, background and reference lie beside the pings; other files are listed."""
     wav(folder / "empty.wav")
     wav(folder / "ball.wav")
-    with pytest.raises(InputError, match="2 recordings have no pose"):
-        read_folder(folder, PLAIN)
+    wav(folder / "call.wav")
     ball = {"file": "ball.wav", "radius": 0.02, "distance": 0.5}
-    assert len(read_folder(folder, ImportSettings(background="empty.wav", reference=ball))) == 3
+    settings = ImportSettings(background="empty.wav", reference=ball)
+    found = read_folder(folder, settings, [folder / "call.wav"])
+    assert (len(found), found.notes) == (3, ())
+    assert read_folder(folder, settings).notes == ("call.wav: no pings, as their names say",)
+
+
+def test_the_long_file_lies_beside_others(folder):
+    for index in (0, 1):
+        (folder / f"{index}.wav").unlink()
+    wav(folder / "call.wav")
+    write(folder, ["time_ms,x_m", "0.1,0", "0.3,1"])
+    found = read_folder(folder, PLAIN, [folder / "call.wav"])
+    assert found.labels[0] == "2.wav, row 1"
+
+
+def test_a_ping_of_a_long_file_ends_when_the_next_call_leaves(tmp_path):
+    wav(tmp_path / "long.wav")
+    write(tmp_path, ["time_ms,x_m", "0.3,0", "0.1,1", "0.4,2"])
+    found = read_folder(tmp_path, PLAIN)
+    np.testing.assert_allclose(found.until, [4e-4, 3e-4, np.inf])
+    assert [Cutter(found).samples(index) for index in range(3)] == [10, 20, 20]
+    write(tmp_path, ["time_ms,x_m", "0.3,0", "0.1,1", "0.3,2"])
+    with pytest.raises(InputError, match=r"rows 1 and 3 have the same time of emission in long"):
+        read_folder(tmp_path, PLAIN)
 
 
 def test_what_has_no_partner_is_refused_or_skipped(folder):
     (folder / "1.wav").unlink()
     with pytest.raises(InputError, match=r"1 poses have no recording, such as 1\.wav"):
         read_folder(folder, PLAIN)
-    wav(folder / "more.wav")
+    wav(folder / "7.wav")
     found = read_folder(folder, ImportSettings(missing="skip"))
     assert found.labels == ("0.wav", "2.wav")
     assert found.columns.values["x"].tolist() == [0, 2]
     assert found.notes == ("1 poses without a recording are left out",)
     (folder / "1.wav").write_bytes((folder / "0.wav").read_bytes())
-    with pytest.raises(InputError, match=r"1 recordings have no pose, such as more\.wav"):
+    with pytest.raises(InputError, match=r"1 recordings have no pose, such as 7\.wav"):
         read_folder(folder, PLAIN)
 
 

@@ -103,6 +103,34 @@ def test_pings_off_by_one_are_named(seed, step, name):
     assert "off by one" in found.message
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_a_wrong_sampling_rate_is_named(seed):
+    """Poses at several distances tell how long ranges are."""
+    rng = np.random.default_rng(400 + seed)
+    poses = poses_of(rng, "volume")
+    factor = (0.5, 0.65, 0.8, 1.25, 1.5, 1.8, 0.6, 0.7)[seed]
+    first = factor * first_echoes(rng, poses, body(rng))
+    found = verdict(table(poses), first)
+    assert found.name == "scale of ranges"
+    times = float(re.search(r"that are ([\d.]+) times", found.message)[1])
+    assert times * factor == pytest.approx(1.0, abs=0.1)
+    assert "import.sampling_rate" in found.message
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_swapped_channels_are_named(seed):
+    rng = np.random.default_rng(500 + seed)
+    poses = poses_of(rng, KINDS[seed % 3])
+    ears = np.array([[0, 0.03, 0], [0, -0.03, 0], [0, 0, 0.03], [0, 0, -0.03]])
+    first = first_echoes(rng, poses, body(rng), ears=ears)
+    one, other = rng.choice(4, 2, replace=False)
+    first[:, [one, other]] = first[:, [other, one]]
+    found = verdict(table(poses), first, ears=ears)
+    low, high = sorted((one, other))
+    assert found.name in (f"channels {low} and {high} swapped", "left-handed frame")
+    assert "import.channels" in found.message
+
+
 @pytest.mark.parametrize("seed", range(12))
 def test_a_shuffled_table_is_named(seed):
     rng = np.random.default_rng(300 + seed)

@@ -169,7 +169,9 @@ def test_what_was_understood_is_said_and_drawn(tmp_path):
     text = "\n".join(describe(known))
     for words in (
         "a.npz (numpy), 250000 Hz",
-        "24 read, 0 clipped and rejected; 21 train, 1 validation, 2 test",
+        "24 read, 6.4 ms each, 0 clipped and rejected; 21 train, 1 validation, 2 test",
+        "channel 1:  loudest echo",
+        "echoes in 24 of 24 pings",
         "receivers:  2, omnidirectional",
         "frame enu; lengths in m",
         "linear, 20 to 80 kHz",
