@@ -13,6 +13,8 @@ import typer
 from sononerf.cli.options import (
     Config,
     Figures,
+    FrameName,
+    InFrame,
     Json,
     OnWhat,
     Overrides,
@@ -210,7 +212,10 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
             )
     if (folder / "report.html").is_file():
         say(f"report:      {folder / 'report.html'}")
+    original = folder / "reconstruction" / "mesh_original.ply"
     say(f"mesh:        {folder / 'reconstruction' / 'mesh.ply'}")
+    if original.is_file():
+        say(f"             {original} in the frame and unit of the recordings")
     say(f"pictures:    {folder / 'reconstruction' / 'view.png'}, {folder / 'prediction'}")
     say(f"numbers:     {folder / 'metrics.json'}")
     say(f"TensorBoard: tensorboard --logdir {folder}")
@@ -223,8 +228,12 @@ def predict(
         Split | None, typer.Option(help="Which poses of the ensemble; test by default.")
     ] = None,
     poses: Annotated[
-        Path | None, typer.Option(help="CSV of your own poses: x,y,z,yaw,pitch,roll (m, degrees).")
+        Path | None,
+        typer.Option(
+            help="CSV of your own poses: x,y,z,yaw,pitch,roll (m, degrees), or as of the import."
+        ),
     ] = None,
+    frame: InFrame = "auto",
     output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
     pictures: Annotated[
         str, typer.Option(help="How many poses are drawn, best to worst: a number, or all.")
@@ -243,6 +252,7 @@ def predict(
         run,
         split=split or "test",
         poses_csv=poses,
+        frame=frame,
         output=output,
         pictures="all" if pictures == "all" else int(pictures),
         accelerator=accelerator,
@@ -318,6 +328,10 @@ def evaluate(
     unit: Annotated[
         Unit | None, typer.Option(help="Of the numbers in the truth's file; m by default.")
     ] = None,
+    frame: Annotated[
+        FrameName | None,
+        typer.Option(help="Of the truth's file: auto, world or original; auto by default."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Compare a run's mesh with the true surface, and show all its numbers."""
@@ -329,6 +343,7 @@ def evaluate(
         truth=truth,
         registration=registration,
         unit=unit,
+        frame=frame,
         progress=Progress(quiet=as_json),
     )
     if as_json:

@@ -10,6 +10,7 @@ import typer
 
 from sononerf.cli.options import (
     Exported,
+    InFrame,
     Json,
     Overrides,
     app,
@@ -172,18 +173,19 @@ def import_(
 @app.command()
 def export(
     source: Annotated[Path, typer.Argument(help="A store, or the folder of a run.")],
-    output: Annotated[Path, typer.Argument(help="File to write: .mat, .h5, .nc or .csv.")],
+    output: Annotated[Path, typer.Argument(help="File: .mat, .h5, .nc, .csv, .ply, .stl or .glb.")],
     what: Annotated[
         Exported,
         typer.Option(
             help="auto: echoes of a store; of a run, points for .csv and else the prediction."
         ),
     ] = "auto",
+    frame: InFrame = "auto",
 ) -> None:
-    """Write echoes, predictions, volumes or surface points for other programs."""
+    """Write echoes, predictions, volumes, meshes or surface points for other programs."""
     from sononerf.run.export import export as export_part
 
-    say(f"wrote {export_part(source, output, what=what)}")
+    say(f"wrote {export_part(source, output, what=what, frame=frame)}")
 
 
 @app.command()

@@ -24,7 +24,8 @@ app = typer.Typer(
 Accelerator = Literal["auto", "cpu", "gpu"]
 SurfaceMethod = Literal["auto", "open", "filled", "hull", "sheet", "isosurface"]
 Registration = Literal["none", "rigid", "similarity"]
-Exported = Literal["auto", "echoes", "prediction", "volume", "points"]
+Exported = Literal["auto", "echoes", "prediction", "volume", "points", "mesh"]
+FrameName = Literal["auto", "world", "original"]
 Figures = Literal["svg", "pdf"]
 Unit = Literal["m", "cm", "mm"]
 Split = Literal["test", "val", "train"]
@@ -40,6 +41,13 @@ Overrides = Annotated[
 ]
 Run = Annotated[Path, typer.Argument(help="Folder of a run.")]
 Json = Annotated[bool, typer.Option("--json", help="One JSON object on standard output.")]
+InFrame = Annotated[
+    FrameName,
+    typer.Option(
+        help="world: z up, metres. original: of the recordings, or of the scene's file. auto: "
+        "original for recordings."
+    ),
+]
 OnWhat = Annotated[Accelerator, typer.Option(help="What to compute on.")]
 
 

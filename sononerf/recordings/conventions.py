@@ -18,13 +18,15 @@ enu and up in ned.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from sononerf.array_types import Floats
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import Poses, look_at, rotation_from_euler
 from sononerf.recordings.columns import EULER, PLACE, QUATERNION, Columns
-from sononerf.settings.import_schema import ImportSettings, TurntableSettings
+from sononerf.settings.import_schema import LENGTHS, ImportSettings, TurntableSettings
 
 NED_TO_ENU = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 DOWN_TO_UP = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
@@ -60,6 +62,20 @@ def frame_matrices(settings: ImportSettings) -> tuple[Floats, Floats]:
         "camera": (np.eye(3), np.array(CAMERA_TO_HEAD)),
     }[settings.frame]
     return world, head
+
+
+def original_frame(columns: Columns, settings: ImportSettings) -> dict[str, Any]:
+    """Return the matrices that lead back from our frame and metres; none for a turntable.
+
+    Returns:
+        attributes: ``to_original`` (4, 4) and ``head_to_original`` (3, 3), plain data.
+    """
+    if settings.turntable is not None:
+        return {}
+    world, head = frame_matrices(settings)
+    matrix = np.eye(4)
+    matrix[:3, :3] = world.T / LENGTHS[columns.units.get(PLACE[0], "m")]
+    return {"to_original": matrix.tolist(), "head_to_original": head.T.tolist()}
 
 
 def to_poses(columns: Columns, settings: ImportSettings) -> Poses:

@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -18,6 +18,7 @@ from sononerf.echoes.echoes import stated_head
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, SonoNerfError
 from sononerf.field.module import EchoModule
+from sononerf.geometry.frame import Frame
 from sononerf.head.attached import attached
 from sononerf.head.head import Head
 from sononerf.scene.scene import Scene, load_scene
@@ -163,14 +164,22 @@ def true_scene(settings: Settings) -> Scene | None:
         return None
 
 
-def true_mesh(settings: Settings) -> trimesh.Trimesh | None:
+def true_mesh(
+    settings: Settings, stated: Mapping[str, Any] | None = None
+) -> trimesh.Trimesh | None:
     """Return ``evaluation.truth``, or else the scene's own surface; None where neither is known.
+
+    Args:
+        settings: Of the experiment.
+        stated: Attributes of the store, or provenance of the run, that state the frame of the file.
 
     Raises:
         InputError: If the file of ``evaluation.truth`` is no mesh.
     """
     if settings.evaluation.truth is not None:
-        return read_truth(settings.evaluation.truth, settings.evaluation.unit)
+        chosen = settings.evaluation
+        frame = Frame.of(stated or {}, chosen.frame)
+        return frame.to_world(read_truth(settings.evaluation.truth, chosen.unit))
     scene = true_scene(settings)
     return None if scene is None else scene.mesh
 

@@ -20,6 +20,7 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble, seal
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, SettingsError
+from sononerf.geometry.frame import KEYS
 from sononerf.head.attached import attach
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
@@ -158,7 +159,7 @@ def _write(
         sections["spectrogram"] = {**sections["spectrogram"], **limits}
     turned = Rotation.from_rotvec(found.aim).as_matrix()
     earlier = store.attributes
-    kept = ("origin", "source", "licence", "format", "units")
+    kept = ("origin", "source", "licence", "format", "units", "import", *KEYS)
     with storage.lock(output):
         made = EnsembleStore.create(
             output,

@@ -73,7 +73,8 @@ def compare_runs(
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder(first)
-    runs = [run.fitted, RunFolder(second).fitted]
+    other = RunFolder(second)
+    runs = [run.fitted, other.fitted]
     if first.resolve() == second.resolve():
         raise SettingsError(
             f"{first} and {second} are the same run; give as the second a run without what is "
@@ -83,7 +84,7 @@ def compare_runs(
     folder = output or first / f"compare-{second.resolve().name}"
     with run.locked(folder), results_folder(folder):
         found = compare_runs_of(*runs, accelerator=accelerator, progress=progress)
-        surfaces = [true_mesh(each.settings) for each in runs]
+        surfaces = [true_mesh(each.fitted.settings, each.provenance) for each in (run, other)]
         truth = _added(*surfaces)
         names = first.resolve().name, second.resolve().name
         for name in ("first", "second", "difference"):

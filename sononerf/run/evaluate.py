@@ -15,6 +15,7 @@ from sononerf import storage
 from sononerf.errors import InputError
 from sononerf.evaluation.baseline import BASELINES
 from sononerf.evaluation.geometry import Kind, Truth, baseline_volume, check_truth
+from sononerf.geometry.frame import FrameName
 from sononerf.progress import Progress
 from sononerf.run.build import Unit, read_truth, true_scene
 from sononerf.run.reconstruct import reconstruct
@@ -35,6 +36,7 @@ class EvaluationWork:
         registration: What lays the reconstruction over the truth; ``evaluation.registration`` where
             None.
         unit: Of the numbers in the file; ``evaluation.unit`` where None.
+        frame: Of the file; ``evaluation.frame`` where None.
     """
 
     def __init__(
@@ -43,12 +45,14 @@ class EvaluationWork:
         truth: Path | None = None,
         registration: Kind | None = None,
         unit: Unit | None = None,
+        frame: FrameName | None = None,
     ) -> None:
         settings = run.fitted.settings
         self._run = run
         self._file = truth or settings.evaluation.truth
         self._kind: Kind = registration or settings.evaluation.registration
         self._unit: Unit = unit or settings.evaluation.unit
+        self._frame = run.frame(frame or settings.evaluation.frame)
         self._stop = threading.Event()
         with suppress(InputError):  # raised again by the part that needs the echoes
             _ = run.echoes  # loaded once, before other threads ask for them
@@ -84,7 +88,7 @@ class EvaluationWork:
     def _truth(self) -> tuple[Scene | None, trimesh.Trimesh | None]:
         """Return the scene, where that gives the true surface, and the surface."""
         if self._file:
-            return None, read_truth(self._file, self._unit)
+            return None, self._frame.to_world(read_truth(self._file, self._unit))
         scene = true_scene(self._run.fitted.settings)
         return scene, None if scene is None else scene.mesh
 
@@ -121,6 +125,7 @@ def evaluate(
     truth: Path | None = None,
     registration: Kind | None = None,
     unit: Unit | None = None,
+    frame: FrameName | None = None,
     begun: EvaluationWork | None = None,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
@@ -130,7 +135,7 @@ def evaluate(
 
     Args:
         run: A run that was reconstructed.
-        truth, registration, unit: As of :class:`EvaluationWork`.
+        truth, registration, unit, frame: As of :class:`EvaluationWork`.
         begun: An evaluation of this run that goes on already.
         progress: Where to show it.
 
@@ -145,7 +150,7 @@ def evaluate(
     _ = run.fitted  # a folder that is no run is refused before it is locked
     with run.locked():
         if begun is None:
-            with EvaluationWork(run, truth, registration, unit) as work:
+            with EvaluationWork(run, truth, registration, unit, frame) as work:
                 if not (run.reconstruction / "mesh.ply").is_file():
                     reconstruct(run, progress=progress)
                 work.begin()

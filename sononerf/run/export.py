@@ -20,9 +20,10 @@ from sononerf import __version__, storage
 from sononerf.echoes.echoes import complete_store
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
+from sononerf.geometry.frame import Frame, FrameName
 from sononerf.geometry.poses import Poses
 from sononerf.run.run_folder import RunFolder
-from sononerf.surface.mesh_files import confidence_of
+from sononerf.surface.mesh_files import MeshFormat, confidence_of, mesh_bytes
 from sononerf.surface.start.volume import Volume
 
 FileType = Literal["mat", "h5", "nc"]
@@ -129,13 +130,13 @@ def _netcdf(arrays: Mapping[str, Named], attributes: Mapping[str, str]) -> bytes
         return buffer.getvalue()
 
 
-What = Literal["auto", "echoes", "prediction", "volume", "points"]
+What = Literal["auto", "echoes", "prediction", "volume", "points", "mesh"]
 
 ARRAYS: dict[str, FileType] = {".mat": "mat", ".h5": "h5", ".hdf5": "h5", ".nc": "nc"}
-FRAME = "world frame, right-handed, z up, metres"
+MESHES: dict[str, MeshFormat] = {".ply": "ply", ".stl": "stl", ".glb": "glb"}
 
 
-def export(source: Path, output: Path, *, what: What = "auto") -> Path:
+def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName = "auto") -> Path:
     """Write a part of a store or a run as a file of another format, which its suffix names.
 
     =========== =================================== ==========================================
@@ -145,13 +146,15 @@ def export(source: Path, output: Path, *, what: What = "auto") -> Path:
     prediction  ``.mat .h5 .nc``                    predicted and measured spectrograms
     volume      ``.mat .h5 .nc``                    summed reflectivity on a grid
     points      ``.csv``, ``.mat .h5 .nc``          vertices, normals, poses that heard them
+    mesh        ``.ply .stl .glb``                  the surface
     =========== =================================== ==========================================
 
     Args:
         source: A store, or the folder of a run.
         output: The file.
-        what: Which part. ``auto``: echoes of a store; of a run the points for ``.csv``, else the
-            prediction.
+        what: Which part. ``auto``: echoes of a store; of a run the mesh or the points, as the
+            suffix says, else the prediction.
+        frame: Of places and directions; the original one of recordings for ``auto``.
 
     Returns:
         output: The file that was written.
@@ -163,23 +166,38 @@ def export(source: Path, output: Path, *, what: What = "auto") -> Path:
         StorageError: If the file cannot be written.
     """
     suffix = output.suffix.lower()
-    if suffix not in (*ARRAYS, ".csv"):
-        raise SettingsError(f"{output}: expected a suffix of {', '.join([*ARRAYS, '.csv'])}")
+    if suffix not in (*ARRAYS, *MESHES, ".csv"):
+        listed = ", ".join([*ARRAYS, *MESHES, ".csv"])
+        raise SettingsError(f"{output}: expected a suffix of {listed}")
     is_store = (source / "zarr.json").is_file()
-    if what == "auto":
-        what = "echoes" if is_store else "points" if suffix == ".csv" else "prediction"
+    if what == "auto" and not is_store:
+        what = "mesh" if suffix in MESHES else "points" if suffix == ".csv" else "prediction"
+    elif what == "auto":
+        what = "echoes"
     if is_store != (what == "echoes"):
         kind = "a store" if is_store else "no store"
         raise InputError(
-            f"{source}: is {kind}; echoes come from a store, prediction, volume and points from "
-            "the folder of a run"
+            f"{source}: is {kind}; echoes come from a store, prediction, volume, points and mesh "
+            "from the folder of a run"
         )
+    if (what == "mesh") != (suffix in MESHES):
+        raise SettingsError(
+            f"{output}: a mesh is written as {', '.join(MESHES)}, and nothing else is; choose "
+            "another suffix, or another --what"
+        )
+    stated = EnsembleStore.open(source).attributes if is_store else RunFolder(source).provenance
+    chosen = Frame.of(stated, frame)
+    if suffix in MESHES:
+        mesh = RunFolder(source).mesh()
+        data = mesh_bytes(chosen.mesh(mesh), MESHES[suffix], confidence=confidence_of(mesh))
+        storage.commit_bytes(output, data)
+        return output
     if suffix == ".csv":
-        storage.commit_text(output, _csv(source, what))
+        storage.commit_text(output, _csv(source, what, chosen))
         return output
     parts = {"echoes": _echoes, "prediction": _prediction, "volume": _volume, "points": _points}
-    arrays, attributes = parts[what](source)
-    plain = {"software": f"sononerf {__version__}", "frame": FRAME, **attributes}
+    arrays, attributes = parts[what](source, chosen)
+    plain = {"software": f"sononerf {__version__}", "frame": chosen.name, **attributes}
     storage.commit_bytes(output, file_bytes(ARRAYS[suffix], arrays, plain))
     return output
 
@@ -187,13 +205,13 @@ def export(source: Path, output: Path, *, what: What = "auto") -> Path:
 Part = tuple[dict[str, Named], dict[str, str]]
 
 
-def _csv(source: Path, what: What) -> str:
+def _csv(source: Path, what: What, frame: Frame) -> str:
     if what == "echoes":
         store = EnsembleStore.open(source)
-        return Poses(store.positions, store.rotations).table()
+        return frame.table(Poses(store.positions, store.rotations))
     if what != "points":
         raise SettingsError(f"{what}: a .csv file holds poses or points; choose .mat, .h5 or .nc")
-    arrays, _ = _points(source)
+    arrays, _ = _points(source, frame)
     columns = [arrays["position"].values, arrays["normal"].values, arrays["poses"].values[:, None]]
     rows = (",".join(f"{value:.9g}" for value in row) for row in np.hstack(columns))
     return "\n".join(["x,y,z,nx,ny,nz,poses", *rows]) + "\n"
@@ -206,21 +224,22 @@ def _axes(range_m: NDArray[Any], frequency: NDArray[Any]) -> dict[str, Named]:
     }
 
 
-def _poses(position: NDArray[Any], rotation: NDArray[Any]) -> dict[str, Named]:
+def _poses(position: NDArray[Any], rotation: NDArray[Any], frame: Frame) -> dict[str, Named]:
+    places, turned = frame.places(position), frame.rotations(rotation)
     return {
-        "position": Named(position, ("pose", "world"), "m", "position of the head"),
-        "rotation": Named(rotation, ("pose", "world", "head"), "", "rotation from head to world"),
+        "position": Named(places, ("pose", "world"), frame.unit_name, "position of the head"),
+        "rotation": Named(turned, ("pose", "world", "head"), "", "rotation from head to world"),
     }
 
 
-def _echoes(source: Path) -> Part:
+def _echoes(source: Path, frame: Frame) -> Part:
     store = complete_store(source)
     loud = np.stack([store.read_pose(index) for index in range(len(store))])
     known = store.attributes
     units = str((known.get("units") or {}).get("spectrogram", "linear magnitude"))
     arrays = {
         "spectrogram": Named(loud, ("pose", "ear", "range", "frequency"), "1", units),
-        **_poses(store.positions, store.rotations),
+        **_poses(store.positions, store.rotations, frame),
         "split": Named(store.split, ("pose",), "", "0 train, 1 validation, 2 test"),
         **_axes(store.range, store.frequency),
     }
@@ -232,7 +251,7 @@ def _echoes(source: Path) -> Part:
     }
 
 
-def _prediction(source: Path) -> Part:
+def _prediction(source: Path, frame: Frame) -> Part:
     file = source / "prediction" / "spectrograms.npz"
     if not file.is_file():
         raise InputError(f"{file}: missing; make it with `sononerf predict {source}`")
@@ -247,7 +266,7 @@ def _prediction(source: Path) -> Part:
             if name in found
         }
         arrays["number"] = Named(found["pose"], ("pose",), "", "number of the pose in the store")
-        arrays |= _poses(found["position"], found["rotation"])
+        arrays |= _poses(found["position"], found["rotation"], frame)
         arrays |= _axes(found["range_m"], found["frequency_hz"])
         return arrays, {"reference": repr(float(found["reference"]))}
     except (OSError, ValueError, KeyError, EOFError) as error:
@@ -271,26 +290,44 @@ def read_volume(source: Path) -> Volume:
         raise InputError(f"{file}: damaged ({error}); reconstruct again") from error
 
 
-def _volume(source: Path) -> Part:
+def _volume(source: Path, frame: Frame) -> Part:
     volume = read_volume(source)
+    turn = (frame.matrix[:3, :3] * frame.unit).round(6)
+    if not np.isin(turn, (-1.0, 0.0, 1.0)).all():
+        raise InputError(
+            f"{source}: the axes of the original frame are not those of the grid; export the "
+            "volume with --frame world"
+        )
+    order = np.abs(turn).argmax(axis=1)
+    values, places = volume.values.transpose(order), []
+    for axis, old in enumerate(order.tolist()):
+        along = volume.axes()[old]
+        ends = np.zeros((len(along), 3))
+        ends[:, old] = along
+        placed = frame.places(ends)[:, axis]
+        backwards = len(placed) > 1 and placed[1] < placed[0]
+        values = np.flip(values, axis) if backwards else values
+        places.append(placed[::-1] if backwards else placed)
     axes = {
-        name: Named(axis, (name,), "m", f"centre of the voxel along {name}")
-        for name, axis in zip("xyz", volume.axes(), strict=True)
+        name: Named(axis, (name,), frame.unit_name, f"centre of the voxel along {name}")
+        for name, axis in zip("xyz", places, strict=True)
     }
     meaning = "reflectivity summed over directions and frequencies"
-    return {"reflectivity": Named(volume.values, ("x", "y", "z"), "1", meaning), **axes}, {}
+    return {
+        "reflectivity": Named(np.ascontiguousarray(values), ("x", "y", "z"), "1", meaning),
+        **axes,
+    }, {}
 
 
-def _points(source: Path) -> Part:
+def _points(source: Path, frame: Frame) -> Part:
     mesh = RunFolder(source).mesh()
     heard = confidence_of(mesh)
     if heard is None:
         heard = np.zeros(len(mesh.vertices), np.int32)
+    places, normals = frame.places(mesh.vertices), frame.directions(mesh.vertex_normals)
     return {
-        "position": Named(np.asarray(mesh.vertices), ("point", "world"), "m", "vertex of the mesh"),
-        "normal": Named(
-            np.asarray(mesh.vertex_normals), ("point", "world"), "", "outward unit normal"
-        ),
+        "position": Named(places, ("point", "world"), frame.unit_name, "vertex of the mesh"),
+        "normal": Named(normals, ("point", "world"), "", "outward unit normal"),
         "poses": Named(heard, ("point",), "", "number of poses that heard the surface around it"),
     }, {}
 

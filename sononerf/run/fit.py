@@ -7,6 +7,7 @@ import logging
 import resource
 import sys
 import time
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -36,7 +37,7 @@ from sononerf.run.build import head_of, module_for, true_mesh, with_store
 from sononerf.run.evaluate import EvaluationWork, evaluate
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
-from sononerf.run.run_folder import RunFolder, flat
+from sononerf.run.run_folder import RunFolder, flat, stated_frame
 from sononerf.run.simulate import (
     background_path,
     open_ensemble,
@@ -223,7 +224,7 @@ def fit(
                 run.begin_fit(settings)
                 run.write_provenance(
                     echo_hash=echoes.store.attributes["echo_hash"],
-                    to_original=echoes.store.attributes.get("to_original"),
+                    **stated_frame(echoes.store.attributes),
                     threads=torch.get_num_threads(),
                 )
                 if "simulate_s" not in run.read_metrics().get("cost", {}):
@@ -293,7 +294,7 @@ def _fit(
                 ProgressCallback(task),
                 Pace(),
                 preview,
-                SurfaceImages(preview, _truth(settings)),
+                SurfaceImages(preview, _truth(settings, attributes)),
                 SpectrogramImages(data.whole("val"), renderer.range, renderer.frequency),
                 keeper,
             ],
@@ -336,12 +337,12 @@ def _announce(
     )
 
 
-def _truth(settings: Settings) -> trimesh.Trimesh | None:
+def _truth(settings: Settings, attributes: Mapping[str, Any]) -> trimesh.Trimesh | None:
     """Return the true surface for previews; None where it is unknown or has to be registered."""
     if settings.evaluation.registration != "none":
         return None
     try:
-        return true_mesh(settings)
+        return true_mesh(settings, attributes)
     except InputError as error:
         logger.warning("%s", error)
         return None

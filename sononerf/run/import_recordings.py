@@ -25,6 +25,7 @@ from sononerf.head.attached import attach
 from sononerf.head.reception import warn_of_call
 from sononerf.progress import Progress
 from sononerf.recordings.channel_check import faults_of_channels
+from sononerf.recordings.conventions import original_frame
 from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses, shifted
 from sononerf.report.pictures.spectrogram_picture import pings_png
 from sononerf.run.understand import Understood, understand
@@ -176,6 +177,7 @@ def _attributes(known: Understood, wanted: str) -> dict[str, Any]:
         "licence": known.wanted.licence,
         "settings": {name: plain[name] for name in HEAD_SECTIONS},
         "import": known.wanted.model_dump(mode="json"),
+        **original_frame(known.recording.columns, known.wanted),
         "calibration": known.calibration,
         "rejected_clipped": known.clipped,
         "speed_of_sound": known.head.speed_of_sound,

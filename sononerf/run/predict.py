@@ -26,15 +26,41 @@ from sononerf.evaluation.prediction import (
 )
 from sononerf.evaluation.prediction import predict as predict_poses
 from sononerf.evaluation.traced import Traced
+from sononerf.geometry.frame import FrameName
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
+from sononerf.recordings.columns import read_table
+from sononerf.recordings.conventions import to_poses
 from sononerf.report.pictures.spectrogram_picture import spectrogram_picture
 from sononerf.run.build import results_folder
 from sononerf.run.fitted import NAME as TRACED_NAME
 from sononerf.run.run_folder import RunFolder
+from sononerf.settings.import_schema import read_import_settings
 
 logger = logging.getLogger("sononerf")
+
+
+def read_poses(run: RunFolder, path: Path, frame: FrameName = "auto") -> Poses:
+    """Read a table of poses.
+
+    Args:
+        run: Whose frame is meant.
+        path: In the world's frame with the header ``x,y,z,yaw,pitch,roll`` (m, degrees); in the
+            original one of recordings with the columns, units and conventions of their import.
+        frame: ``auto``: the original one of recordings that have one.
+
+    Raises:
+        InputError: If the table is none.
+    """
+    stated = run.provenance.get("poses_as")
+    recorded = run.provenance.get("origin") == "recorded"
+    if frame == "world" or not stated or (frame == "auto" and not recorded):
+        return Poses.read(path)
+    with _named(path):
+        settings = read_import_settings(stated, "the run's provenance")
+        return to_poses(read_table(path, settings), settings)
+
 
 DRAWN = 3
 """Poses that are drawn where no number is given: the best, the median and the worst."""
@@ -45,6 +71,7 @@ def predict(
     *,
     split: Split = "test",
     poses_csv: Path | None = None,
+    frame: FrameName = "auto",
     output: Path | None = None,
     pictures: int | Literal["all"] = DRAWN,
     accelerator: str = "auto",
@@ -55,7 +82,8 @@ def predict(
     Args:
         run: A fitted run.
         split: Which poses of the ensemble.
-        poses_csv: Poses of the user's instead: header ``x,y,z,yaw,pitch,roll``, metres and degrees.
+        poses_csv: Poses of the user's instead; see :func:`read_poses`.
+        frame: Of these poses.
         output: Folder of the results; ``RUN/prediction`` where None.
         pictures: How many poses are drawn: from the best to the worst where they were measured,
             else from the first to the last.
@@ -71,7 +99,7 @@ def predict(
     """
     progress = progress or Progress(quiet=True)
     run = RunFolder.of(run)
-    own = Poses.read(poses_csv) if poses_csv else None
+    own = read_poses(run, poses_csv, frame) if poses_csv else None
     fitted = run.fitted
     kind = "" if own is None and split == "test" else f"-{'poses' if own is not None else split}"
     folder = output or run.path / f"prediction{kind}"

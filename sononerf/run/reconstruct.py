@@ -17,12 +17,14 @@ from sononerf import storage
 from sononerf.callbacks.tensorboard import add_mesh, writing
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.field.checkpoint_io import model_checksum
+from sononerf.geometry.frame import Frame
 from sononerf.progress import Progress
 from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png, side_by_side_png
 from sononerf.report.pictures.mip_picture import mip_pictures
 from sononerf.run.build import results_folder, true_mesh
 from sononerf.run.run_folder import RunFolder
 from sononerf.surface import reconstruction
+from sononerf.surface.mesh_files import mesh_bytes
 from sononerf.surface.reconstruction import refine, starts_of
 from sononerf.surface.refine import descent as stages
 from sononerf.surface.refine.refinement import STATE_VERSION, Refinement
@@ -188,7 +190,7 @@ def reconstruct(
             surface = refine_surface(run, surface, accelerator=accelerator, progress=progress)
         if own:
             run.begin("surface")
-        _write(folder, surface, true_mesh(run.fitted.settings))
+        _write(folder, surface, true_mesh(run.fitted.settings, run.provenance), run.frame())
         if surface.openness is not None and surface.openness.kind in OPEN:
             progress.say(OPEN[surface.openness.kind].format(surface.openness))
         if output is None:
@@ -205,11 +207,14 @@ def _has_echoes(run: RunFolder, progress: Progress) -> bool:
         return False
 
 
-def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None) -> None:
+def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None, frame: Frame) -> None:
     mesh, seen = surface.mesh, surface.confidence
     assert surface.volume is not None  # it was read out of a field
     for kind in FORMATS:
         storage.commit_bytes(folder / f"mesh.{kind}", surface.file(kind))
+        if not frame.is_world:
+            data = mesh_bytes(frame.mesh(mesh), kind, confidence=seen)
+            storage.commit_bytes(folder / f"mesh_original.{kind}", data)
     if seen is not None:
         storage.commit_bytes(folder / "confidence.png", confidence_png(mesh, seen))
     storage.commit_bytes(folder / "volume.vti", vti_bytes(surface.volume))

@@ -7,7 +7,7 @@ import importlib.metadata
 import os
 import platform
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -22,6 +22,7 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.errors import IncompatibleError, InputError
 from sononerf.evaluation.traced import Traced
 from sononerf.field.checkpoint_io import DESCRIPTION_NAME
+from sononerf.geometry.frame import KEYS, Frame, FrameName
 from sononerf.head.attached import attach
 from sononerf.run.fitted import Fitted, echoes_of, load_fitted, load_traced, save_traced
 from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
@@ -40,6 +41,11 @@ Stage = Literal["fit", "surface", "traced", "prediction", "evaluation"]
 STAGES: tuple[Stage, ...] = ("fit", "surface", "traced", "prediction", "evaluation")
 """Stages of a run, in order: the fit; the reconstruction; gain and weight of echoes traced off it;
 the prediction of held-out poses; the comparison with the true surface and the baselines."""
+POSE_KEYS = (
+    *("length", "angle", "frame", "axes", "head_axes", "positive_pitch", "quaternion", "look_at"),
+    "turntable",
+)
+"""Settings of an import that say how a table of poses is to be read."""
 RECORDED = ("torch", "lightning", "numpy", "scipy", "trimesh", "manifold3d", "embreex", "zarr")
 
 
@@ -64,6 +70,13 @@ def differing_keys(old: Settings, new: Settings) -> list[str]:
         if first.get(key) != second.get(key)
         and not any(key == free or key.startswith(f"{free}.") for free in FREE_KEYS)
     ]
+
+
+def stated_frame(attributes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the attributes of a store state of the frame that its poses were given in."""
+    facts = {key: attributes.get(key) for key in (*KEYS, "origin")}
+    given = attributes.get("import") or {}
+    return {**facts, "poses_as": {key: given[key] for key in POSE_KEYS if key in given}}
 
 
 class RunFolder:
@@ -126,6 +139,17 @@ class RunFolder:
         if settings.scene is not None:
             return settings.poses.heldout > 0
         return len(self.echoes.store.indices("test")) > 0
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What the run was made with; empty where the file is not there."""
+        file = self.path / "provenance.json"
+        found = storage.read_json(file) if file.is_file() else {}
+        return found if isinstance(found, dict) else {}
+
+    def frame(self, name: FrameName = "auto") -> Frame:
+        """Return the frame of that name; see :meth:`sononerf.geometry.frame.Frame.of`."""
+        return Frame.of(self.provenance, name)
 
     def mesh(self) -> trimesh.Trimesh:
         """Read the reconstructed surface.

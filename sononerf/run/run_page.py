@@ -200,7 +200,13 @@ def _surface(page: Page, run: RunFolder, settings: Settings) -> None:
     if not run.is_done("surface"):
         page.say(f"None yet: {command}.")
         return
-    mesh = run.mesh()
+    mesh, frame = run.mesh(), run.frame()
+    if not frame.is_world:
+        low, high = (frame.mesh(mesh).bounds).round(1).tolist()
+        page.say(
+            f"mesh_original.ply is in the frame and unit of the recordings ({frame.unit_name}): "
+            f"from {low} to {high}. All else is in the world frame: z up, metres."
+        )
     views = SurfaceViews(
         mesh,
         confidence_of(mesh),
@@ -223,7 +229,7 @@ def _surface(page: Page, run: RunFolder, settings: Settings) -> None:
 def _truth_beside(page: Page, run: RunFolder, settings: Settings) -> trimesh.Trimesh | None:
     """Return the true surface in the frame of the reconstruction; None where it is not known."""
     try:
-        true = true_mesh(settings)
+        true = true_mesh(settings, run.provenance)
     except SonoNerfError as error:
         page.say(f"The true surface is not shown: {error}.")
         return None
@@ -312,7 +318,7 @@ def _provenance(page: Page, path: Path) -> None:
 def _figures(page: Page, path: Path, fitted: Fitted, progress: Progress) -> None:
     page.heading("As in the paper")
     page.heading("Scene and poses (figures 4 to 6)", 3)
-    mesh = true_mesh(fitted.settings)
+    mesh = true_mesh(fitted.settings, RunFolder(path).provenance)
     if mesh is None:
         page.say("The true surface is not known here: no scene or `evaluation.truth` can be read.")
     else:

@@ -91,7 +91,9 @@ class View:
     def _show_surface(self) -> None:
         settings, mesh = self.run.open(), self.run.mesh()
         try:
-            truth = true_mesh(settings) if settings.evaluation.registration == "none" else None
+            truth = None
+            if settings.evaluation.registration == "none":
+                truth = true_mesh(settings, self.run.provenance)
         except InputError as error:
             self._say(str(error))
             truth = None

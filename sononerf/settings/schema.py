@@ -330,6 +330,7 @@ class EvaluationSettings(Section):
 
     truth: Path | None = None
     unit: Literal["m", "cm", "mm"] = "m"  # of the numbers in the file of the truth
+    frame: Literal["auto", "world", "original"] = "auto"  # of that file; auto: of the recordings
     registration: Literal["none", "rigid", "similarity"] = "none"
 
 

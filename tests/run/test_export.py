@@ -9,8 +9,10 @@ import h5py
 import numpy as np
 import pytest
 import scipy.io
+import trimesh
 import zarr
 
+from sononerf import storage
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
 from sononerf.geometry.poses import Poses
@@ -38,6 +40,36 @@ def test_echoes_of_a_store(echoes, tmp_path):
     poses = Poses.read(export(echoes, tmp_path / "poses.csv"))
     assert np.allclose(poses.positions, store.positions)
     assert np.allclose(poses.rotations, store.rotations)
+
+
+def test_a_mesh_is_written_in_each_frame(run, tmp_path):
+    """A simulation has no other frame than the world's unless its scene's file has one."""
+    facts = storage.read_json(run / "provenance.json")
+    own = RunFolder(run).mesh()
+    written = trimesh.load(export(run, tmp_path / "a.ply"), process=False)
+    np.testing.assert_allclose(written.vertices, own.vertices, atol=1e-7)
+    turned = [[0, 1000, 0, 5], [1000, 0, 0, 0], [0, 0, -1000, 0], [0, 0, 0, 1]]
+    storage.commit_json(run / "provenance.json", {**facts, "to_original": turned})
+    try:
+        there = trimesh.load(export(run, tmp_path / "b.stl", frame="original"))
+        np.testing.assert_allclose(there.bounds[1, 0], 1e3 * own.bounds[1, 1] + 5, rtol=1e-3)
+        assert there.volume == pytest.approx(1e9 * own.volume, rel=1e-3)
+        volume = export(run, tmp_path / "v.h5", what="volume", frame="original")
+        plain = export(run, tmp_path / "w.h5", what="volume")
+        with h5py.File(volume) as one, h5py.File(plain) as other:
+            a, b = one["reflectivity"][...], other["reflectivity"][...]
+            np.testing.assert_array_equal(a, np.flip(b.transpose(1, 0, 2), 2))
+            np.testing.assert_allclose(one["x"][...], 1e3 * other["y"][...] + 5)
+            np.testing.assert_allclose(one["z"][...], -1e3 * other["z"][...][::-1])
+            assert one["x"].attrs["units"] == "mm"
+        oblique = [[600, 800, 0, 0], [-800, 600, 0, 0], [0, 0, 1000, 0], [0, 0, 0, 1]]
+        storage.commit_json(run / "provenance.json", {**facts, "to_original": oblique})
+        with pytest.raises(InputError, match="export the volume with --frame world"):
+            export(run, tmp_path / "v.h5", what="volume", frame="original")
+    finally:
+        storage.commit_json(run / "provenance.json", facts)
+    with pytest.raises(SettingsError, match=r"a mesh is written as \.ply, \.stl, \.glb"):
+        export(run, tmp_path / "m.stl", what="points")
 
 
 def test_the_store_opens_with_names_and_units(echoes):
