@@ -30,7 +30,7 @@ import numpy as np
 
 from sononerf.array_types import Floats, Ints
 from sononerf.geometry.poses import Poses
-from sononerf.recordings.columns import EULER, PLACE, Columns
+from sononerf.recordings.columns import EULER, PLACE, QUATERNION, Columns
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.distance_model import Prediction, predict
 from sononerf.settings.import_schema import ImportSettings
@@ -63,6 +63,8 @@ RANGES_CLEARLY = 0.5
 """The same as CLEARLY for such a factor: of 120 sound sets two gained 0.3, and the others less."""
 ORDERS = 4
 """Number of random orders that the stated order of the poses is compared with."""
+XYZW = (QUATERNION[-1], *QUATERNION[:-1])
+"""Columns that hold w, x, y, z if numbers in the order x, y, z, w were named w, x, y, z."""
 AIM_FLOOR = np.radians(20.0)
 """Heads that look closer to the body than this do so equally well, rad."""
 AROUND = 0.15
@@ -114,6 +116,9 @@ def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]
             found[f"sign of {angle}"] = to_poses(_scaled(columns, (angle,), -1.0), settings)
         swapped = {**columns.values, "yaw": columns.values["roll"], "roll": columns.values["yaw"]}
         found["yaw and roll swapped"] = to_poses(_with(columns, swapped), settings)
+    if columns.has(*QUATERNION):
+        parts = {name: columns.values[old] for name, old in zip(QUATERNION, XYZW, strict=True)}
+        found["quaternion order"] = to_poses(_with(columns, {**columns.values, **parts}), settings)
     for order in ("yxz", "zyx", "xzy", "yzx", "zxy"):
         places = {name: columns.values[old] for name, old in zip(PLACE, order, strict=True)}
         found[f"swapped axes, {order} for xyz"] = to_poses(
@@ -390,6 +395,7 @@ def _turns(poses: Poses) -> bool:
 
 
 HINTS = {
+    "quaternion order": "the quaternion's scalar is its last number (columns qx, qy, qz, qw)",
     "the row after": "each ping belongs to the pose one row later; pings and poses are off by one",
     "the row before": "each ping belongs to the pose one row earlier; pings and poses are off "
     "by one",

@@ -24,7 +24,7 @@ from sononerf.errors import IncompatibleError
 from sononerf.head.attached import attach
 from sononerf.head.reception import warn_of_call
 from sononerf.progress import Progress
-from sononerf.recordings.channel_check import faults_of_channels
+from sononerf.recordings.channel_check import Channel, faults_of_channels
 from sononerf.recordings.conventions import original_frame
 from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses, shifted
 from sononerf.report.pictures.spectrogram_picture import pings_png
@@ -252,12 +252,7 @@ def describe(known: Understood) -> list[str]:
         f"{1e3 * (axis[1] - axis[0]) if len(axis) > 1 else 0.0:.2f} mm",
         f"frequency:  {frequency[0] / 1e3:.1f} to {frequency[-1] / 1e3:.1f} kHz in "
         f"{len(frequency)} bins (window {analysis.window}, hop {analysis.hop}, fft {analysis.fft})",
-        *(
-            f"channel {number}:  loudest echo {channel.level_db + 0.0:.1f} dB, noise "
-            f"{-channel.noise_db:.0f} dB below it; echoes in {channel.heard} of {channel.asked} "
-            "pings"
-            for number, channel in enumerate(known.channels)
-        ),
+        *(_channel_line(number, channel) for number, channel in enumerate(known.channels)),
     ]
     of_impulse = replace(known.head, call=CallSettings())
     here, there = (1e3 * head.resolution for head in (known.head, of_impulse))
@@ -271,6 +266,16 @@ def describe(known: Understood) -> list[str]:
         lines.append(f"calibration: {json.dumps(applied)}")
     faults = [f"warning:    {fault}" for fault in faults_of_channels(known.channels)]
     return [*lines, *(f"note:       {note}" for note in known.notes), *faults]
+
+
+def _channel_line(number: int, channel: Channel) -> str:
+    noise = "no noise"
+    if np.isfinite(channel.noise_db):
+        noise = f"noise {-channel.noise_db:.0f} dB below it"
+    return (
+        f"channel {number}:  loudest echo {channel.level_db + 0.0:.1f} dB, {noise}; echoes in "
+        f"{channel.heard} of {channel.asked} pings"
+    )
 
 
 def _kinds(units: dict[str, str]) -> dict[str, str]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sononerf.array_types import Ints
 from sononerf.echoes.splits import draw_split, split_of
-from sononerf.errors import InputError, SettingsError
+from sononerf.errors import InputError, NumericalError, SettingsError
 from sononerf.geometry.poses import Poses
 from sononerf.head.call import call_content, call_waveform
 from sononerf.head.head import Head
@@ -145,6 +145,8 @@ def understand(
     limits, power = found_ranges(
         head_of(settings), cutter, recording, data.get("spectrogram", {}), progress
     )
+    if not power.any():
+        raise NumericalError(f"{recording.path}: all recordings are silent; check the channels")
     plain = settings.plain()
     plain["spectrogram"] |= limits
     settings = validate_settings(plain, settings.source or "import")

@@ -198,22 +198,44 @@ import: {{frame: ned, quaternion: wxyz, compress: true}}
 """
 
 
-def table(places, rotations):
-    """Return the table of poses: north, east, down in mm, and quaternions."""
+def table(places, rotations, first, name):
+    """Return the table of poses: north, east, down in mm, and quaternions.
+
+    Args:
+        places (P, 3): m.
+        rotations (P, 3, 3): Head to world.
+        first: The first column of each row.
+        name: Of the first column.
+    """
     rows = np.column_stack([1e3 * places, quaternions(rotations)])
     lines = [
-        ",".join([f"ping_{number:03d}.wav", *(f"{value:.7f}" for value in row)])
-        for number, row in enumerate(rows)
+        ",".join([one, *(f"{value:.7f}" for value in row)])
+        for one, row in zip(first, rows, strict=True)
     ]
-    return "\n".join(["file,x_mm,y_mm,z_mm,qw,qx,qy,qz", *lines]) + "\n"
+    return "\n".join([f"{name},x_mm,y_mm,z_mm,qw,qx,qy,qz", *lines]) + "\n"
 
 
-def write_folder(folder, count=120):
+def write_folder(folder, count=120, seed=0):
     """Write a folder of recordings: 16-bit WAV files, ``poses.csv`` and ``import.yaml``."""
     folder.mkdir(parents=True, exist_ok=True)
-    places, rotations = poses(count)
-    for number, heard in enumerate(waveforms(places, rotations)):
-        samples = np.round(32767.0 * heard).astype(np.int16)
-        wavfile.write(folder / f"ping_{number:03d}.wav", RATE, samples.T)
-    (folder / "poses.csv").write_text(table(places, rotations))
+    places, rotations = poses(count, seed)
+    names = [f"ping_{number:03d}.wav" for number in range(count)]
+    for name, heard in zip(names, waveforms(places, rotations, seed), strict=True):
+        wavfile.write(folder / name, RATE, np.round(32767.0 * heard).astype(np.int16).T)
+    (folder / "poses.csv").write_text(table(places, rotations, names, "file"))
+    (folder / "import.yaml").write_text(SETTINGS)
+
+
+def write_long(folder, count=120, seed=0):
+    """Write the same as one long file, ``flight.wav``, with the time of each call."""
+    folder.mkdir(parents=True, exist_ok=True)
+    places, rotations = poses(count, seed)
+    heard = np.round(32767.0 * waveforms(places, rotations, seed)).astype(np.int16)
+    begins = 500 + (SAMPLES + 300) * np.arange(count)
+    samples = np.zeros((begins[-1] + SAMPLES + 500, heard.shape[1]), np.int16)
+    for begin, one in zip(begins, heard, strict=True):
+        samples[begin : begin + SAMPLES] = one.T
+    wavfile.write(folder / "flight.wav", RATE, samples)
+    times = [f"{begin / RATE:.9f}" for begin in begins]
+    (folder / "poses.csv").write_text(table(places, rotations, times, "time_s"))
     (folder / "import.yaml").write_text(SETTINGS)

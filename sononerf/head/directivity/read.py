@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import logging
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ import numpy as np
 from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.head.directivity.record import MOST_RECEIVERS, Directivity, unit_vectors
+
+logger = logging.getLogger("sononerf")
 
 MOST_BYTES = 500_000_000
 ANGLES = ("azimuth_deg", "elevation_deg")
@@ -142,6 +145,18 @@ def content_hash(path: Path) -> str:
 @lru_cache(maxsize=4)
 def _read(path: Path, content: str) -> Directivity:
     del content  # a changed file is read again
+    found = _of_its_kind(path)
+    if found.is_flat:
+        logger.warning(
+            "%s: the directivity is measured in one plane alone; beside it gains fade to zero, so "
+            "echoes from there count as silent; measure other elevations too, or set "
+            "ears.directivity=omnidirectional",
+            path,
+        )
+    return found
+
+
+def _of_its_kind(path: Path) -> Directivity:
     with path.open("rb") as file:
         start = file.read(128)
     if start.startswith(HDF5_SIGNATURE):

@@ -134,6 +134,11 @@ def _portions(missed: Ints) -> tuple[Ints, int]:
 
 
 MOST_RECEIVERS = 256
+FEW = 3
+"""Fewer directions than this lie in one plane anyway."""
+FLAT = 0.1
+"""Thickness of a set of directions over its width below which it is a plane, no unit: elevations of
+a few degrees beside azimuths all around."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,6 +216,14 @@ class Directivity:
             raise InputError(
                 f"{self.source}: states {len(self.places)} places of {receivers} receivers"
             )
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether all directions lie in one plane: a circle around the head was measured."""
+        if len(self.directions) < FEW:
+            return False
+        size = np.linalg.svd(self.directions, compute_uv=False) / math.sqrt(len(self.directions))
+        return bool(size[2] < FLAT * size[1])
 
     def weights(self, directions: Floats) -> csr_array:
         """Return the weights (N, M) that bring gains to directions (N, 3); rows sum to 1 or less.
