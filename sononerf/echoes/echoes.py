@@ -19,12 +19,14 @@ from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.detection import Onsets, asked_poses, find_onsets
 from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
+from sononerf.echoes.recorded_noise import seal_recorded
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
 from sononerf.echoes.splits import repeats, split_of
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError, expect
 from sononerf.geometry.poses import Poses
 from sononerf.head.attached import attach, attached
+from sononerf.head.decibels import active_level
 from sononerf.head.head import Head
 from sononerf.settings.schema import HEAD_SECTIONS
 from sononerf.shown import Picture, Shown, picture_of
@@ -144,9 +146,13 @@ class Echoes(Shown):
         )
         for index, spectrogram in enumerate(given):
             store.write_pose(index, spectrogram)
-        pairs = repeats(poses, purposes)
-        again = {index: store.read_pose(other) for index, other in pairs.items()}
-        seal(store, again, silent="spectrograms: all training poses are silent")
+        silent = "spectrograms: all training poses are silent"
+        if calibrated:
+            pairs = repeats(poses, purposes)
+            again = {index: store.read_pose(other) for index, other in pairs.items()}
+            seal(store, again, silent=silent)
+        else:
+            seal_recorded(store, head, poses, purposes, silent=silent)
         return cls(store, head)
 
     @classmethod
@@ -275,6 +281,11 @@ class Echoes(Shown):
     def reference(self) -> float:
         """Magnitude m0 that reported decibels refer to."""
         return float(self.store.attributes["reference"])
+
+    @property
+    def active_db(self) -> float | Floats:
+        """Level from which a cell is active, dB: one number, or (E, 1, F) above noise."""
+        return active_level(self.store.attributes.get("noise"), self.reference)
 
     @property
     def calibrated(self) -> bool:

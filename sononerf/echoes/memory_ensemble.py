@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.layout import SPLITS, checked_axes, plain_attributes
 from sononerf.errors import InputError, NumericalError
-from sononerf.head.decibels import RANGE_DB, compress, mae_db
+from sononerf.head.decibels import RANGE_DB, active_level, compress, mae_db
 
 
 class Ensemble(ABC):
@@ -183,13 +183,20 @@ class MemoryEnsemble(Ensemble):
         """Do nothing: what is complete in memory needs no mark."""
 
 
-def seal(ensemble: Ensemble, again: dict[int, Singles], *, silent: str) -> None:
+def seal(
+    ensemble: Ensemble,
+    again: dict[int, Singles],
+    *,
+    silent: str,
+    noise: Floats | None = None,
+) -> None:
     """Fix the reported decibels and the noise floor of a complete ensemble, and seal it.
 
     Args:
         ensemble: No pose is missing.
         again: By number of a test pose, what the same pose heard another time, (E, R, F).
         silent: What to say if no training pose heard anything.
+        noise ((E, F) or None): Its root mean square, where it is known.
 
     Raises:
         NumericalError: If no training pose heard anything.
@@ -198,11 +205,14 @@ def seal(ensemble: Ensemble, again: dict[int, Singles], *, silent: str) -> None:
     if loudest <= 0.0:
         raise NumericalError(silent)
     reference = loudest * 10.0 ** (-RANGE_DB / 20.0)
-    noise: dict[str, float | None] = {"noise_floor_mae_db": None, "noise_floor_mae_db_active": None}
+    floor: dict[str, float | None] = {"noise_floor_mae_db": None, "noise_floor_mae_db_active": None}
     if again:
         first = compress(np.stack([ensemble.read_pose(i) for i in again]), reference)
         second = compress(np.stack(list(again.values())), reference)
-        noise["noise_floor_mae_db"] = mae_db(first, second)
-        noise["noise_floor_mae_db_active"] = mae_db(first, second, active=True)
-    ensemble.update_attributes(reference=reference, **noise)
+        floor["noise_floor_mae_db"] = mae_db(first, second)
+        level = active_level(noise, reference)
+        floor["noise_floor_mae_db_active"] = mae_db(first, second, active=True, active_db=level)
+    if noise is not None:
+        ensemble.update_attributes(noise=noise.tolist())
+    ensemble.update_attributes(reference=reference, **floor)
     ensemble.seal()

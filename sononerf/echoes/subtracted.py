@@ -58,7 +58,7 @@ class SubtractedStore(EnsembleStore):
     @property
     def attributes(self) -> dict[str, Any]:
         """As of the whole, but for the loudness of what is left; its noise floor is not known."""
-        unknown = dict.fromkeys(("noise_floor_mae_db", "noise_floor_mae_db_active"))
+        unknown = dict.fromkeys(("noise_floor_mae_db", "noise_floor_mae_db_active", "noise"))
         given = super().attributes
         return {**given, **unknown, "reference": given["reference"] * self._part}
 

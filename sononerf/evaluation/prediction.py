@@ -192,13 +192,14 @@ def prediction_numbers(
     level, predicted, alone = (
         compress(part, reference) for part in (measured, prediction.magnitude, prediction.rendered)
     )
-    floor = ("noise_floor_mae_db", "noise_floor_mae_db_active")
+    floor = ("noise_floor_mae_db", "noise_floor_mae_db_active", "noise_floor_of")
+    active_db = echoes.active_db
     return {
         "poses": len(level),
-        **prediction_metrics(level, predicted, mean_db=mean),
+        **prediction_metrics(level, predicted, mean_db=mean, active_db=active_db),
         **{key: store.attributes.get(key) for key in floor},
         "rendered_mae_db": mae_db(level, alone),
-        "rendered_mae_db_active": mae_db(level, alone, active=True),
+        "rendered_mae_db_active": mae_db(level, alone, active=True, active_db=active_db),
         "traced_weight": prediction.traced_weight,
         "traced_fault": prediction.traced_fault,
     }
@@ -228,7 +229,7 @@ def prediction_metrics(
     predicted_db: ArrayLike,
     *,
     mean_db: ArrayLike,
-    active_db: float = ACTIVE_DB,
+    active_db: float | Floats = ACTIVE_DB,
 ) -> dict[str, float | None]:
     """Compare predicted spectrograms with measured ones.
 
@@ -237,7 +238,8 @@ def prediction_metrics(
             read a few poses at a time.
         mean_db ((E, R, F), dB): Mean spectrogram of the training poses: what knowing nothing of the
             pose predicts.
-        active_db (dB): A cell is active where the measured or the judged spectrogram reaches this.
+        active_db (dB): A cell is active where the measured or the judged spectrogram reaches this;
+            one number, or one that is broadcast to a spectrogram.
 
     Returns:
         metrics: ``mae_db``, ``mae_db_active``, ``mean_predictor_mae_db``,

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torchmetrics import MeanMetric
 
+from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import IncompatibleError, NumericalError, SettingsError, expect
 from sononerf.field.checkpoint_io import DurableCheckpointIO
@@ -145,6 +146,7 @@ class EchoModule(lightning.LightningModule):
         self.possible = possible
         self.learning_rate = options.learning_rate or self.field.learning_rate
         self.total_steps = self.steps_per_epoch = 1
+        self.active_db: float | Floats = ACTIVE_DB
         self.mae = MeanMetric()
         self.mae_active = MeanMetric()
 
@@ -184,7 +186,7 @@ class EchoModule(lightning.LightningModule):
                 left[:] = True  # the user's own box is kept whole
             return torch.as_tensor(left, device=places.device)
 
-        return cls(
+        made = cls(
             field,
             renderer,
             reference=echoes.reference,
@@ -195,6 +197,8 @@ class EchoModule(lightning.LightningModule):
             options=options,
             possible=possible,
         )
+        made.active_db = echoes.active_db
+        return made
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]  # no option of Lightning's runs code here
@@ -388,7 +392,10 @@ class EchoModule(lightning.LightningModule):
         predicted = decibels(self(batch), self.reference)
         measured = decibels(batch.spectrum, self.reference)
         error = (predicted - measured).abs()
-        active = (predicted >= ACTIVE_DB) | (measured >= ACTIVE_DB)
+        level = torch.as_tensor(self.active_db, dtype=error.dtype, device=error.device)
+        if level.dim():
+            level = level[..., batch.bins]
+        active = (predicted >= level) | (measured >= level)
         self.mae.update(error)
         if bool(active.any()):
             self.mae_active.update(error[active])

@@ -17,6 +17,9 @@ RANGE_DB = 60.0
 """Level of the loudest cell above the reference, dB; also the scale of PSNR and SSIM."""
 ACTIVE_DB = 3.0
 """Level from which a cell is active, dB."""
+EXCEEDED = 1e-3
+"""Probability that a cell of noise counts as active, no unit: one cell in a thousand does not move
+a mean over active cells."""
 CHUNK_POSES = 8
 """Number of poses that are compared at once; more of them would only take more memory."""
 
@@ -40,6 +43,20 @@ def compress(magnitude: ArrayLike, reference: float) -> Floats:
         np.asarray(magnitude, dtype=np.float64) / reference
     )
     return level_db
+
+
+def active_level(noise: ArrayLike | None, reference: float) -> float | Floats:
+    """Return the level from which a cell is active, dB: one number, or (E, 1, F) above noise.
+
+    Args:
+        noise ((E, F) or None): Root mean square of the magnitude of noise; None where none is
+            known.
+        reference: Magnitude that decibels refer to.
+    """
+    if noise is None:
+        return ACTIVE_DB
+    exceeded = np.asarray(noise, dtype=np.float64) * math.sqrt(math.log(1.0 / EXCEEDED))
+    return np.maximum(compress(exceeded, reference), ACTIVE_DB)[:, None]
 
 
 def expand(level_db: ArrayLike, reference: float) -> Floats:
@@ -75,7 +92,7 @@ def pose_chunks(
 
 
 def mae_all_and_active(
-    measured: NDArray[np.floating], predicted: NDArray[np.floating], active_db: float
+    measured: NDArray[np.floating], predicted: NDArray[np.floating], active_db: float | Floats
 ) -> tuple[float, float | None]:
     """Mean absolute error over all cells, and over active ones; None where none is active."""
     total = active_total = 0.0
@@ -90,14 +107,15 @@ def mae_all_and_active(
 
 
 def mae_db(
-    a: ArrayLike, b: ArrayLike, *, active: bool = False, active_db: float = ACTIVE_DB
+    a: ArrayLike, b: ArrayLike, *, active: bool = False, active_db: float | Floats = ACTIVE_DB
 ) -> float | None:
     """Mean absolute difference of two sets of spectrograms.
 
     Args:
         a, b ((P, ...), dB): Spectrograms.
         active: Whether only those cells count that reach ``active_db`` in either.
-        active_db (dB): What makes a cell active.
+        active_db (dB): What makes a cell active; one number, or one that is broadcast to a
+            spectrogram.
 
     Returns:
         error (dB): None where no cell is active.

@@ -18,9 +18,11 @@ from sononerf import storage
 from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble, seal
+from sononerf.echoes.recorded_noise import seal_recorded
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, SettingsError
 from sononerf.geometry.frame import KEYS
+from sononerf.geometry.poses import Poses
 from sononerf.head.attached import attach
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
@@ -192,7 +194,12 @@ def _write(
                 heard = moved(store.read_pose(index), np.asarray(store.range), found.range_offset)
                 made.write_pose(index, (factor * heard).astype(np.float32))
                 task.advance()
-        seal(made, {}, silent=f"{output}: no pose heard anything")
+        poses = Poses(made.positions, made.rotations)
+        silent = f"{output}: no pose heard anything"
+        if earlier.get("origin") == "recorded":
+            seal_recorded(made, fitted.head, poses, made.split, silent=silent)
+        else:
+            seal(made, {}, silent=silent)
     return EnsembleStore.open(output)
 
 

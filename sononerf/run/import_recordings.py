@@ -17,8 +17,7 @@ import numpy as np
 from sononerf import __version__, storage
 from sononerf.array_types import Singles
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.memory_ensemble import seal
-from sononerf.echoes.splits import repeats
+from sononerf.echoes.recorded_noise import seal_recorded
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError
 from sononerf.head.attached import attach
@@ -160,9 +159,8 @@ def import_understood(
             for index in missing:
                 store.write_pose(index, spectrogram_of(known, int(known.pings[index])))
                 task.advance()
-        pairs = repeats(poses, known.split)
-        again = {index: store.read_pose(other) for index, other in pairs.items()}
-        seal(store, again, silent=f"{output}: all recordings are silent; check the channels")
+        silent = f"{output}: all recordings are silent; check the channels"
+        seal_recorded(store, known.head, poses, known.split, silent=silent)
     store = EnsembleStore.open(output)
     return store, verdict(known, store)
 

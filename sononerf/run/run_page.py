@@ -103,6 +103,13 @@ HELD_OUT = (
 )
 
 
+FLOOR_OF = {
+    None: "the same echoes simulated with other rays",
+    "repeated poses": "between poses that were recorded twice",
+    "noise before the first echoes": "what noise as strong as that before the first echoes makes",
+}
+
+
 def _numbers(page: Page, run: RunFolder) -> None:
     metrics = run.read_metrics()
     prediction, geometry = metrics.get("prediction") or {}, metrics.get("geometry") or {}
@@ -122,12 +129,13 @@ def _numbers(page: Page, run: RunFolder) -> None:
         page.say(
             f"Mean over {prediction.get('poses')} poses that were never trained on, in decibels "
             "above 60 dB below the loudest training echo. Active cells: measured or predicted is "
-            "3 dB or more. Field alone: without the echoes that are traced off the run's own mesh. "
+            "3 dB or more, and above the noise of recordings. Field alone: without the "
+            "echoes that are traced off the run's own mesh. "
             "Mean spectrogram: what the mean of the training poses predicts for every pose."
             + (
                 ""
                 if prediction.get("noise_floor_mae_db") is None
-                else " Noise floor: the same echoes simulated with other rays."
+                else f" Noise floor: {FLOOR_OF[prediction.get('noise_floor_of')]}."
             )
         )
     elif run.has_heldout:
