@@ -194,7 +194,8 @@ def calibrate(
     kinds: Annotated[
         list[str],
         typer.Argument(
-            metavar="ERROR...", help="gain, range_offset, speed_of_sound, position, aim."
+            metavar="ERROR...",
+            help="gain, range_offset, speed_of_sound, radius, support, beam_radius, position, aim.",
         ),
     ],
     output: Annotated[Path | None, typer.Option(help="The corrected store.")] = None,

@@ -31,7 +31,15 @@ from sononerf.run.fitted import Fitted
 from sononerf.run.run_folder import RunFolder
 from sononerf.settings.schema import HEAD_SECTIONS, SpectrogramSettings
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.self_calibration import KINDS, Calibration, Calibrator, Estimate, Kind
+from sononerf.surface.refine.recording_errors import (
+    KINDS,
+    Calibration,
+    Estimate,
+    Kind,
+    changed_head,
+)
+from sononerf.surface.refine.self_calibration import Calibrator
+from sononerf.surface.refine.support_search import above, find_support, with_support
 
 STEPS = 20
 """At most so many Gauss-Newton steps; they usually end earlier."""
@@ -41,6 +49,11 @@ DETERMINED = 0.25
 """Largest uncertainty of a length, range resolutions, at which an error counts as found."""
 DETERMINED_DB = 1.0
 """The same of a gain, dB."""
+DETERMINED_RESOLUTIONS = 1.0
+"""Largest uncertainty of the turntable's radius, the support's height and the emitter's radius,
+range resolutions, at which they count as found."""
+ON_CYLINDER = 0.02
+"""Largest range of the poses' distances from the axis of a turntable, over their mean."""
 INFORMED = 0.7
 """Largest uncertainty of a pose over the spread of all poses, no unit, at which the echoes say more
 than the spread does."""
@@ -85,11 +98,12 @@ def calibrate(
     Args:
         run: Folder of a run with a surface.
         output: The corrected store; the run's own store is left as it is.
-        kinds: Which errors: ``gain``, ``range_offset``, ``speed_of_sound``, ``position``, ``aim``.
+        kinds: Which errors, of :data:`KINDS`.
         progress: Where to show it.
 
     Raises:
-        SettingsError: If a kind is unknown.
+        SettingsError: If a kind is unknown, or the poses are not on a cylinder and ``radius`` is
+            asked for.
         InputError: If the run has no surface, or its echoes are not there.
         IncompatibleError: If there is a store at ``output`` already.
     """
@@ -101,16 +115,53 @@ def calibrate(
         raise IncompatibleError(f"{output}: holds something already; choose another --output")
     storage.probe_writable(output)
     store = opened.echoes.store
-    estimate = _estimate(opened.echoes, mesh, wanted, progress)
-    corrected = _write(fitted, store, output, estimate.calibration, wanted, progress)
-    lines, warnings = describe(fitted.head, store, mesh, estimate, wanted)
+    echoes = opened.echoes
+    if "radius" in wanted:
+        _check_cylinder(echoes)
+    known: dict[str, float] = {}
+    if "support" in wanted and echoes.head.plane is None:
+        echoes, mesh, known["support"] = _with_support(echoes, mesh, progress)
+    left = tuple(kind for kind in wanted if kind not in known)
+    estimate = _estimate(echoes, mesh, left, progress)
+    estimate.deviation.update(known)
+    corrected = _write(fitted, echoes, output, estimate.calibration, wanted, progress)
+    lines, warnings = describe(echoes.head, store, mesh, estimate, wanted)
     return Calibrated(corrected, estimate, lines, warnings)
+
+
+def _check_cylinder(echoes: Echoes) -> None:
+    distance = np.linalg.norm(echoes.positions[:, :2], axis=1)
+    if np.ptp(distance) > ON_CYLINDER * distance.mean():
+        raise SettingsError(
+            "radius: the poses are not those of a turntable: their distances from the z axis are "
+            f"{distance.min():.3g} to {distance.max():.3g} m; leave radius out"
+        )
+
+
+def _with_support(
+    echoes: Echoes, mesh: trimesh.Trimesh, progress: Progress
+) -> tuple[Echoes, trimesh.Trimesh, float]:
+    """Return the echoes above the support that the surface stands on, and what is above it.
+
+    The third value is the standard deviation of its height, m.
+    """
+    with progress.task("searching the support", 100) as task:
+
+        def shown(share: float) -> None:
+            task.advance(round(100 * share) - task.done)
+
+        height, deviation = find_support(mesh, echoes, shown)
+    head = with_support(echoes.head, height)
+    return Echoes(echoes.store, head, echoes.hull), above(mesh, height), deviation
 
 
 def _estimate(
     echoes: Echoes, mesh: trimesh.Trimesh, kinds: Sequence[Kind], progress: Progress
 ) -> Estimate:
     head = echoes.head
+    if not kinds:
+        nothing = Calibration.none(len(head.receivers), len(echoes.store))
+        return Estimate(nothing, {}, [])
     work = Calibrator(mesh, echoes, Optics(head), kinds, dependent=dependent_cells(head.analysis))
     with progress.task("calibrating", STEPS * len(work.poses)) as task:
         for _ in range(STEPS):
@@ -137,16 +188,18 @@ def dependent_cells(analysis: SpectrogramSettings) -> float:
 
 def _write(
     fitted: Fitted,
-    store: Ensemble,
+    echoes: Echoes,
     output: Path,
     found: Calibration,
     kinds: Sequence[Kind],
     progress: Progress,
 ) -> EnsembleStore:
     """Write the store without the errors; see :func:`calibrate`."""
-    settings = fitted.settings
-    plain = settings.plain()
+    settings, store = fitted.settings, echoes.store
+    plain, now = settings.plain(), changed_head(echoes.head, found.support, found.beam_radius)
     sections = {name: plain[name] for name in HEAD_SECTIONS}
+    sections["support"] = now.support.model_dump(mode="json")
+    sections["ears"] = {**sections["ears"], "beam_radius": now.ears.beam_radius}
     speed = fitted.head.speed_of_sound * math.exp(found.speed_of_sound)
     axis = np.asarray(store.range, dtype=np.float64)
     if "speed_of_sound" in kinds:
@@ -165,7 +218,7 @@ def _write(
     with storage.lock(output):
         made = EnsembleStore.create(
             output,
-            poses_positions=store.positions + found.position,
+            poses_positions=store.positions + found.position + found.radius * outward(store),
             poses_rotations=turned @ store.rotations,
             split=store.split,
             range=axis,
@@ -182,6 +235,9 @@ def _write(
                         "gain_db": (found.gain * _DB).tolist(),
                         "range_offset_m": found.range_offset,
                         "speed_of_sound": speed,
+                        "radius_m": found.radius,
+                        "beam_radius_m": found.beam_radius,
+                        "support": sections["support"],
                     },
                 },
             },
@@ -215,11 +271,18 @@ def moved(magnitude: NDArray[np.floating], axis: NDArray[np.floating], offset: f
     return np.asarray((1.0 - part) * low + part * high, dtype=np.float64)
 
 
+def outward(store: Ensemble) -> Floats:
+    """Return the directions from the z axis to the poses, (P, 3) unit vectors."""
+    away = store.positions * np.array([1.0, 1.0, 0.0])
+    return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+
+
 def _fingerprint(found: Calibration) -> str:
     values = np.concatenate(
         [
             found.gain,
             [found.range_offset, found.speed_of_sound],
+            [found.radius, found.support, found.beam_radius],
             found.position.ravel(),
             found.aim.ravel(),
         ]
@@ -246,9 +309,10 @@ def describe(
     reach = float(np.linalg.norm(store.positions[train] - mesh.centroid, axis=1).mean())
     resolution, speed = head.resolution, head.speed_of_sound
     error = estimate.error_db
-    lines = [
-        f"error:          {error[0]:.2f} dB before, {error[-1]:.2f} dB after {len(error)} steps"
-    ]
+    lines = []
+    if error:
+        steps = f"{error[-1]:.2f} dB after {len(error)} steps"
+        lines.append(f"error:          {error[0]:.2f} dB before, {steps}")
     warnings = []
     if "gain" in kinds:
         gains = ", ".join(f"{_DB * value:+.2f}" for value in found.gain)
@@ -266,6 +330,24 @@ def describe(
         warnings.append(
             "gain and range_offset together: a larger object is louder and nearer, so both may be "
             "wrong together; calibrate one of them by a reference target (import.reference)"
+        )
+    distance = float(np.linalg.norm(store.positions[train][:, :2], axis=1).mean())
+    plane = head.plane
+    for kind, name, before in (
+        ("radius", "radius", distance),
+        ("support", "support", None if plane is None else float(np.dot(plane.point, plane.normal))),
+        ("beam_radius", "beam radius", head.ears.beam_radius),
+    ):
+        if kind not in kinds or before is None:
+            continue
+        now, uncertain = before + getattr(found, kind), deviation[kind]
+        lines.append(f"{name + ':':15s} {1e3 * now:.1f} ± {1e3 * uncertain:.1f} mm")
+        if uncertain > DETERMINED_RESOLUTIONS * resolution:
+            warnings.append(f"{kind}: the echoes hardly determine it; measure it")
+    if "radius" in kinds and "range_offset" in kinds:
+        warnings.append(
+            "radius and range_offset together: near and far poses alone tell them apart; their sum "
+            "is found better than each"
         )
     if "speed_of_sound" in kinds:
         uncertain = deviation["speed_of_sound"]

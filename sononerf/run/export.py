@@ -59,7 +59,7 @@ def file_bytes(
 
     MATLAB's file (version 5) has one variable per array and the structs ``units``, ``axes`` and
     ``attributes``. HDF5 has one dataset per array, with dimension scales. NetCDF (version 3, 64-bit
-    offsets) has one variable per array; :func:`xarray.open_dataset` reads it.
+    offsets) has one variable per array.
 
     Args:
         file_type: Kind of file.

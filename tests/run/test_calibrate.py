@@ -17,7 +17,7 @@ from sononerf.run.build import with_store
 from sononerf.run.calibrate import calibrate, dependent_cells, describe, kinds_of, moved
 from sononerf.run.fitted import echoes_of, load_fitted
 from sononerf.settings.schema import SpectrogramSettings
-from sononerf.surface.refine.self_calibration import Calibration, Estimate
+from sononerf.surface.refine.recording_errors import Calibration, Estimate
 
 SPHERE = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
 

@@ -18,133 +18,50 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
 from sononerf.array_types import Floats, Singles
 from sononerf.echoes.echoes import Echoes
+from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.decibels import ACTIVE_DB
-from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
 from sononerf.surface.refine.objective import FLOOR_DB, TRUST
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.visibility import listen, sight_of
+from sononerf.surface.refine.recording_errors import (
+    OF_HEAD,
+    Body,
+    Calibration,
+    Estimate,
+    Kind,
+    changed_head,
+)
 
-Kind = Literal["gain", "range_offset", "speed_of_sound", "position", "aim"]
-KINDS: tuple[Kind, ...] = ("gain", "range_offset", "speed_of_sound", "position", "aim")
 STEP = 0.02
 """Length of a finite difference, shortest wavelengths: small against interference, large against
 rounding."""
+LEVEL_POSES = 50
+"""Number of poses that the level of a recording is first taken from, and that errors are compared
+on; steps improve it."""
+MOST_POSES = 60
+"""Number of poses, at most and evenly, that errors are taken from which all poses share. So many
+determine them better than the surface is known."""
+GROUPS = 12
+"""Number of groups of neighbouring poses that uncertainties are taken from: each sees the surface
+from another side."""
+FARTHER = 4
+"""Number of times, at most, that a step of the shared errors is doubled while the error falls.
+Interference makes the derivatives of fine cells steep but short, and steps too small."""
 TURN = 0.01
 """The same of an aim, rad: small against the beam's width."""
+LARGEST_STEP = 0.5
+"""Bound of one step of a length, range resolutions: the derivatives hold no farther."""
 LEAST_DB = 0.5
 """Differences below this have the weight of one of it: physical optics is no better."""
 _DB = 20.0 / math.log(10.0)
-
-
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """Errors of a recording; zero where nothing is wrong.
-
-    Attributes:
-        gain (E,): Natural logarithm of how much too loud each receiver is.
-        range_offset (m): How much too far everything is heard.
-        speed_of_sound: Logarithm of the true speed over the assumed one.
-        position ((P, 3), m): To be added to the stated positions.
-        aim ((P, 3), rad): Rotation vectors, world frame, to be applied to the stated rotations.
-    """
-
-    gain: Floats
-    range_offset: float
-    speed_of_sound: float
-    position: Floats
-    aim: Floats
-
-    @classmethod
-    def none(cls, receivers: int, poses: int) -> Calibration:
-        """Return no errors."""
-        return cls(np.zeros(receivers), 0.0, 0.0, np.zeros((poses, 3)), np.zeros((poses, 3)))
-
-
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """What was found, and how well.
-
-    Attributes:
-        calibration: The errors.
-        deviation: One standard deviation of each kind: shared errors in their own unit; position
-            (m) and aim (rad) as the root mean square over poses and axes.
-        error_db: Mean absolute difference over active cells before each step, and after the last.
-    """
-
-    calibration: Calibration
-    deviation: dict[str, float]
-    error_db: list[float]
-
-
-class Body:
-    """A surface whose spectrograms are rendered for poses with errors.
-
-    Args:
-        mesh: m.
-        optics: The head.
-    """
-
-    def __init__(self, mesh: trimesh.Trimesh, optics: Optics) -> None:
-        self.optics = optics
-        like = optics.get_buffer("wavenumber")
-        faces = np.array(mesh.faces, dtype=np.int64)
-        self.vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
-        self.operators = MeshOperators(torch.as_tensor(faces).to(like.device), len(self.vertices))
-        self.area = self.operators.areas(self.vertices)
-        passes = smoothing_passes(optics.wavelength, self.operators.edge_length(self.vertices))
-        self.bending = self.operators.bending(self.vertices, unit(self.area), passes)
-        self.sight = sight_of(optics, self.vertices.cpu().numpy(), faces)
-
-    def render(
-        self, positions: Floats, rotations: Floats, stretch: Floats, late: Floats
-    ) -> Singles:
-        """Return magnitudes (P, E, R, F) on the whole axis.
-
-        Args:
-            positions, rotations ((P, 3), (P, 3, 3)): Of the heads, m.
-            stretch, late ((P,), (P,)): Factor on paths, and m added to them.
-        """
-        optics = self.optics
-        shape = (len(positions), optics.ears, optics.rows, len(optics.frequencies))
-        found = np.zeros(shape, dtype=np.float32)
-        places, turns = (torch.as_tensor(part).to(self.vertices) for part in (positions, rotations))
-        with torch.no_grad():
-            pieces, heads, middle = listen(
-                optics,
-                self.operators,
-                self.vertices,
-                self.area,
-                self.bending,
-                self.sight,
-                places,
-                turns,
-            )
-            if not len(pieces.pose):
-                return found
-            heard = optics.render(
-                (self.vertices - middle).float(),
-                self.area.float(),
-                pieces,
-                heads,
-                stretch=torch.as_tensor(stretch).to(heads.emitters),
-                late=torch.as_tensor(late).to(heads.emitters),
-            )
-        magnitude = heard.power.sqrt().cpu().numpy()
-        for one, rendered, row in zip(found, magnitude, heard.row.tolist(), strict=True):
-            first, last = max(row, 0), min(row + rendered.shape[1], optics.rows)
-            if last > first:
-                one[:, first:last] = rendered[:, first - row : last - row]
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +86,8 @@ class Calibrator:
     Attributes:
         change: Length of the last step over one standard deviation, of the error that changed most;
             of poses the root mean square.
+        stretch: How many times as far as a step the shared errors could go, no unit, 1 or more. So
+            much less than the derivatives say do the echoes determine them.
     """
 
     def __init__(
@@ -185,42 +104,60 @@ class Calibrator:
         self.poses = np.concatenate((echoes.training, echoes.validation))
         self.found = Calibration.none(optics.ears, len(echoes.positions))
         self.layer, self.scale = 0.0, 0.0
+        self._optics: dict[tuple[float, float], Optics] = {}
+        axis = np.array([0.0, 0.0, 1.0])
+        away = echoes.positions - (echoes.positions @ axis)[:, None] * axis
+        length = np.linalg.norm(away, axis=1, keepdims=True)
+        self._outward = away / np.maximum(length, 1e-12)  # (P, 3)
         unit_length = STEP * optics.wavelength
         reach = float(np.linalg.norm(echoes.positions - mesh.centroid, axis=1).mean())
         self.local = [
             *(_Column("position", unit_length, n) for n in range(3) if "position" in kinds),
             *(_Column("aim", TURN, n) for n in range(3) if "aim" in kinds),
         ]
-        self.shared = [_Column("gain", 0.0, n) for n in range(optics.ears) if "gain" in kinds]
+        # The level of recordings is not known, and every other error would take it up.
+        levels = "gain" in kinds or not echoes.calibrated
+        self.shared = [_Column("gain", 0.0, n) for n in range(optics.ears) if levels]
+        lengths = ("radius", "support")
+        self.shared += [_Column(name, unit_length) for name in lengths if name in kinds]
+        if "beam_radius" in kinds:
+            self.shared.append(_Column("beam_radius", STEP * optics.head.ears.beam_radius))
         if "range_offset" in kinds:
             self.shared.append(_Column("range_offset", unit_length))
         if "speed_of_sound" in kinds:
             self.shared.append(_Column("speed_of_sound", unit_length / reach))
-        if {"range_offset", "speed_of_sound"} & set(kinds):
+        if {"range_offset", "speed_of_sound", "radius"} & set(kinds):
             self.shared.append(_Column("layer", unit_length))
             self.shared.append(_Column("scale", unit_length / float(mesh.scale)))
+        if not self.local:
+            count = min(MOST_POSES, len(self.poses))
+            chosen = np.linspace(0, len(self.poses) - 1, count).round().astype(int)
+            self.poses = self.poses[chosen]
         # How far poses may be off, one standard deviation; learned from what is found.
         self.spread = {"position": optics.head.resolution / 2.0, "aim": 5.0 * TURN}
         self.weight = np.ones((optics.ears, 1, len(optics.frequencies)))
         self.error_db: list[float] = []
         self.deviation: dict[str, float] = {}
         self.change = math.inf
+        self.stretch = 1.0
 
     def step(self, shown: Callable[[], None] = lambda: None) -> float:
         """Do one step; return the error before it, dB. ``shown`` is called once per pose."""
         bodies = self._bodies()
+        if not self.error_db and not self.echoes.calibrated:
+            self.found.gain[:] = self._level(bodies[""])
         locals_, shareds = len(self.local), len(self.shared)
         size = locals_ + shareds
         total = np.zeros((shareds, shareds))
         towards = np.zeros(shareds)
-        kept = []
+        kept: list[tuple[int, Any, Floats, Floats]] = []
         errors, cost, cells = [], 0.0, 0.0
         sums = np.zeros((2, *self.weight.shape))
         for number in self.poses.tolist():
             residual, jacobian, active = self._linear(bodies, number)
             shown()
             if not active.any():
-                kept.append((number, np.zeros((locals_, size)), np.zeros(locals_)))
+                kept.append((number, np.zeros((locals_, size)), np.zeros(locals_), 0.0 * towards))
                 continue
             sums[0] += (np.abs(residual) * active).sum(axis=1, keepdims=True)
             sums[1] += active.sum(axis=1, keepdims=True)
@@ -235,28 +172,47 @@ class Calibrator:
             cells += float(len(r))
             total += normal[locals_:, locals_:]
             towards += right[locals_:]
-            kept.append((number, normal[:locals_], right[:locals_]))
+            kept.append((number, normal[:locals_], right[:locals_], right[locals_:]))
         self.error_db.append(float(np.mean(errors)) if errors else math.inf)
-        self._solve(kept, total, towards, cost / max(cells, 1.0) * self.dependent)
+        shared = self._solve(kept, total, towards, cost / max(cells, 1.0) * self.dependent)
+        self._move_all(shared)
+        if shareds:
+            self._go_on(shared)
         usual = sums[0] / np.maximum(sums[1], 1.0)
         usual = np.where(sums[1] > 0.0, usual, usual.max())
         power = np.maximum(usual, 0.25 * np.median(usual)) ** -TRUST
         self.weight = power / power.mean()
         return self.error_db[-1]
 
+    def _level(self, body: Body) -> Floats:
+        """Return how much louder the receivers are than the surface's echoes, (E,) logarithms."""
+        energy = np.zeros((2, self.optics.ears))
+        for number in self.poses[:: max(len(self.poses) // LEVEL_POSES, 1)].tolist():
+            pose = slice(number, number + 1)
+            at = self.echoes.positions[pose], self.echoes.rotations[pose]
+            rendered = body.render(*at, np.ones(1), np.zeros(1))[0]
+            for row, magnitude in enumerate((self.echoes.magnitude(number).numpy(), rendered)):
+                energy[row] += np.square(magnitude, dtype=np.float64).sum(axis=(1, 2))
+        return np.asarray(np.log(np.maximum(energy[0], 1e-300) / np.maximum(energy[1], 1e-300)) / 2)
+
     def _solve(
         self,
-        kept: list[tuple[int, Floats, Floats]],
+        kept: list[tuple[int, Any, Floats, Floats]],
         total: Floats,
         towards: Floats,
         noise: float,
-    ) -> None:
-        """Solve the normal equations, move all unknowns, and learn spreads and uncertainties."""
+    ) -> Floats:
+        """Solve the normal equations, move the poses, and learn spreads and uncertainties.
+
+        Returns:
+            shared (S,): Step of the shared errors.
+        """
         locals_ = len(self.local)
         prior = np.diag([noise / self.spread[column.name] ** 2 for column in self.local])
         reduced, right = total.copy(), towards.copy()
-        inverses = []
-        for _, normal, own in kept:
+        inverses: list[tuple[Floats, Floats, Floats]] = []
+        self.deviation = {}
+        for _, normal, own, _slope in kept:
             inverse = np.linalg.inv(normal[:, :locals_] + prior) if locals_ else np.zeros((0, 0))
             cross = normal[:, locals_:]
             # The prior pulls towards no error at all.
@@ -273,7 +229,7 @@ class Calibrator:
         steps: list[float] = []
         variances: dict[str, list[float]] = {"position": [], "aim": []}
         squares: dict[str, list[float]] = {"position": [], "aim": []}
-        for (number, _, _), (inverse, cross, now) in zip(kept, inverses, strict=True):
+        for (number, *_), (inverse, cross, now) in zip(kept, inverses, strict=True):
             if not locals_:
                 break
             step = inverse @ (now - cross @ shared)
@@ -290,10 +246,36 @@ class Calibrator:
         for name in {column.name for column in self.local}:
             self.deviation[name] = math.sqrt(float(np.mean(variances[name])))
             self.spread[name] = math.sqrt(float(np.mean(squares[name]) + np.mean(variances[name])))
-        self._move_all(shared)
-        for column, variance in zip(self.shared, np.diag(covariance), strict=True):
-            deviation = math.sqrt(max(noise * float(variance), 0.0))
+        spread = covariance @ self._scatter(kept, inverses) @ covariance
+        for column, variance, grouped in zip(
+            self.shared, np.diag(covariance), np.diag(spread), strict=True
+        ):
+            deviation = math.sqrt(max(noise * float(variance), float(grouped), 0.0))
             self.deviation[column.name] = max(self.deviation.get(column.name, 0.0), deviation)
+        return shared
+
+    def _scatter(
+        self,
+        kept: list[tuple[int, Any, Floats, Floats]],
+        inverses: list[tuple[Floats, Floats, Floats]],
+    ) -> Floats:
+        """Return the covariance of the sums of slopes over groups of neighbouring poses, (S, S).
+
+        What a surface does not explain is alike at poses that are neighbours, so that their cells
+        are no independent measurements.
+        """
+        numbers = np.array([each[0] for each in kept])
+        away = self.echoes.positions[numbers] - self.mesh.centroid
+        away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+        group = (away @ fibonacci_sphere(GROUPS).T).argmax(axis=1)
+        sums = np.zeros((GROUPS, len(self.shared)))
+        for index, ((_, _, _, slope), (inverse, cross, now)) in enumerate(
+            zip(kept, inverses, strict=True)
+        ):
+            sums[group[index]] += slope - cross.T @ inverse @ now
+        sums = sums[np.unique(group)]
+        sums -= sums.mean(axis=0)
+        return np.asarray(sums.T @ sums * len(sums) / max(len(sums) - 1, 1))
 
     def _local_values(self, number: int) -> Floats:
         return np.array(
@@ -313,50 +295,104 @@ class Calibrator:
         self.found.aim[number] = (Rotation.from_rotvec(turn) * before).as_rotvec()
 
     def _move_all(self, step: Floats) -> None:
-        gain = self.found.gain
-        offset, speed = self.found.range_offset, self.found.speed_of_sound
+        changed: dict[str, float] = {}
+        most = LARGEST_STEP * self.optics.head.resolution
         for column, value in zip(self.shared, step.tolist(), strict=True):
             if column.name == "gain":
-                gain[column.axis] += value
-            elif column.name == "range_offset":
-                offset += value
+                self.found.gain[column.axis] += value
+            elif column.name in ("layer", "scale"):
+                setattr(self, column.name, getattr(self, column.name) + value)
             elif column.name == "speed_of_sound":
-                speed += value
-            elif column.name == "layer":
-                self.layer += value
+                changed[column.name] = self.found.speed_of_sound + value
             else:
-                self.scale += value
-        self.found = Calibration(gain, offset, speed, self.found.position, self.found.aim)
+                bound = most if column.name != "beam_radius" else 10.0 * column.step
+                moved = min(max(value, -bound), bound)
+                changed[column.name] = getattr(self.found, column.name) + moved
+        for name, value in changed.items():
+            self.found = replace(self.found, **{name: value})  # type: ignore[arg-type]
+
+    def _go_on(self, step: Floats) -> None:
+        """Repeat a step, each time doubled, as long as the error falls."""
+        best, moved, doubled = self.error(), 1.0, 1.0
+        for _ in range(FARTHER):
+            self.stretch = max(self.stretch, moved)
+            before = (self.found, self.found.gain.copy(), self.layer, self.scale)
+            self._move_all(step)
+            error = self.error()
+            if error >= best:
+                self.found, gain, self.layer, self.scale = before
+                self.found.gain[:] = gain
+                return
+            moved += doubled
+            best, step, doubled = error, 2.0 * step, 2.0 * doubled
+
+    def error(self) -> float:
+        """Return the absolute difference of some poses over active cells, dB per measured one."""
+        kept, self.shared = self.shared, []
+        body = self._bodies()
+        self.shared = kept
+        chosen = self.poses[:: max(len(self.poses) // LEVEL_POSES, 1)].tolist()
+        total, count = 0.0, 0
+        if not self.error_db and not self.echoes.calibrated:
+            self.found.gain[:] = self._level(body[""])
+        for number in chosen:
+            residual, measured, active = self._linear(body, number, slopes=False)
+            total += float(np.abs(residual[active]).sum())
+            count += int((measured >= ACTIVE_DB).sum())
+        return total / count if count else math.inf
+
+    def _optics_of(self, support: float, beam_radius: float) -> Optics:
+        """Return the optics of a head whose support is higher and whose beam is wider, m."""
+        key = (support, beam_radius)
+        if key not in self._optics:
+            self._optics[key] = Optics(changed_head(self.optics.head, *key))
+        return self._optics[key]
 
     def _bodies(self) -> dict[str, Body]:
-        """Return the surface as it is, and changed as the unknowns of the surface do."""
+        """Return the surface as it is, and changed as the unknowns of surface and head do."""
         normals = np.array(self.mesh.vertex_normals)
-        middle = self.mesh.centroid
+        middle, found = self.mesh.centroid, self.found
+        self._optics = {(0.0, 0.0): self.optics}  # those of the step before go
 
-        def changed(layer: float, scale: float) -> Body:
+        def changed(layer: float, scale: float, support: float, beam_radius: float) -> Body:
+            optics = self._optics_of(support, beam_radius)
             places = (self.mesh.vertices - middle) * math.exp(scale) + middle + layer * normals
-            return Body(trimesh.Trimesh(places, self.mesh.faces, process=False), self.optics)
+            return Body(trimesh.Trimesh(places, self.mesh.faces, process=False), optics)
 
-        found = {"": changed(self.layer, self.scale)}
+        at = {
+            "layer": self.layer,
+            "scale": self.scale,
+            "support": found.support,
+            "beam_radius": found.beam_radius,
+        }
+        bodies = {"": changed(**at)}
         for column in self.shared:
-            if column.name == "layer":
-                found["layer"] = changed(self.layer + column.step, self.scale)
-            elif column.name == "scale":
-                found["scale"] = changed(self.layer, self.scale + column.step)
-        return found
+            if column.name in at:
+                moved = {**at, column.name: at[column.name] + column.step}
+                bodies[column.name] = changed(**moved)
+        return bodies
 
-    def _linear(self, bodies: dict[str, Body], number: int) -> tuple[Floats, Floats, Floats]:
-        """Return residual (E, R, F) dB, derivatives (U, E, R, F) and active cells of a pose."""
+    def _linear(
+        self, bodies: dict[str, Body], number: int, *, slopes: bool = True
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return residual (E, R, F) dB, derivatives (U, E, R, F) and active cells of a pose.
+
+        Without ``slopes`` what was measured (E, R, F) stands in their place.
+        """
+        unknowns = [*self.local, *self.shared] if slopes else []
         found = self.found
-        position = self.echoes.positions[number] + found.position[number]
+        outward = self._outward[number]
+        position = self.echoes.positions[number] + found.position[number] + found.radius * outward
         turned = Rotation.from_rotvec(found.aim[number]).as_matrix()
         rotation = turned @ self.echoes.rotations[number]
         positions, rotations, stretch, late = [position], [rotation], [0.0], [0.0]
-        for column in [*self.local, *self.shared]:
-            if column.name in ("gain", "layer", "scale"):
+        for column in unknowns:
+            if column.name in ("gain", "layer", "scale", *OF_HEAD):
                 continue
             along = np.eye(3)[column.axis] * column.step
-            moved = along if column.name == "position" else 0.0
+            moved = along if column.name == "position" else np.zeros(3)
+            if column.name == "radius":
+                moved = column.step * outward
             turn = along if column.name == "aim" else np.zeros(3)
             positions.append(position + moved)
             rotations.append(Rotation.from_rotvec(turn).as_matrix() @ rotation)
@@ -375,21 +411,26 @@ class Calibrator:
         a, b = _DB * np.log1p(measured / reference), compressed(rendered[0])
         columns, after = [], iter(rendered[1:])
         one = (positions[:1], rotations[:1], factors[:1], lates[:1])
-        for column in [*self.local, *self.shared]:
+        for column in unknowns:
             if column.name == "gain":
                 slope = -_DB * np.expm1(-b / _DB)
                 slope[np.arange(len(slope)) != column.axis] = 0.0
-            elif column.name in ("layer", "scale"):
+            elif column.name in ("layer", "scale", *OF_HEAD):
                 body = bodies[column.name].render(*(np.asarray(part) for part in one))[0]
                 slope = (compressed(body) - b) / column.step
             else:
                 slope = (compressed(next(after)) - b) / column.step
             columns.append(slope)
         active = (a >= ACTIVE_DB) | (b >= ACTIVE_DB)
-        return a - b, np.stack(columns), active
+        return a - b, np.stack(columns) if slopes else a, active
 
     def result(self) -> Estimate:
         """Return what was found so far."""
         names = {"layer", "scale"}
-        known = {name: value for name, value in self.deviation.items() if name not in names}
+        shared = {column.name for column in self.shared}
+        known = {
+            name: value * (self.stretch if name in shared else 1.0)
+            for name, value in self.deviation.items()
+            if name not in names
+        }
         return Estimate(self.found, known, list(self.error_db))

@@ -8,7 +8,11 @@ import pytest
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from sononerf.surface.refine.self_calibration import Body, Calibrator
+from sononerf.geometry.poses import cylinder_poses
+from sononerf.surface.refine.optics import Optics
+from sononerf.surface.refine.recording_errors import Body, changed_head
+from sononerf.surface.refine.self_calibration import Calibrator
+from sononerf.surface.refine.support_search import with_support
 from tests.memory import echoes_of
 from tests.surface.conftest import RADIUS
 
@@ -91,3 +95,44 @@ def test_without_errors_nothing_is_found(body, heard, optics):
     estimate = found(body, heard(), optics, "gain", "speed_of_sound", steps=2)
     assert np.abs(estimate.calibration.gain).max() < 1e-3
     assert abs(estimate.calibration.speed_of_sound) < 1e-4
+
+
+def turntable(optics, head, body, *, radius=0.0):
+    """What poses of a turntable hear with a head, stated with another head and another radius."""
+    poses = cylinder_poses(
+        24, radius=0.3, heights=(-0.1, 0.2), aim_jitter=0.0, generator=np.random.default_rng(0)
+    )
+    heard = Body(body, Optics(head)).render(
+        poses.positions, poses.rotations, np.ones(24), np.zeros(24)
+    )
+    stated = poses.positions * (1.0 + radius / 0.3 * np.array([1.0, 1.0, 0.0]))
+    return echoes_of(
+        optics.head, stated, poses.rotations, lambda pose: 2.0 * heard[pose],
+        np.zeros(24, dtype=int), origin="recorded",
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_radius_of_a_turntable_is_found(body, optics):
+    echoes = turntable(optics, optics.head, body, radius=0.001)
+    estimate = found(body, echoes, optics, "radius", steps=8)
+    assert estimate.calibration.radius == pytest.approx(-0.001, abs=0.0002)
+    assert estimate.deviation["radius"] < 0.002
+    np.testing.assert_allclose(estimate.calibration.gain, np.log(2.0), atol=0.05)
+
+
+@pytest.mark.slow
+def test_the_height_of_a_support_is_found(body, optics):
+    low, true = (with_support(optics.head, -1.2 * RADIUS + up) for up in (0.0, 0.0008))
+    standing = Optics(low)
+    echoes = turntable(standing, true, body)
+    estimate = found(body, echoes, standing, "support", steps=8)
+    assert estimate.calibration.support == pytest.approx(0.0008, abs=0.0002)
+
+
+@pytest.mark.slow
+def test_the_radius_of_the_emitter_is_found(body, optics):
+    true = changed_head(optics.head, 0.0, 0.3 * optics.head.ears.beam_radius)
+    estimate = found(body, turntable(optics, true, body), optics, "beam_radius", steps=8)
+    expected = 0.3 * optics.head.ears.beam_radius
+    assert estimate.calibration.beam_radius == pytest.approx(expected, rel=0.2)

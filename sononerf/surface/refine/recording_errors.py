@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: MIT
+"""Errors of a recording, and a surface as it is heard with them."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+import trimesh
+
+from sononerf.array_types import Floats, Singles
+from sononerf.head.head import Head
+from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
+from sononerf.surface.refine.optics import Optics
+from sononerf.surface.refine.visibility import listen, sight_of
+
+Kind = Literal[
+    "gain",
+    "range_offset",
+    "speed_of_sound",
+    "radius",
+    "support",
+    "beam_radius",
+    "position",
+    "aim",
+]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+OF_HEAD = ("support", "beam_radius")
+"""Errors of the head, whose change needs other tables."""
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Errors of a recording; zero where nothing is wrong.
+
+    Attributes:
+        gain (E,): Natural logarithm of how much too loud each receiver is.
+        range_offset (m): How much too far everything is heard.
+        speed_of_sound: Logarithm of the true speed over the assumed one.
+        radius (m): To be added to the distance of the poses from the turntable's axis.
+        support (m): How much higher the support is than assumed, along its normal.
+        beam_radius (m): To be added to the radius of the emitter.
+        position ((P, 3), m): To be added to the stated positions.
+        aim ((P, 3), rad): Rotation vectors, world frame, to be applied to the stated rotations.
+    """
+
+    gain: Floats
+    range_offset: float
+    speed_of_sound: float
+    position: Floats
+    aim: Floats
+    radius: float = 0.0
+    support: float = 0.0
+    beam_radius: float = 0.0
+
+    @classmethod
+    def none(cls, receivers: int, poses: int) -> Calibration:
+        """Return no errors."""
+        return cls(np.zeros(receivers), 0.0, 0.0, np.zeros((poses, 3)), np.zeros((poses, 3)))
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """What was found, and how well.
+
+    Attributes:
+        calibration: The errors.
+        deviation: One standard deviation of each kind: shared errors in their own unit; position
+            (m) and aim (rad) as the root mean square over poses and axes.
+        error_db: Mean absolute difference over active cells before each step, and after the last.
+    """
+
+    calibration: Calibration
+    deviation: dict[str, float]
+    error_db: list[float]
+
+
+class Body:
+    """A surface whose spectrograms are rendered for poses with errors.
+
+    Args:
+        mesh: m.
+        optics: The head.
+    """
+
+    def __init__(self, mesh: trimesh.Trimesh, optics: Optics) -> None:
+        self.optics = optics
+        like = optics.get_buffer("wavenumber")
+        faces = np.array(mesh.faces, dtype=np.int64)
+        self.vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
+        self.operators = MeshOperators(torch.as_tensor(faces).to(like.device), len(self.vertices))
+        self.area = self.operators.areas(self.vertices)
+        passes = smoothing_passes(optics.wavelength, self.operators.edge_length(self.vertices))
+        self.bending = self.operators.bending(self.vertices, unit(self.area), passes)
+        self.sight = sight_of(optics, self.vertices.cpu().numpy(), faces)
+
+    def render(
+        self, positions: Floats, rotations: Floats, stretch: Floats, late: Floats
+    ) -> Singles:
+        """Return magnitudes (P, E, R, F) on the whole axis.
+
+        Args:
+            positions, rotations ((P, 3), (P, 3, 3)): Of the heads, m.
+            stretch, late ((P,), (P,)): Factor on paths, and m added to them.
+        """
+        optics = self.optics
+        shape = (len(positions), optics.ears, optics.rows, len(optics.frequencies))
+        found = np.zeros(shape, dtype=np.float32)
+        places, turns = (torch.as_tensor(part).to(self.vertices) for part in (positions, rotations))
+        with torch.no_grad():
+            pieces, heads, middle = listen(
+                optics,
+                self.operators,
+                self.vertices,
+                self.area,
+                self.bending,
+                self.sight,
+                places,
+                turns,
+            )
+            if not len(pieces.pose):
+                return found
+            heard = optics.render(
+                (self.vertices - middle).float(),
+                self.area.float(),
+                pieces,
+                heads,
+                stretch=torch.as_tensor(stretch).to(heads.emitters),
+                late=torch.as_tensor(late).to(heads.emitters),
+            )
+        magnitude = heard.power.sqrt().cpu().numpy()
+        for one, rendered, row in zip(found, magnitude, heard.row.tolist(), strict=True):
+            first, last = max(row, 0), min(row + rendered.shape[1], optics.rows)
+            if last > first:
+                one[:, first:last] = rendered[:, first - row : last - row]
+        return found
+
+
+def changed_head(head: Head, support: float, beam_radius: float) -> Head:
+    """Return a head whose support is higher (m, along its normal) and whose beam is wider (m)."""
+    plane, ears = head.plane, head.ears
+    standing = head.support
+    if plane is not None:
+        point = np.asarray(plane.point) + support * np.asarray(plane.normal)
+        standing = standing.model_copy(update={"point": tuple(point.tolist())})
+    if beam_radius:
+        ears = ears.model_copy(update={"beam_radius": max(ears.beam_radius + beam_radius, 0.0)})
+    return dataclasses.replace(head, ears=ears, support=standing)

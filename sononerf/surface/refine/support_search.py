@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: MIT
+"""Where the support is that a body stands on, found from a surface that was fitted without it.
+
+A support is a mirror. Without it a fit takes the image for a part of the body that hangs below the
+support. The upper part of the surface is surely body. It is heard together with its image in
+supports at trial heights, and the height that explains the echoes best is the support's. What lies
+below the part is the same for all heights, so that it does not matter which of it is body.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+import trimesh
+
+from sononerf.array_types import Floats
+from sononerf.echoes.echoes import Echoes
+from sononerf.errors import InputError
+from sononerf.head.head import Head
+from sononerf.surface.refine.optics import Optics
+from sononerf.surface.refine.self_calibration import Calibrator
+
+UP = (0.0, 0.0, 1.0)
+"""Normal of a support that is looked for: a table is level."""
+CUTS = (0.4, 0.5, 0.6)
+"""Where the upper part begins, parts of the surface's height, no unit. A body and its image are
+equally high, so that the support is about the middle. The three answers differ by as much as the
+height is uncertain."""
+
+
+def with_support(head: Head, height: float) -> Head:
+    """Return a head above a level support at a height, m, world frame."""
+    given = {"point": (0.0, 0.0, height), "normal": UP}
+    return dataclasses.replace(head, support=head.support.model_copy(update=given))
+
+
+def above(mesh: trimesh.Trimesh, height: float) -> trimesh.Trimesh:
+    """Return the part of a mesh that lies above a height, m."""
+    kept = (np.asarray(mesh.triangles)[:, :, 2] > height).all(axis=1)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces[kept])
+
+
+def find_support(
+    mesh: trimesh.Trimesh, echoes: Echoes, shown: Callable[[float], None]
+) -> tuple[float, float]:
+    """Return the height of a level support and its standard deviation, m, world frame.
+
+    Args:
+        mesh: A surface that was fitted without a support, m.
+        echoes: What was measured.
+        shown: Called with the part of the work that is done.
+
+    Raises:
+        InputError: If the surface is flatter than the range resolution.
+    """
+    low, high = mesh.bounds[:, 2]
+    step = echoes.head.resolution / 2.0
+    if high - low < 8.0 * step:
+        raise InputError("the surface is too flat to tell what it stands on; measure the support")
+    found = []
+    for number, cut in enumerate(CUTS):
+        begin = low + cut * (high - low)
+        part = above(mesh, begin)
+        heights = np.arange(low - 2.0 * step, begin, step)
+        errors = []
+        for row, height in enumerate(heights.tolist()):
+            head = with_support(echoes.head, height)
+            heard = Echoes(echoes.store, head, echoes.hull)
+            work = Calibrator(part, heard, Optics(head), (), dependent=1.0)
+            errors.append(work.error())
+            shown((number + (row + 1) / len(heights)) / len(CUTS))
+        found.append(heights[0] + step * least(np.array(errors)))
+    spread = float(np.std(found, ddof=1))
+    return float(np.median(found)), math.hypot(spread, step / math.sqrt(12.0))
+
+
+def least(values: Floats) -> float:
+    """Return where a row of values (N,) is least, between two of them too."""
+    at = int(values.argmin())
+    if at in (0, len(values) - 1):
+        return float(at)
+    before, here, after = values[at - 1 : at + 2].tolist()
+    bend = before - 2.0 * here + after
+    return at + (0.5 * (before - after) / bend if math.isfinite(bend) and bend > 0.0 else 0.0)

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: MIT
+"""A support that a fit did not know is found from the image below the body."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from sononerf.errors import InputError
+from sononerf.geometry.poses import cylinder_poses
+from sononerf.surface.refine.optics import Optics
+from sononerf.surface.refine.recording_errors import Body
+from sononerf.surface.refine.support_search import find_support, least, with_support
+from tests.memory import echoes_of
+from tests.surface.conftest import RADIUS
+
+HEIGHT = -1.1 * RADIUS
+
+
+@pytest.fixture(scope="module")
+def body():
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    way = np.asarray(mesh.vertices) / RADIUS
+    bump = 1.0 + 0.12 * np.sin(5 * way[:, 0]) * np.cos(4 * way[:, 1] + 1)
+    return trimesh.Trimesh(RADIUS * bump[:, None] * way, mesh.faces, process=False)
+
+
+@pytest.fixture
+def heard(body, optics):
+    """Poses of a turntable that hear the body and its image, in recordings of unknown level."""
+    standing = Optics(with_support(optics.head, HEIGHT))
+    poses = cylinder_poses(
+        12, radius=0.3, heights=(0.0, 0.2), aim_jitter=0.0, generator=np.random.default_rng(0)
+    )
+    still, late = np.ones(12), np.zeros(12)
+    magnitude = 0.3 * Body(body, standing).render(poses.positions, poses.rotations, still, late)
+    return echoes_of(
+        optics.head,
+        poses.positions,
+        poses.rotations,
+        lambda pose: magnitude[pose],
+        np.zeros(12, dtype=int),
+        origin="recorded",
+    )
+
+
+@pytest.mark.slow
+def test_it_is_found_below_a_body_and_its_image(body, heard):
+    image = trimesh.Trimesh(
+        body.vertices * [1, 1, -1] + [0, 0, 2 * HEIGHT], body.faces[:, ::-1], process=False
+    )
+    shares = []
+    height, deviation = find_support(trimesh.util.concatenate([body, image]), heard, shares.append)
+    resolution = heard.head.resolution
+    # The body is two range resolutions wide.
+    assert height == pytest.approx(HEIGHT, abs=0.5 * resolution)
+    assert 0.1 * resolution < deviation < resolution
+    assert shares == sorted(shares)
+    assert shares[-1] == 1.0
+
+
+def test_a_flat_surface_is_refused(heard):
+    plate = trimesh.creation.box((0.05, 0.05, 0.004))
+    with pytest.raises(InputError, match="too flat to tell what it stands on"):
+        find_support(plate, heard, lambda share: None)
+
+
+def test_the_least_value_lies_between_those_of_a_parabola():
+    at = np.arange(6.0)
+    assert least((at - 2.3) ** 2) == pytest.approx(2.3)
+    assert least(at) == 0.0
+    assert least(-at) == 5.0
