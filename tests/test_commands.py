@@ -21,7 +21,7 @@ SMALL = (
     *("poses.count=24", "poses.validation=2", "poses.heldout=2", "simulation.rays=2000"),
     *("simulation.noise_floor_poses=0", "fit.epochs=2", "fit.steps_per_epoch=20"),
 )
-FITTED = ("fit.epochs=4", "reconstruction.refine=false")
+FITTED = ("fit.epochs=2", "reconstruction.refine=false")
 """Settings that make the commands of the pages short; what is imported has no simulation."""
 
 

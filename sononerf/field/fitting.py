@@ -42,15 +42,18 @@ def quiet_lightning() -> None:
         warnings.filterwarnings("ignore", message=pattern)
 
 
+def has_accelerator() -> bool:
+    """Tell whether there is a GPU that torch can use."""
+    return bool(torch.cuda.is_available() or torch.backends.mps.is_available())
+
+
 def require_accelerator(accelerator: str) -> None:
     """Refuse a GPU that is not there.
 
     Raises:
         ResourceError: If ``gpu`` was asked for and there is none.
     """
-    if accelerator == "gpu" and not (
-        torch.cuda.is_available() or torch.backends.mps.is_available()
-    ):
+    if accelerator == "gpu" and not has_accelerator():
         raise ResourceError("no GPU that torch can use; take --accelerator cpu, or auto")
 
 

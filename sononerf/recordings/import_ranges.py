@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.array_types import Floats
+from sononerf.echoes.detection import MOST_POSES
 from sononerf.echoes.region import echo_extent
 from sononerf.errors import InputError
 from sononerf.head.call import call_waveform, covered, sweep_delay
@@ -152,6 +153,17 @@ ASKED = 64
 """So many pings, evenly over all, are asked for ranges and noise."""
 
 
+def analysis_bytes(head: Head) -> float:
+    """Return the memory that the analysis of one ping takes, bytes: its frames and products."""
+    frame = head.analysis.window + 4 * len(head.frequency)
+    return 8.0 * len(head.receivers) * len(head.range) * frame
+
+
+def kept_bytes(head: Head, pings: int) -> float:
+    """Return the memory that the powers over range of some pings take, with working copies."""
+    return 6 * 8.0 * len(head.receivers) * len(head.range) * min(pings, MOST_POSES)
+
+
 def found_ranges(
     head: Head,
     cutter: Cutter,
@@ -215,9 +227,8 @@ def found_ranges(
     long_enough = np.flatnonzero(lengths >= count)
     asked = np.linspace(0, len(long_enough) - 1, min(ASKED, len(long_enough))).round().astype(int)
     pings = long_enough[np.unique(asked)]
-    values = analysis.window + 4 * len(head.frequency)  # per frame: samples and products
     require_memory(
-        8.0 * len(head.receivers) * len(wide.range) * (values + 6 * len(pings)),
+        analysis_bytes(wide) + kept_bytes(wide, len(pings)),
         f"{recording.path}: the analysis of {high:.3g} m of range",
         "set spectrogram.range_max",
     )

@@ -28,7 +28,7 @@ from sononerf.evaluation.traced import Traced, learn_traced
 from sononerf.field.checkpoint_io import previous_of, save_weights
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import fit as fit_field
-from sononerf.field.fitting import require_accelerator
+from sononerf.field.fitting import has_accelerator, require_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.field.step_cost import StepCost, step_cost
 from sononerf.memory import gigabytes, require_memory
@@ -274,7 +274,8 @@ def _fit(
     )
     total = data.steps_per_epoch * settings.fit.epochs
     total = min(total, settings.fit.max_steps or total)
-    _announce(step_cost(module, data), echoes, settings, total, progress)
+    if hardware["accelerator"] == "cpu" or not has_accelerator():
+        _announce(step_cost(module, data), echoes, settings, total, progress)
     resumed = _can_resume(run)
     if not resumed and not follows():
         run.clear_previews()

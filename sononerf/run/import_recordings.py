@@ -7,6 +7,7 @@ import hashlib
 import json
 import logging
 import tempfile
+import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError
 from sononerf.head.attached import attach
 from sononerf.head.reception import warn_of_call
-from sononerf.progress import Progress
+from sononerf.progress import Progress, duration
 from sononerf.recordings.channel_check import Channel, faults_of_channels
 from sononerf.recordings.conventions import original_frame
 from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses, shifted
@@ -36,6 +37,8 @@ logger = logging.getLogger("sononerf")
 SHOWN = 3  # pings in a picture
 NOT_HASHED = ("source", "licence")
 """What does not change the echoes."""
+WRITTEN_SECONDS = 0.01
+"""Time to write one ping durably, s, on a usual disk."""
 COARSER = 1.5
 """Range resolution over that of an impulse, no unit, from which on pulse compression is proposed:
 less would hardly be seen."""
@@ -250,6 +253,7 @@ def describe(known: Understood) -> list[str]:
         f"{1e3 * (axis[1] - axis[0]) if len(axis) > 1 else 0.0:.2f} mm",
         f"frequency:  {frequency[0] / 1e3:.1f} to {frequency[-1] / 1e3:.1f} kHz in "
         f"{len(frequency)} bins (window {analysis.window}, hop {analysis.hop}, fft {analysis.fft})",
+        _cost_line(known),
         *(_channel_line(number, channel) for number, channel in enumerate(known.channels)),
     ]
     of_impulse = replace(known.head, call=CallSettings())
@@ -264,6 +268,17 @@ def describe(known: Understood) -> list[str]:
         lines.append(f"calibration: {json.dumps(applied)}")
     faults = [f"warning:    {fault}" for fault in faults_of_channels(known.channels)]
     return [*lines, *(f"note:       {note}" for note in known.notes), *faults]
+
+
+def _cost_line(known: Understood) -> str:
+    """Say how large the store becomes and how long the import takes, measured on one ping."""
+    begun = time.monotonic()
+    heard = spectrogram_of(known, int(known.pings[0]))
+    seconds = len(known.pings) * (time.monotonic() - begun + WRITTEN_SECONDS)
+    return (
+        f"store:      {1e-6 * len(known.pings) * heard.nbytes:,.0f} MB at most, in about "
+        f"{duration(seconds)}"
+    )
 
 
 def _channel_line(number: int, channel: Channel) -> str:

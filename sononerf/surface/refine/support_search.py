@@ -25,10 +25,14 @@ from sononerf.surface.refine.self_calibration import Calibrator
 
 UP = (0.0, 0.0, 1.0)
 """Normal of a support that is looked for: a table is level."""
-CUTS = (0.4, 0.5, 0.6)
-"""Where the upper part begins, parts of the surface's height, no unit. A body and its image are
-equally high, so that the support is about the middle. The three answers differ by as much as the
-height is uncertain."""
+MIDDLE = 0.5
+"""Where the upper part first begins, parts of the surface's height, no unit: a body and its image
+are equally high."""
+CUTS = (1.0, 2.0, 3.0)
+"""Where it begins then: so far above the first answer, range resolutions. The lower the better, as
+long as none of it is the image; the answers differ by as much as the height is uncertain."""
+NEAR = 3.0
+"""The second search reaches so far around the first answer, range resolutions."""
 
 
 def with_support(head: Head, height: float) -> Head:
@@ -60,19 +64,25 @@ def find_support(
     step = echoes.head.resolution / 2.0
     if high - low < 8.0 * step:
         raise InputError("the surface is too flat to tell what it stands on; measure the support")
+
+    def search(begin: float, heights: Floats, first: float, last: float) -> float:
+        part, errors = above(mesh, begin), []
+        for row, height in enumerate(heights.tolist()):
+            heard = Echoes(echoes.store, with_support(echoes.head, height), echoes.hull)
+            work = Calibrator(part, heard, Optics(heard.head), (), dependent=1.0)
+            errors.append(work.error())
+            shown(first + (last - first) * (row + 1) / len(heights))
+        return float(heights[0] + step * least(np.array(errors)))
+
+    middle = low + MIDDLE * (high - low)
+    about = search(middle, np.arange(low - 2.0 * step, middle, step), 0.0, 0.4)
+    reach = 2.0 * step * NEAR
     found = []
     for number, cut in enumerate(CUTS):
-        begin = low + cut * (high - low)
-        part = above(mesh, begin)
-        heights = np.arange(low - 2.0 * step, begin, step)
-        errors = []
-        for row, height in enumerate(heights.tolist()):
-            head = with_support(echoes.head, height)
-            heard = Echoes(echoes.store, head, echoes.hull)
-            work = Calibrator(part, heard, Optics(head), (), dependent=1.0)
-            errors.append(work.error())
-            shown((number + (row + 1) / len(heights)) / len(CUTS))
-        found.append(heights[0] + step * least(np.array(errors)))
+        begin = about + 2.0 * step * cut
+        heights = np.arange(about - reach, min(begin, about + reach), step)
+        share = 0.4 + 0.6 * np.array([number, number + 1]) / len(CUTS)
+        found.append(search(begin, heights, *share))
     spread = float(np.std(found, ddof=1))
     return float(np.median(found)), math.hypot(spread, step / math.sqrt(12.0))
 
