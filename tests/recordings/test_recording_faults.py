@@ -204,9 +204,10 @@ FAULTS = {
     "other background": (background(rate=192_000), r"empty\.wav: 4 channels at 192000 Hz"),
     "background of a channel": (background(channels=1), r"empty\.wav: 1 channels"),
     "time-expanded": (every(lambda s: s, 40_000), r"frequency_max.*sampling_rate|above half"),
-    "no call": (
-        settings(("call:\n  {kind: linear", "call:\n  {kind: file, file: call.wav, kind2: x")),
-        r"call",
+    "no call": (lambda f: (f / "call.wav").unlink(), r"call\.wav: no such file"),
+    "silent call": (
+        lambda f: wavfile.write(f / "call.wav", RATE, np.zeros(400, "int16")),
+        r"call\.wav: is silent",
     ),
     # Tables.
     "no unit": (renamed(x_mm="x"), r"column x has no unit; name it x_m or set import\.length"),

@@ -191,8 +191,7 @@ ears:
   receivers: [[0, -0.02, 0], [0, 0.02, 0], [0, 0, -0.02], [0, 0, 0.02]]
   directivity: omnidirectional
   beam_radius: 0
-call:
-  {{kind: linear, duration: {DURATION}, frequency_start: {HIGH}, frequency_end: {LOW}}}
+call: {{kind: file, file: call.wav}}
 spectrogram: {{frequency_min: {LOW}, frequency_max: {HIGH}}}
 import: {{frame: ned, quaternion: wxyz, compress: true}}
 """
@@ -223,6 +222,7 @@ def write_folder(folder, count=120, seed=0):
     for name, heard in zip(names, waveforms(places, rotations, seed), strict=True):
         wavfile.write(folder / name, RATE, np.round(32767.0 * heard).astype(np.int16).T)
     (folder / "poses.csv").write_text(table(places, rotations, names, "file"))
+    wavfile.write(folder / "call.wav", RATE, np.round(32767.0 * sweep()).astype(np.int16))
     (folder / "import.yaml").write_text(SETTINGS)
 
 
@@ -238,4 +238,5 @@ def write_long(folder, count=120, seed=0):
     wavfile.write(folder / "flight.wav", RATE, samples)
     times = [f"{begin / RATE:.9f}" for begin in begins]
     (folder / "poses.csv").write_text(table(places, rotations, times, "time_s"))
+    wavfile.write(folder / "call.wav", RATE, np.round(32767.0 * sweep()).astype(np.int16))
     (folder / "import.yaml").write_text(SETTINGS)

@@ -46,7 +46,7 @@ def test_the_right_ear_fits_better(tmp_path):
 
     places = "ears.receivers=[[0, 0.01, 0.002], [0, -0.01, 0.002]]"
     run(
-        *("simulate", "scene.name=three_spheres", "poses.count=60", "simulation.rays=20000"),
+        *("simulate", "scene.name=three_spheres", "poses.count=40", "simulation.rays=5000"),
         *("simulation.noise_floor_poses=0", "ears.directivity=file", "ears.file=right.sofa"),
         *(places, "--output", "direct", "--waveforms", "recordings"),
     )
@@ -54,7 +54,7 @@ def test_the_right_ear_fits_better(tmp_path):
     for name in ("right.sofa", "right.mat", "right.csv", "wrong.csv"):
         run("import", "recordings", "recordings", f"ears.file={name}", "--output", f"s-{name}")
         run(
-            *("fit", f"data.store=s-{name}", "fit.epochs=8", "prediction.traced=off"),
+            *("fit", f"data.store=s-{name}", "fit.epochs=3", "prediction.traced=off"),
             *("reconstruction.refine=false", "--output", f"r-{name}"),
         )
         metrics = json.loads((tmp_path / f"r-{name}/metrics.json").read_text())
