@@ -344,6 +344,11 @@ def describe(
         lines.append(f"{name + ':':15s} {1e3 * now:.1f} ± {1e3 * uncertain:.1f} mm")
         if uncertain > DETERMINED_RESOLUTIONS * resolution:
             warnings.append(f"{kind}: the echoes hardly determine it; measure it")
+    if "radius" in kinds:
+        warnings.append(
+            "radius: a surface that was fitted to a wrong radius hears nearly the same, and takes "
+            "up most of the error; the stated uncertainty does not hold unless the surface is known"
+        )
     if "radius" in kinds and "range_offset" in kinds:
         warnings.append(
             "radius and range_offset together: near and far poses alone tell them apart; their sum "

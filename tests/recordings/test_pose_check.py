@@ -22,6 +22,11 @@ ORDERS = {"yxz": "yxz", "zyx": "zyx", "xzy": "xzy", "yzx": "zxy", "zxy": "yzx"}
 """Where the columns were moved, and the name of how they go back."""
 
 
+def few(seeds, often):
+    """Return the seeds; those after the first ones are for the long tests."""
+    return [seed if seed < often else pytest.param(seed, marks=pytest.mark.slow) for seed in seeds]
+
+
 def scaled(columns, names, factor):
     values = {**columns.values, **{name: factor * columns.values[name] for name in names}}
     return Columns("t", values, {}, None, columns.units)
@@ -42,7 +47,7 @@ def verdict(columns, first, *, ears=EARS, settings=PLAIN):
     )
 
 
-@pytest.mark.parametrize("seed", range(30))
+@pytest.mark.parametrize("seed", few(range(30), 8))
 def test_clean_sets_raise_no_alarm(seed):
     rng = np.random.default_rng(seed)
     poses = poses_of(rng, (*KINDS, "table")[seed % 4])
@@ -60,7 +65,10 @@ FAULTS = (
     "time offset",
     "reversed turntable",
 )
-CASES = [(FAULTS[number % len(FAULTS)], number) for number in range(30)]
+CASES = [
+    pytest.param(FAULTS[n % len(FAULTS)], n, marks=[pytest.mark.slow] if n >= 8 else [])
+    for n in range(30)
+]
 
 
 @pytest.mark.parametrize(("fault", "seed"), CASES)
@@ -91,7 +99,7 @@ def test_distortions_are_named(fault, seed):
     assert "\n" not in found.message
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", few(range(12), 3))
 @pytest.mark.parametrize(("step", "name"), [(1, "the row after"), (-1, "the row before")])
 def test_pings_off_by_one_are_named(seed, step, name):
     rng = np.random.default_rng(200 + seed)
@@ -103,7 +111,7 @@ def test_pings_off_by_one_are_named(seed, step, name):
     assert "off by one" in found.message
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", few(range(8), 3))
 def test_a_wrong_sampling_rate_is_named(seed):
     """Poses at several distances tell how long ranges are."""
     rng = np.random.default_rng(400 + seed)
@@ -117,7 +125,7 @@ def test_a_wrong_sampling_rate_is_named(seed):
     assert "import.sampling_rate" in found.message
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", few(range(6), 3))
 def test_swapped_channels_are_named(seed):
     rng = np.random.default_rng(500 + seed)
     poses = poses_of(rng, KINDS[seed % 3])
@@ -131,7 +139,7 @@ def test_swapped_channels_are_named(seed):
     assert "import.channels" in found.message
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", few(range(12), 3))
 def test_a_shuffled_table_is_named(seed):
     rng = np.random.default_rng(300 + seed)
     poses = poses_of(rng, KINDS[seed % 3])

@@ -6,12 +6,15 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sononerf.head.directivity.sofa import write_sofa
 from tests.head.directivity.patterns import FREQUENCY, pair, sononerf_fields, write_v5
+
+SHARPER = 4
 
 
 def write_csv(path, ears, order=(0, 1)):
@@ -32,8 +35,14 @@ def write_csv(path, ears, order=(0, 1)):
 @pytest.mark.slow
 def test_the_right_ear_fits_better(tmp_path):
     ears = pair(beam=False)
+    # Narrow lobes, so that much depends on them.
+    ears = replace(ears, gains=ears.gains**SHARPER)
+    sides = sononerf_fields()["array_struct"]
+    for side in ("left_struct", "right_struct"):
+        table = sides[side]["hrtf_gridded_array"]
+        sides[side] = {**sides[side], "hrtf_gridded_array": table**SHARPER}
     write_sofa(tmp_path / "right.sofa", ears)
-    write_v5(tmp_path / "right.mat", sononerf_fields())
+    write_v5(tmp_path / "right.mat", {"array_struct": sides})
     write_csv(tmp_path / "right.csv", ears)
     write_csv(tmp_path / "wrong.csv", ears, (1, 0))
 
