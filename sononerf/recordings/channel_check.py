@@ -14,10 +14,10 @@ from sononerf.recordings.audio import Recording
 from sononerf.recordings.pings import mix
 from sononerf.settings.import_schema import Channels
 
-DEAF = 0.25
+DEAF = 0.35
 """A channel counts as deaf if it heard echoes in less than this fraction of the pings in which
 another channel heard one, no unit. Receivers beside one another hear the same body, and noise that
-was pulse-compressed gives a false echo in up to a tenth of the pings."""
+was pulse-compressed gives a false echo in up to a quarter of the pings."""
 FAINT_DB = 40.0
 """A channel counts as faint if its echoes are weaker than the strongest channel's by more, dB: ears
 that look apart differ by 20 to 30 dB."""
