@@ -56,7 +56,7 @@ SHUFFLED = 0.6
 log-likelihood per ping. The largest gain of 40 shuffled sets was 0.33; right poses gain 2 or
 more."""
 MOST_CHANNELS = 8
-"""So many channels, at most, are swapped in pairs: 28 pairs take some seconds."""
+"""Number of channels, at most, that are swapped in pairs: 28 pairs take some seconds."""
 RANGE_FACTORS = tuple(float(f) for f in np.exp(np.linspace(-0.6, 0.6, 13)) if abs(f - 1.0) > 0.01)
 """Factors of all ranges, 10 % apart: those of a wrong sampling rate or speed of sound."""
 RANGES_CLEARLY = 0.5

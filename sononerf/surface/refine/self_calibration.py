@@ -47,8 +47,8 @@ LEVEL_POSES = 50
 """Number of poses that the level of a recording is first taken from, and that errors are compared
 on; steps improve it."""
 MOST_POSES = 60
-"""Number of poses, at most and evenly, that errors are taken from which all poses share. So many
-determine them better than the surface is known."""
+"""Number of poses, at most, from which the errors that all poses share are found. More poses do not
+help, because the surface is known less well than this number of poses determines the errors."""
 GROUPS = 12
 """Number of groups of neighbouring poses that uncertainties are taken from: each sees the surface
 from another side."""
