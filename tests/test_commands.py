@@ -15,6 +15,7 @@ import pytest
 from sononerf.head.call import call_waveform
 from sononerf.recordings.audio import wav_bytes
 from sononerf.settings.schema import CallSettings
+from tests.command import succeed
 
 ROOT = Path(__file__).resolve().parent.parent
 SMALL = (
@@ -63,11 +64,7 @@ def test_the_commands_of_a_page_run(page, tmp_path):
         given = shortened(words)
         if given[1] == "fit" and "--output" not in given:
             given += ["--output", f"run{(runs := runs + 1)}"]
-        done = subprocess.run(
-            [sys.executable, "-m", "sononerf.cli", *given[1:]],
-            cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, f"{given}\n{done.stderr}"
+        succeed(tmp_path, *given[1:])
     for block in blocks:
         done = subprocess.run(
             [sys.executable, "-c", block], cwd=tmp_path, capture_output=True, text=True, timeout=300

@@ -25,7 +25,8 @@ def run(code):
 
 @pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="Linux alone has such a limit")
 @pytest.mark.parametrize(
-    "allocation", ["numpy.ones(free // 4)", "torch.ones(free // 2, dtype=torch.float32)"]
+    "allocation",
+    ["numpy.zeros(free // 16)", "torch.empty(free // 8, dtype=torch.float32)"],
 )
 def test_more_memory_than_there_is_gives_one_line(allocation):
     """NumPy and torch fail where the system would else kill the process."""
@@ -36,7 +37,7 @@ def test_more_memory_than_there_is_gives_one_line(allocation):
         "free = available_memory()\n"
         "try:\n"
         "    with memory_limited():\n"
-        f"        {allocation}\n"
+        f"        kept = [{allocation} for _ in range(4)]  # untouched, twice what is free\n"
         "except ResourceError as error:\n"
         "    print(error, error.exit_code)\n"
     )

@@ -4,13 +4,13 @@
 from __future__ import annotations
 
 import re
-import subprocess
-import sys
+from functools import partial
 
 import numpy as np
 import pytest
 import trimesh
 
+from tests.command import succeed
 from tests.recordings.two_spheres import GAP, RADIUS, centres, write_folder
 
 
@@ -32,14 +32,7 @@ def test_from_wav_and_csv_to_two_spheres(tmp_path):
         "data: {store: store}\nevaluation: {truth: truth.stl, unit: mm}\n"
     )
 
-    def run(*words):
-        found = subprocess.run(
-            [sys.executable, "-m", "sononerf.cli", *words],
-            cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False,
-        )  # fmt: skip
-        assert found.returncode == 0, found.stderr
-        return found.stderr
-
+    run = partial(succeed, tmp_path)
     assert "no other convention" in run(
         "import", "recordings", "recordings", "--output", "store", "--dry-run"
     )

@@ -37,6 +37,7 @@ from sononerf.surface.refine.recording_errors import (
     Estimate,
     Kind,
     changed_head,
+    outward,
 )
 from sononerf.surface.refine.self_calibration import Calibrator
 from sononerf.surface.refine.support_search import above, find_support, with_support
@@ -213,12 +214,13 @@ def _write(
         sections["air"] = {**sections["air"], "speed_of_sound": speed}
         sections["spectrogram"] = {**sections["spectrogram"], **limits}
     turned = Rotation.from_rotvec(found.aim).as_matrix()
+    positions = store.positions + found.position + found.radius * outward(store.positions)
     earlier = store.attributes
     kept = ("origin", "source", "licence", "format", "units", "import", *KEYS)
     with storage.lock(output):
         made = EnsembleStore.create(
             output,
-            poses_positions=store.positions + found.position + found.radius * outward(store),
+            poses_positions=positions,
             poses_rotations=turned @ store.rotations,
             split=store.split,
             range=axis,
@@ -269,12 +271,6 @@ def moved(magnitude: NDArray[np.floating], axis: NDArray[np.floating], offset: f
     last = len(axis) - 1
     low, high = (magnitude[:, np.clip(first + more, 0, last)] for more in (0, 1))
     return np.asarray((1.0 - part) * low + part * high, dtype=np.float64)
-
-
-def outward(store: Ensemble) -> Floats:
-    """Return the directions from the z axis to the poses, (P, 3) unit vectors."""
-    away = store.positions * np.array([1.0, 1.0, 0.0])
-    return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
 
 
 def _fingerprint(found: Calibration) -> str:

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from sononerf.head.directivity.sofa import write_sofa
+from tests.command import succeed
 from tests.head.directivity.patterns import FREQUENCY, pair, sononerf_fields, write_v5
 
 SHARPER = 4
@@ -46,13 +46,7 @@ def test_the_right_ear_fits_better(tmp_path):
     write_csv(tmp_path / "right.csv", ears)
     write_csv(tmp_path / "wrong.csv", ears, (1, 0))
 
-    def run(*words):
-        done = subprocess.run(
-            [sys.executable, "-m", "sononerf.cli", *words],
-            cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-
+    run = partial(succeed, tmp_path)
     places = "ears.receivers=[[0, 0.01, 0.002], [0, -0.01, 0.002]]"
     run(
         *("simulate", "scene.name=three_spheres", "poses.count=40", "simulation.rays=5000"),

@@ -41,6 +41,15 @@ def ball():
 
 
 @pytest.fixture(scope="session")
+def bumpy():
+    """A bumpy sphere: a round one tells no lateral shift."""
+    mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
+    way = np.asarray(mesh.vertices) / RADIUS
+    bump = 1.0 + 0.12 * np.sin(5 * way[:, 0]) * np.cos(4 * way[:, 1] + 1)
+    return trimesh.Trimesh(RADIUS * bump[:, None] * way, mesh.faces, process=False)
+
+
+@pytest.fixture(scope="session")
 def optics(settings):
     return Optics(head_of(settings))
 

@@ -139,6 +139,12 @@ class Body:
         return found
 
 
+def outward(positions: Floats) -> Floats:
+    """Return the directions from the z axis to places (P, 3), m, as unit vectors (P, 3)."""
+    away = positions * np.array([1.0, 1.0, 0.0])
+    return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
+
+
 def changed_head(head: Head, support: float, beam_radius: float) -> Head:
     """Return a head whose support is higher (m, along its normal) and whose beam is wider (m)."""
     plane, ears = head.plane, head.ears

@@ -38,14 +38,15 @@ from sononerf.surface.refine.recording_errors import (
     Estimate,
     Kind,
     changed_head,
+    outward,
 )
 
 STEP = 0.02
 """Length of a finite difference, shortest wavelengths: small against interference, large against
 rounding."""
 LEVEL_POSES = 50
-"""Number of poses that the level of a recording is first taken from, and that errors are compared
-on; steps improve it."""
+"""Number of poses from which the first level of a recording is taken, and on which errors are
+compared. Later steps improve the level."""
 MOST_POSES = 60
 """Number of poses, at most, from which the errors that all poses share are found. More poses do not
 help, because the surface is known less well than this number of poses determines the errors."""
@@ -86,8 +87,8 @@ class Calibrator:
     Attributes:
         change: Length of the last step over one standard deviation, of the error that changed most;
             of poses the root mean square.
-        stretch: How many times as far as a step the shared errors could go, no unit, 1 or more. So
-            much less than the derivatives say do the echoes determine them.
+        stretch: Largest distance that the shared errors went, over the step that the derivatives
+            gave, no unit, 1 or more. Uncertainties are multiplied by it.
     """
 
     def __init__(
@@ -105,10 +106,7 @@ class Calibrator:
         self.found = Calibration.none(optics.ears, len(echoes.positions))
         self.layer, self.scale = 0.0, 0.0
         self._optics: dict[tuple[float, float], Optics] = {}
-        axis = np.array([0.0, 0.0, 1.0])
-        away = echoes.positions - (echoes.positions @ axis)[:, None] * axis
-        length = np.linalg.norm(away, axis=1, keepdims=True)
-        self._outward = away / np.maximum(length, 1e-12)  # (P, 3)
+        self._outward = outward(echoes.positions)
         unit_length = STEP * optics.wavelength
         reach = float(np.linalg.norm(echoes.positions - mesh.centroid, axis=1).mean())
         self.local = [
@@ -143,7 +141,7 @@ class Calibrator:
 
     def step(self, shown: Callable[[], None] = lambda: None) -> float:
         """Do one step; return the error before it, dB. ``shown`` is called once per pose."""
-        bodies = self._bodies()
+        bodies = self._bodies(self.shared)
         if not self.error_db and not self.echoes.calibrated:
             self.found.gain[:] = self._level(bodies[""])
         locals_, shareds = len(self.local), len(self.shared)
@@ -328,9 +326,7 @@ class Calibrator:
 
     def error(self) -> float:
         """Return the absolute difference of some poses over active cells, dB per measured one."""
-        kept, self.shared = self.shared, []
-        body = self._bodies()
-        self.shared = kept
+        body = self._bodies([])
         chosen = self.poses[:: max(len(self.poses) // LEVEL_POSES, 1)].tolist()
         total, count = 0.0, 0
         if not self.error_db and not self.echoes.calibrated:
@@ -348,8 +344,8 @@ class Calibrator:
             self._optics[key] = Optics(changed_head(self.optics.head, *key))
         return self._optics[key]
 
-    def _bodies(self) -> dict[str, Body]:
-        """Return the surface as it is, and changed as the unknowns of surface and head do."""
+    def _bodies(self, unknowns: list[_Column]) -> dict[str, Body]:
+        """Return the surface as it is, and changed as unknowns of surface and head do."""
         normals = np.array(self.mesh.vertex_normals)
         middle, found = self.mesh.centroid, self.found
         self._optics = {(0.0, 0.0): self.optics}  # those of the step before go
@@ -366,7 +362,7 @@ class Calibrator:
             "beam_radius": found.beam_radius,
         }
         bodies = {"": changed(**at)}
-        for column in self.shared:
+        for column in unknowns:
             if column.name in at:
                 moved = {**at, column.name: at[column.name] + column.step}
                 bodies[column.name] = changed(**moved)

@@ -19,24 +19,15 @@ from tests.surface.conftest import RADIUS
 COUNT = 14
 
 
-@pytest.fixture(scope="module")
-def body():
-    """A bumpy sphere: a round one tells no lateral shift."""
-    mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
-    way = np.asarray(mesh.vertices) / RADIUS
-    bump = 1.0 + 0.12 * np.sin(5 * way[:, 0]) * np.cos(4 * way[:, 1] + 1)
-    return trimesh.Trimesh(RADIUS * bump[:, None] * way, mesh.faces, process=False)
-
-
 @pytest.fixture
-def heard(body, optics, poses):
-    """What poses at several distances hear of the body, with errors."""
+def heard(bumpy, optics, poses):
+    """What poses at several distances hear of the bumpy, with errors."""
 
     def make(*, gain=(0.0, 0.0), offset=0.0, speed=0.0):
         positions, rotations = poses.positions[:COUNT], poses.rotations[:COUNT]
         positions = positions * np.linspace(0.8, 1.25, len(positions))[:, None]
         count = len(positions)
-        magnitude = Body(body, optics).render(
+        magnitude = Body(bumpy, optics).render(
             positions, rotations, np.full(count, np.exp(-speed)), np.full(count, 2 * offset)
         )
         magnitude = magnitude * np.exp(np.asarray(gain, dtype=np.float32))[:, None, None]
@@ -53,27 +44,27 @@ def found(mesh, echoes, optics, *kinds, steps=6):
     return work.result()
 
 
-def test_gains_are_found(body, heard, optics):
-    estimate = found(body, heard(gain=(0.1, 0.7)), optics, "gain", steps=4)
+def test_gains_are_found(bumpy, heard, optics):
+    estimate = found(bumpy, heard(gain=(0.1, 0.7)), optics, "gain", steps=4)
     np.testing.assert_allclose(estimate.calibration.gain, [0.1, 0.7], atol=0.02)
     assert estimate.error_db[-1] < 0.2 * estimate.error_db[0]
 
 
-def test_a_range_offset_is_told_from_the_size(body, heard, optics):
+def test_a_range_offset_is_told_from_the_size(bumpy, heard, optics):
     # A fit to ranges that are 2 mm too far makes the body smaller by as much.
-    normals = np.asarray(body.vertex_normals)
-    small = trimesh.Trimesh(body.vertices - 0.002 * normals, body.faces, process=False)
+    normals = np.asarray(bumpy.vertex_normals)
+    small = trimesh.Trimesh(bumpy.vertices - 0.002 * normals, bumpy.faces, process=False)
     estimate = found(small, heard(offset=0.002), optics, "range_offset", steps=8)
     assert estimate.calibration.range_offset == pytest.approx(0.002, abs=0.0002)
     assert estimate.deviation["range_offset"] < 0.001
 
 
-def test_the_speed_of_sound_is_found_from_several_distances(body, heard, optics):
-    several = found(body, heard(speed=0.005), optics, "speed_of_sound")
+def test_the_speed_of_sound_is_found_from_several_distances(bumpy, heard, optics):
+    several = found(bumpy, heard(speed=0.005), optics, "speed_of_sound")
     assert several.calibration.speed_of_sound == pytest.approx(0.005, abs=0.0005)
 
 
-def test_positions_and_aims_are_found(body, heard, optics):
+def test_positions_and_aims_are_found(bumpy, heard, optics):
     echoes = heard()
     rng = np.random.default_rng(1)
     shift = rng.normal(0.0, 0.001, echoes.positions.shape)
@@ -81,7 +72,7 @@ def test_positions_and_aims_are_found(body, heard, optics):
     true, echoes.positions = echoes.positions, echoes.positions + shift
     straight = echoes.rotations
     echoes.rotations = Rotation.from_rotvec(turn).as_matrix() @ straight
-    estimate = found(body, echoes, optics, "position", "aim", steps=8)
+    estimate = found(bumpy, echoes, optics, "position", "aim", steps=8)
     corrected = echoes.positions + estimate.calibration.position
     towards = true / np.linalg.norm(true, axis=1, keepdims=True)
     off = ((corrected - true) * towards).sum(axis=1)
@@ -91,18 +82,18 @@ def test_positions_and_aims_are_found(body, heard, optics):
     assert 0.0 < estimate.deviation["position"] < 0.01
 
 
-def test_without_errors_nothing_is_found(body, heard, optics):
-    estimate = found(body, heard(), optics, "gain", "speed_of_sound", steps=2)
+def test_without_errors_nothing_is_found(bumpy, heard, optics):
+    estimate = found(bumpy, heard(), optics, "gain", "speed_of_sound", steps=2)
     assert np.abs(estimate.calibration.gain).max() < 1e-3
     assert abs(estimate.calibration.speed_of_sound) < 1e-4
 
 
-def turntable(optics, head, body, *, radius=0.0):
+def turntable(optics, head, bumpy, *, radius=0.0):
     """What poses of a turntable hear with a head, stated with another head and another radius."""
     poses = cylinder_poses(
         24, radius=0.3, heights=(-0.1, 0.2), aim_jitter=0.0, generator=np.random.default_rng(0)
     )
-    heard = Body(body, Optics(head)).render(
+    heard = Body(bumpy, Optics(head)).render(
         poses.positions, poses.rotations, np.ones(24), np.zeros(24)
     )
     stated = poses.positions * (1.0 + radius / 0.3 * np.array([1.0, 1.0, 0.0]))
@@ -113,26 +104,26 @@ def turntable(optics, head, body, *, radius=0.0):
 
 
 @pytest.mark.slow
-def test_the_radius_of_a_turntable_is_found(body, optics):
-    echoes = turntable(optics, optics.head, body, radius=0.001)
-    estimate = found(body, echoes, optics, "radius", steps=8)
+def test_the_radius_of_a_turntable_is_found(bumpy, optics):
+    echoes = turntable(optics, optics.head, bumpy, radius=0.001)
+    estimate = found(bumpy, echoes, optics, "radius", steps=8)
     assert estimate.calibration.radius == pytest.approx(-0.001, abs=0.0002)
     assert estimate.deviation["radius"] < 0.002
     np.testing.assert_allclose(estimate.calibration.gain, np.log(2.0), atol=0.05)
 
 
 @pytest.mark.slow
-def test_the_height_of_a_support_is_found(body, optics):
+def test_the_height_of_a_support_is_found(bumpy, optics):
     low, true = (with_support(optics.head, -1.2 * RADIUS + up) for up in (0.0, 0.0008))
     standing = Optics(low)
-    echoes = turntable(standing, true, body)
-    estimate = found(body, echoes, standing, "support", steps=8)
+    echoes = turntable(standing, true, bumpy)
+    estimate = found(bumpy, echoes, standing, "support", steps=8)
     assert estimate.calibration.support == pytest.approx(0.0008, abs=0.0002)
 
 
 @pytest.mark.slow
-def test_the_radius_of_the_emitter_is_found(body, optics):
+def test_the_radius_of_the_emitter_is_found(bumpy, optics):
     true = changed_head(optics.head, 0.0, 0.3 * optics.head.ears.beam_radius)
-    estimate = found(body, turntable(optics, true, body), optics, "beam_radius", steps=8)
+    estimate = found(bumpy, turntable(optics, true, bumpy), optics, "beam_radius", steps=8)
     expected = 0.3 * optics.head.ears.beam_radius
     assert estimate.calibration.beam_radius == pytest.approx(expected, rel=0.2)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A support that a fit did not know is found from the image below the body."""
+"""A support that a fit did not know is found from the image below the bumpy."""
 
 from __future__ import annotations
 
@@ -18,23 +18,15 @@ from tests.surface.conftest import RADIUS
 HEIGHT = -1.1 * RADIUS
 
 
-@pytest.fixture(scope="module")
-def body():
-    mesh = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
-    way = np.asarray(mesh.vertices) / RADIUS
-    bump = 1.0 + 0.12 * np.sin(5 * way[:, 0]) * np.cos(4 * way[:, 1] + 1)
-    return trimesh.Trimesh(RADIUS * bump[:, None] * way, mesh.faces, process=False)
-
-
 @pytest.fixture
-def heard(body, optics):
+def heard(bumpy, optics):
     """Poses of a turntable that hear the body and its image, in recordings of unknown level."""
     standing = Optics(with_support(optics.head, HEIGHT))
     poses = cylinder_poses(
         12, radius=0.3, heights=(0.0, 0.2), aim_jitter=0.0, generator=np.random.default_rng(0)
     )
     still, late = np.ones(12), np.zeros(12)
-    magnitude = 0.3 * Body(body, standing).render(poses.positions, poses.rotations, still, late)
+    magnitude = 0.3 * Body(bumpy, standing).render(poses.positions, poses.rotations, still, late)
     return echoes_of(
         optics.head,
         poses.positions,
@@ -46,12 +38,12 @@ def heard(body, optics):
 
 
 @pytest.mark.slow
-def test_it_is_found_below_a_body_and_its_image(body, heard):
+def test_it_is_found_below_a_body_and_its_image(bumpy, heard):
     image = trimesh.Trimesh(
-        body.vertices * [1, 1, -1] + [0, 0, 2 * HEIGHT], body.faces[:, ::-1], process=False
+        bumpy.vertices * [1, 1, -1] + [0, 0, 2 * HEIGHT], bumpy.faces[:, ::-1], process=False
     )
     shares = []
-    height, deviation = find_support(trimesh.util.concatenate([body, image]), heard, shares.append)
+    height, deviation = find_support(trimesh.util.concatenate([bumpy, image]), heard, shares.append)
     resolution = heard.head.resolution
     # The body is two range resolutions wide.
     assert height == pytest.approx(HEIGHT, abs=0.5 * resolution)
