@@ -114,11 +114,11 @@ def calibrate(
     fitted, mesh = opened.fitted, opened.mesh()
     if output.exists() and any(output.iterdir()):
         raise IncompatibleError(f"{output}: holds something already; choose another --output")
-    storage.probe_writable(output)
-    store = opened.echoes.store
     echoes = opened.echoes
     if "radius" in wanted:
         _check_cylinder(echoes)
+    storage.remove_if_empty(storage.probe_writable(output))
+    store = echoes.store
     known: dict[str, float] = {}
     if "support" in wanted and echoes.head.plane is None:
         echoes, mesh, known["support"] = _with_support(echoes, mesh, progress)

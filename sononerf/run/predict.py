@@ -57,9 +57,8 @@ def read_poses(run: RunFolder, path: Path, frame: FrameName = "auto") -> Poses:
     recorded = run.provenance.get("origin") == "recorded"
     if frame == "world" or not stated or (frame == "auto" and not recorded):
         return Poses.read(path)
-    with _named(path):
-        settings = read_import_settings(stated, "the run's provenance")
-        return to_poses(read_table(path, settings), settings)
+    settings = read_import_settings(stated, "the run's provenance")
+    return to_poses(read_table(path, settings), settings)
 
 
 DRAWN = 3

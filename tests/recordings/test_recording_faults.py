@@ -262,7 +262,7 @@ WARNED = {
     "millimetres for metres": (renamed(x_mm="x_m", y_mm="y_m", z_mm="z_m"), r"lengths in mm\?"),
     "scalar last": (
         renamed(qw="qz", qx="qw", qy="qx", qz="qy"),
-        r"scalar is its last number|another convention",
+        r"scalar is its last number",
     ),
     "swapped channels": (every(lambda s: s[:, [2, 1, 0, 3]]), r"channels 0 and 2 swapped"),
     "wrong rate": (every_file(500_000), r"sampling rate"),

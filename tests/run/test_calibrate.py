@@ -102,6 +102,9 @@ def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path):
         calibrate(run, tmp_path / "out", ["gian"])
     with pytest.raises(SettingsError, match="no error is given"):
         kinds_of([])
+    with pytest.raises(SettingsError, match="radius: the poses are not those of a turntable"):
+        calibrate(run, tmp_path / "out", ["radius"])
+    assert not (tmp_path / "out").exists()
     (run / "reconstruction" / "mesh.ply").unlink()
     with pytest.raises(InputError, match=r"mesh\.ply: there is no surface"):
         calibrate(run, tmp_path / "out", ["gain"])
