@@ -32,6 +32,7 @@ from sononerf.evaluation import baseline
 from sononerf.evaluation import geometry as geometry_module
 from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.run import fit as fit_module
+from tests.small_views import draw_small
 
 pytestmark = pytest.mark.thorough
 
@@ -100,6 +101,7 @@ def quick():
         patch.setattr(geometry_module, "geometry_metrics", metrics)
         patch.setattr(geometry_module, "BASELINE_VOXELS", 24)
         patch.setattr(baseline, "LEVEL_SAMPLES", 500)
+        draw_small(patch)
         yield
 
 

@@ -190,23 +190,25 @@ def export(
 
 @app.command()
 def calibrate(
-    run: Annotated[Path, typer.Argument(help="Folder of a run with a surface.")],
+    source: Annotated[
+        Path, typer.Argument(help="Folder of a run with a surface; for lag, a store too.")
+    ],
     kinds: Annotated[
         list[str],
         typer.Argument(
             metavar="ERROR...",
-            help="gain, range_offset, speed_of_sound, radius, support, beam_radius, position, aim.",
+            help="lag, gain, range_offset, speed_of_sound, radius, support, beam_radius, position, aim.",
         ),
     ],
     output: Annotated[Path | None, typer.Option(help="The corrected store.")] = None,
 ) -> None:
-    """Find errors of a recording by a run's surface, and write a corrected store."""
+    """Find errors of a recording, and write a corrected store."""
     from sononerf.progress import Progress
     from sononerf.run.calibrate import calibrate as find_errors
 
     if output is None:
         raise SettingsError("--output is missing; name the store, such as --output data/corrected")
-    found = find_errors(run, output, kinds, progress=Progress())
+    found = find_errors(source, output, kinds, progress=Progress())
     for line in found.lines:
         say(line)
     for line in found.warnings:

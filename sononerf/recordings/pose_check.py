@@ -206,7 +206,7 @@ def check_poses(
     unit = _unit(stated[asked], ranges)
     if unit.name:
         return unit
-    head = _Head(emitter, receivers, resolution)
+    head = Consistency(emitter, receivers, resolution)
     own = head.misfit(stated[asked], ranges)
     scaled = _scaled_ranges(head, stated[asked], ranges, own)
     late = _late(stated[asked], own.prediction, resolution)
@@ -241,7 +241,7 @@ def check_poses(
     return Verdict(named[0], _message(named), gains[best])
 
 
-def _scaled_ranges(head: _Head, poses: Poses, ranges: Floats, own: _Misfit) -> Verdict:
+def _scaled_ranges(head: Consistency, poses: Poses, ranges: Floats, own: Misfit) -> Verdict:
     """Tell whether all ranges times a factor fit the poses clearly better.
 
     Poses at one distance from the body fit ranges of any scale.
@@ -249,7 +249,7 @@ def _scaled_ranges(head: _Head, poses: Poses, ranges: Floats, own: _Misfit) -> V
     gains = {}
     for factor in RANGE_FACTORS:
         # Longer ranges have longer errors.
-        found = _Head(head.emitter, head.receivers, factor * head.resolution).misfit(
+        found = Consistency(head.emitter, head.receivers, factor * head.resolution).misfit(
             poses, factor * ranges
         )
         gains[factor] = own.total - found.total + found.count * math.log(factor)
@@ -264,7 +264,7 @@ def _scaled_ranges(head: _Head, poses: Poses, ranges: Floats, own: _Misfit) -> V
     )
 
 
-def _order(head: _Head, poses: Poses, ranges: Floats, own: _Misfit) -> Verdict:
+def _order(head: Consistency, poses: Poses, ranges: Floats, own: Misfit) -> Verdict:
     """Return by how much the poses explain the echoes better than the same poses in other orders.
 
     The verdict is empty if few echoes contradict the others, because then the order is right, or
@@ -287,19 +287,35 @@ def _order(head: _Head, poses: Poses, ranges: Floats, own: _Misfit) -> Verdict:
 
 
 @dataclass(frozen=True, eq=False)
-class _Misfit:
+class Misfit:
+    """How badly poses explain first echoes.
+
+    Attributes:
+        total: Sum of the logarithms of the scales of errors; less is better.
+        count: Number of errors in the sum.
+        prediction: Of each ping by the others.
+    """
+
     total: float
     count: float
     prediction: Prediction
 
 
 @dataclass(frozen=True, eq=False)
-class _Head:
+class Consistency:
+    """How well poses explain the first echoes of a head.
+
+    Attributes:
+        emitter ((3,), m): Head frame.
+        receivers ((E, 3), m): Head frame.
+        resolution (m): Range resolution.
+    """
+
     emitter: Floats
     receivers: Floats
     resolution: float
 
-    def misfit(self, poses: Poses, first: Floats) -> _Misfit:
+    def misfit(self, poses: Poses, first: Floats) -> Misfit:
         """Return the sum of logarithms of error scales of pings (P, E)."""
         out = poses.positions + poses.rotations @ self.emitter
         back = poses.positions[:, None] + np.einsum("pij,ej->pei", poses.rotations, self.receivers)
@@ -320,7 +336,7 @@ class _Head:
         if self._hears_direction():
             angle = _off_axis(poses, found.centre, float(np.nanmedian(first)))
             total += len(angle) * np.log(max(float(np.median(angle)), AIM_FLOOR))
-        return _Misfit(float(total), count, found)
+        return Misfit(float(total), count, found)
 
     def _hears_direction(self) -> bool:
         """Tell whether it matters which way the head looks."""

@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +27,10 @@ from sononerf.head.attached import attach
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
-from sononerf.run.fitted import Fitted
+from sononerf.recordings.lag import LAGS, find_lag, is_path, later
+from sononerf.recordings.pose_check import Consistency
 from sononerf.run.run_folder import RunFolder
-from sononerf.settings.schema import HEAD_SECTIONS, SpectrogramSettings
+from sononerf.settings.schema import SpectrogramSettings
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.recording_errors import (
     KINDS,
@@ -55,6 +56,10 @@ DETERMINED_RESOLUTIONS = 1.0
 range resolutions, at which they count as found."""
 ON_CYLINDER = 0.02
 """Largest range of the poses' distances from the axis of a turntable, over their mean."""
+LAG = "lag"
+"""Name of the lag of poses behind pings, which is found from first echoes alone."""
+DETERMINED_ROWS = 0.5
+"""Largest uncertainty of a lag, rows, at which it counts as found."""
 INFORMED = 0.7
 """Largest uncertainty of a pose over the spread of all poses, no unit, at which the echoes say more
 than the spread does."""
@@ -87,34 +92,39 @@ def kinds_of(names: Sequence[str]) -> tuple[Kind, ...]:
     unknown = [name for name in names if name not in KINDS]
     if unknown or not names:
         found = f"unknown error {unknown[0]!r}" if unknown else "no error is given"
-        raise SettingsError(f"{found}; known: {', '.join(KINDS)}")
+        raise SettingsError(f"{found}; known: {', '.join((LAG, *KINDS))}")
     return tuple(kind for kind in KINDS if kind in names)
 
 
 def calibrate(
-    run: Path, output: Path, kinds: Sequence[str], *, progress: Progress | None = None
+    source: Path, output: Path, kinds: Sequence[str], *, progress: Progress | None = None
 ) -> Calibrated:
     """Find errors of the recording that a run was fitted to, and write a corrected store.
 
     Args:
-        run: Folder of a run with a surface.
-        output: The corrected store; the run's own store is left as it is.
-        kinds: Which errors, of :data:`KINDS`.
+        source: Folder of a run with a surface; for the lag, a store too.
+        output: The corrected store; the source's own store is left as it is.
+        kinds: Which errors, of :data:`KINDS`, or :data:`LAG` alone.
         progress: Where to show it.
 
     Raises:
-        SettingsError: If a kind is unknown, or the poses are not on a cylinder and ``radius`` is
-            asked for.
+        SettingsError: If a kind is unknown, or the poses are not those of a turntable (``radius``)
+            or of a path (``lag``).
         InputError: If the run has no surface, or its echoes are not there.
         IncompatibleError: If there is a store at ``output`` already.
     """
     progress = progress or Progress(quiet=True)
-    wanted = kinds_of(kinds)
-    opened = RunFolder.of(run)
-    fitted, mesh = opened.fitted, opened.mesh()
     if output.exists() and any(output.iterdir()):
         raise IncompatibleError(f"{output}: holds something already; choose another --output")
-    echoes = opened.echoes
+    if LAG in kinds:
+        return _without_lag(source, output, kinds, progress)
+    wanted = kinds_of(kinds)
+    if _is_store(source):
+        raise SettingsError(
+            f"{source}: a store; {wanted[0]} is found by a surface: fit first, and name the run"
+        )
+    opened = RunFolder.of(source)
+    echoes, mesh = opened.echoes, opened.mesh()
     if "radius" in wanted:
         _check_cylinder(echoes)
     storage.remove_if_empty(storage.probe_writable(output))
@@ -125,9 +135,48 @@ def calibrate(
     left = tuple(kind for kind in wanted if kind not in known)
     estimate = _estimate(echoes, mesh, left, progress)
     estimate.deviation.update(known)
-    corrected = _write(fitted, echoes, output, estimate.calibration, wanted, progress)
+    corrected = _write(echoes, output, estimate.calibration, wanted, progress)
     lines, warnings = describe(echoes.head, store, mesh, estimate, wanted)
     return Calibrated(corrected, estimate, lines, warnings)
+
+
+def _is_store(source: Path) -> bool:
+    return (source / "zarr.json").is_file()
+
+
+def _without_lag(
+    source: Path, output: Path, kinds: Sequence[str], progress: Progress
+) -> Calibrated:
+    """Write a store whose poses are those of their pings; see :func:`calibrate`."""
+    if set(kinds) != {LAG}:
+        raise SettingsError(f"{LAG} is found before a surface is known: calibrate it alone")
+    echoes = Echoes.open(source) if _is_store(source) else RunFolder.of(source).echoes
+    store, head = echoes.store, echoes.head
+    poses, onsets = Poses(store.positions, store.rotations), echoes.onsets
+    if not is_path(poses):
+        raise SettingsError(
+            f"{LAG}: successive poses are no neighbours, so the places between them are unknown; "
+            f"leave {LAG} out"
+        )
+    check = Consistency(head.emitter, head.receivers, head.resolution)
+    with progress.task("searching the lag", len(LAGS)) as task:
+        rows, deviation = find_lag(poses, onsets.first, onsets.poses, check, task.advance)
+    storage.remove_if_empty(storage.probe_writable(output))
+    moved_on = later(poses, rows)
+    found = replace(
+        Calibration.none(len(head.receivers), len(poses)),
+        position=moved_on.positions - poses.positions,
+        aim=Rotation.from_matrix(
+            moved_on.rotations @ poses.rotations.transpose(0, 2, 1)
+        ).as_rotvec(),
+    )
+    uncertain = "the first echoes hardly tell; compare the clocks"
+    return Calibrated(
+        _write(echoes, output, found, (), progress),
+        Estimate(found, {LAG: deviation}, []),
+        [f"lag:            ping n belongs to row n {rows:+.2f} ± {deviation:.2f} of the poses"],
+        [f"{LAG}: {uncertain}"] if deviation > DETERMINED_ROWS else [],
+    )
 
 
 def _check_cylinder(echoes: Echoes) -> None:
@@ -188,7 +237,6 @@ def dependent_cells(analysis: SpectrogramSettings) -> float:
 
 
 def _write(
-    fitted: Fitted,
     echoes: Echoes,
     output: Path,
     found: Calibration,
@@ -196,12 +244,9 @@ def _write(
     progress: Progress,
 ) -> EnsembleStore:
     """Write the store without the errors; see :func:`calibrate`."""
-    settings, store = fitted.settings, echoes.store
-    plain, now = settings.plain(), changed_head(echoes.head, found.support, found.beam_radius)
-    sections = {name: plain[name] for name in HEAD_SECTIONS}
-    sections["support"] = now.support.model_dump(mode="json")
-    sections["ears"] = {**sections["ears"], "beam_radius": now.ears.beam_radius}
-    speed = fitted.head.speed_of_sound * math.exp(found.speed_of_sound)
+    store, head = echoes.store, changed_head(echoes.head, found.support, found.beam_radius)
+    sections = head.plain()
+    speed = head.speed_of_sound * math.exp(found.speed_of_sound)
     axis = np.asarray(store.range, dtype=np.float64)
     if "speed_of_sound" in kinds:
         axis = axis * math.exp(found.speed_of_sound)
@@ -245,7 +290,7 @@ def _write(
             },
             receivers=store.receivers,
         )
-        attach(settings, output)
+        attach(head, output)
         factor = np.exp(-found.gain)[:, None, None]
         with progress.task("writing", len(store)) as task:
             for index in made.missing():
@@ -255,7 +300,7 @@ def _write(
         poses = Poses(made.positions, made.rotations)
         silent = f"{output}: no pose heard anything"
         if earlier.get("origin") == "recorded":
-            seal_recorded(made, fitted.head, poses, made.split, silent=silent)
+            seal_recorded(made, head, poses, made.split, silent=silent)
         else:
             seal(made, {}, silent=silent)
     return EnsembleStore.open(output)

@@ -120,7 +120,7 @@ def test_noise_has_as_many_independent_values_as_its_spread_tells():
 def test_noise_is_detected_about_as_rarely_as_is_stated(monkeypatch):
     """At one in a thousand, for it can be counted; the mean is not quite gamma-distributed."""
     monkeypatch.setattr(detection, "FALSE_ALARMS", 1e-3)
-    power = noise_power(200_000)
+    power = noise_power(60_000)
     factor = threshold_factor(ECHO.looks)
     assert 0.5e-3 < (power > factor * np.quantile(power, RANK)).mean() < 1.6e-3
 

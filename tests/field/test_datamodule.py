@@ -61,7 +61,7 @@ def assert_same(one, two):
 @pytest.mark.filterwarnings(
     "ignore:.*_MultiProcessingDataLoaderIter.__del__:pytest.PytestUnraisableExceptionWarning"
 )
-@pytest.mark.parametrize("whole", [True, False])
+@pytest.mark.parametrize("whole", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_workers_change_nothing(store, whole):
     found = [
         first(module(store, whole_poses=whole, workers=workers).train_dataloader(), 7)

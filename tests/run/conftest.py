@@ -14,6 +14,7 @@ from sononerf.run import reconstruct as reconstruct_module
 from sononerf.run.fit import fit
 from sononerf.run.simulate import simulate
 from sononerf.settings.loading import validate_settings
+from tests.small_views import draw_small
 
 TINY = {
     "scene": {"name": "sphere", "options": {"radius": 0.02}},
@@ -94,6 +95,12 @@ def run(fitted, tmp_path):
     for name in ("model.safetensors", "model.json"):
         shutil.copy(fitted / name, path)
     return path
+
+
+@pytest.fixture(autouse=True)
+def small_views(monkeypatch):
+    """Views of meshes are drawn with few pixels; their full size has tests of its own."""
+    draw_small(monkeypatch)
 
 
 @pytest.fixture

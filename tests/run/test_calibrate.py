@@ -98,7 +98,7 @@ def test_what_is_not_determined_is_said(run):
 
 
 def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path):
-    with pytest.raises(SettingsError, match="unknown error 'gian'; known: gain"):
+    with pytest.raises(SettingsError, match="unknown error 'gian'; known: lag, gain"):
         calibrate(run, tmp_path / "out", ["gian"])
     with pytest.raises(SettingsError, match="no error is given"):
         kinds_of([])

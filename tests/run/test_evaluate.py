@@ -120,8 +120,8 @@ def test_amid_surroundings_the_target_is_judged_alone_too(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("content", [b"", b"ply\nnonsense", b"\x00" * 100])
-def test_a_damaged_mesh_is_told(run, content, no_projections):
-    reconstruct(run, spacing=0.012)
+def test_a_damaged_mesh_is_told(run, content):
+    (run / "reconstruction").mkdir()
     (run / "reconstruction" / "mesh.ply").write_bytes(content)
     with pytest.raises(InputError, match=r"mesh\.ply: .*reconstruct again"):
         evaluate(run)

@@ -42,7 +42,14 @@ def test_it_goes_where_it_is_told_to(home):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(("kind", "passed"), [("scene", 6), ("field", 1), ("renderer", 1)])
+@pytest.mark.parametrize(
+    ("kind", "passed"),
+    [
+        ("scene", 6),
+        pytest.param("field", 1, marks=pytest.mark.slow),
+        pytest.param("renderer", 1, marks=pytest.mark.slow),
+    ],
+)
 def test_what_is_written_installs_and_passes_its_own_test(tmp_path, kind, passed):
     source, target = tmp_path / "tin-drum", tmp_path / "installed"
     new_plugin(kind, "tin-drum", source)

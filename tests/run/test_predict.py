@@ -123,7 +123,10 @@ def test_poses_of_ones_own_need_neither_store_nor_scene(run, tmp_path, monkeypat
     assert not (run / "metrics.json").exists()
 
 
-@pytest.mark.parametrize(("pictures", "drawn"), [("all", 8), (0, 0), (1, 1), (3, 3), (100, 8)])
+@pytest.mark.parametrize(
+    ("pictures", "drawn"),
+    [("all", 8), (0, 0), (3, 3), pytest.param(100, 8, marks=pytest.mark.slow)],
+)
 def test_as_many_poses_are_drawn_as_wanted(run, pictures, drawn):
     folder = predict(run, split="train", pictures=pictures, accelerator="cpu")
     assert len(list(folder.glob("pose_*.png"))) == drawn

@@ -186,7 +186,9 @@ def test_colours_tell_outside_from_inside(finished):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize(("kind", "begins"), [("svg", b"<?xml"), ("pdf", b"%PDF")])
+@pytest.mark.parametrize(
+    ("kind", "begins"), [("svg", b"<?xml"), pytest.param("pdf", b"%PDF", marks=pytest.mark.slow)]
+)
 def test_figures_for_a_paper_are_the_same_each_time(finished, kind, begins):
     (finished / "epochs" / "0001").mkdir(parents=True)
     told = {"epoch": 1, "step": 10, "val/mae_db": 1.5}
