@@ -197,7 +197,8 @@ def calibrate(
         list[str],
         typer.Argument(
             metavar="ERROR...",
-            help="lag, gain, range_offset, speed_of_sound, radius, support, beam_radius, position, aim.",
+            help="lag, gain, range_offset, speed_of_sound, radius, support, beam_radius, position, "
+            "aim.",
         ),
     ],
     output: Annotated[Path | None, typer.Option(help="The corrected store.")] = None,

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -11,25 +10,22 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from sononerf import storage
-from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.memory_ensemble import Ensemble, seal
-from sononerf.echoes.recorded_noise import seal_recorded
+from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, SettingsError
-from sononerf.geometry.frame import KEYS
 from sononerf.geometry.poses import Poses
-from sononerf.head.attached import attach
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
 from sononerf.recordings.lag import LAGS, find_lag, is_path, later
 from sononerf.recordings.pose_check import Consistency
+from sononerf.run.corrected_store import DECIBELS, write_corrected
 from sononerf.run.run_folder import RunFolder
+from sononerf.run.trial_fits import fitted_error, least_error
 from sononerf.settings.schema import SpectrogramSettings
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.recording_errors import (
@@ -38,10 +34,13 @@ from sononerf.surface.refine.recording_errors import (
     Estimate,
     Kind,
     changed_head,
-    outward,
 )
 from sononerf.surface.refine.self_calibration import Calibrator
-from sononerf.surface.refine.support_search import above, find_support, with_support
+from sononerf.surface.refine.support_search import (
+    above,
+    find_support,
+    with_support,
+)
 
 STEPS = 20
 """At most so many Gauss-Newton steps; they usually end earlier."""
@@ -63,7 +62,6 @@ DETERMINED_ROWS = 0.5
 INFORMED = 0.7
 """Largest uncertainty of a pose over the spread of all poses, no unit, at which the echoes say more
 than the spread does."""
-_DB = 20.0 / math.log(10.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,16 +126,22 @@ def calibrate(
     if "radius" in wanted:
         _check_cylinder(echoes)
     storage.remove_if_empty(storage.probe_writable(output))
-    store = echoes.store
+    tried = [
+        kind for kind in wanted if kind == "radius" or (kind == "support" and echoes.head.plane)
+    ]
+    if tried and len(wanted) > 1:
+        raise SettingsError(f"{tried[0]} is found by fits at several values: calibrate it alone")
+    if tried:
+        return _by_trials(opened, tried[0], output, progress)
     known: dict[str, float] = {}
-    if "support" in wanted and echoes.head.plane is None:
+    if "support" in wanted:
         echoes, mesh, known["support"] = _with_support(echoes, mesh, progress)
-    left = tuple(kind for kind in wanted if kind not in known)
-    estimate = _estimate(echoes, mesh, left, progress)
+    estimate = _estimate(echoes, mesh, [kind for kind in wanted if kind not in known], progress)
     estimate.deviation.update(known)
-    corrected = _write(echoes, output, estimate.calibration, wanted, progress)
-    lines, warnings = describe(echoes.head, store, mesh, estimate, wanted)
-    return Calibrated(corrected, estimate, lines, warnings)
+    corrected = write_corrected(echoes, output, estimate.calibration, progress)
+    return Calibrated(
+        corrected, estimate, *describe(echoes.head, echoes.store, mesh, estimate, wanted)
+    )
 
 
 def _is_store(source: Path) -> bool:
@@ -172,7 +176,7 @@ def _without_lag(
     )
     uncertain = "the first echoes hardly tell; compare the clocks"
     return Calibrated(
-        _write(echoes, output, found, (), progress),
+        write_corrected(echoes, output, found, progress),
         Estimate(found, {LAG: deviation}, []),
         [f"lag:            ping n belongs to row n {rows:+.2f} ± {deviation:.2f} of the poses"],
         [f"{LAG}: {uncertain}"] if deviation > DETERMINED_ROWS else [],
@@ -186,6 +190,37 @@ def _check_cylinder(echoes: Echoes) -> None:
             "radius: the poses are not those of a turntable: their distances from the z axis are "
             f"{distance.min():.3g} to {distance.max():.3g} m; leave radius out"
         )
+
+
+def _by_trials(opened: RunFolder, kind: str, output: Path, progress: Progress) -> Calibrated:
+    """Find the radius or the support's height by fits at several; see :func:`calibrate`."""
+    echoes, settings = opened.echoes, opened.fitted.settings
+    folder, step = output.with_name(f"{output.name}-trials"), echoes.head.resolution
+    nothing = Calibration.none(len(echoes.head.receivers), len(echoes.store))
+
+    def corrected(offset: float) -> tuple[Echoes, Calibration]:
+        if kind == "radius":
+            return echoes, replace(nothing, radius=offset)
+        return Echoes(echoes.store, changed_head(echoes.head, support=offset)), nothing
+
+    def error_at(trial: int) -> float:
+        own = storage.read_json(opened.reconstruction / "read_out.json")["validation_error_db"]
+        if not trial and own is not None:
+            return float(own)
+        name = f"{1e3 * step * trial:+.1f}"
+        place = folder / f"{kind}{name}mm"
+        right, found = corrected(step * trial)
+        write_corrected(right, place / "store", found, progress)
+        error = fitted_error(settings, place / "store", place / "run", progress)
+        progress.say(f"{kind} {name} mm: {error:.2f} dB on validation poses")
+        return error
+
+    at, deviation = least_error(error_at)
+    right, found = corrected(step * at)
+    estimate = Estimate(found, {kind: step * deviation}, [])
+    store = write_corrected(right, output, found, progress)
+    said = describe(right.head, echoes.store, opened.mesh(), estimate, [kind])
+    return Calibrated(store, estimate, *said)
 
 
 def _with_support(
@@ -236,107 +271,8 @@ def dependent_cells(analysis: SpectrogramSettings) -> float:
     return max(float(slices * bandwidth / spacing), 1.0)
 
 
-def _write(
-    echoes: Echoes,
-    output: Path,
-    found: Calibration,
-    kinds: Sequence[Kind],
-    progress: Progress,
-) -> EnsembleStore:
-    """Write the store without the errors; see :func:`calibrate`."""
-    store, head = echoes.store, changed_head(echoes.head, found.support, found.beam_radius)
-    sections = head.plain()
-    speed = head.speed_of_sound * math.exp(found.speed_of_sound)
-    axis = np.asarray(store.range, dtype=np.float64)
-    if "speed_of_sound" in kinds:
-        axis = axis * math.exp(found.speed_of_sound)
-        step = axis[1] - axis[0]
-        # The same slices: limits that lie between them do not depend on rounding.
-        limits = {
-            "range_min": float(axis[0] - step / 4.0),
-            "range_max": float(axis[-1] + step / 4.0),
-        }
-        sections["air"] = {**sections["air"], "speed_of_sound": speed}
-        sections["spectrogram"] = {**sections["spectrogram"], **limits}
-    turned = Rotation.from_rotvec(found.aim).as_matrix()
-    positions = store.positions + found.position + found.radius * outward(store.positions)
-    earlier = store.attributes
-    kept = ("origin", "source", "licence", "format", "units", "import", *KEYS)
-    with storage.lock(output):
-        made = EnsembleStore.create(
-            output,
-            poses_positions=positions,
-            poses_rotations=turned @ store.rotations,
-            split=store.split,
-            range=axis,
-            frequency=store.frequency,
-            attributes={
-                **{name: earlier[name] for name in kept if name in earlier},
-                "echo_hash": f"{earlier['echo_hash']}-{_fingerprint(found)}",
-                "settings": sections,
-                "speed_of_sound": speed,
-                "calibration": {
-                    **(earlier.get("calibration") or {}),
-                    "self_calibration": {
-                        "of": str(store.path),
-                        "gain_db": (found.gain * _DB).tolist(),
-                        "range_offset_m": found.range_offset,
-                        "speed_of_sound": speed,
-                        "radius_m": found.radius,
-                        "beam_radius_m": found.beam_radius,
-                        "support": sections["support"],
-                    },
-                },
-            },
-            receivers=store.receivers,
-        )
-        attach(head, output)
-        factor = np.exp(-found.gain)[:, None, None]
-        with progress.task("writing", len(store)) as task:
-            for index in made.missing():
-                heard = moved(store.read_pose(index), np.asarray(store.range), found.range_offset)
-                made.write_pose(index, (factor * heard).astype(np.float32))
-                task.advance()
-        poses = Poses(made.positions, made.rotations)
-        silent = f"{output}: no pose heard anything"
-        if earlier.get("origin") == "recorded":
-            seal_recorded(made, head, poses, made.split, silent=silent)
-        else:
-            seal(made, {}, silent=silent)
-    return EnsembleStore.open(output)
-
-
-def moved(magnitude: NDArray[np.floating], axis: NDArray[np.floating], offset: float) -> Floats:
-    """Return magnitudes (E, R, F) that are heard so much nearer (m), between slices linearly."""
-    if offset == 0.0:
-        return np.asarray(magnitude, dtype=np.float64)
-    at = (axis + offset - axis[0]) / (axis[1] - axis[0])
-    first = np.floor(at).astype(int)
-    part = (at - first)[:, None]
-    last = len(axis) - 1
-    low, high = (magnitude[:, np.clip(first + more, 0, last)] for more in (0, 1))
-    return np.asarray((1.0 - part) * low + part * high, dtype=np.float64)
-
-
-def _fingerprint(found: Calibration) -> str:
-    values = np.concatenate(
-        [
-            found.gain,
-            [found.range_offset, found.speed_of_sound],
-            [found.radius, found.support, found.beam_radius],
-            found.position.ravel(),
-            found.aim.ravel(),
-        ]
-    )
-    return hashlib.sha256(np.round(values, 9).astype("<f8").tobytes()).hexdigest()[:12]
-
-
 def describe(
-    head: Head,
-    store: Ensemble,
-    mesh: trimesh.Trimesh,
-    estimate: Estimate,
-    kinds: Sequence[Kind],
+    head: Head, store: Ensemble, mesh: trimesh.Trimesh, estimate: Estimate, kinds: Sequence[str]
 ) -> tuple[list[str], list[str]]:
     """Return what was found and what is not determined, one line each.
 
@@ -345,89 +281,81 @@ def describe(
         estimate: What was found.
         kinds: What was looked for.
     """
-    found, deviation = estimate.calibration, estimate.deviation
-    train = store.indices("train")
-    reach = float(np.linalg.norm(store.positions[train] - mesh.centroid, axis=1).mean())
-    resolution, speed = head.resolution, head.speed_of_sound
-    error = estimate.error_db
-    lines = []
+    found, deviation, error = estimate.calibration, estimate.deviation, estimate.error_db
+    away = store.positions[store.indices("train")] - mesh.centroid
+    distance = np.linalg.norm(away, axis=1)
+    lines, warnings = [], []
+
+    def say(kind: str, text: str, warning: str | None = None) -> None:
+        lines.append(f"{kind.replace('_', ' ') + ':':15s} {text}")
+        if warning:
+            warnings.append(f"{kind}: {warning}")
+
     if error:
-        steps = f"{error[-1]:.2f} dB after {len(error)} steps"
-        lines.append(f"error:          {error[0]:.2f} dB before, {steps}")
-    warnings = []
+        say("error", f"{error[0]:.2f} dB before, {error[-1]:.2f} dB after {len(error)} steps")
     if "gain" in kinds:
-        gains = ", ".join(f"{_DB * value:+.2f}" for value in found.gain)
-        lines.append(f"gain:           {gains} dB, each ± {_DB * deviation['gain']:.2f} dB")
-        if _DB * deviation["gain"] > DETERMINED_DB:
-            warnings.append("gain: the echoes do not determine it")
+        uncertain = DECIBELS * deviation["gain"]
+        vague = uncertain > DETERMINED_DB
+        gains = ", ".join(f"{DECIBELS * value:+.2f}" for value in found.gain)
+        say(
+            "gain",
+            f"{gains} dB, each ± {uncertain:.2f} dB",
+            "the echoes do not determine it" if vague else None,
+        )
     if "range_offset" in kinds:
-        off, uncertain = 1e3 * found.range_offset, deviation["range_offset"]
-        lines.append(f"range offset:   {off:+.2f} ± {1e3 * uncertain:.2f} mm")
-        if uncertain > DETERMINED * resolution:
-            warnings.append(
-                "range_offset: the echoes do not separate it from the size of the object"
-            )
+        uncertain = deviation["range_offset"]
+        say(
+            "range_offset",
+            f"{1e3 * found.range_offset:+.2f} ± {1e3 * uncertain:.2f} mm",
+            "the echoes do not separate it from the size of the object"
+            if uncertain > DETERMINED * head.resolution
+            else None,
+        )
     if {"gain", "range_offset"} <= set(kinds):
         warnings.append(
             "gain and range_offset together: a larger object is louder and nearer, so both may be "
             "wrong together; calibrate one of them by a reference target (import.reference)"
         )
-    distance = float(np.linalg.norm(store.positions[train][:, :2], axis=1).mean())
-    plane = head.plane
-    for kind, name, before in (
-        ("radius", "radius", distance),
-        ("support", "support", None if plane is None else float(np.dot(plane.point, plane.normal))),
-        ("beam_radius", "beam radius", head.ears.beam_radius),
-    ):
-        if kind not in kinds or before is None:
-            continue
-        now, uncertain = before + getattr(found, kind), deviation[kind]
-        lines.append(f"{name + ':':15s} {1e3 * now:.1f} ± {1e3 * uncertain:.1f} mm")
-        if uncertain > DETERMINED_RESOLUTIONS * resolution:
-            warnings.append(f"{kind}: the echoes hardly determine it; measure it")
-    if "radius" in kinds:
-        warnings.append(
-            "radius: a surface that was fitted to a wrong radius hears nearly the same, and takes "
-            "up most of the error; the stated uncertainty does not hold unless the surface is known"
-        )
-    if "radius" in kinds and "range_offset" in kinds:
-        warnings.append(
-            "radius and range_offset together: near and far poses alone tell them apart; their sum "
-            "is found better than each"
-        )
-    if "speed_of_sound" in kinds:
-        uncertain = deviation["speed_of_sound"]
-        lines.append(
-            f"speed of sound: {speed * math.exp(found.speed_of_sound):.2f} "
-            f"± {speed * uncertain:.2f} m/s"
-        )
-        if uncertain * reach > DETERMINED * resolution or _one_distance(store, mesh, resolution):
-            warnings.append(
-                "speed_of_sound: all poses are at one distance, so it cannot be separated from "
-                "the size of the object; record from several distances"
+    for kind, value in _lengths(head, store, found).items():
+        if kind in kinds:
+            uncertain = deviation[kind]
+            vague = uncertain > DETERMINED_RESOLUTIONS * head.resolution
+            say(
+                kind,
+                f"{1e3 * value:.1f} ± {1e3 * uncertain:.1f} mm",
+                "the echoes hardly determine it; measure it" if vague else None,
             )
-    for kind, name, factor, unit in (
-        ("position", "position", 1e3, "mm"),
-        ("aim", "aim", math.degrees(1.0), "degrees"),
-    ):
-        if kind not in kinds:
-            continue
-        values = getattr(found, kind)[train]
-        usual = math.sqrt(float(np.square(values).mean()))
-        uncertain = deviation[kind]
-        spread = math.hypot(usual, uncertain)
-        lines.append(
-            f"{name + ':':15s} {factor * usual:.2f} {unit} per axis, each ± "
-            f"{factor * uncertain:.2f} {unit}"
+    if "speed_of_sound" in kinds:
+        uncertain, speed = deviation["speed_of_sound"], head.speed_of_sound
+        vague = uncertain * distance.mean() > DETERMINED * head.resolution
+        say(
+            "speed_of_sound",
+            f"{speed * math.exp(found.speed_of_sound):.2f} ± {speed * uncertain:.2f} m/s",
+            "all poses are at one distance, so it cannot be separated from the size of the "
+            "object; record from several distances"
+            if vague or distance.std() < head.resolution
+            else None,
         )
-        if uncertain > INFORMED * spread:
-            warnings.append(
-                f"{kind}: the echoes hardly determine it; the poses stay about as they were"
+    for kind, factor, unit in (("position", 1e3, "mm"), ("aim", math.degrees(1.0), "degrees")):
+        if kind in kinds:
+            values, uncertain = getattr(found, kind)[store.indices("train")], deviation[kind]
+            usual = math.sqrt(float(np.square(values).mean()))
+            vague = uncertain > INFORMED * math.hypot(usual, uncertain)
+            say(
+                kind,
+                f"{factor * usual:.2f} {unit} per axis, each ± {factor * uncertain:.2f} {unit}",
+                "the echoes hardly determine it; the poses stay about as they were"
+                if vague
+                else None,
             )
     return lines, warnings
 
 
-def _one_distance(store: Ensemble, mesh: trimesh.Trimesh, resolution: float) -> bool:
-    """Whether all training poses are at one distance, as far as ranges can be resolved."""
-    away = np.linalg.norm(store.positions[store.indices("train")] - mesh.centroid, axis=1)
-    return float(np.std(away)) < resolution
+def _lengths(head: Head, store: Ensemble, found: Calibration) -> dict[str, float]:
+    """Return the lengths of a recording as they were found, m."""
+    lengths = {"beam_radius": head.ears.beam_radius + found.beam_radius}
+    at = store.positions[store.indices("train")]
+    lengths["radius"] = float(np.linalg.norm(at[:, :2], axis=1).mean()) + found.radius
+    if head.plane is not None:
+        lengths["support"] = float(np.dot(head.plane.point, head.plane.normal))
+    return lengths

@@ -28,8 +28,6 @@ Kind = Literal[
     "aim",
 ]
 KINDS: tuple[Kind, ...] = get_args(Kind)
-OF_HEAD = ("support", "beam_radius")
-"""Errors of the head, whose change needs other tables."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +39,6 @@ class Calibration:
         range_offset (m): How much too far everything is heard.
         speed_of_sound: Logarithm of the true speed over the assumed one.
         radius (m): To be added to the distance of the poses from the turntable's axis.
-        support (m): How much higher the support is than assumed, along its normal.
         beam_radius (m): To be added to the radius of the emitter.
         position ((P, 3), m): To be added to the stated positions.
         aim ((P, 3), rad): Rotation vectors, world frame, to be applied to the stated rotations.
@@ -53,7 +50,6 @@ class Calibration:
     position: Floats
     aim: Floats
     radius: float = 0.0
-    support: float = 0.0
     beam_radius: float = 0.0
 
     @classmethod
@@ -145,8 +141,8 @@ def outward(positions: Floats) -> Floats:
     return away / np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
 
 
-def changed_head(head: Head, support: float, beam_radius: float) -> Head:
-    """Return a head whose support is higher (m, along its normal) and whose beam is wider (m)."""
+def changed_head(head: Head, *, support: float = 0.0, beam_radius: float = 0.0) -> Head:
+    """Return a head whose support is higher (m, along its normal), and its emitter larger (m)."""
     plane, ears = head.plane, head.ears
     standing = head.support
     if plane is not None:

@@ -32,13 +32,11 @@ from sononerf.head.decibels import ACTIVE_DB
 from sononerf.surface.refine.objective import FLOOR_DB, TRUST
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.recording_errors import (
-    OF_HEAD,
     Body,
     Calibration,
     Estimate,
     Kind,
     changed_head,
-    outward,
 )
 
 STEP = 0.02
@@ -105,8 +103,7 @@ class Calibrator:
         self.poses = np.concatenate((echoes.training, echoes.validation))
         self.found = Calibration.none(optics.ears, len(echoes.positions))
         self.layer, self.scale = 0.0, 0.0
-        self._optics: dict[tuple[float, float], Optics] = {}
-        self._outward = outward(echoes.positions)
+        self._optics: dict[float, Optics] = {}
         unit_length = STEP * optics.wavelength
         reach = float(np.linalg.norm(echoes.positions - mesh.centroid, axis=1).mean())
         self.local = [
@@ -116,15 +113,13 @@ class Calibrator:
         # The level of recordings is not known, and every other error would take it up.
         levels = "gain" in kinds or not echoes.calibrated
         self.shared = [_Column("gain", 0.0, n) for n in range(optics.ears) if levels]
-        lengths = ("radius", "support")
-        self.shared += [_Column(name, unit_length) for name in lengths if name in kinds]
         if "beam_radius" in kinds:
             self.shared.append(_Column("beam_radius", STEP * optics.head.ears.beam_radius))
         if "range_offset" in kinds:
             self.shared.append(_Column("range_offset", unit_length))
         if "speed_of_sound" in kinds:
             self.shared.append(_Column("speed_of_sound", unit_length / reach))
-        if {"range_offset", "speed_of_sound", "radius"} & set(kinds):
+        if {"range_offset", "speed_of_sound"} & set(kinds):
             self.shared.append(_Column("layer", unit_length))
             self.shared.append(_Column("scale", unit_length / float(mesh.scale)))
         if not self.local:
@@ -337,30 +332,27 @@ class Calibrator:
             count += int((measured >= ACTIVE_DB).sum())
         return total / count if count else math.inf
 
-    def _optics_of(self, support: float, beam_radius: float) -> Optics:
-        """Return the optics of a head whose support is higher and whose beam is wider, m."""
-        key = (support, beam_radius)
-        if key not in self._optics:
-            self._optics[key] = Optics(changed_head(self.optics.head, *key))
-        return self._optics[key]
+    def _optics_of(self, beam_radius: float) -> Optics:
+        """Return the optics of a head whose emitter is larger, m."""
+        if beam_radius not in self._optics:
+            head = changed_head(self.optics.head, beam_radius=beam_radius)
+            self._optics[beam_radius] = Optics(head)
+        return self._optics[beam_radius]
 
     def _bodies(self, unknowns: list[_Column]) -> dict[str, Body]:
         """Return the surface as it is, and changed as unknowns of surface and head do."""
         normals = np.array(self.mesh.vertex_normals)
         middle, found = self.mesh.centroid, self.found
-        self._optics = {(0.0, 0.0): self.optics}  # those of the step before go
+        self._optics = {0.0: self.optics}  # those of the step before go
 
-        def changed(layer: float, scale: float, support: float, beam_radius: float) -> Body:
-            optics = self._optics_of(support, beam_radius)
+        def changed(layer: float, scale: float, beam_radius: float) -> Body:
             places = (self.mesh.vertices - middle) * math.exp(scale) + middle + layer * normals
-            return Body(trimesh.Trimesh(places, self.mesh.faces, process=False), optics)
+            return Body(
+                trimesh.Trimesh(places, self.mesh.faces, process=False),
+                self._optics_of(beam_radius),
+            )
 
-        at = {
-            "layer": self.layer,
-            "scale": self.scale,
-            "support": found.support,
-            "beam_radius": found.beam_radius,
-        }
+        at = {"layer": self.layer, "scale": self.scale, "beam_radius": found.beam_radius}
         bodies = {"": changed(**at)}
         for column in unknowns:
             if column.name in at:
@@ -377,18 +369,15 @@ class Calibrator:
         """
         unknowns = [*self.local, *self.shared] if slopes else []
         found = self.found
-        outward = self._outward[number]
-        position = self.echoes.positions[number] + found.position[number] + found.radius * outward
+        position = self.echoes.positions[number] + found.position[number]
         turned = Rotation.from_rotvec(found.aim[number]).as_matrix()
         rotation = turned @ self.echoes.rotations[number]
         positions, rotations, stretch, late = [position], [rotation], [0.0], [0.0]
         for column in unknowns:
-            if column.name in ("gain", "layer", "scale", *OF_HEAD):
+            if column.name in ("gain", "layer", "scale", "beam_radius"):
                 continue
             along = np.eye(3)[column.axis] * column.step
             moved = along if column.name == "position" else np.zeros(3)
-            if column.name == "radius":
-                moved = column.step * outward
             turn = along if column.name == "aim" else np.zeros(3)
             positions.append(position + moved)
             rotations.append(Rotation.from_rotvec(turn).as_matrix() @ rotation)
@@ -411,7 +400,7 @@ class Calibrator:
             if column.name == "gain":
                 slope = -_DB * np.expm1(-b / _DB)
                 slope[np.arange(len(slope)) != column.axis] = 0.0
-            elif column.name in ("layer", "scale", *OF_HEAD):
+            elif column.name in ("layer", "scale", "beam_radius"):
                 body = bodies[column.name].render(*(np.asarray(part) for part in one))[0]
                 slope = (compressed(body) - b) / column.step
             else:

@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
 
 from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
@@ -72,7 +73,7 @@ def find_support(
             work = Calibrator(part, heard, Optics(heard.head), (), dependent=1.0)
             errors.append(work.error())
             shown(first + (last - first) * (row + 1) / len(heights))
-        return float(heights[0] + step * least(np.array(errors)))
+        return float(heights[0] + step * least(errors))
 
     middle = low + MIDDLE * (high - low)
     about = search(middle, np.arange(low - 2.0 * step, middle, step), 0.0, 0.4)
@@ -87,11 +88,12 @@ def find_support(
     return float(np.median(found)), math.hypot(spread, step / math.sqrt(12.0))
 
 
-def least(values: Floats) -> float:
+def least(values: ArrayLike) -> float:
     """Return where a row of values (N,) is least, between two of them too."""
-    at = int(values.argmin())
-    if at in (0, len(values) - 1):
+    row = np.asarray(values, dtype=np.float64)
+    at = int(row.argmin())
+    if at in (0, len(row) - 1):
         return float(at)
-    before, here, after = values[at - 1 : at + 2].tolist()
+    before, here, after = row[at - 1 : at + 2].tolist()
     bend = before - 2.0 * here + after
     return at + (0.5 * (before - after) / bend if math.isfinite(bend) and bend > 0.0 else 0.0)
