@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import re
+import resource
 import shutil
 import time
 from pathlib import Path
@@ -271,6 +272,17 @@ WARNED = {
         r"time of the emission|sampling rate",
     ),
 }
+
+
+@pytest.fixture(autouse=True)
+def four_gigabytes():
+    """A fault that takes 4 GB of memory, with the half that the command starts with, fails."""
+    lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+    used = sum(1024 * int(line.split()[1]) for line in lines if line.startswith("VmData:"))
+    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    resource.setrlimit(resource.RLIMIT_DATA, (used + 3_500_000_000, hard))
+    yield
+    resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
 
 
 def said_of(folder, output, caplog):
