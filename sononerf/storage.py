@@ -15,6 +15,7 @@ import os
 import re
 import shutil
 import socket
+import stat
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -28,6 +29,7 @@ _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<pid>\d+)(?:-\d+)?\.tmp", re.DOTALL)
 _LOCK_NAME = ".lock"
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
 _WAYS_OUT = {
+    errno.ELOOP: "is a link; put the file itself in its place",
     errno.ENOSPC: "the disk is full; free space, then give the same command again",
     errno.EDQUOT: "the quota is used up; free space, then give the same command again",
     errno.EFBIG: "the file would pass the size limit; raise it (ulimit -f)",
@@ -266,7 +268,7 @@ def append_line(path: Path, text: str) -> None:
     """
     try:
         is_new = not path.exists()
-        descriptor = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
+        descriptor = _open_own(path, os.O_RDWR | os.O_APPEND)
         try:
             size = os.fstat(descriptor).st_size
             is_torn = size > 0 and os.pread(descriptor, 1, size - 1) != b"\n"
@@ -360,7 +362,7 @@ def remove_if_empty(folders: list[Path]) -> None:
 def _take(path: Path) -> int | None:
     """Open and lock a lock file; return its descriptor, or None where another holds it."""
     while True:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        descriptor = _open_own(path, os.O_RDWR)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             # Its last owner removes it on leaving: what we locked may be a name no more.
@@ -376,6 +378,43 @@ def _take(path: Path) -> int | None:
         os.close(descriptor)
 
 
+def refuse_links(folder: Path) -> None:
+    """Refuse a folder that holds a symbolic link, through which files elsewhere would be written.
+
+    The folder itself may be one: its name is the user's own.
+
+    Raises:
+        StorageError: If there is a link in it or in a folder below it.
+    """
+    waiting = [folder]
+    while waiting:
+        with os.scandir(waiting.pop()) as entries:
+            for entry in entries:
+                if entry.is_symlink():
+                    raise StorageError(
+                        f"{entry.path}: is a link to {Path(entry.path).readlink()}, and what is "
+                        "written there would be lost elsewhere; put the file or folder itself in "
+                        "its place, or choose another folder"
+                    )
+                if entry.is_dir():
+                    waiting.append(Path(entry.path))
+
+
+def _open_own(path: Path, flags: int) -> int:
+    """Open a file that is changed in place, and create it where there is none.
+
+    Raises:
+        OSError: Also if it is a link, no regular file, or has a second name elsewhere.
+    """
+    descriptor = os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
+    found = os.fstat(descriptor)
+    # A lock that its owner has just removed has no name.
+    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+        os.close(descriptor)
+        raise OSError(errno.EMLINK, "is no file of its own; remove it")
+    return descriptor
+
+
 def is_held(folder: Path) -> bool:
     """Tell whether a process holds a folder, or died without letting go of it; see :func:`lock`."""
     return (folder / _LOCK_NAME).is_file()
@@ -387,11 +426,12 @@ def lock(folder: Path) -> Iterator[None]:
 
     Raises:
         LockedError: If another process holds it; the message names its process and start.
-        StorageError: If the lock file cannot be written.
+        StorageError: If the lock file cannot be written, or the folder holds links.
     """
     make_folder(folder)
     path = folder / _LOCK_NAME
     try:
+        refuse_links(folder)
         descriptor = _take(path)
     except OSError as error:
         raise storage_error("cannot be locked", path, error) from error

@@ -368,3 +368,43 @@ def test_messages_say_what_to_do(tmp_path):
         error = storage.storage_error("cannot be written", tmp_path, OSError(code, "reason"))
         assert hint in str(error)
     assert json.loads(storage.to_json({"b": 1, "a": 2}, sort_keys=True)) == {"a": 2, "b": 1}
+
+
+@pytest.mark.parametrize("name", [".lock", "metrics.json", "checkpoints", "epochs/0001/mip_x.png"])
+@pytest.mark.parametrize("kind", ["file", "folder", "nothing"])
+def test_a_folder_with_links_is_not_held(tmp_path, name, kind):
+    outside, run = tmp_path / "outside", tmp_path / "run"
+    if kind == "file":
+        outside.write_text("precious")
+    elif kind == "folder":
+        outside.mkdir()
+    (run / name).parent.mkdir(parents=True)
+    (run / name).symlink_to(outside)
+    with (
+        pytest.raises(StorageError, match=f"{name}: is a link to {outside}, .*put the file"),
+        storage.lock(run),
+    ):
+        pass
+    assert outside.exists() == (kind != "nothing")
+    assert kind != "file" or outside.read_text() == "precious"
+    assert names(run) == [name.partition("/")[0]]
+
+
+def test_a_folder_that_is_a_link_itself_is_held(tmp_path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / "disk")
+    with storage.lock(tmp_path / "run"):
+        assert names(tmp_path / "disk") == [".lock"]
+
+
+@pytest.mark.parametrize("write", [lambda file: storage.append_line(file, "x"), storage._take])
+def test_what_is_changed_in_place_is_a_file_of_its_own(tmp_path, write):
+    outside = tmp_path / "outside"
+    outside.write_text("precious\n")
+    (tmp_path / "link").symlink_to(outside)
+    (tmp_path / "second").hardlink_to(outside)
+    os.mkfifo(tmp_path / "pipe")
+    for name in ("link", "second", "pipe"):
+        with pytest.raises((StorageError, OSError)):
+            write(tmp_path / name)
+    assert outside.read_text() == "precious\n"

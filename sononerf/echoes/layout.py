@@ -352,6 +352,11 @@ class Manifest:
                     records[pose] = record
         return records
 
+    @property
+    def is_sealed(self) -> bool:
+        """Whether all records are in ``manifest.json``."""
+        return self.path.is_file() and not self.journal.exists()
+
     def seal(self) -> None:
         """Compact the journal into ``manifest.json``, whose bytes know no order of writing."""
         records = self.read()

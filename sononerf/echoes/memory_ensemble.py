@@ -110,13 +110,29 @@ class Ensemble(ABC):
                 f"{self.path}: pose {index} has shape {values.shape}, "
                 f"expected (receivers, ranges, frequencies) {wanted}"
             )
-        if not np.isfinite(values).all():
-            raise NumericalError(f"{self.path}: pose {index} holds NaN or infinite magnitudes")
+        fault = fault_of(values)
+        if fault:
+            raise NumericalError(f"{self.path}: pose {index} holds {fault}")
         return values
 
     def _refuse_unknown(self, index: int) -> None:
         if not 0 <= index < len(self):
             raise InputError(f"{self.path}: no pose {index}; there are 0 to {len(self) - 1}")
+
+
+LOUDEST = 1e18
+"""Largest magnitude of a spectrogram: the square of a larger one is no number of single
+precision."""
+
+
+def fault_of(spectrogram: Singles) -> str:
+    """Return where a spectrogram (E, R, F) holds what is no magnitude; empty if nowhere."""
+    usable = (spectrogram >= 0.0) & (spectrogram <= LOUDEST)  # False for NaN
+    if usable.all():
+        return ""
+    at = np.unravel_index(int(usable.argmin()), usable.shape)
+    found = spectrogram[at]
+    return f"the magnitude {found:g} (receiver {at[0]}, range slice {at[1]}, frequency {at[2]})"
 
 
 class MemoryEnsemble(Ensemble):

@@ -27,7 +27,7 @@ from sononerf.echoes.layout import (
     read_axes,
     write_group,
 )
-from sononerf.echoes.memory_ensemble import Ensemble
+from sononerf.echoes.memory_ensemble import Ensemble, fault_of
 from sononerf.errors import IncompatibleError, InputError
 
 
@@ -179,7 +179,7 @@ class EnsembleStore(Ensemble):
         if index not in self._records:  # another process may have added it since
             self._records = self._manifest.read()
         record = self._records.get(index)
-        way_out = "give the same simulate command again"
+        way_out = "give the same simulate or import command again"
         if record is None or not self._chunk(index).is_file():
             raise InputError(f"{self.path}: pose {index} is missing; {way_out}")
         try:
@@ -190,12 +190,43 @@ class EnsembleStore(Ensemble):
             ) from error
         if _sha256(values) != record.sha256:
             raise InputError(f"{self.path}: pose {index} is damaged (SHA-256); {way_out}")
+        fault = fault_of(values)
+        if fault:
+            raise InputError(
+                f"{self.path}: pose {index} holds {fault}; whoever wrote the store has to mend it"
+            )
         return values
 
     def missing(self) -> list[int]:
         """Return the poses that are not there, or whose file has another size than recorded."""
         self._records = self._manifest.read()
         return [index for index in np.arange(len(self)).tolist() if not self._is_there(index)]
+
+    @property
+    def is_sealed(self) -> bool:
+        """Whether no pose is missing and what is computed of all poses is there too."""
+        return "reference" in self._attributes and self._manifest.is_sealed and not self.missing()
+
+    def damaged(self) -> list[int]:
+        """Read all poses that are there; return those that are damaged."""
+        found = []
+        for index in np.arange(len(self)).tolist():
+            if self._is_there(index):
+                try:
+                    self.read_pose(index)
+                except InputError:
+                    found.append(index)
+        return found
+
+    def remove_damaged(self) -> None:
+        """Remove the files of damaged poses, which then are missing.
+
+        Raises:
+            StorageError: If one cannot be removed.
+        """
+        self._refuse_reading()
+        for index in self.damaged():
+            storage.remove_file(self._chunk(index))
 
     def check(self) -> list[str]:
         """Read everything and return what is wrong, one line each; nothing where all is well."""

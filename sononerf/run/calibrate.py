@@ -13,6 +13,7 @@ import trimesh
 from scipy.spatial.transform import Rotation
 
 from sononerf import storage
+from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.echoes.store import EnsembleStore
@@ -123,8 +124,11 @@ def calibrate(
         )
     opened = RunFolder.of(source)
     echoes, mesh = opened.echoes, opened.mesh()
-    if "radius" in wanted:
-        _check_cylinder(echoes)
+    if "radius" in wanted and not _is_turntable(echoes.positions):
+        raise SettingsError(
+            "radius: the poses are not those of a turntable: their distances from the z axis "
+            "differ; leave radius out"
+        )
     storage.remove_if_empty(storage.probe_writable(output))
     tried = [
         kind for kind in wanted if kind == "radius" or (kind == "support" and echoes.head.plane)
@@ -183,13 +187,10 @@ def _without_lag(
     )
 
 
-def _check_cylinder(echoes: Echoes) -> None:
-    distance = np.linalg.norm(echoes.positions[:, :2], axis=1)
-    if np.ptp(distance) > ON_CYLINDER * distance.mean():
-        raise SettingsError(
-            "radius: the poses are not those of a turntable: their distances from the z axis are "
-            f"{distance.min():.3g} to {distance.max():.3g} m; leave radius out"
-        )
+def _is_turntable(positions: Floats) -> bool:
+    """Tell whether poses (P, 3), m, are at one distance from the z axis."""
+    distance = np.linalg.norm(positions[:, :2], axis=1)
+    return bool(np.ptp(distance) < ON_CYLINDER * distance.mean())
 
 
 def _by_trials(opened: RunFolder, kind: str, output: Path, progress: Progress) -> Calibrated:
@@ -310,6 +311,12 @@ def describe(
             "the echoes do not separate it from the size of the object"
             if uncertain > DETERMINED * head.resolution
             else None,
+        )
+    if "range_offset" in kinds and _is_turntable(store.positions):
+        warnings.append(
+            "range_offset: all poses are those of a turntable, where a larger object sounds nearly "
+            "the same; the stated uncertainty does not hold; measure it with a reference target "
+            "(import.reference)"
         )
     if {"gain", "range_offset"} <= set(kinds):
         warnings.append(

@@ -157,8 +157,7 @@ def _wait_for_store(settings: Settings, folder: Path) -> EnsembleStore:
 def _is_sealed(path: Path) -> bool:
     if not (path / "zarr.json").is_file():
         return False
-    store = EnsembleStore.open(path)
-    return "reference" in store.attributes and not store.missing()
+    return EnsembleStore.open(path).is_sealed
 
 
 def fit(
@@ -209,6 +208,8 @@ def fit(
         _fit(settings, run, echoes, hardware, Progress(quiet=True))
         return run
     if overwrite:
+        if path.is_symlink():
+            progress.say(f"{path} is a link to {path.readlink()}; the run there is moved aside")
         aside = run.move_aside()
         if aside:
             progress.say(f"moved the old run to {aside}")

@@ -140,7 +140,7 @@ def import_understood(
         store = EnsembleStore.open(output)
         if store.attributes.get("echo_hash") != wanted:
             raise IncompatibleError(f"{output}: holds other echoes; choose another --output")
-        if "reference" in store.attributes and not store.missing():
+        if store.is_sealed and not store.damaged():
             return store, verdict(known, store)
     warn_of_call(known.settings.call, known.settings.spectrogram)
     poses = known.poses[known.pings]
@@ -156,6 +156,7 @@ def import_understood(
             attributes=_attributes(known, wanted),
             receivers=len(known.head.receivers),
         )
+        store.remove_damaged()
         attach(known.settings, output)
         missing = store.missing()
         with progress.task("importing", len(missing)) as task:

@@ -136,6 +136,7 @@ def simulate(
         store = EnsembleStore.create(
             path, poses_positions=poses.positions, poses_rotations=poses.rotations, **given
         )
+        store.remove_damaged()
         attach(head, path)
         if shard is None and whole is not None:
             take_shards(store, whole)
@@ -153,7 +154,7 @@ def _finished(path: Path, wanted: str) -> EnsembleStore | None:
             f"{path}: holds echoes of other settings; choose another --output, or leave the scene "
             "out of the settings to take the echoes as they are"
         )
-    return store if "reference" in store.attributes and not store.missing() else None
+    return store if store.is_sealed and not store.damaged() else None
 
 
 def echo_hash(

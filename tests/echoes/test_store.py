@@ -17,6 +17,7 @@ import pytest
 import zarr
 
 from sononerf import storage
+from sononerf.echoes.layout import PoseRecord
 from sononerf.echoes.memory_ensemble import seal
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, NumericalError, StorageError
@@ -123,6 +124,48 @@ def test_a_pose_in_the_place_of_another_is_refused(tmp_path):
     chunk(tmp_path / "s", 2).write_bytes(chunk(tmp_path / "s", 3).read_bytes())
     with pytest.raises(InputError, match=r"pose 2 is damaged \(SHA-256\)"):
         store.read_pose(2)
+
+
+def forged(store, index, values):
+    """Write a pose as a stranger would: values that nothing here would write, rightly hashed."""
+    array = zarr.open_array(store.path, path="spectrogram", mode="r+")
+    array[index] = values
+    digest = hashlib.sha256(values.astype("<f4").tobytes()).hexdigest()
+    store._manifest.add(index, PoseRecord(chunk(store.path, index).stat().st_size, digest))
+
+
+@pytest.mark.parametrize("poison", [np.nan, np.inf, 1e30, -1.0])
+def test_poison_with_a_right_hash_is_refused_with_its_place(tmp_path, poison):
+    store, values = filled(tmp_path / "s"), spectrogram(4)
+    values[1, 3, 2] = poison
+    forged(store, 4, values)
+    words = r"pose 4 holds the magnitude \S+ \(receiver 1, range slice 3, frequency 2\)"
+    with pytest.raises(InputError, match=words):
+        EnsembleStore.open(tmp_path / "s").read_pose(4)
+    with pytest.raises(NumericalError, match=words):
+        store.write_pose(4, values)
+
+
+def test_a_store_that_was_killed_while_it_was_sealed_is_not_sealed(tmp_path):
+    store = EnsembleStore.create(tmp_path / "s", **axes())
+    for index in range(POSES):
+        store.write_pose(index, spectrogram(index))
+    store.update_attributes(reference=1e-3)
+    assert not EnsembleStore.open(tmp_path / "s").is_sealed  # killed here
+    store.seal()
+    assert EnsembleStore.open(tmp_path / "s").is_sealed
+    chunk(tmp_path / "s", 3).unlink()
+    assert not EnsembleStore.open(tmp_path / "s").is_sealed
+
+
+def test_a_damaged_pose_can_be_removed_and_is_missing_then(tmp_path):
+    store = filled(tmp_path / "s")
+    data = bytearray(chunk(tmp_path / "s", 3).read_bytes())
+    data[len(data) // 2] ^= 1
+    chunk(tmp_path / "s", 3).write_bytes(data)
+    assert (store.missing(), store.damaged()) == ([], [3])
+    store.remove_damaged()
+    assert (store.missing(), store.damaged()) == ([3], [])
 
 
 def test_a_chunk_without_its_record_counts_as_missing(tmp_path):

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -96,6 +97,20 @@ def test_what_is_not_determined_is_said(run):
         "position: the echoes hardly determine it",
     ):
         assert words in text
+
+
+def test_a_turntable_hardly_tells_a_range_offset(run):
+    fitted = load_fitted(run)
+    store = echoes_of(fitted).store
+    angle = np.arange(len(store))
+    turned = SimpleNamespace(
+        indices=store.indices,
+        positions=np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1),
+    )
+    estimate = Estimate(Calibration.none(2, len(store)), {"range_offset": 1e-4}, [])
+    for poses, warned in ((store, False), (turned, True)):
+        _, warnings = describe(fitted.head, poses, SPHERE, estimate, ("range_offset",))
+        assert any("those of a turntable" in line for line in warnings) == warned
 
 
 def test_bad_input_is_one_line_and_leaves_nothing(run, tmp_path):

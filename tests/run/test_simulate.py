@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import signal
 from dataclasses import replace
 
@@ -215,6 +216,17 @@ def test_stops_and_other_numbers_of_workers_change_no_byte(tiny, echoes, tmp_pat
     alone = EnsembleStore.open(echoes)
     assert stopper.written == len(alone) - 3 - 4
     assert content(store) == content(alone)
+
+
+def test_the_same_command_mends_a_damaged_pose(tiny, echoes, tmp_path):
+    shutil.copytree(echoes, tmp_path / "store")
+    file = next((tmp_path / "store" / "spectrogram").glob("c.3.*"))
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+    made = simulate(tiny(), output=tmp_path / "store", workers=1)
+    assert made.check() == []
+    assert content(made) == content(EnsembleStore.open(echoes))
 
 
 def test_shards_that_stop_and_go_on_make_the_same_bytes_as_one_process(
