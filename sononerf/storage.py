@@ -392,20 +392,15 @@ def refuse_links(folder: Path) -> None:
             for entry in entries:
                 if entry.is_symlink():
                     raise StorageError(
-                        f"{entry.path}: is a link to {Path(entry.path).readlink()}, and what is "
-                        "written there would be lost elsewhere; put the file or folder itself in "
-                        "its place, or choose another folder"
+                        f"{entry.path}: is a link to {Path(entry.path).readlink()}, so that files "
+                        "elsewhere would be written; put the file or folder itself in its place"
                     )
                 if entry.is_dir():
                     waiting.append(Path(entry.path))
 
 
 def _open_own(path: Path, flags: int) -> int:
-    """Open a file that is changed in place, and create it where there is none.
-
-    Raises:
-        OSError: Also if it is a link, no regular file, or has a second name elsewhere.
-    """
+    """Open or create a file that is changed in place; links and special files are errors."""
     descriptor = os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
     found = os.fstat(descriptor)
     # A lock that its owner has just removed has no name.
