@@ -9,6 +9,7 @@ import math
 from pathlib import Path
 
 from sononerf.errors import InputError
+from sononerf.input_files import require_regular
 
 MOST_BYTES = 200_000_000
 """A larger file is no table of poses; it is refused before it is read."""
@@ -22,6 +23,7 @@ def read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
             length.
     """
     try:
+        require_regular(path)
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"{path}: larger than {MOST_BYTES} bytes; no table of poses")
         text = path.read_text(encoding="utf-8-sig")

@@ -19,7 +19,7 @@ PACKAGE = ROOT / "sononerf"
 
 FLOORS = (
     ("errors", "array_types", "compiled", "progress", "memory"),
-    ("storage", "shown", "tables", "settings", "geometry"),
+    ("storage", "input_files", "shown", "tables", "settings", "geometry"),
     ("scene", "head"),
     ("echoes",),
     ("simulation", "recordings"),

@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from sononerf.array_types import Bools, Floats
 from sononerf.errors import InputError
 from sononerf.head.row_filters import WINDOW_BANDWIDTH, WINDOW_DURATION
+from sononerf.input_files import require_regular
 
 LONGEST = 0.1  # s, as the settings' longest sweep
 SHORTEST = 8  # samples
@@ -152,6 +153,7 @@ def _read(path: Path) -> tuple[int, NDArray[np.generic]]:
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         try:
+            require_regular(path)
             rate, samples = scipy.io.wavfile.read(path)
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None

@@ -20,6 +20,7 @@ from sononerf.array_types import Floats
 from sononerf.echoes.layout import SPLITS
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses, euler_from_rotation
+from sononerf.input_files import require_regular
 from sononerf.recordings.columns import Columns
 
 WAV, OTHERS = (".wav",), (".flac", ".ogg", ".aiff", ".aif", ".w64", ".caf")
@@ -58,6 +59,7 @@ def _read(path: Path, *stamp: int) -> tuple[float, NDArray[Any]]:
 
 
 def _wav(path: Path) -> tuple[float, NDArray[Any]]:
+    require_regular(path)
     with path.open("rb") as file:
         start = file.read(12)
     if start[:4] not in (b"RIFF", b"RIFX", b"RF64") or start[8:12] != b"WAVE":

@@ -17,6 +17,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from sononerf.errors import SettingsError
+from sononerf.input_files import require_regular
 from sononerf.settings.schema import Settings
 
 MAX_SETTINGS_BYTES = 1_000_000
@@ -88,6 +89,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         SettingsError: If the file is missing, not UTF-8, too large, or no YAML mapping.
     """
     try:
+        require_regular(path)
         if path.stat().st_size > MAX_SETTINGS_BYTES:
             raise SettingsError(f"{path}: larger than {MAX_SETTINGS_BYTES} bytes; no settings file")
         text = path.read_text(encoding="utf-8-sig")

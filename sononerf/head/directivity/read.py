@@ -15,6 +15,7 @@ import numpy as np
 from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.head.directivity.record import MOST_RECEIVERS, Directivity, unit_vectors
+from sononerf.input_files import require_regular
 
 logger = logging.getLogger("sononerf")
 
@@ -134,6 +135,7 @@ def content_hash(path: Path) -> str:
         InputError: If it cannot be read.
     """
     try:
+        require_regular(path)
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except FileNotFoundError:
