@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -59,6 +60,27 @@ def require_memory(needed: float, what: str, remedy: str) -> None:
         raise ResourceError(
             f"{what} needs about {gigabytes(needed)} of memory, and {gigabytes(free)} are free; "
             f"{remedy}"
+        )
+
+
+def require_disk(needed: float, folder: Path, what: str, remedy: str) -> None:
+    """Refuse files that need more space than the disk has free, before they are written.
+
+    Args:
+        needed: Bytes.
+        folder: Where they go; it need not be there.
+        what: The files, for the message.
+        remedy: What the user can do.
+
+    Raises:
+        ResourceError: With the space needed and the space free.
+    """
+    there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
+    free = shutil.disk_usage(there).free
+    if needed > free:
+        raise ResourceError(
+            f"{what} needs about {gigabytes(needed)} of disk, and {gigabytes(free)} are free at "
+            f"{there}; {remedy}"
         )
 
 

@@ -27,6 +27,7 @@ from sononerf.head.call import call_content
 from sononerf.head.ears import directivity_content
 from sononerf.head.head import Head
 from sononerf.head.reception import warn_of_call
+from sononerf.memory import require_disk
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
 from sononerf.settings.loading import checked_section
@@ -40,6 +41,8 @@ from sononerf.simulation.workers import SeedOf, simulated
 Write = Callable[[int, Singles], None]
 HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")
 """Sections of the settings that the echoes depend on."""
+LEAST_BYTES = 2.0
+"""Space of one cell of a spectrogram on disk, bytes: compressed stores have 2.2 to 2.9."""
 
 
 def simulate(
@@ -116,6 +119,14 @@ def simulate(
         range_max=head.analysis.range_max,
     )
     if path is not None:
+        cells = len(poses) * len(head.receivers) * len(head.range) * len(head.frequency)
+        share = 1 if shard is None else shard.count
+        require_disk(
+            LEAST_BYTES * cells / share,
+            path,
+            f"{path}: the echoes of {len(poses):,} poses",
+            "lower poses.count, or choose another disk with --output",
+        )
         storage.probe_writable(path)
     if simulator.engine.note:
         progress.say(f"echoes: {simulator.engine.note}")
