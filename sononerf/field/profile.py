@@ -290,7 +290,8 @@ class ProfileRenderer(Renderer):
                     known *= weight.index_select(0, place)
             response, lead = field.echo(places, unit.T, bins, place, code)  # (M, B), (M,)
             response = response.T
-            self.points_evaluated += len(place)
+            if self.training:
+                self.points_evaluated += len(place)
             squared = response.abs().square() if response.is_complex() else response.square()
             echoes.append((squared * known)[None])
             at.append(middle - lead / self.bin)

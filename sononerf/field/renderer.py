@@ -60,6 +60,8 @@ class Renderer(nn.Module):
         head: What heard the spectra.
 
     Attributes:
+        points_evaluated: Number of points at which the field was evaluated in training. Pictures
+            and validation do not count, so that the number does not depend on when they are drawn.
         support (2, 3): Point (m) and unit normal of the plane that mirrors sound; None where there
             is none. A renderer that does not know images may leave it out.
     """
@@ -320,7 +322,8 @@ class ShellRenderer(Renderer):
         told = -world if self.told == "incidence" else -rotation[:, None, :, 0].expand(world.shape)
         told = told[:, None].expand(places.shape)
         inside = field.inside(places)  # (P, R, D)
-        self.points_evaluated += inside.sum()
+        if self.training:
+            self.points_evaluated += inside.sum()
         slice_index, direction_index = inside.flatten(0, 1).nonzero(as_tuple=True)
         response = field.select(places[inside], told[inside], bins)  # (N, B)
         sums = []
