@@ -40,12 +40,14 @@ class Fitted:
         hull: Free space in front of the onsets of the training poses.
         settings: Of the experiment.
         echo_hash: Of the echoes that were fitted to.
+        folder: The run's.
     """
 
     module: EchoModule
     hull: EchoHull
     settings: Settings
     echo_hash: str
+    folder: Path
 
     @property
     def head(self) -> Head:
@@ -95,7 +97,7 @@ def load_fitted(path: Path) -> Fitted:
                 f"{settings.renderer.kind} of this version: {str(error).splitlines()[-1].strip()}"
             ) from None
     module.eval()
-    return Fitted(module, hull, settings, echoes)
+    return Fitted(module, hull, settings, echoes, path)
 
 
 def _hull(state: dict[str, torch.Tensor]) -> EchoHull:
@@ -113,7 +115,10 @@ def echoes_of(fitted: Fitted) -> Echoes:
         IncompatibleError: If others lie there.
     """
     settings = fitted.settings
-    path = settings.data.store or default_store(settings, fitted.echo_hash)
+    stated = settings.data.store or default_store(settings, fitted.echo_hash)
+    # The fit may have been started elsewhere: above its run the store lies as it did from there.
+    places = [stated, *(folder / stated for folder in fitted.folder.absolute().parents)]
+    path = next((place for place in places if (place / "zarr.json").is_file()), stated)
     if not path.exists():
         again = (
             "import the recordings again"

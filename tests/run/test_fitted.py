@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -231,3 +232,15 @@ def test_what_was_fitted_without_its_background_is_measured_without_it(run, tiny
     assert reference == pytest.approx(np.sqrt(0.75) * heard.attributes["reference"], rel=1e-5)
     with pytest.raises(IncompatibleError, match=r"data\.background"):
         fit(tiny(), path)
+
+
+def test_a_run_finds_its_store_from_another_working_folder(run, echoes, tmp_path, monkeypatch):
+    home, other = tmp_path / "home", tmp_path / "other"
+    shutil.copytree(echoes, home / "data" / "store")
+    (other / "data" / "store").mkdir(parents=True)  # holds nothing
+    plain = load_fitted(run).settings.plain()
+    change(run, settings={**plain, "data": {**plain["data"], "store": "data/store"}})
+    shutil.copytree(run, home / "runs" / "one")
+    monkeypatch.chdir(other)
+    found = echoes_of(load_fitted(Path("../home/runs/one")))
+    assert found.store.path.resolve() == home / "data" / "store"
