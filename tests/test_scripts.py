@@ -129,6 +129,7 @@ def test_an_argument_of_another_kind_is_named(made, call, message):
         call(scene, echoes)
 
 
+@pytest.mark.slow
 def test_objects_show_themselves_in_a_notebook(made):
     scene, echoes, model, surface = made
     heard = sn.predict(model, None, echoes.poses("test"), progress=QUIET)

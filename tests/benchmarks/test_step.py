@@ -50,6 +50,7 @@ def measured(tmp_path_factory):
     return text, json.loads(file.read_text())
 
 
+@pytest.mark.slow
 def test_equation_17_as_it_stands_has_the_loss_of_the_shell_renderer(measured):
     _, found = measured
     assert found["loss_of_equation_17_differs_by"] < 1e-4

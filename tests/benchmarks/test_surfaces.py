@@ -171,6 +171,7 @@ def test_exact_echoes_are_read_from_the_store_that_is_given(asked, tmp_path):
     assert runs["exact-0"][2] == Path("echoes")
 
 
+@pytest.mark.slow
 def test_the_scaled_world_is_made_of_the_unscaled_one_and_judged_in_its_metres(
     asked, monkeypatch, tmp_path
 ):

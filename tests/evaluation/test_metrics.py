@@ -123,6 +123,7 @@ def ground(size=0.2):
     return slab
 
 
+@pytest.mark.slow
 def test_surroundings_cost_the_target_nothing():
     """A perfect target beside ground that is 3 mm off: its half of the gap belongs to neither."""
     low = ground()
@@ -135,6 +136,7 @@ def test_surroundings_cost_the_target_nothing():
     assert geometry_metrics(found, sphere(RADIUS), samples=5000)["chamfer_m"] > 0.01
 
 
+@pytest.mark.slow
 def test_what_grew_off_the_target_towards_the_ground_counts_against_it():
     # Two thirds of the way from the sphere (bottom at -15 mm) to the ground (top at -50 mm).
     lump = sphere(0.002, (0, 0, -0.025))

@@ -229,7 +229,11 @@ def truth_on_vertices():
 # Values between the vertices are interpolated, so the truth on the finest vertices misses by so
 # much too; coarser levels and hidden layers make up for that. With 1331 vertices in 1024 entries
 # most share one with another vertex, and may miss by half as much again.
-@pytest.mark.parametrize(("log2_entries", "allowed"), [(17, 1.0), (10, 1.5)], ids=["own", "shared"])
+@pytest.mark.parametrize(
+    ("log2_entries", "allowed"),
+    [pytest.param(17, 1.0, marks=pytest.mark.slow), (10, 1.5)],
+    ids=["own", "shared"],
+)
 def test_it_learns_a_coloured_ball(log2_entries, allowed):
     field = ball(levels=3, log2_entries=log2_entries)
     steps, generator = 300, torch.Generator().manual_seed(0)

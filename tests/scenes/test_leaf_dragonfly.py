@@ -25,6 +25,7 @@ def test_the_leaf_is_the_same_with_and_without_prey(caplog):
     assert not caplog.records
 
 
+@pytest.mark.slow
 @pytest.mark.thorough
 def test_materials_are_options_and_one_alone_is_one():
     scene = load_scene("leaf_dragonfly", {"material": "rigid", "dragonfly": "leaf"})

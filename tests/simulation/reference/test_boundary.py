@@ -151,6 +151,7 @@ def test_a_thin_disc_has_its_limit_at_low_frequency():
     assert abs(echo - exact) < 0.03 * abs(exact)
 
 
+@pytest.mark.slow
 def test_a_thin_disc_reflects_as_physical_optics_says_at_high_frequency():
     radius, distance = 0.02, 0.3
     found = operators(thin_disc(radius, 3e-4, 0.0027))

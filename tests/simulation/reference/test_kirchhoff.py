@@ -211,6 +211,7 @@ def test_turning_scene_and_head_together_changes_nothing():
     assert np.abs(one[0] - two[1]).max() > 0.1 * np.abs(one).max()
 
 
+@pytest.mark.slow
 def test_finer_pieces_say_the_same():
     coarse, fine = (
         echoes(kirchhoff(sphere(0.0286), elements_per_wavelength=parts), [0.3, 0.0, 0.0])[0]

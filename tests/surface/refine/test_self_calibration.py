@@ -57,6 +57,7 @@ def test_a_range_offset_is_told_from_the_size(bumpy, heard, optics):
     assert estimate.deviation["range_offset"] < 0.001
 
 
+@pytest.mark.slow
 def test_the_speed_of_sound_is_found_from_several_distances(bumpy, heard, optics):
     several = found(bumpy, heard(speed=0.005), optics, "speed_of_sound")
     assert several.calibration.speed_of_sound == pytest.approx(0.005, abs=0.0005)
