@@ -426,7 +426,6 @@ def lock(folder: Path) -> Iterator[None]:
     make_folder(folder)
     path = folder / _LOCK_NAME
     try:
-        refuse_links(folder)
         descriptor = _take(path)
     except OSError as error:
         raise storage_error("cannot be locked", path, error) from error
@@ -439,6 +438,7 @@ def lock(folder: Path) -> Iterator[None]:
             "or choose another folder with --output"
         )
     try:
+        refuse_links(folder)  # while no other process changes it
         started = time.strftime("%Y-%m-%d %H:%M:%S")
         owner = f"process {os.getpid()} on {socket.gethostname()} since {started}\n"
         os.ftruncate(descriptor, 0)

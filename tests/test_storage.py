@@ -380,11 +380,9 @@ def test_a_folder_with_links_is_not_held(tmp_path, name, kind):
         outside.mkdir()
     (run / name).parent.mkdir(parents=True)
     (run / name).symlink_to(outside)
-    with (
-        pytest.raises(StorageError, match=f"{name}: is a link to {outside}, .*put the file"),
-        storage.lock(run),
-    ):
-        pass
+    with pytest.raises(StorageError, match=f"{name}: .*is a link.*; put the file"):
+        with storage.lock(run):
+            pass
     assert outside.exists() == (kind != "nothing")
     assert kind != "file" or outside.read_text() == "precious"
     assert names(run) == [name.partition("/")[0]]

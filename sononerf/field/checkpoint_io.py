@@ -110,6 +110,7 @@ class DurableCheckpointIO(CheckpointIO):
             raise InputError(f"{chosen}: no checkpoint of plain data: {first}") from error
         if not isinstance(content, dict):
             raise InputError(f"{chosen}: holds {type(content).__name__}, expected a checkpoint")
+        _refuse_nan(chosen, content.get("state_dict"))
         return content
 
     def remove_checkpoint(self, path: Any) -> None:
@@ -181,4 +182,12 @@ def load_weights(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         state = safetensors.torch.load(data)
     except Exception as error:  # the reader's errors have no common base
         raise InputError(f"{weights}: no safetensors file ({error})") from error
+    _refuse_nan(weights, state)
     return state, description
+
+
+def _refuse_nan(path: Path, state: Any) -> None:
+    """Refuse weights that hold NaN: all that is rendered with them would be NaN."""
+    for name, values in state.items() if isinstance(state, dict) else ():
+        if isinstance(values, Tensor) and bool(torch.isnan(values).any()):
+            raise InputError(f"{path}: {name} holds NaN; repeat the fit with --overwrite")

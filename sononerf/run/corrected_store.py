@@ -34,7 +34,7 @@ def write_corrected(
     """Write echoes without the errors of their recording; an interrupted call goes on.
 
     Args:
-        echoes: With the errors, but for those of the support, which their head is free of.
+        echoes: With the errors. The support of their head is the right one already.
         output: The corrected store.
         found: The errors.
         progress: Where to show it.

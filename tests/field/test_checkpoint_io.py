@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import resource
 
 import numpy as np
@@ -11,7 +12,13 @@ import pytest
 import torch
 
 from sononerf.errors import InputError, StorageError
-from sononerf.field.checkpoint_io import DurableCheckpointIO, fault_of, previous_of
+from sononerf.field.checkpoint_io import (
+    DurableCheckpointIO,
+    fault_of,
+    load_weights,
+    previous_of,
+    save_weights,
+)
 
 
 @pytest.fixture
@@ -125,3 +132,13 @@ def test_urls_are_refused(url):
 def test_remove_takes_both(path):
     DurableCheckpointIO().remove_checkpoint(path)
     assert list(path.parent.iterdir()) == []
+
+
+def test_nan_in_weights_is_refused_with_their_name(path):
+    state = {"field.table": torch.tensor([1.0, math.nan]), "hull.first": torch.tensor([-math.inf])}
+    DurableCheckpointIO().save_checkpoint({"state_dict": state}, path)
+    with pytest.raises(InputError, match=r"field\.table holds NaN; repeat the fit"):
+        DurableCheckpointIO().load_checkpoint(path)
+    save_weights(path.parent, state, {"echo_hash": "x"})
+    with pytest.raises(InputError, match=r"model\.safetensors: field\.table holds NaN"):
+        load_weights(path.parent)
