@@ -119,6 +119,7 @@ def simulate(
         range_max=head.analysis.range_max,
     )
     if path is not None:
+        storage.remove_if_empty(storage.probe_writable(path))
         cells = len(poses) * len(head.receivers) * len(head.range) * len(head.frequency)
         share = 1 if shard is None else shard.count
         require_disk(
@@ -127,7 +128,6 @@ def simulate(
             f"{path}: the echoes of {len(poses):,} poses",
             "lower poses.count, or choose another disk with --output",
         )
-        storage.probe_writable(path)
     if simulator.engine.note:
         progress.say(f"echoes: {simulator.engine.note}")
     given: dict[str, Any] = {
