@@ -113,6 +113,17 @@ def test_an_interrupted_import_goes_on(brought, tmp_path):
     assert files(store.path) == whole
 
 
+def test_the_same_import_mends_a_damaged_pose(brought):
+    store, _ = brought()
+    whole = files(store.path)
+    chunk = next((store.path / "spectrogram").glob("c.5.*"))
+    data = bytearray(chunk.read_bytes())
+    data[len(data) // 2] ^= 1
+    chunk.write_bytes(data)
+    assert brought()[0].check() == []
+    assert files(store.path) == whole
+
+
 def test_repeated_pings_tell_the_noise_floor(brought):
     given = arrays()
     twice = {name: np.repeat(given[name], 2, axis=0) for name in ("position_m", "rotation")}
