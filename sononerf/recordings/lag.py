@@ -19,14 +19,16 @@ from sononerf.geometry.poses import Poses
 from sononerf.recordings.pose_check import Consistency
 
 MOST_ROWS = 4.0
-"""Largest lag that is looked for, rows; a larger one is seen by its whole rows."""
+"""Largest lag that is searched, rows. The check of an import names
+a table that is off by whole rows, so that larger lags are rare."""
 STEP = 0.2
 """Spacing of the lags that are tried, rows; between them the likelihood is weighted."""
 LAGS = np.arange(-MOST_ROWS, MOST_ROWS + STEP / 2.0, STEP)
 INDEPENDENT = 25.0
-"""Number of errors, at most, that count as independent: the coefficients of the body's model. What
-that model leaves is alike at all pings from one side. With it, 24 flights of 90 to 300 pings around
-random bodies were off by 0.7 standard deviations, root mean square, and by 1.8 at most."""
+"""Number of errors, at most, that count as independent, no unit: the number of coefficients of the
+model of the body. Errors of that model are alike at all pings from one side. With this number, 24
+flights of 90 to 300 pings around random bodies were off by 0.7 standard deviations, root mean
+square, and by 1.8 at most."""
 PATH = 0.5
 """Largest median distance of successive poses over that of random pairs, no unit, at which they
 count as a path. Poses in random order reach 1."""

@@ -205,9 +205,10 @@ def _by_trials(opened: RunFolder, kind: str, output: Path, progress: Progress) -
         return Echoes(echoes.store, changed_head(echoes.head, support=offset)), nothing
 
     def error_at(trial: int) -> float:
-        own = storage.read_json(opened.reconstruction / "read_out.json")["validation_error_db"]
-        if not trial and own is not None:
-            return float(own)
+        if not trial:  # the run itself, where it was refined
+            own = storage.read_json(opened.reconstruction / "read_out.json")["validation_error_db"]
+            if own is not None:
+                return float(own)
         name = f"{1e3 * step * trial:+.1f}"
         place = folder / f"{kind}{name}mm"
         right, found = corrected(step * trial)

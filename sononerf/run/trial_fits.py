@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""Errors that a fitted surface takes up, found by a whole fit at each of several trial values.
+"""Errors of a recording that bend the fitted surface, found by whole fits at trial values.
 
-The radius of a turntable is one: for each radius there is a body with the same first echoes, so a
-surface that was fitted to a wrong radius hears nearly the same, and derivatives about it point
-nowhere. How well the best surface of each radius explains the validation poses still differs.
+The radius of a turntable is one: for each radius there is a body with the same first echoes. A
+surface that was fitted to a wrong radius explains the echoes nearly as well, and derivatives at
+that surface do not show the error. Whole fits do: the best surface of the right radius has the
+least error on the validation poses.
 """
 
 from __future__ import annotations
