@@ -53,10 +53,10 @@ class IncompatibleError(SonoNerfError):
 
 
 class StoppedError(SonoNerfError):
-    """Stopped by a signal, with everything saved; the same command goes on."""
+    """Stopped by a signal; the message says what the same command does."""
 
-    def __init__(self, signal_number: int, message: str = "") -> None:
-        super().__init__(message or "stopped; the same command goes on where it stopped")
+    def __init__(self, signal_number: int, message: str) -> None:
+        super().__init__(message)
         self.exit_code = 128 + signal_number
 
 

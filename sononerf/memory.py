@@ -110,6 +110,18 @@ def memory_limited() -> Iterator[None]:
         wanted = used + free
         if hard == resource.RLIM_INFINITY or wanted < hard:
             resource.setrlimit(resource.RLIMIT_DATA, (wanted, hard))
+    with memory_faults():
+        yield
+
+
+@contextmanager
+def memory_faults() -> Iterator[None]:
+    """Turn the errors that NumPy and torch raise where memory is short into one of ours.
+
+    Raises:
+        ResourceError: In their place.
+    """
+    free = available_memory()
     try:
         yield
     except (MemoryError, RuntimeError) as error:

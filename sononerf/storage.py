@@ -9,26 +9,24 @@ folders and on ``flock``.
 from __future__ import annotations
 
 import errno
-import fcntl
 import json
 import os
 import re
 import shutil
-import socket
 import stat
 import threading
-import time
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from sononerf.errors import InputError, LockedError, NumericalError, StorageError
+from sononerf.errors import InputError, NumericalError, StorageError
 
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<pid>\d+)(?:-\d+)?\.tmp", re.DOTALL)
-_LOCK_NAME = ".lock"
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
-_WAYS_OUT = {
+_watchers: list[Callable[[Path, Path | None], None]] = []
+WAYS_OUT = {
     errno.ELOOP: "is a link; put the file itself in its place",
     errno.ENOSPC: "the disk is full; free space, then give the same command again",
     errno.EDQUOT: "the quota is used up; free space, then give the same command again",
@@ -40,12 +38,13 @@ _WAYS_OUT = {
     errno.EIO: "the disk reports an input/output error; check the disk, choose another folder",
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
 }
+"""What to do about an operating system's refusal, by its number."""
 
 
 def storage_error(what: str, path: Path, error: OSError) -> StorageError:
     """Return one line for an operating system's refusal: what, which path, why, what to do."""
     reason = error.strerror or str(error)
-    way_out = _WAYS_OUT.get(error.errno or 0, f"{reason}; check the path and the disk")
+    way_out = WAYS_OUT.get(error.errno or 0, f"{reason}; check the path and the disk")
     return StorageError(f"{path}: {what}: {way_out}")
 
 
@@ -144,6 +143,8 @@ def commit(
                 writer(file)
                 file.flush()
                 os.fsync(file.fileno())
+            for watcher in _watchers:
+                watcher(path, temporary)
             if previous is not None:
                 _keep(path, previous)
             os.replace(temporary, path)  # noqa: PTH105
@@ -154,6 +155,21 @@ def commit(
             raise
     except OSError as error:
         raise storage_error("cannot be written", path, error) from error
+
+
+@contextmanager
+def watched(watcher: Callable[[Path, Path | None], None]) -> Iterator[None]:
+    """Let a function know of every file, in whatever thread it is written, before it is there.
+
+    Args:
+        watcher: Called with the target and, where it is written, the temporary file that holds its
+            content; where it is removed, None. What it raises stops the change.
+    """
+    _watchers.append(watcher)
+    try:
+        yield
+    finally:
+        _watchers.remove(watcher)
 
 
 def commit_bytes(path: Path, data: bytes | memoryview) -> None:
@@ -268,7 +284,7 @@ def append_line(path: Path, text: str) -> None:
     """
     try:
         is_new = not path.exists()
-        descriptor = _open_own(path, os.O_RDWR | os.O_APPEND)
+        descriptor = open_own(path, os.O_RDWR | os.O_APPEND)
         try:
             size = os.fstat(descriptor).st_size
             is_torn = size > 0 and os.pread(descriptor, 1, size - 1) != b"\n"
@@ -284,6 +300,40 @@ def append_line(path: Path, text: str) -> None:
         raise storage_error("cannot be appended to", path, error) from error
 
 
+def append_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Append plain data to a journal as one line of JSON with a checksum; see `append_line`."""
+    body = to_json(record, sort_keys=True)
+    # The checksum covers the text before it, so that a torn or damaged line is no record.
+    append_line(path, f"{body[:-1]},{_checksum_field(body)}}}")
+
+
+def read_records(path: Path) -> list[dict[str, Any]]:
+    """Read the whole records of a journal; torn and damaged lines are none.
+
+    Raises:
+        InputError: If it cannot be read.
+    """
+    try:
+        lines = path.read_bytes().split(b"\n")
+    except FileNotFoundError:
+        return []
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    records = []
+    for line in lines:
+        with suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            record = json.loads(line.decode())
+            del record["crc32"]
+            body = to_json(record, sort_keys=True)
+            if line.decode() == f"{body[:-1]},{_checksum_field(body)}}}":
+                records.append(record)
+    return records
+
+
+def _checksum_field(body: str) -> str:
+    return f'"crc32":{zlib.crc32(body.encode())}'
+
+
 def remove_file(path: Path) -> None:
     """Remove a file, durably; nothing happens where there is none.
 
@@ -291,6 +341,9 @@ def remove_file(path: Path) -> None:
         StorageError: If it cannot be removed.
     """
     try:
+        if path.exists():
+            for watcher in _watchers:
+                watcher(path, None)
         path.unlink()
         sync_folder(path.parent)
     except FileNotFoundError:
@@ -359,47 +412,7 @@ def remove_if_empty(folders: list[Path]) -> None:
             folder.rmdir()
 
 
-def _take(path: Path) -> int | None:
-    """Open and lock a lock file; return its descriptor, or None where another holds it."""
-    while True:
-        descriptor = _open_own(path, os.O_RDWR)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Its last owner removes it on leaving: what we locked may be a name no more.
-            with suppress(FileNotFoundError):
-                if path.stat().st_ino == os.fstat(descriptor).st_ino:
-                    return descriptor
-        except BlockingIOError:
-            os.close(descriptor)
-            return None
-        except BaseException:
-            os.close(descriptor)
-            raise
-        os.close(descriptor)
-
-
-def refuse_links(folder: Path) -> None:
-    """Refuse a folder that holds a symbolic link, through which files elsewhere would be written.
-
-    The folder itself may be one: its name is the user's own.
-
-    Raises:
-        StorageError: If there is a link in it or in a folder below it.
-    """
-    waiting = [folder]
-    while waiting:
-        with os.scandir(waiting.pop()) as entries:
-            for entry in entries:
-                if entry.is_symlink():
-                    raise StorageError(
-                        f"{entry.path}: is a link to {Path(entry.path).readlink()}, so that files "
-                        "elsewhere would be written; put the file or folder itself in its place"
-                    )
-                if entry.is_dir():
-                    waiting.append(Path(entry.path))
-
-
-def _open_own(path: Path, flags: int) -> int:
+def open_own(path: Path, flags: int) -> int:
     """Open or create a file that is changed in place; links and special files are errors."""
     descriptor = os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
     found = os.fstat(descriptor)
@@ -408,43 +421,3 @@ def _open_own(path: Path, flags: int) -> int:
         os.close(descriptor)
         raise OSError(errno.EMLINK, "is no file of its own; remove it")
     return descriptor
-
-
-def is_held(folder: Path) -> bool:
-    """Tell whether a process holds a folder, or died without letting go of it; see :func:`lock`."""
-    return (folder / _LOCK_NAME).is_file()
-
-
-@contextmanager
-def lock(folder: Path) -> Iterator[None]:
-    """Hold a folder against other processes; the kernel lets go when the process dies.
-
-    Raises:
-        LockedError: If another process holds it; the message names its process and start.
-        StorageError: If the lock file cannot be written, or the folder holds links.
-    """
-    make_folder(folder)
-    path = folder / _LOCK_NAME
-    try:
-        descriptor = _take(path)
-    except OSError as error:
-        raise storage_error("cannot be locked", path, error) from error
-    if descriptor is None:
-        owner = ""
-        with suppress(OSError, UnicodeDecodeError):
-            owner = path.read_text(encoding="utf-8").strip()
-        raise LockedError(
-            f"{folder}: in use by {owner or 'another process'}; wait for it to end, "
-            "or choose another folder with --output"
-        )
-    try:
-        refuse_links(folder)  # while no other process changes it
-        started = time.strftime("%Y-%m-%d %H:%M:%S")
-        owner = f"process {os.getpid()} on {socket.gethostname()} since {started}\n"
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, owner.encode(), 0)
-        yield
-    finally:
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
-        os.close(descriptor)

@@ -19,7 +19,7 @@ PACKAGE = ROOT / "sononerf"
 
 FLOORS = (
     ("errors", "array_types", "compiled", "progress", "memory"),
-    ("storage", "input_files", "shown", "tables", "settings", "geometry"),
+    ("storage", "checksums", "locks", "input_files", "shown", "tables", "settings", "geometry"),
     ("scene", "head"),
     ("echoes",),
     ("simulation", "recordings"),
@@ -360,6 +360,7 @@ def test_no_file_is_too_long_to_know():
 @pytest.mark.parametrize(
     ("module", "heavy"),
     [
+        ("sononerf.cli.start", ["typer", "rich", "pydantic", "numpy"]),
         (
             "sononerf.cli.entry",
             ["torch", "lightning", "pyvista", "vtkmodules", "zarr", "matplotlib"],

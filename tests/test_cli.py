@@ -4,14 +4,17 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import functools
 import io
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,9 +28,9 @@ import yaml
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sononerf import __version__, storage
+from sononerf import __version__, locks
 from sononerf.callbacks import preview
-from sononerf.cli import entry
+from sononerf.cli import entry, start
 from sononerf.evaluation import baseline
 from sononerf.evaluation import geometry as geometry_module
 from sononerf.field.checkpoint_io import load_weights, save_weights
@@ -62,7 +65,7 @@ def run(*arguments):
         patch.setattr(sys, "argv", ["sononerf", *map(str, arguments)])
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             with pytest.raises(SystemExit) as caught:
-                entry.main()
+                start.main()
     return SimpleNamespace(code=caught.value.code or 0, out=out.getvalue(), err=err.getvalue())
 
 
@@ -588,7 +591,7 @@ def test_a_folder_that_is_no_run(clean):
 
 
 def test_a_folder_in_use(clean):
-    with storage.lock(Path("run")):
+    with locks.lock(Path("run")):
         message = refused(7, "fit", SMOKE, "--output", "run")
         assert f"in use by process {os.getpid()}" in message
         assert "in use" in refused(7, "fit", SMOKE, "--output", "run", "--overwrite")
@@ -728,16 +731,43 @@ def test_a_gpu_that_is_not_there(smoke, clean, command, monkeypatch):
     assert not Path("out/spectrograms.npz").exists()
 
 
-def test_a_fault_of_ours_is_not_dressed_up(monkeypatch):
+def test_a_fault_of_ours_is_one_line_and_a_file_with_its_traceback(monkeypatch, tmp_path):
     def broken():
-        raise ZeroDivisionError("ours")
+        raise ZeroDivisionError("ours\nand more")
 
     from sononerf.run import scenes
 
     monkeypatch.setattr(scenes, "describe_scenes", broken)
-    monkeypatch.setattr(sys, "argv", ["sononerf", "scenes"])
-    with pytest.raises(ZeroDivisionError):
-        entry.main()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    line = refused(1, "scenes")
+    assert line.startswith(
+        "error: unforeseen: ZeroDivisionError: ours; this is a fault of sononerf"
+    )
+    kept = Path(line.rpartition(" ")[2])
+    assert kept.is_relative_to(tmp_path)
+    assert "in broken" in kept.read_text()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "missing"))
+    assert refused(1, "scenes").endswith("or of a plugin")
+
+
+@pytest.mark.parametrize(
+    ("raised", "hint"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device", "/disk/events"), "/disk/events: .*full"),
+        (OSError(errno.EIO, "Input/output error"), "input/output error"),
+    ],
+)
+def test_a_disk_that_fails_a_library_is_a_storage_fault(monkeypatch, raised, hint):
+    from sononerf.run import scenes
+
+    def library():
+        try:
+            raise raised
+        except OSError as error:
+            raise ValueError("the library's own words") from error
+
+    monkeypatch.setattr(scenes, "describe_scenes", library)
+    assert re.search(hint, refused(4, "scenes"))
 
 
 # Help.
@@ -790,10 +820,45 @@ def test_signals_outside_the_fit_unwind_and_say_so(monkeypatch, number):
 
     before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
     monkeypatch.setattr(scenes, "describe_scenes", work)
-    assert "the same command goes on" in refused(128 + number, "scenes")
+    assert refused(128 + number, "scenes") == "stopped; the same command begins anew"
     assert closed == [True]
     after = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
     assert after == before
+
+
+def test_a_signal_during_an_import_is_told_whatever_the_import_makes_of_it(monkeypatch):
+    from sononerf.run import scenes
+
+    def compiled():
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(5)
+        except BaseException as error:
+            raise ImportError("multiarray failed to import") from error
+
+    monkeypatch.setattr(scenes, "describe_scenes", compiled)
+    assert refused(143, "scenes").startswith("stopped; ")
+
+
+@pytest.mark.parametrize("place", ["typer", "sononerf.cli.files"])
+def test_sigterm_while_the_command_line_is_imported_is_told(tmp_path, place):
+    """A signal comes as a module is imported that the command line needs from the first."""
+    (tmp_path / "sitecustomize.py").write_text(
+        "import os, sys\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        f"        if name == {place!r}:\n"
+        "            os.kill(os.getpid(), 15)\n"
+        "sys.meta_path.insert(0, Finder())\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-m", "sononerf.cli", "simulate", "smoke"],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
+    assert done.returncode == 143
+    assert done.stderr == "stopped; the same command goes on where it stopped\n"
 
 
 @pytest.mark.slow

@@ -8,19 +8,17 @@ import errno
 import json
 import os
 import resource
-import signal
 import stat
 import subprocess
 import sys
 import threading
-import time
 from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from sononerf import storage
-from sononerf.errors import InputError, LockedError, NumericalError, StorageError
+from sononerf.errors import InputError, NumericalError, StorageError
 
 
 @contextmanager
@@ -284,85 +282,6 @@ def test_probe_below_a_file_is_a_storage_error(tmp_path):
     assert names(tmp_path) == ["file"]
 
 
-def fork(work):
-    """Run `work` in a forked child; return its pid."""
-    pid = os.fork()
-    if pid == 0:
-        try:
-            work()
-        except BaseException:
-            os._exit(1)
-        os._exit(0)
-    return pid
-
-
-def test_lock_refuses_the_second_and_names_the_first(tmp_path):
-    with storage.lock(tmp_path):
-        with pytest.raises(LockedError, match=rf"process {os.getpid()} on .* since \d{{4}}-"):
-            with storage.lock(tmp_path):
-                pass
-    with storage.lock(tmp_path):
-        pass
-    assert names(tmp_path) == []
-
-
-def test_lock_is_not_taken_on_a_name_that_its_last_owner_removed(tmp_path, monkeypatch):
-    real, names_removed = storage.fcntl.flock, []
-
-    def flock(descriptor, operation):
-        if not names_removed:
-            names_removed.append((tmp_path / ".lock").unlink())
-        real(descriptor, operation)
-
-    monkeypatch.setattr(storage.fcntl, "flock", flock)
-    with storage.lock(tmp_path):
-        assert names(tmp_path) == [".lock"]
-        with pytest.raises(LockedError), storage.lock(tmp_path):
-            pass
-
-
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")  # only locks
-def test_lock_dies_with_its_process(tmp_path):
-    ready = tmp_path / "ready"
-
-    def hold():
-        with storage.lock(tmp_path):
-            storage.commit_bytes(ready, b"")
-            time.sleep(60)
-
-    pid = fork(hold)
-    while not ready.exists():
-        time.sleep(0.005)
-    with pytest.raises(LockedError, match=f"process {pid} "):
-        with storage.lock(tmp_path):
-            pass
-    os.kill(pid, signal.SIGKILL)
-    os.waitpid(pid, 0)
-    with storage.lock(tmp_path):
-        pass
-
-
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")  # only locks
-def test_of_many_at_once_one_holds_the_lock_at_a_time(tmp_path):
-    def work():
-        deadline = time.monotonic() + 20
-        for _ in range(10):
-            while True:
-                try:
-                    with storage.lock(tmp_path):
-                        descriptor = os.open(tmp_path / "inside", os.O_CREAT | os.O_EXCL)
-                        os.close(descriptor)
-                        os.unlink(tmp_path / "inside")  # noqa: PTH108
-                    break
-                except LockedError:
-                    if time.monotonic() > deadline:
-                        raise
-                    time.sleep(0.0005)
-
-    pids = [fork(work) for _ in range(4)]
-    assert [os.waitpid(pid, 0)[1] for pid in pids] == [0] * 4
-
-
 def test_messages_say_what_to_do(tmp_path):
     for code, hint in [(errno.ENOSPC, "free space"), (errno.EACCES, "permission"), (9999, "check")]:
         error = storage.storage_error("cannot be written", tmp_path, OSError(code, "reason"))
@@ -370,33 +289,7 @@ def test_messages_say_what_to_do(tmp_path):
     assert json.loads(storage.to_json({"b": 1, "a": 2}, sort_keys=True)) == {"a": 2, "b": 1}
 
 
-@pytest.mark.parametrize("name", [".lock", "metrics.json", "checkpoints", "epochs/0001/mip_x.png"])
-@pytest.mark.parametrize("kind", ["file", "folder", "nothing"])
-def test_a_folder_with_links_is_not_held(tmp_path, name, kind):
-    outside, run = tmp_path / "outside", tmp_path / "run"
-    if kind == "file":
-        outside.write_text("precious")
-    elif kind == "folder":
-        outside.mkdir()
-    (run / name).parent.mkdir(parents=True)
-    (run / name).symlink_to(outside)
-    with pytest.raises(StorageError, match=f"{name}: .*is a link.*; put the file"):
-        with storage.lock(run):
-            pass
-    assert outside.exists() == (kind != "nothing")
-    assert kind != "file" or outside.read_text() == "precious"
-    assert names(run) == [name.partition("/")[0]]
-
-
-def test_a_folder_that_is_a_link_itself_is_held(tmp_path):
-    (tmp_path / "disk").mkdir()
-    (tmp_path / "run").symlink_to(tmp_path / "disk")
-    with storage.lock(tmp_path / "run"):
-        assert names(tmp_path / "disk") == [".lock"]
-
-
-@pytest.mark.parametrize("write", [lambda file: storage.append_line(file, "x"), storage._take])
-def test_what_is_changed_in_place_is_a_file_of_its_own(tmp_path, write):
+def test_what_is_changed_in_place_is_a_file_of_its_own(tmp_path):
     outside = tmp_path / "outside"
     outside.write_text("precious\n")
     (tmp_path / "link").symlink_to(outside)
@@ -404,5 +297,5 @@ def test_what_is_changed_in_place_is_a_file_of_its_own(tmp_path, write):
     os.mkfifo(tmp_path / "pipe")
     for name in ("link", "second", "pipe"):
         with pytest.raises((StorageError, OSError)):
-            write(tmp_path / name)
+            storage.append_line(tmp_path / name, "x")
     assert outside.read_text() == "precious\n"

@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: MIT
 """``python -m sononerf.cli`` is the command ``sononerf``."""
 
-from sononerf.cli.entry import main
+from sononerf.cli.start import main
 
 main()

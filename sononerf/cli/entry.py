@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""The entry of the command line: the root command, signals, and exit codes."""
+"""The root command, and what its faults are called."""
 
 from __future__ import annotations
 
 import logging
-import signal
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import FrameType
+import tempfile
+import traceback
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -16,11 +14,12 @@ import typer
 from sononerf import __version__
 from sononerf.cli import experiments, files
 from sononerf.cli.options import app, say
-from sononerf.errors import SettingsError, SonoNerfError, StoppedError
+from sononerf.errors import SettingsError, SonoNerfError
 from sononerf.memory import memory_limited
 from sononerf.progress import Progress
+from sononerf.storage import WAYS_OUT, commit_text, storage_error
 
-__all__ = ["app", "experiments", "files", "main"]
+__all__ = ["app", "experiments", "fault_of", "files", "run"]
 
 
 def _version(wanted: bool) -> None:
@@ -47,59 +46,40 @@ def _root(
     logging.basicConfig(format="warning: %(message)s", level=logging.WARNING)
 
 
-class _SignalledError(BaseException):
-    """A signal came; nothing on the way may take it for a fault and go on."""
-
-    def __init__(self, number: int) -> None:
-        self.number = number
-
-
-@contextmanager
-def _signals_unwind() -> Iterator[None]:
-    """Let signals close files and end child processes on the way out."""
-
-    def unwind(number: int, frame: FrameType | None) -> None:
-        del frame
-        raise _SignalledError(number)
-
-    before = {}
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        # What was ignored when we were started (nohup, a shell's &) stays ignored.
-        if signal.getsignal(number) is not signal.SIG_IGN:
-            before[number] = signal.signal(number, unwind)
-    try:
-        yield
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+def run() -> int:
+    """Run the command that was given, and return its exit code; raises whatever it raises."""
+    with memory_limited():
+        return app(prog_name="sononerf", standalone_mode=False) or 0
 
 
-def _run() -> int:
-    try:
-        with _signals_unwind(), memory_limited():
-            return app(prog_name="sononerf", standalone_mode=False) or 0
-    except SonoNerfError as error:
-        fault = error
-    except typer.TyperException as error:
+def fault_of(error: Exception) -> SonoNerfError:
+    """Return what a command raised as a fault that the user can read."""
+    if isinstance(error, SonoNerfError):
+        return error
+    if isinstance(error, typer.TyperException):
         where = getattr(getattr(error, "ctx", None), "command_path", "sononerf")
         text = error.format_message().rstrip(".").replace("Value error, ", "")
         text = text.replace(". Did you mean", "; did you mean").rstrip("?")
-        fault = SettingsError(f"{text[:1].lower()}{text[1:]}; see `{where} --help`")
-    except _SignalledError as error:
-        fault = StoppedError(error.number)
-    if isinstance(fault, StoppedError):
-        say(str(fault))  # the user's wish, not a fault
-        return fault.exit_code
-    for line in str(fault).splitlines():
-        typer.echo(f"error: {line}", err=True)
-    return fault.exit_code
+        return SettingsError(f"{text[:1].lower()}{text[1:]}; see `{where} --help`")
+    return _unforeseen(error)
 
 
-def main() -> None:
-    """Run the command line and end with the exit code of what went wrong."""
+def _unforeseen(error: Exception) -> SonoNerfError:
+    """Return one line for a fault that nothing expected; a file keeps its traceback."""
+    refused: BaseException | None = error
+    while refused is not None:
+        # Libraries report a full disk by an exception of their own around the system's.
+        if isinstance(refused, OSError) and refused.errno in WAYS_OUT:
+            path = Path(str(refused.filename or "a file"))
+            return storage_error("cannot be read or written", path, refused)
+        refused = refused.__cause__ or refused.__context__
+    first = str(error).partition("\n")[0]
+    line = f"unforeseen: {type(error).__name__}: {first}"
     try:
-        sys.exit(_run())
-    except BrokenPipeError:
-        # The reader of our output went away, as `head` does.
-        sys.stderr.close()
-        sys.exit(141)
+        kept = Path(tempfile.mkdtemp(prefix="sononerf-")) / "traceback.txt"
+        commit_text(kept, f"sononerf {__version__}\n{''.join(traceback.format_exception(error))}")
+    except (OSError, SonoNerfError):
+        return SonoNerfError(f"{line}; this is a fault of sononerf, or of a plugin")
+    return SonoNerfError(
+        f"{line}; this is a fault of sononerf, or of a plugin: report it with {kept}"
+    )

@@ -332,20 +332,37 @@ def evaluate(
         FrameName | None,
         typer.Option(help="Of the truth's file: auto, world or original; auto by default."),
     ] = None,
+    verify: Annotated[
+        bool,
+        typer.Option(
+            "--verify",
+            help="Write nothing: check that all files are as they were written, and compute all "
+            "numbers again from field, echoes and surface.",
+        ),
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Compare a run's mesh with the true surface, and show all its numbers."""
     from sononerf.progress import Progress
     from sononerf.run.evaluate import evaluate as evaluate_run
+    from sononerf.run.verify import TrueSurface
+    from sononerf.run.verify import verify as verify_run
 
-    metrics = evaluate_run(
-        run,
-        truth=truth,
-        registration=registration,
-        unit=unit,
-        frame=frame,
-        progress=Progress(quiet=as_json),
-    )
+    true: TrueSurface = {
+        "truth": truth,
+        "registration": registration,
+        "unit": unit,
+        "frame": frame,
+    }
+    progress = Progress(quiet=as_json)
+    if verify:
+        checked = verify_run(run, progress=progress, **true)
+        if as_json:
+            print_json(checked)
+        else:
+            say("all {files} files are as written; all {numbers} numbers hold".format(**checked))
+        return
+    metrics = evaluate_run(run, progress=progress, **true)
     if as_json:
         print_json(metrics)
     else:

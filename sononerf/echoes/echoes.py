@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from sononerf import storage
+from sononerf import locks, storage
 from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.detection import Onsets, asked_poses, find_onsets
 from sononerf.echoes.free_space import EchoHull, weighted
@@ -187,7 +187,7 @@ class Echoes(Shown):
         """
         path, mine = Path(path), self.store
         storage.probe_writable(path)
-        with storage.lock(path):
+        with locks.lock(path):
             written = EnsembleStore.create(
                 path,
                 poses_positions=mine.positions,

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import zlib
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -307,9 +306,7 @@ class Manifest:
 
     def add(self, pose: int, record: PoseRecord) -> None:
         """Append a finished pose to the journal, durably."""
-        body = storage.to_json({"pose": pose, **record.plain()}, sort_keys=True)
-        # The checksum covers the text before it, so that a torn or damaged line is no record.
-        storage.append_line(self.journal, f"{body[:-1]},{_checksum_field(body)}}}")
+        storage.append_record(self.journal, {"pose": pose, **record.plain()})
 
     def read(self) -> dict[int, PoseRecord]:
         """Return the finished poses in order."""
@@ -336,20 +333,10 @@ class Manifest:
         )
 
     def _read_journal(self) -> dict[int, PoseRecord]:
-        try:
-            lines = self.journal.read_bytes().split(b"\n")
-        except FileNotFoundError:
-            return {}
-        except OSError as error:
-            raise InputError(f"{self.journal}: cannot be read ({error.strerror})") from None
         records = {}
-        for line in lines:
-            with suppress(ValueError, KeyError, TypeError, RecursionError):
-                data = json.loads(line.decode())
-                pose, record = int(data["pose"]), _record(data)
-                body = storage.to_json({"pose": pose, **record.plain()}, sort_keys=True)
-                if line.decode() == f"{body[:-1]},{_checksum_field(body)}}}":
-                    records[pose] = record
+        for data in storage.read_records(self.journal):
+            with suppress(ValueError, KeyError, TypeError):
+                records[int(data["pose"])] = _record(data)
         return records
 
     @property
@@ -364,10 +351,6 @@ class Manifest:
         data = {"schema_version": MANIFEST_VERSION, "checksum": _digest(records), "poses": poses}
         storage.commit_json(self.path, data)
         storage.remove_file(self.journal)
-
-
-def _checksum_field(body: str) -> str:
-    return f'"crc32":{zlib.crc32(body.encode())}'
 
 
 def _digest(records: dict[int, PoseRecord]) -> str:

@@ -61,9 +61,6 @@ class EnsembleStore(Ensemble):
         self._axes, self._spectrogram = read_axes(path, group)
         self._manifest = Manifest(path)
         self._records = self._manifest.read()
-        if mode == "r+":
-            storage.clean_leftovers(path)
-            storage.clean_leftovers(path / SPECTROGRAM)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _reopen, (self.path, self.mode)
@@ -117,7 +114,6 @@ class EnsembleStore(Ensemble):
         if not (path / "zarr.json").exists():
             _refuse_foreign(path)
             storage.make_folder(path)
-            storage.clean_leftovers(path)
             create_arrays(path, axes, receivers)
             write_group(path, plain)
         store = cls(path, mode="r+")

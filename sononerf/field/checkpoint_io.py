@@ -19,6 +19,7 @@ from lightning.pytorch.plugins.io import CheckpointIO
 from torch import Tensor
 
 from sononerf import storage
+from sononerf.checksums import require_recorded
 from sononerf.errors import IncompatibleError, InputError
 
 _log = logging.getLogger("sononerf")
@@ -158,6 +159,7 @@ def load_weights(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         IncompatibleError: If a newer sononerf wrote it.
     """
     path = folder / DESCRIPTION_NAME
+    require_recorded(folder, path, "fetch the run again, or repeat the fit with --overwrite")
     description = storage.read_json(path)
     version = description.get("schema_version") if isinstance(description, dict) else None
     if not isinstance(version, int) or isinstance(version, bool) or version < 1:

@@ -110,4 +110,7 @@ def _made(
     if head is None:
         raise SettingsError("head: missing; give the head that heard the echoes")
     chosen = plugins.check_options(make, options, where=f"{what}.options", given=2)
-    return make(region, tensor(head.frequency) if group == plugins.FIELDS else head, **chosen)
+    heard = tensor(head.frequency) if group == plugins.FIELDS else head
+    if not isinstance(given, str):
+        return make(region, heard, **chosen)
+    return plugins.call(f"{what} {given!r}", make, region, heard, **chosen)

@@ -206,7 +206,7 @@ def _by_trials(opened: RunFolder, kind: str, output: Path, progress: Progress) -
 
     def error_at(trial: int) -> float:
         if not trial:  # the run itself, where it was refined
-            own = storage.read_json(opened.reconstruction / "read_out.json")["validation_error_db"]
+            own = opened.read_out["validation_error_db"]
             if own is not None:
                 return float(own)
         name = f"{1e3 * step * trial:+.1f}"

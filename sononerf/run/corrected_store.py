@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sononerf import storage
+from sononerf import locks
 from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import seal
@@ -57,7 +57,7 @@ def write_corrected(
     positions = store.positions + found.position + found.radius * outward(store.positions)
     earlier = store.attributes
     kept = ("origin", "source", "licence", "format", "units", "import", *KEYS)
-    with storage.lock(output):
+    with locks.lock(output):
         made = EnsembleStore.create(
             output,
             poses_positions=positions,

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sononerf import __version__, storage
+from sononerf import __version__, locks, storage
 from sononerf.errors import SonoNerfError
 from sononerf.memory import available_cores, available_memory
 
@@ -187,7 +187,7 @@ def _disk(folder: Path) -> Finding:
     if free < ENOUGH_DISK:
         return Finding("disk", text, False, "make room, or give another --output")
     try:
-        with tempfile.TemporaryDirectory(dir=folder) as place, storage.lock(Path(place)):
+        with tempfile.TemporaryDirectory(dir=folder) as place, locks.lock(Path(place)):
             storage.commit_text(Path(place) / "probe", "probe")
     except (OSError, SonoNerfError) as error:
         return Finding(

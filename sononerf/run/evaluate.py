@@ -11,7 +11,6 @@ from typing import Any
 
 import trimesh
 
-from sononerf import storage
 from sononerf.errors import InputError
 from sononerf.evaluation.baseline import BASELINES
 from sononerf.evaluation.geometry import Kind, Truth, baseline_volume, check_truth
@@ -111,7 +110,7 @@ class EvaluationWork:
         truth = laid.result()
         if truth is None:
             return None
-        level = storage.read_json(self._run.reconstruction / "read_out.json")["level"]
+        level = self._run.read_out["level"]
         return {**truth.of_reconstruction(self._true.result()[0]), "level": level}
 
     def _baseline(self, laid: Future[Truth | None], name: str) -> dict[str, Any] | None:

@@ -17,12 +17,13 @@ import scipy.io
 from numpy.typing import NDArray
 
 from sononerf import __version__, storage
+from sononerf.checksums import require_recorded
 from sononerf.echoes.echoes import complete_store
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
 from sononerf.geometry.frame import Frame, FrameName
 from sononerf.geometry.poses import Poses
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run_folder import RunFolder, locked
 from sononerf.surface.mesh_files import MeshFormat, confidence_of, mesh_bytes
 from sononerf.surface.start.volume import Volume
 
@@ -185,21 +186,24 @@ def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName 
             f"{output}: a mesh is written as {', '.join(MESHES)}, and nothing else is; choose "
             "another suffix, or another --what"
         )
-    stated = EnsembleStore.open(source).attributes if is_store else RunFolder(source).provenance
-    chosen = Frame.of(stated, frame)
+    run = RunFolder(source)
+    stated = EnsembleStore.open(source).attributes if is_store else run.provenance
+    with locked([] if is_store else [run], output):
+        storage.commit_bytes(output, _content(source, suffix, what, Frame.of(stated, frame)))
+    return output
+
+
+def _content(source: Path, suffix: str, what: What, frame: Frame) -> bytes:
+    """Return the bytes of the file that :func:`export` writes."""
     if suffix in MESHES:
         mesh = RunFolder(source).mesh()
-        data = mesh_bytes(chosen.mesh(mesh), MESHES[suffix], confidence=confidence_of(mesh))
-        storage.commit_bytes(output, data)
-        return output
+        return mesh_bytes(frame.mesh(mesh), MESHES[suffix], confidence=confidence_of(mesh))
     if suffix == ".csv":
-        storage.commit_text(output, _csv(source, what, chosen))
-        return output
+        return _csv(source, what, frame).encode()
     parts = {"echoes": _echoes, "prediction": _prediction, "volume": _volume, "points": _points}
-    arrays, attributes = parts[what](source, chosen)
-    plain = {"software": f"sononerf {__version__}", "frame": chosen.name, **attributes}
-    storage.commit_bytes(output, file_bytes(ARRAYS[suffix], arrays, plain))
-    return output
+    arrays, attributes = parts[what](source, frame)
+    plain = {"software": f"sononerf {__version__}", "frame": frame.name, **attributes}
+    return file_bytes(ARRAYS[suffix], arrays, plain)
 
 
 Part = tuple[dict[str, Named], dict[str, str]]
@@ -336,4 +340,5 @@ def _reconstructed(source: Path, name: str) -> Path:
     file = source / "reconstruction" / name
     if not file.is_file():
         raise InputError(f"{file}: missing; make it with `sononerf reconstruct {source}`")
+    require_recorded(source, file, "reconstruct again")
     return file

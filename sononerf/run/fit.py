@@ -17,7 +17,7 @@ import torch
 import trimesh
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 
-from sononerf import storage
+from sononerf import locks, storage
 from sononerf.callbacks.epoch import CheckpointCallback, ProgressCallback
 from sononerf.callbacks.preview import PreviewCallback, SpectrogramImages, SurfaceImages
 from sononerf.callbacks.tensorboard import FLOORS, Pace, RunLogger, log_results
@@ -144,7 +144,7 @@ def _wait_for_store(settings: Settings, folder: Path) -> EnsembleStore:
     background = background_path(settings)
     last_held = time.monotonic()
     while not all(_is_sealed(part) for part in (path, background) if part is not None):
-        if storage.is_held(folder):
+        if locks.is_held(folder):
             last_held = time.monotonic()
         if time.monotonic() - last_held > PATIENCE_SECONDS:
             raise ResourceError(

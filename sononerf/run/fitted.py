@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 
 from sononerf import storage
+from sononerf.checksums import require_recorded
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import IncompatibleError, InputError, SettingsError
@@ -169,6 +170,7 @@ def load_traced(path: Path) -> Traced | None:
     file = path / NAME
     if not file.is_file():
         return None
+    require_recorded(path, file, "remove it, and `sononerf fit` makes it again")
     try:
         with safe_open(str(file), "pt") as opened:
             found = {name: opened.get_tensor(name).numpy() for name in opened.keys()}

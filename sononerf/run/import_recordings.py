@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sononerf import __version__, storage
+from sononerf import __version__, locks, storage
 from sononerf.array_types import Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.recorded_noise import seal_recorded
@@ -145,7 +145,7 @@ def import_understood(
     warn_of_call(known.settings.call, known.settings.spectrogram)
     poses = known.poses[known.pings]
     storage.probe_writable(output)
-    with storage.lock(output):
+    with locks.lock(output):
         store = EnsembleStore.create(
             output,
             poses_positions=poses.positions,

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import time
 from pathlib import Path
 from typing import Literal
@@ -31,6 +32,8 @@ from sononerf.surface.refine.refinement import STATE_VERSION, Refinement
 from sononerf.surface.start.read_out import Method
 from sononerf.surface.start.volume import vti_bytes
 from sononerf.surface.surface import FORMATS, Surface
+
+logger = logging.getLogger("sononerf")
 
 STATE = Path("checkpoints") / "surface.safetensors"
 """Where the state of an interrupted refinement is kept, in the run's folder."""
@@ -80,7 +83,7 @@ def refine_surface(
         options=settings.simulation,
         seed=settings.fit.seed,
         accelerator=accelerator,
-        state=_saved_state(file, belongs),
+        state=_saved_state(run, file, belongs),
         after_step=after_step,
         progress=progress,
     )
@@ -116,9 +119,14 @@ def _metadata(file: Path) -> dict[str, str] | None:
         return None  # without a state the refinement starts from the beginning
 
 
-def _saved_state(file: Path, belongs: dict[str, str]) -> dict[str, Tensor] | None:
+def _saved_state(run: RunFolder, file: Path, belongs: dict[str, str]) -> dict[str, Tensor] | None:
     """Return the state of an interrupted refinement of the same starts, or None."""
     if _metadata(file) != belongs:
+        return None
+    try:
+        run.require_recorded(file, "the refinement starts from the beginning")
+    except InputError as error:
+        logger.warning("%s", error)
         return None
     with safe_open(str(file), "pt") as opened:
         return {name: opened.get_tensor(name) for name in opened.keys()}

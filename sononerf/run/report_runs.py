@@ -16,7 +16,7 @@ from sononerf.report.pictures.curve_picture import curves_picture
 from sononerf.report.pictures.mip_picture import mip_pictures
 from sononerf.report.pictures.spectrogram_picture import spectrogram_picture
 from sononerf.run.export import read_volume
-from sononerf.run.run_folder import RunFolder, differing_keys, flat
+from sononerf.run.run_folder import RunFolder, differing_keys, flat, locked
 from sononerf.run.run_page import curves_of, damage_named, page_of, read_predictions
 from sononerf.settings.schema import Settings
 
@@ -60,7 +60,7 @@ def report(
     target = output or (paths[0] / PAGE if len(paths) == 1 else Path(PAGE))
     if target.suffix.lower() != ".html":
         raise InputError(f"{target}: expected a file whose name ends in .html")
-    with runs[0].locked(target):
+    with locked(runs, target):
         if len(runs) == 1:
             page = page_of(runs[0], settings[0], paper, progress)
         else:

@@ -9,7 +9,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import overload
 
-from sononerf import storage
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError
 from sononerf.evaluation.difference import Comparison
@@ -85,7 +84,7 @@ class Run(Shown):
             echoes: Echoes | None = self._folder.echoes
         except InputError:
             echoes = None
-        known = storage.read_json(self._folder.reconstruction / "read_out.json")
+        known = self._folder.read_out
         surface = Surface(
             mesh,
             method=known["method"],

@@ -7,8 +7,8 @@ import importlib.metadata
 import os
 import platform
 import shutil
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
-from sononerf import __version__, storage
+from sononerf import __version__, checksums, locks, storage
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import IncompatibleError, InputError
 from sononerf.evaluation.traced import Traced
@@ -115,7 +115,7 @@ class RunFolder:
         if self._locks or elsewhere:
             yield
             return
-        with storage.lock(self.path):
+        with locks.lock(self.path), checksums.recorded(self.path):
             self._locks += 1
             try:
                 yield
@@ -144,8 +144,13 @@ class RunFolder:
     def provenance(self) -> dict[str, Any]:
         """What the run was made with; empty where the file is not there."""
         file = self.path / "provenance.json"
+        self.require_recorded(file, "fetch the run again, or repeat the fit with --overwrite")
         found = storage.read_json(file) if file.is_file() else {}
         return found if isinstance(found, dict) else {}
+
+    def require_recorded(self, file: Path, remedy: str) -> None:
+        """Refuse a damaged file; see :func:`sononerf.checksums.require_recorded`."""
+        checksums.require_recorded(self.path, file, remedy)
 
     def frame(self, name: FrameName = "auto") -> Frame:
         """Return the frame of that name; see :meth:`sononerf.geometry.frame.Frame.of`."""
@@ -162,6 +167,7 @@ class RunFolder:
             raise InputError(
                 f"{file}: there is no surface; make one with `sononerf reconstruct {self.path}`"
             )
+        self.require_recorded(file, f"reconstruct again with `sononerf reconstruct {self.path}`")
         try:
             mesh = trimesh.load_mesh(file, file_type="ply")
         except Exception as error:  # trimesh's readers raise whatever they met first
@@ -169,6 +175,21 @@ class RunFolder:
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
             raise InputError(f"{file}: holds no surface; reconstruct again")
         return mesh
+
+    @property
+    def read_out(self) -> dict[str, Any]:
+        """How the reconstructed surface was read out.
+
+        Raises:
+            InputError: If it is missing or damaged.
+        """
+        file = self.reconstruction / "read_out.json"
+        again = f"reconstruct again with `sononerf reconstruct {self.path}`"
+        self.require_recorded(file, again)
+        found = storage.read_json(file)
+        if not isinstance(found, dict):
+            raise InputError(f"{file}: damaged; {again}")
+        return found
 
     def traced(self) -> Traced | None:
         """Return the surface that echoes are traced off, and their weight; None without them."""
@@ -296,7 +317,7 @@ class RunFolder:
         number = 1
         while (aside := path.with_name(f"{path.name}.old-{number}")).exists():
             number += 1
-        with storage.lock(path):
+        with locks.lock(path):
             if not self.config.is_file():
                 self._refuse_foreign()
             try:
@@ -309,6 +330,7 @@ class RunFolder:
         """Return what ``metrics.json`` holds so far."""
         if not self.metrics.is_file():
             return {"schema": METRICS_SCHEMA}
+        self.require_recorded(self.metrics, "remove it, and the same fit command goes on")
         metrics = storage.read_json(self.metrics)
         if not isinstance(metrics, dict):
             raise InputError(f"{self.metrics}: holds no metrics; remove it and evaluate again")
@@ -318,17 +340,20 @@ class RunFolder:
         self, section: str, values: dict[str, Any] | None, *, merge: bool = False
     ) -> None:
         """Replace one section of ``metrics.json``; the others are left as they are."""
-        metrics = self.read_metrics()
-        if merge:
-            values = {**(metrics.get(section) or {}), **(values or {})}
-        storage.commit_json(self.metrics, {**metrics, "schema": METRICS_SCHEMA, section: values})
+        with self.locked():
+            metrics = self.read_metrics()
+            if merge:
+                values = {**(metrics.get(section) or {}), **(values or {})}
+            metrics |= {"schema": METRICS_SCHEMA, section: values}
+            storage.commit_json(self.metrics, metrics)
 
     def drop_metrics(self, section: str) -> None:
         """Take one section out of ``metrics.json``, where it is there."""
-        metrics = self.read_metrics()
-        if section in metrics:
-            del metrics[section]
-            storage.commit_json(self.metrics, metrics)
+        with self.locked():
+            metrics = self.read_metrics()
+            if section in metrics:
+                del metrics[section]
+                storage.commit_json(self.metrics, metrics)
 
     def write_provenance(self, **facts: Any) -> None:
         """Record what the run was made with; no names of people, machines or folders."""
@@ -350,6 +375,15 @@ class RunFolder:
     def clear_previews(self) -> None:
         """Remove the previews of a fit that starts anew."""
         shutil.rmtree(self.path / "epochs", ignore_errors=True)
+
+
+@contextmanager
+def locked(runs: Iterable[RunFolder], output: Path) -> Iterator[None]:
+    """Hold those runs whose folder a file goes into; see :meth:`RunFolder.locked`."""
+    with ExitStack() as stack:
+        for run in runs:
+            stack.enter_context(run.locked(output))
+        yield
 
 
 def _same(one: trimesh.Trimesh, two: trimesh.Trimesh) -> bool:

@@ -12,7 +12,7 @@ from sononerf import storage
 from sononerf.errors import InputError
 from sononerf.report.key_numbers import run_rows
 from sononerf.run.report_runs import names_of
-from sononerf.run.run_folder import RunFolder, flat
+from sononerf.run.run_folder import RunFolder, flat, locked
 
 
 def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
@@ -48,7 +48,8 @@ def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
         writer.writerow(["run", *keys])
         for name, one in zip(names, values, strict=True):
             writer.writerow([name, *("" if one.get(key) is None else one[key] for key in keys)])
-        storage.commit_text(csv, text.getvalue())
+        with locked(runs, csv):
+            storage.commit_text(csv, text.getvalue())
     return [
         "  ".join(
             cell.ljust(width) if not column else cell.rjust(width)

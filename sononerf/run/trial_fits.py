@@ -13,7 +13,6 @@ import math
 from collections.abc import Callable
 from pathlib import Path
 
-from sononerf import storage
 from sononerf.errors import InputError, NumericalError
 from sononerf.progress import Progress
 from sononerf.run.fit import fit
@@ -81,7 +80,7 @@ def fitted_error(settings: Settings, store: Path, run: Path, progress: Progress)
     except NumericalError as error:
         progress.say(f"{run}: {error}")
         return math.inf
-    found = storage.read_json(made.reconstruction / "read_out.json")["validation_error_db"]
+    found = made.read_out["validation_error_db"]
     if found is None:
         raise InputError(f"{run}: its surface was not refined; see what the fit says")
     return float(found)

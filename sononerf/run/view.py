@@ -8,7 +8,6 @@ from pathlib import Path
 
 import trimesh
 
-from sononerf import storage
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError, SonoNerfError
 from sononerf.progress import Progress
@@ -101,7 +100,7 @@ class View:
         self.viewer.show_surface(SurfaceViews(mesh, confidence_of(mesh), truth, limit))
         if (self.run.reconstruction / "volume.vti").is_file():
             self.viewer.show_volume(read_volume(self.run.path))
-        told = storage.read_json(self.run.reconstruction / "read_out.json")
+        told = self.run.read_out
         self._say(f"surface found as {told.get('method')}, refined: {told.get('refined')}")
 
     def _say(self, text: str) -> None:

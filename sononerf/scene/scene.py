@@ -13,7 +13,7 @@ import numpy as np
 import trimesh
 
 from sononerf.array_types import Bools, Floats, Ints
-from sononerf.errors import InputError, SettingsError, SonoNerfError, expect
+from sononerf.errors import InputError, SettingsError, expect
 from sononerf.geometry.faults import surface_faults
 from sononerf.geometry.plane import Plane
 from sononerf.scene.material import MATERIALS, RIGID, Material, MaterialName
@@ -257,13 +257,7 @@ def load_scene(
 
 
 def _built(owner: str, factory: Callable[..., Any], arguments: dict[str, Any]) -> Scene:
-    try:
-        scene = factory(**arguments)
-    except SonoNerfError:
-        raise  # says itself what is wrong, in one line
-    except (Exception, SystemExit) as error:
-        text = " ".join(str(error).split())
-        raise InputError(f"{owner} failed: {type(error).__name__}: {text}") from error
+    scene = plugins.call(owner, factory, **arguments)
     if not isinstance(scene, Scene):
         raise InputError(f"{owner} returned {type(scene).__name__}, expected a Scene")
     return scene

@@ -18,7 +18,8 @@ from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, create
 from pydantic.errors import PydanticUserError
 from pydantic_core import to_jsonable_python
 
-from sononerf.errors import InputError, SettingsError
+from sononerf.errors import InputError, SettingsError, SonoNerfError
+from sononerf.memory import memory_faults
 from sononerf.settings.loading import describe_faults, refuse_truths
 
 SCENES = "sononerf.scenes"
@@ -80,6 +81,29 @@ def load(group: str, name: str) -> Callable[..., Any]:
     if not callable(factory):
         raise InputError(f"{owner} is {type(factory).__name__}, expected a function or class")
     return typing.cast(Callable[..., Any], factory)
+
+
+def call(owner: str, factory: Callable[..., Any], *given: Any, **options: Any) -> Any:
+    """Call a plugin's factory.
+
+    Args:
+        owner: What the plugin is called, for the message.
+        factory: It.
+        given, options: Its arguments.
+
+    Raises:
+        SonoNerfError: As the factory raises it.
+        ResourceError: If there is not enough memory.
+        InputError: If the factory raises anything else.
+    """
+    try:
+        with memory_faults():
+            return factory(*given, **options)
+    except SonoNerfError:
+        raise  # says itself what is wrong, in one line
+    except (Exception, SystemExit) as error:
+        text = " ".join(str(error).split())
+        raise InputError(f"{owner} failed: {type(error).__name__}: {text}") from error
 
 
 def check_options(

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf import __version__, storage
+from sononerf import __version__, locks, storage
 from sononerf.array_types import Floats, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
@@ -143,7 +143,7 @@ def simulate(
         kept = MemoryEnsemble(positions=poses.positions, rotations=poses.rotations, **given)
         _fill(kept, simulator, poses, settings, **how)
         return Echoes(kept, head)
-    with storage.lock(path):
+    with locks.lock(path):
         store = EnsembleStore.create(
             path, poses_positions=poses.positions, poses_rotations=poses.rotations, **given
         )

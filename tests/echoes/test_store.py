@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import zarr
 
-from sononerf import storage
+from sononerf import locks
 from sononerf.echoes.layout import PoseRecord
 from sononerf.echoes.memory_ensemble import seal
 from sononerf.echoes.store import EnsembleStore
@@ -242,7 +242,7 @@ def significant(data):
 
 
 def test_a_folder_that_is_locked_is_no_foreign_one(tmp_path):
-    with storage.lock(tmp_path / "s"):
+    with locks.lock(tmp_path / "s"):
         assert len(filled(tmp_path / "s")) == POSES
 
 
@@ -375,19 +375,20 @@ KILL_POSES, KILL_SHAPE = 30, (2, 40, 16)
 
 def simulate(path, told=lambda: None):
     """What a worker does: open, add what is missing, seal."""
-    store = EnsembleStore.create(
-        path,
-        poses_positions=np.zeros((KILL_POSES, 3)),
-        poses_rotations=np.tile(np.eye(3), (KILL_POSES, 1, 1)),
-        split=np.zeros(KILL_POSES),
-        range=np.arange(1.0, 1.0 + KILL_SHAPE[1]),
-        frequency=np.arange(1.0, 1.0 + KILL_SHAPE[2]),
-        attributes={"echo_hash": "k"},
-    )
-    for index in store.missing():
-        store.write_pose(index, spectrogram(index, KILL_SHAPE))
-        told()
-    store.seal()
+    with locks.lock(path):
+        store = EnsembleStore.create(
+            path,
+            poses_positions=np.zeros((KILL_POSES, 3)),
+            poses_rotations=np.tile(np.eye(3), (KILL_POSES, 1, 1)),
+            split=np.zeros(KILL_POSES),
+            range=np.arange(1.0, 1.0 + KILL_SHAPE[1]),
+            frequency=np.arange(1.0, 1.0 + KILL_SHAPE[2]),
+            attributes={"echo_hash": "k"},
+        )
+        for index in store.missing():
+            store.write_pose(index, spectrogram(index, KILL_SHAPE))
+            told()
+        store.seal()
 
 
 # The child uses nothing that a thread of its parent may hold.

@@ -11,7 +11,7 @@ import pytest
 import safetensors.torch
 import trimesh
 
-from sononerf import storage
+from sononerf import locks, storage
 from sononerf.errors import LockedError, NumericalError, ResourceError
 from sononerf.evaluation import baseline
 from sononerf.evaluation import geometry as geometry_module
@@ -123,8 +123,10 @@ def test_another_surface_repeats_what_depends_on_it(run, steps):
     opened.begin("surface")
     assert [stage for stage in STAGES if opened.is_done(stage)] == ["fit", "traced", "prediction"]
     bumpy = SPHERE.copy().apply_scale(1.01)
-    (opened.reconstruction / "mesh.ply").write_bytes(bumpy.export(file_type="ply"))
-    storage.commit_json(opened.reconstruction / "read_out.json", {"level": None})
+    with opened.locked():
+        mesh = bumpy.export(file_type="ply")
+        storage.commit_bytes(opened.reconstruction / "mesh.ply", mesh)
+        storage.commit_json(opened.reconstruction / "read_out.json", {"level": None})
     del steps[:]
     finish(run, accelerator="cpu")
     assert steps == ["traced", "prediction", "evaluation"]
@@ -213,7 +215,7 @@ def test_a_run_in_use_is_left_alone(run, command):
             command(run)
         caught.append(error.value)
 
-    with storage.lock(run):
+    with locks.lock(run):
         other = threading.Thread(target=elsewhere)
         other.start()
         other.join()

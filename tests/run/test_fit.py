@@ -20,7 +20,7 @@ import torch
 import trimesh
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 
-from sononerf import storage
+from sononerf import locks
 from sononerf.callbacks.epoch import SIGNALS, CheckpointCallback, ProgressCallback
 from sononerf.callbacks.preview import PreviewCallback
 from sononerf.echoes.echoes import Echoes
@@ -314,7 +314,7 @@ def test_overwrite_moves_aside_and_loses_nothing(tiny, tmp_path):
 def test_overwrite_leaves_a_run_at_work_and_other_peoples_folders_alone(tiny, tmp_path):
     path = tmp_path / "run"
     run(tiny(fit={"max_steps": 1}), path)
-    with storage.lock(path), pytest.raises(LockedError, match="in use"):
+    with locks.lock(path), pytest.raises(LockedError, match="in use"):
         run(tiny(fit={"max_steps": 2}), path, overwrite=True)
     assert (path / "model.json").is_file()
     thesis = tmp_path / "thesis"
@@ -466,7 +466,7 @@ def test_a_process_does_not_wait_for_a_first_one_that_does_not_run(tiny, tmp_pat
     monkeypatch.setattr(fit_module, "PATIENCE_SECONDS", 1.0)
     settings = tiny(data={"store": str(tmp_path / "never")})
     began = time.monotonic()
-    with storage.lock(tmp_path / "run"), ThreadPoolExecutor() as pool:
+    with locks.lock(tmp_path / "run"), ThreadPoolExecutor() as pool:
         waiting = pool.submit(fit, settings, tmp_path / "run", accelerator="cpu")
         time.sleep(2.0)
         assert not waiting.done()

@@ -13,12 +13,13 @@ import torch
 import trimesh
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sononerf.checksums import recorded
 from sononerf.errors import IncompatibleError, ResourceError
 from sononerf.progress import Progress
 from sononerf.run import reconstruct as reconstruct_module
 from sononerf.run.reconstruct import STATE, reconstruct, refine_surface
 from sononerf.run.run_folder import RunFolder
-from sononerf.storage import read_json
+from sononerf.storage import commit_json, read_json
 from sononerf.surface import reconstruction
 from sononerf.surface.refine import comparison as core
 from sononerf.surface.refine import descent as stages
@@ -64,7 +65,8 @@ def run(fitted_run, tmp_path, monkeypatch):
 def with_settings(run, section, **values):
     description = json.loads((run / "model.json").read_text())
     description["settings"][section] |= values
-    (run / "model.json").write_text(json.dumps(description))
+    with recorded(run):
+        commit_json(run / "model.json", description)
 
 
 def refined(path, start=BUMPY):

@@ -25,6 +25,7 @@ from sononerf.errors import (
 )
 from sononerf.head.decibels import compress
 from sononerf.head.directivity.sofa import write_sofa
+from sononerf.locks import lock
 from sononerf.run import simulate as run_module
 from sononerf.run.import_recordings import read_recordings
 from sononerf.run.simulate import (
@@ -39,7 +40,6 @@ from sononerf.scene.material import LEAF, RIGID
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.simulation import ensemble as simulate_module
 from sononerf.simulation.shards import Shard
-from sononerf.storage import lock
 from tests.head.directivity.patterns import pair
 
 

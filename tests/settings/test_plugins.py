@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import pytest
 from pydantic import Field
 
-from sononerf.errors import InputError, SettingsError
+from sononerf.errors import InputError, ResourceError, SettingsError
 from sononerf.settings import plugins
 
 PLUGIN_FILES = ("pyproject.toml", "fixture_bar.py")
@@ -226,3 +226,20 @@ def test_annotations_that_cannot_be_read():
 
     with pytest.raises(InputError, match="annotations cannot be read"):
         check({}, strange)
+
+
+@pytest.mark.parametrize(
+    ("raised", "error", "message"),
+    [
+        (ValueError("no\nluck"), InputError, "field 'mine' failed: ValueError: no luck"),
+        (SystemExit(3), InputError, "field 'mine' failed: SystemExit: 3"),
+        (MemoryError(), ResourceError, "more memory than there is"),
+        (SettingsError("levels: too many"), SettingsError, "^levels: too many$"),
+    ],
+)
+def test_a_factory_that_raises_is_one_line(raised, error, message):
+    def factory(region, *, levels):
+        raise raised
+
+    with pytest.raises(error, match=message):
+        plugins.call("field 'mine'", factory, None, levels=3)
