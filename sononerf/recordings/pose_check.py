@@ -29,6 +29,7 @@ from itertools import combinations
 import numpy as np
 
 from sononerf.array_types import Floats, Ints
+from sononerf.geometry.aim import off_axis
 from sononerf.geometry.poses import Poses
 from sononerf.recordings.columns import EULER, PLACE, QUATERNION, Columns
 from sononerf.recordings.conventions import to_poses
@@ -114,8 +115,10 @@ def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]
             found[name] = to_poses(_scaled(columns, EULER, factor), settings)
         for angle in ("yaw", "pitch"):
             found[f"sign of {angle}"] = to_poses(_scaled(columns, (angle,), -1.0), settings)
-        swapped = {**columns.values, "yaw": columns.values["roll"], "roll": columns.values["yaw"]}
-        found["yaw and roll swapped"] = to_poses(_with(columns, swapped), settings)
+        for other in ("roll", "pitch"):
+            values = columns.values
+            swapped = {**values, "yaw": values[other], other: values["yaw"]}
+            found[f"yaw and {other} swapped"] = to_poses(_with(columns, swapped), settings)
     if columns.has(*QUATERNION):
         parts = {name: columns.values[old] for name, old in zip(QUATERNION, XYZW, strict=True)}
         found["quaternion order"] = to_poses(_with(columns, {**columns.values, **parts}), settings)
@@ -334,7 +337,7 @@ class Consistency:
             total += freedom * np.log(_scale(apart, floor / 2.0))
             count += freedom
         if self._hears_direction():
-            angle = _off_axis(poses, found.centre, float(np.nanmedian(first)))
+            angle = off_axis(poses, found.centre)
             total += len(angle) * np.log(max(float(np.median(angle)), AIM_FLOOR))
         return Misfit(float(total), count, found)
 
@@ -346,14 +349,6 @@ class Consistency:
 def _scale(error: Floats, floor: float) -> float:
     """Return a robust standard deviation, m."""
     return float(np.hypot(1.48 * np.median(np.abs(error)), floor))
-
-
-def _off_axis(poses: Poses, centre: Floats, reach: float) -> Floats:
-    """Return the angles (P,) between where heads look and where the body is, rad."""
-    to_body = centre - poses.positions
-    distance = np.linalg.norm(to_body, axis=1)
-    cosine = (to_body * poses.rotations[:, :, 0]).sum(axis=1) / np.maximum(distance, 1e-9 * reach)
-    return np.arccos(cosine.clip(-1.0, 1.0))
 
 
 def _unit(poses: Poses, ranges: Floats) -> Verdict:
@@ -421,6 +416,7 @@ HINTS = {
     "degrees for radians": "angles are in degrees, not in radians (import.angle)",
     "radians for degrees": "angles are in radians, not in degrees (import.angle)",
     "yaw and roll swapped": "the columns yaw and roll are swapped",
+    "yaw and pitch swapped": "the columns yaw and pitch are swapped",
 }
 
 

@@ -34,6 +34,7 @@ from sononerf.field.step_cost import StepCost, step_cost
 from sononerf.memory import gigabytes, require_memory
 from sononerf.progress import Progress, duration
 from sononerf.run.build import head_of, module_for, true_mesh, with_store
+from sononerf.run.doubts import doubts
 from sononerf.run.evaluate import EvaluationWork, evaluate
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
@@ -123,10 +124,6 @@ WAIT_SECONDS = 0.5
 PATIENCE_SECONDS = 120.0
 """How long other processes wait for the first one to take the run's folder, s. Importing torch from
 a slow network disk takes a minute."""
-LINE = (
-    "all training poses lie on a straight line: the echoes do not tell the angle around it, so the "
-    "surface may be drawn out around the line; fly another way as well"
-)
 
 
 def follows() -> bool:
@@ -263,8 +260,9 @@ def _fit(
         )
     corners = (1000 * module.field.region).round().int().tolist()
     progress.say(f"region {corners[0]} to {corners[1]} mm")
-    if echoes.hull.width < echoes.head.resolution:
-        logger.warning("%s", LINE)
+    box = module.field.region.double().numpy()
+    for doubt in [] if follows() else doubts(echoes, box, is_set=lower is not None):
+        logger.warning("%s", doubt)
     renderer = module.renderer
     data = EchoDataModule(
         echoes,

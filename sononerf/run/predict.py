@@ -26,6 +26,7 @@ from sononerf.evaluation.prediction import (
 )
 from sononerf.evaluation.prediction import predict as predict_poses
 from sononerf.evaluation.traced import Traced
+from sononerf.geometry.aim import aim_fault
 from sononerf.geometry.frame import FrameName
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
@@ -106,6 +107,9 @@ def predict(
         poses, numbers = own, np.arange(len(own))
         with _named(poses_csv):
             check_hearing(fitted.module, poses)
+        fault = aim_fault(poses, fitted.module.field.region.double().numpy().mean(axis=0))
+        if fault:
+            logger.warning("%s: %s", poses_csv, fault)
     else:
         poses, numbers = run.echoes.poses(split), run.echoes.store.indices(split)
         if not len(poses):

@@ -31,6 +31,8 @@ from sononerf.settings.section import (
 
 HEAD_SECTIONS = ("air", "ears", "call", "spectrogram", "support")
 """Sections that describe the head: a store and an import state them."""
+SPEED = 343.0
+"""Speed of sound in air at 20 degrees, m/s."""
 FILE_SECTIONS = ("ears", "call")
 """Sections whose key ``file`` names a file."""
 
@@ -183,6 +185,13 @@ class SpectrogramSettings(Section):
             raise ValueError("frequency_max must not exceed half the sampling_rate")
         if self.range_min >= self.range_max:
             raise ValueError("range_min must lie below range_max")
+        wavelength = SPEED / self.frequency_max
+        if wavelength > self.range_max:
+            raise ValueError(
+                f"frequency_max is {self.frequency_max:g} Hz, whose wavelength ({wavelength:.3g} m "
+                f"in air) exceeds range_max ({self.range_max:g} m); are the frequencies in kHz? "
+                "give Hz"
+            )
         if self.fft < self.window:
             raise ValueError("fft must be at least window")
         return self
@@ -385,6 +394,24 @@ class Settings(Section):
     @model_validator(mode="after")
     def _call_is_sampled_and_heard(self) -> Settings:
         check_call(self.call, self.spectrogram)
+        return self
+
+    @model_validator(mode="after")
+    def _head_is_smaller_than_its_ranges(self) -> Settings:
+        ears, limit = self.ears, self.spectrogram.range_max
+        lengths = {
+            "emitter": max(map(abs, ears.emitter)),
+            "left": max(map(abs, ears.left)),
+            "receivers": max(abs(part) for place in ears.receivers or [(0.0,)] for part in place),
+            "piston_radius": ears.piston_radius,
+            "beam_radius": ears.beam_radius,
+        }
+        for name, length in lengths.items():
+            if length > limit:
+                raise ValueError(
+                    f"ears.{name}: {length:g} m exceeds spectrogram.range_max ({limit:g} m); is it "
+                    "in mm? give metres"
+                )
         return self
 
     @cached_property

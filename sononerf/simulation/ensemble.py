@@ -33,7 +33,7 @@ from sononerf.scene.scene import Scene
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.accuracy import MOST, settle_rays
-from sononerf.simulation.pose_faults import check_poses, check_reach, deaf
+from sononerf.simulation.pose_faults import check_aim, check_poses, check_reach, deaf
 from sononerf.simulation.shards import Shard, take_shards
 from sononerf.simulation.simulator import VERSION, Simulator, pose_seed
 from sononerf.simulation.workers import SeedOf, simulated
@@ -111,6 +111,7 @@ def simulate(
     simulator = Simulator.of(scene, head, settings)
     offsets = np.vstack((head.emitter, head.receivers))
     check_poses(scene, poses, offsets=offsets, plane=head.plane)
+    check_aim(scene, poses)
     check_reach(
         scene,
         poses,

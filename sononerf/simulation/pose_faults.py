@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from sononerf.array_types import Bools, Floats
 from sononerf.errors import InputError, NumericalError
+from sononerf.geometry.aim import aim_fault
 from sononerf.geometry.plane import Plane
 from sononerf.geometry.poses import Poses
 from sononerf.geometry.raycast import winding_numbers
@@ -90,6 +91,15 @@ def check_reach(
                 "%s %s (%g m) and will hear nothing; set spectrogram.range_%s, or move them",
                 *(_named(bad), what, limit, "max" if bad is far else "min"),
             )
+
+
+def check_aim(scene: Scene, poses: Poses) -> None:
+    """Warn of poses that look away from the scene, and of poses that are all the same."""
+    fault = aim_fault(poses, np.asarray(scene.mesh.bounds).mean(axis=0))
+    if fault:
+        logger.warning("%s", fault)
+    if len(poses) > 1 and not np.ptp(poses.positions, axis=0).any():
+        logger.warning("all %d poses are at one place; check the table of poses", len(poses))
 
 
 def deaf(range_min: float, range_max: float) -> str:

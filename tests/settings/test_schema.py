@@ -120,7 +120,7 @@ def test_settings_do_not_change(write):
         ("fit.zzz=3", ["fit.zzz: unknown key", "known here: epochs"]),
         ("fit.epochs=0", ["fit.epochs: found 0", "greater than or equal to 1"]),
         ("fit.epochs=true", ["fit.epochs: give a number, not yes or no"]),
-        ("ears.left=[0, true, 0]", ["ears.left.1: give a number, not yes or no"]),
+        ("poses.axis=[0, true, 0]", ["poses.axis.1: give a number, not yes or no"]),
         ("ears.directivity=file", ["ears: the directivity file needs ears.file"]),
         ("ears.file=a.sofa", ["file is of the directivity file, not of ear"]),
         ("ears.directivity=cardioid", ["ears.directivity: found 'cardioid'"]),

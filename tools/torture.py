@@ -1,0 +1,53 @@
+#!/usr/bin/env python3
+# SPDX-License-Identifier: MIT
+"""Do to sononerf what disks, clocks, strangers and tired people do, and see that nothing is lost.
+
+    python tools/torture.py SERIES [--count N] [--seed S] [--output DIR]
+
+``kills``: processes killed at random moments in `simulate`, and in `fit` with all that follows it;
+what they leave, and what the same command makes of it, equals an uninterrupted run.
+``disk``: each call that writes fails once; exit code 4, and old files are as they were.
+``fuzz``: damaged files for all readers. ``flips``: single bits of what sononerf wrote.
+``attacks``: files and folders of strangers; no code, no connection, nothing written outside.
+``mistakes``: wrong units, conventions and sizes; refused, or warned with the cause.
+``mutants``: deliberate faults in the code, which the tests must see.
+
+The seed is drawn where it is not given, and printed: the same seed gives the same trials. The exit
+code is 1 where there was a fault. Files that caused one are kept in ``--output``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import secrets
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))  # the parts of this command, and the package of this checkout
+
+from tools.tortures.fuzz import flips, fuzz  # noqa: E402
+from tools.tortures.harness import Report  # noqa: E402
+
+SERIES = {"fuzz": (fuzz, 50_000), "flips": (flips, 1000)}
+"""Each series, and how many trials it has where no number is given."""
+
+
+def main() -> None:
+    """Run one series, and print what it found."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("series", choices=SERIES)
+    parser.add_argument("--count", type=int, help="number of trials")
+    parser.add_argument("--seed", type=int, default=secrets.randbelow(10**6))
+    parser.add_argument("--output", type=Path, default=Path("torture"), metavar="DIR")
+    given = parser.parse_args()
+    run, count = SERIES[given.series]
+    given.output.mkdir(parents=True, exist_ok=True)
+    print(f"{given.series}, seed {given.seed}", flush=True)
+    report: Report = run(given.count or count, given.seed, given.output)
+    print("\n".join(report.lines()))
+    sys.exit(1 if report.faults else 0)
+
+
+if __name__ == "__main__":
+    main()
