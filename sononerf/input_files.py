@@ -1,12 +1,19 @@
 # SPDX-License-Identifier: MIT
-"""Files that a user names are no devices and no pipes."""
+"""What is looked at before a file that a user names is read."""
 
 from __future__ import annotations
 
+import os
 import stat
+import struct
+import subprocess
+import sys
 from pathlib import Path
 
 from sononerf.errors import InputError
+
+UNSTATED = 0xFFFF_FFFF
+"""Size of samples that stands elsewhere in a WAV file of more than 4 GB, bytes."""
 
 
 def require_regular(path: Path) -> None:
@@ -22,3 +29,48 @@ def require_regular(path: Path) -> None:
     kinds = {stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket"}
     kind = kinds.get(stat.S_IFMT(mode), "a device")
     raise InputError(f"{path}: is {kind}, expected a file; save what it gives as a file first")
+
+
+def require_sound_matlab(path: Path) -> None:
+    """Refuse a MATLAB file of version 5 that crashes its reader; a process of its own reads it.
+
+    SciPy 1.17 reads beyond its tables where the type of an element is damaged. What it refuses with
+    an error passes: whoever reads the file has that error too.
+
+    Raises:
+        InputError: If it does.
+    """
+    script = "import scipy.io, sys; scipy.io.loadmat(sys.argv[1])"
+    read = subprocess.run(
+        [sys.executable, "-I", "-c", script, str(path)], capture_output=True, check=False
+    )
+    if read.returncode < 0:
+        raise InputError(f"{path}: damaged MATLAB file, which crashes its reader; save it again")
+
+
+def require_whole_wav(path: Path) -> None:
+    """Refuse a WAV file that states more samples than it holds: memory would be taken for them.
+
+    Raises:
+        InputError: If it is one. A file of another kind passes.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        start = file.read(12)
+        order = ">" if start[:4] == b"RIFX" else "<"
+        long = 0
+        while len(header := file.read(8)) == 8 and start[8:12] == b"WAVE":
+            name, stated = header[:4], struct.unpack(f"{order}I", header[4:])[0]
+            if name == b"ds64":
+                sizes = file.read(16)
+                long = struct.unpack("<Q", sizes[8:])[0] if len(sizes) == 16 else 0
+                file.seek(-len(sizes), os.SEEK_CUR)
+            if name == b"data":
+                stated = long if stated == UNSTATED and long else stated
+                if file.tell() + stated > size:
+                    held = size - file.tell()
+                    raise InputError(
+                        f"{path}: damaged or truncated WAV file: it states {stated} bytes of "
+                        f"samples and holds {held}; copy it again"
+                    )
+            file.seek(stated + stated % 2, os.SEEK_CUR)

@@ -12,7 +12,6 @@ the first one. *Covered* is what lies within
 from __future__ import annotations
 
 import math
-import struct
 import warnings
 from dataclasses import dataclass
 from fractions import Fraction
@@ -28,7 +27,7 @@ from numpy.typing import NDArray
 from sononerf.array_types import Bools, Floats
 from sononerf.errors import InputError
 from sononerf.head.row_filters import WINDOW_BANDWIDTH, WINDOW_DURATION
-from sononerf.input_files import require_regular
+from sononerf.input_files import require_regular, require_whole_wav
 
 LONGEST = 0.1  # s, as the settings' longest sweep
 SHORTEST = 8  # samples
@@ -154,10 +153,13 @@ def _read(path: Path) -> tuple[int, NDArray[np.generic]]:
         warnings.simplefilter("always")
         try:
             require_regular(path)
+            require_whole_wav(path)
             rate, samples = scipy.io.wavfile.read(path)
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-        except (ValueError, EOFError, struct.error, TypeError, UnboundLocalError, ArithmeticError):
+        except InputError:
+            raise
+        except Exception:  # a damaged file raises whatever its parser met first
             raise InputError(f"{path}: is no WAV of samples; write the call as WAV") from None
     if any("EOF" in str(each.message) for each in told):
         raise InputError(f"{path}: is cut off; copy it again")

@@ -19,7 +19,6 @@ split                 (P,)           0 train, 1 validation, 2 test
 
 from __future__ import annotations
 
-import zipfile
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -66,7 +65,9 @@ def _read(path: Path, *stamp: int) -> dict[str, NDArray[Any]]:
             if isinstance(found, np.ndarray):
                 raise InputError(f"{path}: one array only; save arrays by name with numpy.savez")
             arrays = {name: np.asarray(found[name]) for name in found.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
+    except InputError:
+        raise
+    except Exception as error:  # a damaged file raises whatever its parser met first
         said = " ".join(str(error).split())
         raise InputError(f"{path}: damaged, truncated, or no .npz of numbers ({said})") from None
     odd = [name for name, values in arrays.items() if values.dtype.kind not in "biuf"]

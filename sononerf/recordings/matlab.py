@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from sononerf.array_types import Floats
 from sononerf.errors import InputError
+from sononerf.input_files import require_sound_matlab
 from sononerf.recordings import matlab as hdf5
 
 NUMERIC = {"double", "single", "logical", "char"} | {
@@ -53,13 +53,14 @@ def read_mat(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
             }
     if not start.startswith(b"MATLAB 5.0 MAT-file"):
         raise InputError(f"{path}: no MATLAB file of version 5 or 7.3, whatever its name says")
+    require_sound_matlab(path)
     try:
         found = scipy.io.loadmat(path, variable_names=list(wanted), struct_as_record=True)
-    except (ValueError, TypeError, OSError, EOFError, KeyError, IndexError, zlib.error) as error:
-        said = " ".join(str(error).split())
-        raise InputError(f"{path}: damaged or truncated MATLAB file ({said})") from None
     except (NotImplementedError, MemoryError) as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
+    except Exception as error:  # a damaged file raises whatever its parser met first
+        said = " ".join(str(error).split())
+        raise InputError(f"{path}: damaged or truncated MATLAB file ({said})") from None
     return {name: _old(path, found[name], name, 0) for name in wanted if name in found}
 
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: MIT
 import os
+import re
 
 import numpy as np
 import pytest
@@ -143,7 +144,7 @@ def test_what_is_no_wav_is_refused(tmp_path, written):
     whole = written(call_waveform(SWEEP, RATE).astype(np.float32)).file.read_bytes()
     for length in range(4, len(whole) - 4, 97):
         path.write_bytes(whole[:length])
-        assert "cut off" in (message := told(path)) or "is no WAV" in message
+        assert re.search("cut off|truncated|is no WAV", told(path))
     path.write_bytes(b"RIFF" + bytes(17_000_000))
     assert "cut one call out" in told(path)
 

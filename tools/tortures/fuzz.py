@@ -79,6 +79,7 @@ class _HangError(BaseException):
 
 
 def _alarm(number: int, frame: FrameType | None) -> None:
+    del number, frame
     raise _HangError
 
 
@@ -130,14 +131,12 @@ def _forked(trials: Callable[[int], Trial], numbers: list[int], keep: Path) -> l
             faults.append(f"the process ends with {os.waitstatus_to_exitcode(status)}")
             return faults
         code = os.waitstatus_to_exitcode(status)
-        faults.append(f"trial {begun[-1]}: the process ends with {code}")
+        faults.append(f"{begun[-1]}: the process ends with {code}")
         left = left[ended + 1 :]
     return faults
 
 
-def _work(
-    trials: Callable[[int], Trial], numbers: list[int], tells: int, keep: Path
-) -> None:
+def _work(trials: Callable[[int], Trial], numbers: list[int], tells: int, keep: Path) -> None:
     quiet = os.open(os.devnull, os.O_WRONLY)
     os.dup2(quiet, 1)
     os.dup2(quiet, 2)
@@ -147,8 +146,9 @@ def _work(
     used = sum(1024 * int(line.split()[1]) for line in lines if line.startswith("VmData:"))
     resource.setrlimit(resource.RLIMIT_DATA, (used + MOST_BYTES, resource.RLIM_INFINITY))
     for number in numbers:
-        os.write(tells, f'{{"begun": {number}}}\n'.encode())
         name, read, same, data = trials(number)
+        line = json.dumps({"begun": f"trial {number}, {name}"})
+        os.write(tells, f"{line}\n".encode())
         fault = _judged(read, same)
         if fault:
             (keep / f"{number}").write_bytes(data)

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.head.directivity.record import Directivity, unit_vectors
+from sononerf.input_files import require_sound_matlab
 
 STRUCTS = ("array_struct", "bat_hrtf")
 NUMERIC_CLASSES = {
@@ -76,6 +77,7 @@ def _read_old(path: Path) -> Directivity:
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
+    require_sound_matlab(path)
     try:
         content = loadmat(path, variable_names=STRUCTS, squeeze_me=True, struct_as_record=False)
     except (MatReadError, NotImplementedError) as error:
