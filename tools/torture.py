@@ -28,8 +28,9 @@ sys.path.insert(0, str(ROOT))  # the parts of this command, and the package of t
 
 from tools.tortures.fuzz import flips, fuzz  # noqa: E402
 from tools.tortures.harness import Report  # noqa: E402
+from tools.tortures.interrupted import disk, kills  # noqa: E402
 
-SERIES = {"fuzz": (fuzz, 50_000), "flips": (flips, 1000)}
+SERIES = {"kills": (kills, 500), "disk": (disk, 0), "fuzz": (fuzz, 50_000), "flips": (flips, 1000)}
 """Each series, and how many trials it has where no number is given."""
 
 
@@ -42,6 +43,7 @@ def main() -> None:
     parser.add_argument("--output", type=Path, default=Path("torture"), metavar="DIR")
     given = parser.parse_args()
     run, count = SERIES[given.series]
+    given.output = given.output.absolute()
     given.output.mkdir(parents=True, exist_ok=True)
     print(f"{given.series}, seed {given.seed}", flush=True)
     report: Report = run(given.count or count, given.seed, given.output)

@@ -5,11 +5,13 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import io
 import json
 import os
 import resource
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
@@ -27,6 +29,7 @@ TINY = (
     *("renderer.options.start=50", "renderer.options.prune_below=0.3"),
     *("fit.epochs=3", "fit.steps_per_epoch=4", "fit.batch_poses=2", "fit.batch_frequencies=2"),
     *("fit.checkpoint_seconds=0.05", "preview.voxels=8", "reconstruction.refine=false"),
+    "prediction.traced=off",
 )
 """An experiment that goes through everything in some seconds: a sphere heard from eight poses."""
 TIMES = ("tensorboard", "report.html", "checksums.jsonl", "checkpoints", "provenance.json")
@@ -101,25 +104,29 @@ class Report:
         return [f"{head}{seconds:.0f} s", *(f"  {line}" for line in self.faults[:50])]
 
 
-def warm() -> None:
-    """Import once what commands need, so that each forked one starts at once."""
+def warm(*commands: Iterable[object]) -> None:
+    """Import once what commands need, so that each forked one starts at once.
+
+    Args:
+        commands: Given once, in a folder that goes; what they import and keep is there for all.
+    """
     import torch
 
     torch.set_num_threads(1)  # threads do not live through a fork
-    from sononerf.cli import entry  # noqa: F401
-    from sononerf.run import (  # noqa: F401
-        compare,
-        evaluate,
-        export,
-        fit,
-        import_recordings,
-        predict,
-        reconstruct,
-        report_runs,
-        simulate,
-        table,
-        verify,
-    )
+    from sononerf.cli import entry, start  # noqa: F401
+
+    here = Path.cwd()
+    with tempfile.TemporaryDirectory() as place, contextlib.ExitStack() as stack:
+        stack.callback(os.chdir, here)
+        os.chdir(place)
+        stack.enter_context(contextlib.redirect_stderr(io.StringIO()))
+        stack.enter_context(contextlib.redirect_stdout(io.StringIO()))
+        before = sys.argv
+        stack.callback(setattr, sys, "argv", before)
+        for words in commands:
+            sys.argv = ["sononerf", *map(str, words)]
+            with contextlib.suppress(SystemExit):
+                start.main()
 
 
 def give(
@@ -194,6 +201,8 @@ def _child(before: Callable[[], object] | None) -> int:
     for name in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(name, signal.SIG_DFL)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    # On one core nothing starts processes, which would import everything anew.
+    os.sched_setaffinity(0, {os.getpid() % os.cpu_count()})
     if before is not None:
         before()
     try:
