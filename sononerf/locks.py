@@ -64,6 +64,13 @@ def is_held(folder: Path) -> bool:
     return (folder / _LOCK_NAME).is_file()
 
 
+def remove_dead(folder: Path) -> None:
+    """Remove the lock that a killed process left in a folder whose work is done."""
+    if is_held(folder):
+        with suppress(LockedError, StorageError), lock(folder):
+            pass
+
+
 @contextmanager
 def lock(folder: Path) -> Iterator[None]:
     """Hold a folder against other processes; the kernel lets go when the process dies.

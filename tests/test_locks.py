@@ -75,6 +75,16 @@ def test_lock_dies_with_its_process(tmp_path):
         pass
 
 
+def test_only_the_lock_of_a_dead_process_is_removed(tmp_path):
+    (tmp_path / ".lock").write_text("process 1 on a machine that lost its power\n")
+    (tmp_path / ".metrics.json.999999.tmp").write_text("half")
+    locks.remove_dead(tmp_path)
+    assert names(tmp_path) == []
+    with locks.lock(tmp_path):
+        locks.remove_dead(tmp_path)
+        assert names(tmp_path) == [".lock"]
+
+
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")  # only locks
 def test_of_many_at_once_one_holds_the_lock_at_a_time(tmp_path):
     def work():

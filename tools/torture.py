@@ -4,8 +4,8 @@
 
     python tools/torture.py SERIES [--count N] [--seed S] [--output DIR]
 
-``kills``: processes killed at random moments in `simulate`, and in `fit` with all that follows it;
-what they leave, and what the same command makes of it, equals an uninterrupted run.
+``kill-simulate``, ``kill-fit``: `simulate`, and `fit` with all that follows it, killed at random
+moments and at random writes; what the same command then makes equals an uninterrupted run.
 ``disk``: each call that writes fails once; exit code 4, and old files are as they were.
 ``fuzz``: damaged files for all readers. ``flips``: single bits of what sononerf wrote.
 ``attacks``: files and folders of strangers; no code, no connection, nothing written outside.
@@ -26,11 +26,19 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # the parts of this command, and the package of this checkout
 
+from tools.tortures.attacks import attacks  # noqa: E402
 from tools.tortures.fuzz import flips, fuzz  # noqa: E402
 from tools.tortures.harness import Report  # noqa: E402
-from tools.tortures.interrupted import disk, kills  # noqa: E402
+from tools.tortures.interrupted import disk, kill_fit, kill_simulate  # noqa: E402
 
-SERIES = {"kills": (kills, 500), "disk": (disk, 0), "fuzz": (fuzz, 50_000), "flips": (flips, 1000)}
+SERIES = {
+    "kill-simulate": (kill_simulate, 500),
+    "kill-fit": (kill_fit, 500),
+    "disk": (disk, 0),
+    "attacks": (attacks, 0),
+    "fuzz": (fuzz, 50_000),
+    "flips": (flips, 1000),
+}
 """Each series, and how many trials it has where no number is given."""
 
 

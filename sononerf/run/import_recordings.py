@@ -141,6 +141,7 @@ def import_understood(
         if store.attributes.get("echo_hash") != wanted:
             raise IncompatibleError(f"{output}: holds other echoes; choose another --output")
         if store.is_sealed and not store.damaged():
+            locks.remove_dead(output)
             return store, verdict(known, store)
     warn_of_call(known.settings.call, known.settings.spectrogram)
     poses = known.poses[known.pings]

@@ -285,7 +285,9 @@ class RunFolder:
             storage.commit_text(self.config, dump_yaml(settings))
 
     def _refuse_foreign(self) -> None:
-        foreign = [p.name for p in self.path.iterdir() if not p.name.startswith(".")]
+        # Checksums are recorded before the first file is there.
+        ours = checksums.NAME
+        foreign = [p.name for p in self.path.iterdir() if p.name[0] != "." and p.name != ours]
         if foreign:
             raise InputError(
                 f"{self.path}: holds {sorted(foreign)[0]!r} and is no run; choose another --output"

@@ -166,7 +166,10 @@ def _finished(path: Path, wanted: str) -> EnsembleStore | None:
             f"{path}: holds echoes of other settings; choose another --output, or leave the scene "
             "out of the settings to take the echoes as they are"
         )
-    return store if store.is_sealed and not store.damaged() else None
+    if not store.is_sealed or store.damaged():
+        return None
+    locks.remove_dead(path)
+    return store
 
 
 def echo_hash(

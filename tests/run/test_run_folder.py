@@ -118,3 +118,8 @@ def test_previews_of_an_older_fit_go(run):
     run.clear_previews()
     run.clear_previews()
     assert not (run.path / "epochs").exists()
+
+
+def test_a_run_that_died_before_its_first_file_begins_again(tiny, tmp_path):
+    (tmp_path / "checksums.jsonl").write_text('{"crc32":1}\n')
+    RunFolder(tmp_path).check(tiny())

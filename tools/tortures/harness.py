@@ -13,9 +13,15 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+
+import pytest
+
+from sononerf.report.surface_views import SurfaceViews
+from tests.small_views import draw_small
 
 LIMIT_SECONDS = 120.0
 """A command that takes longer hangs, s; the longest takes 20 s."""
@@ -32,6 +38,16 @@ TINY = (
     "prediction.traced=off",
 )
 """An experiment that goes through everything in some seconds: a sphere heard from eight poses."""
+SIMULATE = ("simulate", *TINY, "--output", "store", "--workers", "1")
+FIT = ("fit", *TINY, "data.store=store", "--output", "run", "--accelerator", "cpu")
+AFTER = {
+    "predict": ("predict", "run", "--accelerator", "cpu"),
+    "reconstruct": ("reconstruct", "run", "--accelerator", "cpu"),
+    "evaluate": ("evaluate", "run"),
+    "report": ("report", "run"),
+    "export": ("export", "run", "run/mesh.mat", "--what", "points"),
+}
+"""Commands after a fit, by their names."""
 TIMES = ("tensorboard", "report.html", "checksums.jsonl", "checkpoints", "provenance.json")
 """What a run holds that tells how long it took, or in how many parts."""
 
@@ -127,6 +143,16 @@ def warm(*commands: Iterable[object]) -> None:
             sys.argv = ["sononerf", *map(str, words)]
             with contextlib.suppress(SystemExit):
                 start.main()
+
+
+@contextmanager
+def prepared() -> Iterator[Path]:
+    """Import and draw once, make what takes long short, and give a folder."""
+    with tempfile.TemporaryDirectory() as place, pytest.MonkeyPatch.context() as patch:
+        draw_small(patch)
+        patch.setattr(SurfaceViews.png, "__defaults__", ((38, 34),))
+        warm(SIMULATE, FIT, *AFTER.values())
+        yield Path(place)
 
 
 def give(
@@ -228,7 +254,7 @@ def contents(folder: Path, *, leaving: Iterable[str] = TIMES) -> dict[str, str]:
     found = {}
     for file in sorted(folder.rglob("*")):
         name = file.relative_to(folder)
-        if not file.is_file() or name.parts[0] in left:
+        if not file.is_file() or name.parts[0] in left or name.name == ".lock":
             continue
         data = file.read_bytes()
         if name.name == "metrics.json":

@@ -11,59 +11,37 @@ import random
 import resource
 import shutil
 import signal
-import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 from scipy.io import wavfile
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import SonoNerfError
 from sononerf.geometry.poses import Poses
-from sononerf.report.surface_views import SurfaceViews
-from tests.small_views import draw_small
 from tools.tortures.harness import (
-    TINY,
+    AFTER,
+    FIT,
+    SIMULATE,
     Outcome,
     Report,
     contents,
     differences,
     give,
     leftovers,
-    warm,
+    prepared,
 )
 
 CODES = (errno.ENOSPC, errno.EIO, errno.EACCES)
 CALLS = ("fsync", "replace", "rename", "link", "mkdir", "write", "pwrite", "ftruncate", "unlink")
 WRITES = os.O_WRONLY | os.O_RDWR | os.O_CREAT
-SIMULATE = ("simulate", *TINY, "--output", "store", "--workers", "1")
-FIT = ("fit", *TINY, "data.store=store", "--output", "run", "--accelerator", "cpu")
-AFTER = {
-    "predict": ("predict", "run", "--accelerator", "cpu"),
-    "reconstruct": ("reconstruct", "run", "--accelerator", "cpu"),
-    "evaluate": ("evaluate", "run"),
-    "report": ("report", "run"),
-    "export": ("export", "run", "run/mesh.mat", "--what", "points"),
-}
 SETTINGS = """\
 ears: {directivity: omnidirectional, receivers: [[0, 0.02, 0], [0, -0.02, 0]]}
 spectrogram: {frequency_min: 20000.0, frequency_max: 80000.0}
 import: {validation: 1, heldout: 1}
 """
-
-
-@contextmanager
-def _prepared() -> Iterator[Path]:
-    """Import and draw once, make what takes long short, and give a folder."""
-    with tempfile.TemporaryDirectory() as place, pytest.MonkeyPatch.context() as patch:
-        draw_small(patch)
-        patch.setattr(SurfaceViews.png, "__defaults__", ((38, 34),))
-        warm(SIMULATE, FIT, *AFTER.values())
-        yield Path(place)
 
 
 def counted(
@@ -134,50 +112,63 @@ def _die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def kills(count: int, seed: int, keep: Path) -> Report:
-    """Kill `simulate`, and `fit` with all that follows it, at random moments and at their writes.
+def kill_simulate(count: int, seed: int, keep: Path) -> Report:
+    """Kill `simulate`; see :func:`_kills`."""
+    return _kills("store", SIMULATE, count, seed, keep)
+
+
+def kill_fit(count: int, seed: int, keep: Path) -> Report:
+    """Kill `fit` with all that follows it; see :func:`_kills`."""
+    return _kills("run", FIT, count, seed, keep)
+
+
+def _kills(name: str, words: tuple[str, ...], count: int, seed: int, keep: Path) -> Report:
+    """Kill a command at random moments and at its writes, and give it again until it ends.
 
     Args:
-        count: How many kills of each of the two.
+        name: Of the folder that the command makes.
+        words: The command.
+        count: How many kills.
         seed: Of the moments.
         keep: Folder that keeps the runs that were a fault.
     """
-    report, rng = Report("kills", seed), random.Random(seed)
-    with _prepared() as folder:
+    report, rng = Report(f"kills of {words[0]}", seed), random.Random(seed)
+    with prepared() as folder:
         whole = folder / "whole"
         whole.mkdir()
-        for name, words in (("store", SIMULATE), ("run", FIT)):
-            once = give(words, whole)
-            assert once.code == 0, once.said
-            calls = _calls(words, _fresh(folder, f"counted-{name}", whole, name))
-            expected = contents(whole / name)
-            done = trials = 0
-            place, known = _fresh(folder, f"{name}-0", whole, name), set[int]()
-            while done < count:
-                trials += 1
-                # Mostly soon, for what was done before is not done again.
-                part = rng.choice((0.2, 0.2, 0.2, 1.0))
-                if rng.random() < 0.5:
-                    after, before = rng.uniform(0, part * once.seconds), None
-                else:
-                    number = rng.randint(1, max(1, int(part * calls)))
-                    after, before = None, counted(number, _die, place)
-                outcome = give(words, place, kill_after=after, before=before)
-                done += outcome.code == -signal.SIGKILL
-                fault = _after_kill(outcome, place / name, known, name)
-                if not fault and outcome.code == 0:
-                    wrong = differences(contents(place / name), expected) + leftovers(place)
-                    fault = f"{len(wrong)} files differ or are left, as {wrong[0]}" if wrong else ""
-                if fault:
-                    report.fault(f"{words[0]}, trial {trials}: {fault}")
-                    shutil.copytree(place, keep / f"{name}-{trials}", dirs_exist_ok=True)
-                if fault or outcome.code == 0:
-                    report.count(f"interrupted {words[0]}s that came to their end")
-                    shutil.rmtree(place)
-                    place, known = _fresh(folder, f"{name}-{trials}", whole, name), set()
-                if trials % 50 == 0:
-                    print(f"  kills: {done} of {count} of {words[0]}", flush=True)
-            report.count(f"kills of {words[0]} ({calls} calls, {once.seconds:.1f} s)", done)
+        give(SIMULATE, whole)
+        once = give(words, _fresh(folder, "once", whole, name))
+        assert once.code == 0, once.said
+        expected = contents(folder / "once" / name)
+        calls = _calls(words, _fresh(folder, "counted", whole, name))
+        report.counts[f"calls that write and {once.seconds:.1f} s a {words[0]}"] = calls
+        done = trials = 0
+        place, known = _fresh(folder, "0", whole, name), set[int]()
+        while done < count:
+            trials += 1
+            # Mostly soon, for what was done before is not done again.
+            part = rng.choice((0.2, 0.2, 0.2, 1.0))
+            if rng.random() < 0.5:
+                after, before = rng.uniform(0, part * once.seconds), None
+            else:
+                number = rng.randint(1, max(1, int(part * calls)))
+                after, before = None, counted(number, _die, place)
+            outcome = give(words, place, kill_after=after, before=before)
+            done += outcome.code == -signal.SIGKILL
+            fault = _after_kill(outcome, place / name, known, name)
+            if not fault and outcome.code == 0:
+                wrong = differences(contents(place / name), expected) + leftovers(place)
+                fault = f"{len(wrong)} files differ or are left, as {wrong[0]}" if wrong else ""
+            if fault:
+                report.fault(f"trial {trials}: {fault}")
+                shutil.copytree(place, keep / f"{name}-{trials}", dirs_exist_ok=True)
+            if fault or outcome.code == 0:
+                report.count("brought to their end and compared")
+                shutil.rmtree(place)
+                place, known = _fresh(folder, str(trials), whole, name), set()
+            if trials % 50 == 0:
+                print(f"  {report.name}: {done} of {count}", flush=True)
+        report.count("kills", done)
     return report
 
 
@@ -235,7 +226,7 @@ def disk(count: int, seed: int, keep: Path) -> Report:
         keep: Folder that keeps what was a fault.
     """
     report, rng = Report("disk", seed), random.Random(seed)
-    with _prepared() as folder:
+    with prepared() as folder:
         whole = folder / "whole"
         whole.mkdir()
         _recordings(whole)
@@ -274,7 +265,7 @@ def disk(count: int, seed: int, keep: Path) -> Report:
                 again = give(commands[name], place)
                 wrong = differences(_plain(place), ends[name]) + leftovers(place)
                 if again.code or wrong:
-                    fault = f"the same command ends with {again.code}; {wrong[:3]} differ"
+                    fault = f"again, exit {again.code}; {wrong[:3]} differ; {again.said[-200:]!r}"
             if fault:
                 report.fault(f"{name}, {what}: {fault}")
                 shutil.copytree(place, keep / f"disk-{trial}", dirs_exist_ok=True)
