@@ -30,6 +30,8 @@ from tools.tortures.attacks import attacks  # noqa: E402
 from tools.tortures.fuzz import flips, fuzz  # noqa: E402
 from tools.tortures.harness import Report  # noqa: E402
 from tools.tortures.interrupted import disk, kill_fit, kill_simulate  # noqa: E402
+from tools.tortures.mistakes import mistakes  # noqa: E402
+from tools.tortures.mutants import mutants  # noqa: E402
 
 SERIES = {
     "kill-simulate": (kill_simulate, 500),
@@ -38,6 +40,8 @@ SERIES = {
     "attacks": (attacks, 0),
     "fuzz": (fuzz, 50_000),
     "flips": (flips, 1000),
+    "mistakes": (mistakes, 0),
+    "mutants": (mutants, 200),
 }
 """Each series, and how many trials it has where no number is given."""
 

@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -202,7 +203,8 @@ def fit(
     if follows():
         # The first process holds the lock, simulates and writes; the others only compute.
         echoes = Echoes(_wait_for_store(settings, path), head)
-        _fit(settings, run, echoes, hardware, Progress(quiet=True))
+        quiet = Progress(quiet=True)
+        _fit(settings, run, _prepared(settings, echoes, hardware, quiet), hardware, quiet)
         return run
     if overwrite:
         if path.is_symlink():
@@ -219,6 +221,7 @@ def fit(
                 started = time.monotonic()
                 echoes = open_or_simulate(settings, workers=workers, progress=progress)
                 simulated = time.monotonic() - started
+                work = _prepared(settings, echoes, hardware, progress)
                 run.begin_fit(settings)
                 run.write_provenance(
                     echo_hash=echoes.store.attributes["echo_hash"],
@@ -227,7 +230,7 @@ def fit(
                 )
                 if "simulate_s" not in run.read_metrics().get("cost", {}):
                     run.write_metrics("cost", {"simulate_s": simulated}, merge=True)
-                _fit(settings, run, echoes, hardware, progress)
+                _fit(settings, run, work, hardware, progress)
             if finishes and run.is_finished:
                 progress.say(f"{path}: is finished; --overwrite fits it anew")
             elif finishes:
@@ -237,14 +240,23 @@ def fit(
     return run
 
 
-def _fit(
-    settings: Settings,
-    run: RunFolder,
-    echoes: Echoes,
-    hardware: dict[str, Any],
-    progress: Progress,
-) -> None:
-    keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
+@dataclass(frozen=True)
+class _Work:
+    """What is fitted to what, in how many steps."""
+
+    echoes: Echoes
+    module: EchoModule
+    data: EchoDataModule
+    steps: int
+
+
+def _prepared(
+    settings: Settings, echoes: Echoes, hardware: dict[str, Any], progress: Progress
+) -> _Work:
+    """Make field and batches, say what speaks against the fit, and refuse what is too large.
+
+    Nothing is written.
+    """
     lower, upper = settings.region.lower, settings.region.upper
     if lower is not None and upper is not None:
         echoes = echoes.within((lower, upper))
@@ -263,11 +275,10 @@ def _fit(
     box = module.field.region.double().numpy()
     for doubt in [] if follows() else doubts(echoes, box, is_set=lower is not None):
         logger.warning("%s", doubt)
-    renderer = module.renderer
     data = EchoDataModule(
         echoes,
         settings.fit,
-        whole_poses=renderer.whole_poses,
+        whole_poses=module.renderer.whole_poses,
         workers=settings.data.workers,
         memory_bytes=settings.data.memory_bytes,
     )
@@ -275,6 +286,19 @@ def _fit(
     total = min(total, settings.fit.max_steps or total)
     if hardware["accelerator"] == "cpu" or not has_accelerator():
         _announce(step_cost(module, data), echoes, settings, total, progress)
+    return _Work(echoes, module, data, total)
+
+
+def _fit(
+    settings: Settings,
+    run: RunFolder,
+    work: _Work,
+    hardware: dict[str, Any],
+    progress: Progress,
+) -> None:
+    echoes, module, data = work.echoes, work.module, work.data
+    renderer = module.renderer
+    keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
     resumed = _can_resume(run)
     if not resumed and not follows():
         run.clear_previews()
@@ -285,7 +309,7 @@ def _fit(
         directions=settings.reconstruction.directions,
     )
     attributes = echoes.store.attributes
-    with progress.task("fitting", total) as task, keeper.watching():
+    with progress.task("fitting", work.steps) as task, keeper.watching():
         fit_field(
             echoes,
             module,

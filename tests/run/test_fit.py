@@ -20,7 +20,7 @@ import torch
 import trimesh
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 
-from sononerf import locks
+from sononerf import locks, memory
 from sononerf.callbacks.epoch import SIGNALS, CheckpointCallback, ProgressCallback
 from sononerf.callbacks.preview import PreviewCallback
 from sononerf.echoes.echoes import Echoes
@@ -511,3 +511,10 @@ def test_any_receivers_from_scene_to_surface(tiny_settings, tmp_path, count, dir
     folder = reconstruct(tmp_path / "run", accelerator="cpu")
     assert RunFolder(tmp_path / "run").read_metrics()["cost"]["steps"] == 2
     assert len(trimesh.load(folder / "mesh.ply").faces) > 100
+
+
+def test_a_fit_that_needs_too_much_memory_leaves_nothing(tiny, tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "available_memory", lambda: 1_000_000)
+    with pytest.raises(ResourceError, match="a step of 2 poses needs about"):
+        fit(tiny(), tmp_path / "run", accelerator="cpu", workers=1)
+    assert not (tmp_path / "run").exists()

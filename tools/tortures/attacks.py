@@ -399,7 +399,7 @@ def attacks(count: int, seed: int, keep: Path) -> Report:
     chosen = every()
     if count:
         chosen = random.Random(seed).sample(chosen, min(count, len(chosen)))
-    with prepared() as folder:
+    with prepared(SIMULATE, FIT) as folder:
         whole, outside = folder / "whole", folder / "outside"
         whole.mkdir()
         outside.mkdir()

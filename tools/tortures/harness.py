@@ -7,6 +7,7 @@ import contextlib
 import hashlib
 import io
 import json
+import logging
 import os
 import resource
 import signal
@@ -146,12 +147,16 @@ def warm(*commands: Iterable[object]) -> None:
 
 
 @contextmanager
-def prepared() -> Iterator[Path]:
-    """Import and draw once, make what takes long short, and give a folder."""
+def prepared(*commands: Iterable[object]) -> Iterator[Path]:
+    """Give some commands once, make what takes long short, and give a folder.
+
+    Args:
+        commands: Those that will be given; all where there are none.
+    """
     with tempfile.TemporaryDirectory() as place, pytest.MonkeyPatch.context() as patch:
         draw_small(patch)
         patch.setattr(SurfaceViews.png, "__defaults__", ((38, 34),))
-        warm(SIMULATE, FIT, *AFTER.values())
+        warm(*(commands or (SIMULATE, FIT, *AFTER.values())))
         yield Path(place)
 
 
@@ -229,6 +234,7 @@ def _child(before: Callable[[], object] | None) -> int:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     # On one core nothing starts processes, which would import everything anew.
     os.sched_setaffinity(0, {os.getpid() % os.cpu_count()})
+    logging.root.handlers.clear()  # those of the parent write elsewhere
     if before is not None:
         before()
     try:

@@ -133,7 +133,7 @@ def _kills(name: str, words: tuple[str, ...], count: int, seed: int, keep: Path)
         keep: Folder that keeps the runs that were a fault.
     """
     report, rng = Report(f"kills of {words[0]}", seed), random.Random(seed)
-    with prepared() as folder:
+    with prepared(SIMULATE, *([] if words == SIMULATE else [words])) as folder:
         whole = folder / "whole"
         whole.mkdir()
         give(SIMULATE, whole)
