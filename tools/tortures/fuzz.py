@@ -106,7 +106,7 @@ def _judged(read: Callable[[], object], same: Callable[[object], bool] | None) -
 Trial = tuple[str, Callable[[], object], Callable[[object], bool] | None, bytes]
 
 
-def _forked(trials: Callable[[int], Trial], numbers: list[int], keep: Path) -> list[str]:
+def judged_apart(trials: Callable[[int], Trial], numbers: list[int], keep: Path) -> list[str]:
     """Judge trials in processes of their own; one that dies is a fault, and the rest goes on."""
     faults, left = [], list(numbers)
     while left:
@@ -161,7 +161,7 @@ def _batches(report: Report, trials: Callable[[int], Trial], count: int, keep: P
     said = time.monotonic()
     for start in range(0, count, BATCH):
         numbers = list(range(start, min(start + BATCH, count)))
-        for line in _forked(trials, numbers, keep):
+        for line in judged_apart(trials, numbers, keep):
             report.fault(line)
         if time.monotonic() - said > 30:
             said = time.monotonic()
