@@ -54,6 +54,12 @@ def read_parts(path: str) -> dict[str, trimesh.Trimesh]:
     if kind in CHECKS:
         CHECKS[kind](data, path)
     parts = _parse(data, kind, path)
+    for name, part in parts.items():
+        if part.vertices.shape[1:] != (3,):
+            found = part.vertices.shape[1]
+            raise InputError(
+                f"{path}: damaged; vertices of {name} have {found} coordinates, expected 3"
+            )
     faces = sum(len(part.faces) for part in parts.values())
     if faces == 0:
         raise InputError(f"{path}: holds no triangles")

@@ -205,7 +205,7 @@ def read_truth(path: Path, unit: Unit = "m") -> trimesh.Trimesh:
         if isinstance(mesh, trimesh.Scene):
             mesh = mesh.to_mesh()
         good = isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 0
-        good = good and bool(np.isfinite(mesh.vertices).all())
+        good = good and mesh.vertices.shape[1:] == (3,) and bool(np.isfinite(mesh.vertices).all())
     except Exception as error:  # trimesh's readers raise whatever they met first
         raise InputError(f"{path}: evaluation.truth: damaged ({error})") from error
     if not good:

@@ -8,6 +8,7 @@ import trimesh
 from trimesh.exchange.gltf import export_gltf
 
 from sononerf.errors import InputError, SettingsError
+from sononerf.run.build import read_truth
 from sononerf.scene.material import MATERIALS
 from sononerf.scene.scene import load_scene
 
@@ -241,3 +242,14 @@ def test_the_material_is_that_of_its_name(tmp_path):
     options = {"path": str(tmp_path / "a.stl"), "unit": "mm"}
     assert load_scene("mesh", options).material == MATERIALS["rigid"]
     assert load_scene("mesh", {**options, "material": "leaf"}).material == MATERIALS["leaf"]
+
+
+def test_an_obj_with_missing_coordinates_is_one_line(tmp_path):
+    (tmp_path / "flat.obj").write_text("v 0 0\nv 1 0\nv 0 1\nf 1 2 3\n")
+    with pytest.raises(InputError, match="have 2 coordinates, expected 3"):
+        load_scene("mesh", {"path": str(tmp_path / "flat.obj"), "unit": "m"})
+    with pytest.raises(InputError, match="holds no surface of finite triangles"):
+        read_truth(tmp_path / "flat.obj")
+    (tmp_path / "mixed.obj").write_text("v 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 2 3 4\n")
+    with pytest.raises(InputError):
+        load_scene("mesh", {"path": str(tmp_path / "mixed.obj"), "unit": "m"})
