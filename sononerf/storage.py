@@ -143,7 +143,7 @@ def commit(
                 writer(file)
                 file.flush()
                 os.fsync(file.fileno())
-            for watcher in _watchers:
+            for watcher in tuple(_watchers):
                 watcher(path, temporary)
             if previous is not None:
                 _keep(path, previous)
@@ -342,7 +342,7 @@ def remove_file(path: Path) -> None:
     """
     try:
         if path.exists():
-            for watcher in _watchers:
+            for watcher in tuple(_watchers):
                 watcher(path, None)
         path.unlink()
         sync_folder(path.parent)

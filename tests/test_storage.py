@@ -222,7 +222,8 @@ def test_append_line_closes_a_torn_line_first(tmp_path):
     with path.open("ab") as file:
         file.write(b"tor")
     storage.append_line(path, "two")
-    assert path.read_bytes() == b"one\ntor\ntwo\n"
+    storage.append_line(path, "three")
+    assert path.read_bytes() == b"one\ntor\ntwo\nthree\n"
 
 
 def test_append_line_tells_a_full_disk():

@@ -176,38 +176,7 @@ def fuzz(count: int, seed: int, keep: Path) -> Report:
         seed: Of the damage.
         keep: Folder that keeps the files that were a fault.
     """
-    report = Report("fuzz", seed)
-    with tempfile.TemporaryDirectory() as place:
-        folder = Path(place)
-        kinds = samples(folder)
-        sound = [kind.read(_put(folder, kind, "sound", kind.data)) for kind in kinds]
-        whole = {name: folder / name for name in ("store", "run")}
-        make_store(whole["store"])
-        make_run(whole["run"])
-        readers = {"store": read_store, "run": read_run}
-        expected = {name: readers[name](path) for name, path in whole.items()}
-
-        def trial(number: int) -> Trial:
-            rng = random.Random(f"{seed} {number}")
-            row = rng.randrange(len(kinds) + 4)
-            if row < len(kinds):
-                kind = kinds[row]
-                data = damaged(kind.data, rng)
-                path = _put(folder, kind, "damaged", data)
-                same = (lambda found: found == sound[row]) if kind.is_checked else None
-                return kind.name, lambda: kind.read(path), same, data
-            name = "store" if row % 2 else "run"
-            file, data = _damaged_file(whole[name], rng, damaged)
-            return (
-                f"{name}: {file.relative_to(whole[name])}",
-                _with(file, data, lambda: readers[name](whole[name])),
-                lambda found: found == expected[name],
-                data,
-            )
-
-        _batches(report, trial, count, keep)
-        report.count(f"files of {len(kinds) + 2} kinds", count)
-    return report
+    return _given(Report("fuzz", seed), damaged, count, keep, all_kinds=True)
 
 
 def flips(count: int, seed: int, keep: Path) -> Report:
@@ -218,25 +187,39 @@ def flips(count: int, seed: int, keep: Path) -> Report:
         seed: Of their places.
         keep: Folder that keeps the files that were a fault.
     """
-    report = Report("flips", seed)
+    return _given(Report("flips", seed), flipped, count, keep, all_kinds=False)
+
+
+def _given(
+    report: Report,
+    damage: Callable[[bytes, random.Random], bytes],
+    count: int,
+    keep: Path,
+    *,
+    all_kinds: bool,
+) -> Report:
+    """Damage files one way and give them to their readers: all kinds, or those with checksums."""
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
+        kinds = [kind for kind in samples(folder) if all_kinds or kind.is_checked]
+        sound = [kind.read(_put(folder, kind, "sound", kind.data)) for kind in kinds]
         whole = {name: folder / name for name in ("store", "run")}
         make_store(whole["store"])
         make_run(whole["run"])
         readers = {"store": read_store, "run": read_run}
         expected = {name: readers[name](path) for name, path in whole.items()}
-        kind = next(one for one in samples(folder) if one.is_checked)
-        sound = kind.read(_put(folder, kind, "sound", kind.data))
 
         def trial(number: int) -> Trial:
-            rng = random.Random(f"{seed} {number}")
-            if number % 5 == 0:
-                data = flipped(kind.data, rng)
-                path = _put(folder, kind, "flipped", data)
-                return kind.name, lambda: kind.read(path), lambda found: found == sound, data
-            name = "store" if number % 2 else "run"
-            file, data = _damaged_file(whole[name], rng, flipped)
+            rng = random.Random(f"{report.seed} {number}")
+            row = rng.randrange(len(kinds) + 4)  # stores and runs have many files
+            if row < len(kinds):
+                kind = kinds[row]
+                data = damage(kind.data, rng)
+                path = _put(folder, kind, "damaged", data)
+                same = (lambda found: found == sound[row]) if kind.is_checked else None
+                return kind.name, lambda: kind.read(path), same, data
+            name = "store" if row % 2 else "run"
+            file, data = _damaged_file(whole[name], rng, damage)
             return (
                 f"{name}: {file.relative_to(whole[name])}",
                 _with(file, data, lambda: readers[name](whole[name])),
@@ -245,7 +228,7 @@ def flips(count: int, seed: int, keep: Path) -> Report:
             )
 
         _batches(report, trial, count, keep)
-        report.count("bits", count)
+        report.count(f"files of {len(kinds) + 2} kinds", count)
     return report
 
 
