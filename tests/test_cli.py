@@ -673,6 +673,7 @@ def test_wrong_options_of_the_read_out(smoke, clean, options):
     assert tree(clean) == {}
 
 
+@pytest.mark.slow
 def test_a_run_has_a_page(at_home, tmp_path):
     before = tree(at_home.run)
     for extra in ([], ["--paper"]):

@@ -106,10 +106,10 @@ def test_the_papers_scenes_differ_in_scene_and_poses_alone():
     assert all(data == settings["three_spheres"] for data in settings.values())
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "slices",
-    [16, pytest.param(512, marks=pytest.mark.slow)],  # its full batch: half a minute
+    [16, 512],
 )
 def test_the_papers_training_takes_steps(tmp_path, monkeypatch, slices):
     settings = load_settings(

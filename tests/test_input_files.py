@@ -26,26 +26,14 @@ def test_an_ordinary_file_and_a_link_to_one_are_read(tmp_path):
         require_regular(tmp_path / "none")
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "kind"),
     [
         (("simulate", SETTINGS, "poses.arrangement=path", "poses.path=PIPE"), "a pipe"),
-        pytest.param(
-            ("simulate", SETTINGS, "poses.arrangement=path", "poses.path=/dev/zero"),
-            "a device",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            ("simulate", SETTINGS, "ears.directivity=file", "ears.file=/dev/zero"),
-            "a device",
-            marks=pytest.mark.slow,
-        ),
-        pytest.param(
-            ("import", "recordings", ".", "--settings", "PIPE"),
-            "a pipe",
-            marks=pytest.mark.slow,
-        ),
+        (("simulate", SETTINGS, "poses.arrangement=path", "poses.path=/dev/zero"), "a device"),
+        (("simulate", SETTINGS, "ears.directivity=file", "ears.file=/dev/zero"), "a device"),
+        (("import", "recordings", ".", "--settings", "PIPE"), "a pipe"),
     ],
 )
 def test_a_file_that_never_ends_is_refused_at_once(words, kind, tmp_path):

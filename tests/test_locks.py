@@ -6,11 +6,15 @@ from __future__ import annotations
 import os
 import signal
 import time
+from pathlib import Path
 
 import pytest
 
 from sononerf import locks, storage
 from sononerf.errors import LockedError, StorageError
+
+OPEN = Path("/proc/self/fd")
+"""Lists the files that this process has open, on Linux."""
 
 
 def names(folder):
@@ -129,3 +133,13 @@ def test_a_folder_that_is_a_link_itself_is_held(tmp_path):
     (tmp_path / "run").symlink_to(tmp_path / "disk")
     with locks.lock(tmp_path / "run"):
         assert names(tmp_path / "disk") == [".lock"]
+
+
+@pytest.mark.skipif(not OPEN.is_dir(), reason="no list of open files")
+def test_a_refused_lock_leaves_no_file_open(tmp_path):
+    with locks.lock(tmp_path):
+        before = len(names(OPEN))
+        for _ in range(3):
+            with pytest.raises(LockedError), locks.lock(tmp_path):
+                pass
+        assert len(names(OPEN)) == before

@@ -95,7 +95,7 @@ def test_the_files_and_scenes_it_names_are_there():
         assert (ROOT / path).is_file(), path
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("code", blocks("python", SIMULATOR))
 def test_the_code_of_the_guides_runs(code):
     names = {}

@@ -300,3 +300,44 @@ def test_what_is_changed_in_place_is_a_file_of_its_own(tmp_path):
         with pytest.raises((StorageError, OSError)):
             storage.append_line(tmp_path / name, "x")
     assert outside.read_text() == "precious\n"
+
+
+def test_all_of_a_file_is_there_when_it_is_synced(tmp_path, monkeypatch):
+    sizes, real = [], os.fsync
+
+    def fsync(descriptor):
+        if stat.S_ISREG(os.fstat(descriptor).st_mode):
+            sizes.append(os.fstat(descriptor).st_size)
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    storage.commit_bytes(tmp_path / "file", b"content")
+    storage.append_line(tmp_path / "journal", "line")
+    storage.commit_folder(tmp_path / "folder", {"part": "text"})
+    assert sizes == [7, 5, 4]
+
+
+def test_the_same_file_under_two_names_leaves_no_third(tmp_path):
+    storage.commit_bytes(tmp_path / "file", b"old")
+    (tmp_path / "previous").hardlink_to(tmp_path / "file")
+    previous = tmp_path / "previous"
+    storage.commit(tmp_path / "file", lambda file: file.write(b"new"), previous=previous)
+    assert names(tmp_path) == ["file", "previous"]
+    assert previous.read_bytes() == b"old"
+
+
+def test_a_journal_that_cannot_be_read_is_refused_and_none_is_empty(tmp_path):
+    with pytest.raises(InputError, match="cannot be read"):
+        storage.read_records(tmp_path)
+    assert storage.read_records(tmp_path / "none") == []
+
+
+def test_torn_and_changed_records_are_none(tmp_path):
+    path = tmp_path / "journal"
+    for number in range(4):
+        storage.append_record(path, {"number": number, "text": "ü"})
+    lines = path.read_bytes().split(b"\n")
+    lines[1] = lines[1].replace(b'"number":1', b'"number":7')
+    lines[2] = lines[2][:-4]
+    path.write_bytes(b"\n".join([*lines[:4], b"[1]", b'{"number": 9}', b"\xff"]))
+    assert [record["number"] for record in storage.read_records(path)] == [0, 3]

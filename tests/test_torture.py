@@ -17,9 +17,9 @@ from tools.tortures.fuzz import damaged, flipped, judged_apart
 from tools.tortures.mutants import mutated, places
 
 ROOT = Path(__file__).resolve().parent.parent
-SERIES = [
-    ("fuzz", 300),
-    ("flips", 150),
+SHARES = [
+    ("fuzz", 150),
+    ("flips", 100),
     ("kill-simulate", 8),
     *(
         pytest.param(*share, marks=pytest.mark.slow)
@@ -28,7 +28,7 @@ SERIES = [
 ]
 
 
-@pytest.mark.parametrize(("series", "count"), SERIES)
+@pytest.mark.parametrize(("series", "count"), SHARES)
 def test_a_share_of_each_series_finds_no_fault(series, count, tmp_path):
     tool = str(ROOT / "tools" / "torture.py")
     words = [series, "--count", str(count), "--seed", "1", "--output", str(tmp_path)]

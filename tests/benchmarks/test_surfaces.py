@@ -73,6 +73,7 @@ def written(output):
     return [json.loads(line) for line in (output / "surfaces.jsonl").read_text().splitlines()]
 
 
+@pytest.mark.slow
 def test_all_that_the_table_asks_for_is_there_and_its_settings_are_known():
     names = [case.name for case in CASES]
     assert len(set(names)) == len(names)

@@ -164,7 +164,7 @@ def test_a_target_that_is_missing_scores_nothing():
         target_metrics(ground(), ground(), ground(), samples=0)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_ground_that_lies_near_does_not_stand_in_for_what_is_missing():
     """The upper half of a sphere that lies 1 mm above the ground: with or without the ground."""
     low = sphere(RADIUS, (0, 0, -0.05 + 0.001 + RADIUS))

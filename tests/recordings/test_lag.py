@@ -87,6 +87,7 @@ def stores(tmp_path_factory):
     return folder, truth
 
 
+@pytest.mark.slow
 def test_a_store_without_its_lag(stores):
     folder, truth = stores
     before = Echoes.open(folder / "flight")

@@ -287,7 +287,7 @@ def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):
     torch.testing.assert_close(chosen[1], torch.tensor([0.1, 0.2, 0.3]))
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
     """The noise of all lies above the zero of the reported decibels, 3, 23 and 33 dB."""
     poses = {"count": 24, "validation": 0, "heldout": 0}

@@ -153,7 +153,7 @@ def test_a_registered_surface_is_judged_in_the_frame_of_the_truth(
     assert found["registration"]["kind"] == "similarity"
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_truth_in_other_units_or_elsewhere_is_refused_before_the_work(
     run, few_samples, no_projections, tmp_path
 ):

@@ -120,7 +120,7 @@ def run_with_stops(settings, path, interrupt, stops, number=signal.SIGTERM):
         [STEPS - 1],
         [PER_EPOCH, 2 * PER_EPOCH],  # through one boundary into another
         [3, PER_EPOCH, PER_EPOCH + 1],
-        list(range(1, 11)),
+        pytest.param(list(range(1, 11)), marks=pytest.mark.slow),
     ],
     ids=str,
 )

@@ -113,6 +113,7 @@ def test_a_port_in_use_is_left_to_the_other_and_the_url_says_which_is_taken(run,
         assert b"<html" in page.read().lower()
 
 
+@pytest.mark.slow
 def test_ctrl_c_ends_it_without_a_word(run, tmp_path):
     command = [sys.executable, "-m", "sononerf.cli", "view", str(run), "--port", "8400"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
@@ -129,6 +130,7 @@ def test_what_is_neither_run_nor_store_is_refused(tmp_path):
         View(tmp_path)
 
 
+@pytest.mark.slow
 def test_without_the_extra_one_line_says_what_to_install(run, tmp_path):
     (tmp_path / "viser.py").write_text("raise ImportError('not here')")
     command = [sys.executable, "-m", "sononerf.cli", "view", str(run)]

@@ -107,6 +107,7 @@ def test_exchanging_emitter_and_ear_changes_nothing():
         assert abs(one - two) < 1e-3 * abs(one)
 
 
+@pytest.mark.slow
 def test_no_sound_is_lost():
     """Power through a sphere around rigid ones, without absorption: as much in as out."""
     engine, radius, step = spheres(*TRIPLE), 0.08, 1e-6

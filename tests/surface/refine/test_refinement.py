@@ -171,7 +171,7 @@ def test_a_start_that_cannot_be_traced_is_told_and_counts_as_the_worst(
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("corrected", [False, True])
+@pytest.mark.parametrize("corrected", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_going_on_from_any_step_ends_the_same(bumpy, echoes, optics, simulated_stage, corrected):
     given = simulated_stage if corrected else {}
     whole = started(bumpy, echoes, optics, **given)

@@ -48,6 +48,7 @@ def test_gains_are_found(bumpy, heard, optics):
     assert estimate.error_db[-1] < 0.2 * estimate.error_db[0]
 
 
+@pytest.mark.slow
 def test_a_range_offset_is_told_from_the_size(bumpy, heard, optics):
     # A fit to ranges that are 2 mm too far makes the body smaller by as much.
     normals = np.asarray(bumpy.vertex_normals)
