@@ -35,6 +35,9 @@ AXES: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
 UNITS = {"position": "m", "range": "m", "frequency": "Hz"}
 """Of the arrays; the others are plain numbers."""
 
+ANEW = "fetch the store again, or move its folder away and simulate or import it anew"
+"""What to do about damage that no single pose makes good."""
+
 
 class DurableStore(LocalStore):
     """zarr's local store, whose own writing is not fsynced, with every write committed."""
@@ -198,11 +201,11 @@ def read_axes(root: Path, group: Any) -> tuple[dict[str, NDArray[Any]], Any]:
         size = chunk.stat().st_size if chunk.is_file() else 0
         # Also bounds what is read: a declared size that no file backs costs no memory.
         if size != array.nbytes + CRC_BYTES:
-            raise InputError(f"{chunk}: {size} bytes, expected {array.nbytes + CRC_BYTES}")
+            raise InputError(f"{chunk}: {size} bytes, expected {array.nbytes + CRC_BYTES}; {ANEW}")
         try:
             axes[name] = np.asarray(array[...])
         except Exception as error:  # zarr's codecs raise their own kinds
-            raise InputError(f"{chunk}: damaged ({error})") from error
+            raise InputError(f"{chunk}: damaged ({error}); {ANEW}") from error
     poses = {len(axes[name]) for name in ("position", "rotation", "split")}
     if len(poses) > 1:
         raise InputError(f"{root}: position, rotation and split differ in length: {sorted(poses)}")
@@ -270,7 +273,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
         )
     plain = {key: value for key, value in stored.items() if key not in _RESERVED}
     if _checksum(plain) != stored.get("checksum"):
-        raise InputError(f"{path}: attributes damaged (checksum); simulate or fetch it again")
+        raise InputError(f"{path}: attributes damaged (checksum); {ANEW}")
     return plain
 
 

@@ -38,8 +38,7 @@ def doubts(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:
     found = [_repeated(training)]
     if echoes.hull.width < echoes.head.resolution:
         found.append(LINE)
-    fault = aim_fault(training, region.mean(axis=0))
-    if fault:
+    if echoes.head.ears.is_directional and (fault := aim_fault(training, region.mean(axis=0))):
         found.append(f"training {fault}")
     found.append(_few(training, region, echoes.head.resolution))
     if is_set:

@@ -108,7 +108,7 @@ def predict(
         with _named(poses_csv):
             check_hearing(fitted.module, poses)
         fault = aim_fault(poses, fitted.module.field.region.double().numpy().mean(axis=0))
-        if fault:
+        if fault and fitted.settings.ears.is_directional:
             logger.warning("%s: %s", poses_csv, fault)
     else:
         poses, numbers = run.echoes.poses(split), run.echoes.store.indices(split)

@@ -101,6 +101,11 @@ class EarSettings(Section):
             )
         return self
 
+    @property
+    def is_directional(self) -> bool:
+        """Whether emitter or receivers hear one direction louder than another."""
+        return self.directivity != "omnidirectional" or self.beam_radius > 0.0
+
 
 class CallSettings(Section):
     """What is emitted: an impulse, a sweep of frequency with its harmonics, or a ``file``.

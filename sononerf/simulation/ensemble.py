@@ -111,7 +111,7 @@ def simulate(
     simulator = Simulator.of(scene, head, settings)
     offsets = np.vstack((head.emitter, head.receivers))
     check_poses(scene, poses, offsets=offsets, plane=head.plane)
-    check_aim(scene, poses)
+    check_aim(scene, poses, is_directional=head.ears.is_directional)
     check_reach(
         scene,
         poses,

@@ -93,10 +93,16 @@ def check_reach(
             )
 
 
-def check_aim(scene: Scene, poses: Poses) -> None:
-    """Warn of poses that look away from the scene, and of poses that are all the same."""
+def check_aim(scene: Scene, poses: Poses, *, is_directional: bool) -> None:
+    """Warn of poses that look away from the scene, and of poses that are all the same.
+
+    Args:
+        scene: What is ensonified.
+        poses: To be checked.
+        is_directional: Whether it matters which way the head looks.
+    """
     fault = aim_fault(poses, np.asarray(scene.mesh.bounds).mean(axis=0))
-    if fault:
+    if fault and is_directional:
         logger.warning("%s", fault)
     if len(poses) > 1 and not np.ptp(poses.positions, axis=0).any():
         logger.warning("all %d poses are at one place; check the table of poses", len(poses))

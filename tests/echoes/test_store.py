@@ -468,3 +468,13 @@ def test_without_repeats_there_is_no_noise_floor(tmp_path):
 def test_silence_is_told(tmp_path):
     with pytest.raises(NumericalError, match="nothing was heard"):
         seal(store_of(tmp_path / "s", [0.0, 0.0, 3.0]), {}, silent="nothing was heard")
+
+
+@pytest.mark.parametrize("axis", ["position", "rotation", "split", "range", "frequency"])
+@pytest.mark.parametrize("change", [lambda data: data[:-9] + b"x" + data[-8:], lambda data: b""])
+def test_a_damaged_axis_names_its_way_out(tmp_path, axis, change):
+    simulate(tmp_path)
+    (chunk,) = (file for file in (tmp_path / axis).rglob("c*") if file.is_file())
+    chunk.write_bytes(change(chunk.read_bytes()))
+    with pytest.raises(InputError, match=f"{axis}.*; fetch the store again, or move its folder"):
+        EnsembleStore.open(tmp_path)

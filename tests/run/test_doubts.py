@@ -61,6 +61,15 @@ def test_poses_that_look_away_are_told(heard):
     assert "the poses look the other way" in told
 
 
+def test_where_heads_look_makes_no_difference_to_omnidirectional_ones(heard):
+    ears = {"directivity": "omnidirectional", "beam_radius": 0.0}
+    head = Head.from_plain({**heard.head.plain(), "ears": ears})
+    turned = heard.rotations @ np.diag([-1.0, -1.0, 1.0])
+    arrays = np.stack([heard.spectrogram(row) for row in range(len(heard))])
+    echoes = Echoes.from_arrays(arrays, Poses(heard.positions, turned), head)
+    assert doubts(echoes, BODY, is_set=False) == []
+
+
 def test_a_body_below_its_support_is_told(heard):
     head = Head.from_plain({**heard.head.plain(), "support": {"point": [0.0, 0.0, 0.07]}})
     told = doubts(Echoes(heard.store, head), BODY, is_set=False)

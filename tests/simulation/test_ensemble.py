@@ -18,7 +18,7 @@ from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
 from sononerf.simulation import workers as workers_module
 from sononerf.simulation.ensemble import simulate_ensemble
-from sononerf.simulation.pose_faults import check_poses, check_reach
+from sononerf.simulation.pose_faults import check_aim, check_poses, check_reach
 from sononerf.simulation.simulator import ensemble_poses, pose_seed
 
 SEED_OF = partial(pose_seed, 5)
@@ -377,3 +377,17 @@ def test_ears_inside_are_refused():
     check_poses(scene, outside, offsets=np.array([[0.01, 0.0, 0.0]]))
     with pytest.raises(InputError, match="inside"):
         check_poses(scene, outside, offsets=np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0]]))
+
+
+def test_poses_that_look_away_or_are_all_the_same_are_told(caplog):
+    scene = load_scene("sphere", {"radius": 0.1})
+    right = Poses.sphere(12, radius=0.4)
+    away = Poses(right.positions, right.rotations @ np.diag([-1.0, -1.0, 1.0]))
+    check_aim(scene, right, is_directional=True)
+    check_aim(scene, away, is_directional=False)
+    assert caplog.messages == []
+    check_aim(scene, away, is_directional=True)
+    check_aim(scene, right[np.zeros(12, int)], is_directional=True)
+    first, second = caplog.messages
+    assert "look away from the body" in first
+    assert second == "all 12 poses are at one place; check the table of poses"
