@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import time
@@ -136,10 +137,19 @@ def test_a_folder_that_is_a_link_itself_is_held(tmp_path):
 
 
 @pytest.mark.skipif(not OPEN.is_dir(), reason="no list of open files")
-def test_a_refused_lock_leaves_no_file_open(tmp_path):
+def test_a_refused_lock_leaves_no_file_open(tmp_path, monkeypatch):
     with locks.lock(tmp_path):
         before = len(names(OPEN))
         for _ in range(3):
             with pytest.raises(LockedError), locks.lock(tmp_path):
                 pass
         assert len(names(OPEN)) == before
+
+    def fail(descriptor, operation):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(locks.fcntl, "flock", fail)
+    before = len(names(OPEN))
+    with pytest.raises(StorageError, match="cannot be locked"), locks.lock(tmp_path):
+        pass
+    assert len(names(OPEN)) == before

@@ -324,6 +324,10 @@ def test_the_same_file_under_two_names_leaves_no_third(tmp_path):
     storage.commit(tmp_path / "file", lambda file: file.write(b"new"), previous=previous)
     assert names(tmp_path) == ["file", "previous"]
     assert previous.read_bytes() == b"old"
+    # A process that died had our number.
+    storage.temporary_beside(previous).write_bytes(b"half")
+    storage.commit(tmp_path / "file", lambda file: file.write(b"last"), previous=previous)
+    assert previous.read_bytes() == b"new"
 
 
 def test_a_journal_that_cannot_be_read_is_refused_and_none_is_empty(tmp_path):
