@@ -113,7 +113,6 @@ class EnsembleStore(Ensemble):
         plain = plain_attributes(path, attributes)
         if not (path / "zarr.json").exists():
             _refuse_foreign(path)
-            storage.make_folder(path)
             create_arrays(path, axes, receivers)
             write_group(path, plain)
         store = cls(path, mode="r+")

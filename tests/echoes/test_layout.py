@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 
 import pytest
+from zarr.core.buffer import default_buffer_prototype
 
-from sononerf.echoes.layout import Manifest, PoseRecord
+from sononerf.echoes.layout import DurableStore, Manifest, PoseRecord
 from sononerf.errors import IncompatibleError, InputError
 
 RECORDS = {index: PoseRecord(100 + index, f"{index:064x}") for index in (3, 0, 11)}
@@ -84,3 +86,17 @@ def test_a_newer_sealed_file_is_refused(manifest):
     manifest.path.write_text(json.dumps({**data, "schema_version": 2}))
     with pytest.raises(IncompatibleError, match="schema_version 2"):
         manifest.read()
+
+
+def test_a_store_of_zarr_commits_and_keeps_what_is_there(tmp_path):
+    first, second = (default_buffer_prototype().buffer.from_bytes(x) for x in (b"one", b"two"))
+    store = DurableStore(tmp_path)
+    asyncio.run(store.set("a/key", first))
+    asyncio.run(store.set_if_not_exists("a/key", second))
+    assert (tmp_path / "a" / "key").read_bytes() == b"one"
+    asyncio.run(store.set_if_not_exists("b/key", second))
+    assert (tmp_path / "b" / "key").read_bytes() == b"two"
+    reading = DurableStore(tmp_path, read_only=True)
+    with pytest.raises(ValueError, match="read-only"):
+        reading.set_sync("a/key", second)
+    assert (tmp_path / "a" / "key").read_bytes() == b"one"
