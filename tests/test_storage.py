@@ -306,15 +306,19 @@ def test_all_of_a_file_is_there_when_it_is_synced(tmp_path, monkeypatch):
     sizes, real = [], os.fsync
 
     def fsync(descriptor):
-        if stat.S_ISREG(os.fstat(descriptor).st_mode):
-            sizes.append(os.fstat(descriptor).st_size)
+        found = os.fstat(descriptor)
+        sizes.append("folder" if stat.S_ISDIR(found.st_mode) else found.st_size)
         real(descriptor)
 
     monkeypatch.setattr(os, "fsync", fsync)
     storage.commit_bytes(tmp_path / "file", b"content")
+    assert sizes == [7, "folder"]
     storage.append_line(tmp_path / "journal", "line")
+    assert sizes[2:] == [5, "folder"]
+    storage.append_line(tmp_path / "journal", "more")
+    assert sizes[4:] == [10]
     storage.commit_folder(tmp_path / "folder", {"part": "text"})
-    assert sizes == [7, 5, 4]
+    assert sizes[5:] == [4, "folder", "folder"]
 
 
 def test_the_same_file_under_two_names_leaves_no_third(tmp_path):
