@@ -14,6 +14,9 @@ from sononerf.errors import InputError
 
 UNSTATED = 0xFFFF_FFFF
 """Size of samples that stands elsewhere in a WAV file of more than 4 GB, bytes."""
+MATLAB_SECONDS, MATLAB_SPEED = 2, 1e5
+"""Processor time for a MATLAB file, s, and how much of it is read at least, bytes/s. SciPy's import
+takes 0.5 s. Arrays are read at 75 MB/s or more, but small structs at 0.2 MB/s."""
 
 
 def require_regular(path: Path) -> None:
@@ -32,20 +35,30 @@ def require_regular(path: Path) -> None:
 
 
 def require_sound_matlab(path: Path) -> None:
-    """Refuse a MATLAB file of version 5 that crashes its reader; a process of its own reads it.
+    """Refuse a MATLAB file of version 5 that crashes its reader or holds it up; a process tries it.
 
-    SciPy 1.17 reads beyond its tables where the type of an element is damaged. What it refuses with
-    an error passes: whoever reads the file has that error too.
+    SciPy 1.17 reads beyond its tables where the type of an element is damaged, and reads millions
+    of elements that are not there where a size is. What it refuses with an error passes: whoever
+    reads the file has that error too.
 
     Raises:
         InputError: If it does.
     """
-    script = "import scipy.io, sys; scipy.io.loadmat(sys.argv[1])"
+    seconds = round(MATLAB_SECONDS + path.stat().st_size / MATLAB_SPEED)
+    script = (
+        "import resource, scipy.io, sys; s = int(sys.argv[2]); "
+        "resource.setrlimit(resource.RLIMIT_CPU, (s, s)); scipy.io.loadmat(sys.argv[1])"
+    )
     read = subprocess.run(
-        [sys.executable, "-I", "-c", script, str(path)], capture_output=True, check=False
+        [sys.executable, "-I", "-c", script, str(path), str(seconds)],
+        capture_output=True,
+        check=False,
     )
     if read.returncode < 0:
-        raise InputError(f"{path}: damaged MATLAB file, which crashes its reader; save it again")
+        raise InputError(
+            f"{path}: damaged MATLAB file, which crashes its reader or takes it more than "
+            f"{seconds} s; save it again"
+        )
 
 
 def require_whole_wav(path: Path) -> None:

@@ -112,9 +112,9 @@ def test_a_type_that_crashes_the_reader_is_one_line(tmp_path):
     of_doubles = b"\x09\0\0\0" + (48).to_bytes(4, "little")
     assert data.count(of_doubles) == 1
     (tmp_path / "x.mat").write_bytes(data.replace(of_doubles, b"\xff" + of_doubles[1:]))
-    with pytest.raises(InputError, match="crashes its reader; save it again"):
+    with pytest.raises(InputError, match="crashes its reader"):
         read_mat(tmp_path / "x.mat", ("x",))
-    with pytest.raises(InputError, match="crashes its reader; save it again"):
+    with pytest.raises(InputError, match="crashes its reader"):
         read_directivity(tmp_path / "x.mat")
 
 
