@@ -20,10 +20,15 @@ ROOT = Path(__file__).resolve().parent.parent
 SHARES = [
     ("fuzz", 150),
     ("flips", 100),
-    ("kill-simulate", 8),
     *(
         pytest.param(*share, marks=pytest.mark.slow)
-        for share in (("attacks", 12), ("mistakes", 12), ("disk", 5), ("kill-fit", 3))
+        for share in (
+            ("kill-simulate", 8),
+            ("attacks", 12),
+            ("mistakes", 12),
+            ("disk", 5),
+            ("kill-fit", 3),
+        )
     ),
 ]
 

@@ -110,7 +110,7 @@ def test_noise_and_clutter_far_behind_are_left_out():
     assert np.ptp(box, axis=0).max() < 0.13
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_a_faint_part_in_front_is_in_the_box():
     """A ground 30 dB louder than what stands on it: the onsets know it."""
     ground = np.array([[x, y, -0.08] for x in (-0.09, 0.0, 0.09) for y in (-0.09, 0.0, 0.09)])

@@ -128,7 +128,7 @@ def test_an_interrupted_refinement_goes_on_to_the_same_surface(interrupted, monk
     np.testing.assert_array_equal(again.mesh.vertices, whole.mesh.vertices)
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize("what", ["another start", "damaged"])
 def test_a_state_that_does_not_fit_is_ignored(interrupted, what):
     if what == "damaged":
@@ -151,6 +151,7 @@ def as_other_stages(file):
     file.write_bytes(safetensors.torch.save(safetensors.torch.load_file(file), said))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [as_other_version, as_other_stages])
 def test_a_state_of_another_version_is_refused_before_anything_is_written(
     interrupted, change, no_projections

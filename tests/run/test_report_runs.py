@@ -185,7 +185,7 @@ def test_colours_tell_outside_from_inside(finished):
     assert (blue > red + 50)[out < -0.015].all()
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "begins"), [("svg", b"<?xml"), pytest.param("pdf", b"%PDF", marks=pytest.mark.slow)]
 )

@@ -9,7 +9,7 @@ from sononerf.scene.scene import MATERIALS, load_scene
 LEAF = {"seed": 3, "curl": 40.0, "bend": 50.0, "length": 0.16, "yaw": 25.0, "roll": 10.0}
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_the_leaf_is_the_same_with_and_without_prey(caplog):
     alone = load_scene("leaf", LEAF)
     both = load_scene("leaf_dragonfly", {**LEAF, "along": 0.01, "heading": 30.0})

@@ -61,6 +61,7 @@ def test_one_worker_is_this_process_in_trials_too(few, tmp_path, monkeypatch):
     assert store.missing() == []
 
 
+@pytest.mark.slow
 def test_noise_of_the_ears_asks_for_no_more_rays(few):
     quiet, noisy = (settled(settings(noise, accuracy_db=2.0))[0] for noise in (None, NOISE))
     assert quiet == noisy

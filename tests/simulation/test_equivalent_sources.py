@@ -57,7 +57,7 @@ def test_a_sphere_is_that_of_the_series(ka):
     assert error < 0.02
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_spheres_that_shade_each_other_are_those_of_multiple_scattering():
     mesh = trimesh.util.concatenate(
         [ball(0.015), ball(0.012, (-0.035, 0.004, 0.0)), ball(0.01, (0.0, 0.03, 0.01))]

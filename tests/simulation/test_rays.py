@@ -170,7 +170,7 @@ def test_a_corner_answers_like_the_image_behind_its_edge_and_loses_what_each_bou
         assert abs(group_delay(found, frequency, distance)) < 1e-4
 
 
-@pytest.mark.thorough
+@pytest.mark.slow
 def test_level_does_not_depend_on_the_number_of_rays_nor_on_the_seed():
     position = np.array([0.3, 0.2, 0.1])
     rotation = look_at(position, np.zeros(3))

@@ -58,6 +58,7 @@ def test_where_something_was_truly_added_is_marked(comparison):
     assert all(marked[name] != without[name] for name in "xyz")
 
 
+@pytest.mark.slow
 def test_where_nothing_is_stronger_there_is_no_ring(comparison, recwarn):
     none = dataclasses.replace(comparison, strongest=None)
     ringed = difference_pngs(comparison, ("with", "without"))

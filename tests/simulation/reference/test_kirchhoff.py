@@ -270,6 +270,7 @@ def test_what_a_plate_hides_is_not_heard():
     assert np.abs(heard).max() > 0.02 * np.abs(alone).max()
 
 
+@pytest.mark.slow
 def test_each_ear_sees_for_itself():
     """Before the left ear, at y = 0.2, stands a plate; the emitter sees past it."""
     ball = sphere(0.03, (0.5, 0.0, 0.0))
