@@ -6,6 +6,7 @@ from __future__ import annotations
 import logging
 import math
 import resource
+import zipfile
 
 import numpy as np
 import pytest
@@ -142,3 +143,31 @@ def test_nan_in_weights_is_refused_with_their_name(path):
     save_weights(path.parent, state, {"echo_hash": "x"})
     with pytest.raises(InputError, match=r"model\.safetensors: field\.table holds NaN"):
         load_weights(path.parent)
+
+
+def test_every_bit_of_an_archives_directory_is_checked(tmp_path):
+    """Its own checksums do not reach there, and torch reads other numbers after some flips."""
+    path = tmp_path / "last.ckpt"
+    DurableCheckpointIO().save_checkpoint({"state_dict": {"w": torch.arange(200.0)}}, path)
+    assert fault_of(path) is None
+    data = path.read_bytes()
+    with zipfile.ZipFile(path) as archive:
+        start = archive.start_dir
+    unsigned = []
+    for place in range(start, len(data)):
+        for bit in range(8):
+            changed = bytearray(data)
+            changed[place] ^= 1 << bit
+            path.write_bytes(changed)
+            if fault_of(path) is None:
+                unsigned.append(place - len(data))
+                found = DurableCheckpointIO().load_checkpoint(path)
+                assert torch.equal(found["state_dict"]["w"], torch.arange(200.0))
+    # Without its length the signature is none, and nothing else has changed.
+    assert set(unsigned) <= {-34, -33}
+
+
+def test_a_checkpoint_of_an_older_version_is_read(tmp_path):
+    torch.save({"state_dict": {"w": torch.ones(3)}}, tmp_path / "last.ckpt")
+    found = DurableCheckpointIO().load_checkpoint(tmp_path / "last.ckpt")
+    assert torch.equal(found["state_dict"]["w"], torch.ones(3))

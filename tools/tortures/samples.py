@@ -134,8 +134,9 @@ def samples(folder: Path) -> list[Sample]:
         "na/temperature": np.full(5, 21.5),
     }
     state = {"w": torch.arange(200.0), "b": torch.ones(3)}
-    checkpoint = io.BytesIO()
-    torch.save({"state_dict": state, "global_step": 7, "epoch": 1}, checkpoint)
+    content = {"state_dict": state, "global_step": 7, "epoch": 1}
+    DurableCheckpointIO().save_checkpoint(content, folder / "last.ckpt")
+    checkpoint = (folder / "last.ckpt").read_bytes()
     packed = io.BytesIO()
     np.savez_compressed(packed, **arrays)
 
@@ -184,7 +185,7 @@ def samples(folder: Path) -> list[Sample]:
             lambda path: read_airsas(path, RATE),
         ),
         Sample("SOFA", ".sofa", _sofa(folder), read_directivity),
-        Sample("checkpoint", ".ckpt", checkpoint.getvalue(), _checkpoint, is_checked=True),
+        Sample("checkpoint", ".ckpt", checkpoint, _checkpoint, is_checked=True),
     ]
 
 
