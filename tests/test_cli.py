@@ -827,6 +827,19 @@ def test_signals_outside_the_fit_unwind_and_say_so(monkeypatch, number):
     assert after == before
 
 
+def test_a_disk_fault_that_was_handled_is_not_the_cause_of_another_fault(monkeypatch):
+    from sononerf.run import scenes
+
+    def broken():
+        try:
+            raise PermissionError(errno.EACCES, "Permission denied")
+        except OSError:
+            raise ZeroDivisionError("ours") from None
+
+    monkeypatch.setattr(scenes, "describe_scenes", broken)
+    assert "unforeseen: ZeroDivisionError" in refused(1, "scenes")
+
+
 def test_a_signal_during_an_import_is_told_whatever_the_import_makes_of_it(monkeypatch):
     from sononerf.run import scenes
 

@@ -80,4 +80,4 @@ def test_the_sizes_of_a_wav_file_above_4_gb_are_known(tmp_path):
 def test_other_files_and_headers_alone_pass(tmp_path):
     for name, data in (("text.wav", b"hello"), ("head.wav", b"RIFF\0\0\0\0WAVEds64"), ("no", b"")):
         (tmp_path / name).write_bytes(data)
-        require_whole_wav(tmp_path / name)
+        assert require_whole_wav(tmp_path / name) is None

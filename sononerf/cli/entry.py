@@ -72,7 +72,8 @@ def _unforeseen(error: Exception) -> SonoNerfError:
         if isinstance(refused, OSError) and refused.errno in WAYS_OUT:
             path = Path(str(refused.filename or "a file"))
             return storage_error("cannot be read or written", path, refused)
-        refused = refused.__cause__ or refused.__context__
+        hidden = refused.__suppress_context__  # what was handled is no cause
+        refused = refused.__cause__ or (None if hidden else refused.__context__)
     first = str(error).partition("\n")[0]
     line = f"unforeseen: {type(error).__name__}: {first}"
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where the command `sononerf` starts: signals are heeded before anything large is imported."""
+"""Where the command `sononerf` starts: signals are caught before anything large is imported."""
 
 from __future__ import annotations
 

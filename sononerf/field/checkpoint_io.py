@@ -70,8 +70,8 @@ def fault_of(path: Path) -> str | None:
     """Return what is wrong with a checkpoint's archive, or None where its checksums hold."""
     try:
         signature = _signature(path)
-        if signature is not None and signature[0] != signature[1]:
-            return "damaged (SHA-256)"
+        if signature is not None:
+            return None if signature[0] == signature[1] else "damaged (SHA-256)"
         with zipfile.ZipFile(path) as archive:
             broken = archive.testzip()
     except FileNotFoundError:
