@@ -81,6 +81,8 @@ class _Reading:
         shape = (len(places), count)
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "Sparse CSR tensor support is in beta")
+            # torch 2.11 says so although it is told not to check.
+            warnings.filterwarnings("ignore", "Sparse invariant checks are implicitly disabled")
             self._matrix = self._compressed(index, value, shape)
             self._transpose = self._compressed(index.flip(0), value, shape[::-1])
 

@@ -35,8 +35,8 @@ from sononerf.field.step_cost import StepCost, step_cost
 from sononerf.memory import gigabytes, require_memory
 from sononerf.progress import Progress, duration
 from sononerf.run.build import head_of, module_for, true_mesh, with_store
-from sononerf.run.doubts import doubts
 from sononerf.run.evaluate import EvaluationWork, evaluate
+from sononerf.run.fit_warnings import fit_warnings
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run_folder import RunFolder, flat, stated_frame
@@ -273,8 +273,8 @@ def _prepared(
     corners = (1000 * module.field.region).round().int().tolist()
     progress.say(f"region {corners[0]} to {corners[1]} mm")
     box = module.field.region.double().numpy()
-    for doubt in [] if follows() else doubts(echoes, box, is_set=lower is not None):
-        logger.warning("%s", doubt)
+    for line in [] if follows() else fit_warnings(echoes, box, is_set=lower is not None):
+        logger.warning("%s", line)
     data = EchoDataModule(
         echoes,
         settings.fit,

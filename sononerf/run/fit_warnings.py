@@ -28,7 +28,7 @@ SIDE = 8
 """Number of places along each side of the region for which it is counted who can hear them."""
 
 
-def doubts(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:
+def fit_warnings(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:
     """Return what speaks against a fit, one line each; nothing where all is well.
 
     Args:
