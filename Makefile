@@ -1,6 +1,6 @@
 PY ?= python3
 
-.PHONY: demo test test-all check
+.PHONY: demo test test-all check docs
 
-demo test test-all check:
+demo test test-all check docs:
 	$(PY) tools/bootstrap.py $@

@@ -158,7 +158,7 @@ def test_an_old_python_is_told_in_one_line(bootstrap, monkeypatch, capsys):
 def test_wrong_usage(bootstrap, arguments, capsys):
     with pytest.raises(SystemExit, match="2"):
         bootstrap.main(arguments)
-    assert "usage: bootstrap.py {demo|test|test-all|check}" in capsys.readouterr().err
+    assert "usage: bootstrap.py {demo|test|test-all|check|docs}" in capsys.readouterr().err
 
 
 def test_each_demo_gets_a_folder_of_its_own(bootstrap, checkout):

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: MIT
-"""The script and the notebooks of the manual run from an empty folder; a user's script is typed."""
+"""The manual builds; its scripts, notebooks and tutorial run from an empty folder."""
 
 from __future__ import annotations
 
+import json
+import os
 import re
 import shutil
 import subprocess
@@ -11,10 +13,15 @@ from pathlib import Path
 
 import pytest
 import trimesh
+import typer
 
 ROOT = Path(__file__).resolve().parent.parent
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.py"))
 BLOCKS = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.DOTALL)
+
+
+TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def run(script, folder):
@@ -23,6 +30,72 @@ def run(script, folder):
     )
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    """Pages of the manual as HTML."""
+    target = tmp_path_factory.mktemp("manual")
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-E"]
+    done = subprocess.run(
+        [*command, ROOT / "docs", target], capture_output=True, text=True, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    return target
+
+
+def test_the_manual_builds_without_warnings_and_loads_nothing_from_the_network(built):
+    pages = sorted(built.rglob("*.html"))
+    assert len(pages) > 25
+    loaded = (
+        r"<(?:script|img|iframe|source)[^>]*src=[\"'](?:https?:)?//|<link[^>]*stylesheet[^>]*//"
+    )
+    for page in pages:
+        assert not re.search(loaded, page.read_text(encoding="utf-8")), page
+
+
+def test_the_manual_states_every_command_setting_and_public_name(built):
+    import sononerf
+    from sononerf.cli.entry import app
+    from sononerf.settings.schema import Settings
+
+    commands = (built / "commands.html").read_text(encoding="utf-8")
+    for name in typer.main.get_command(app).commands:
+        assert f">sononerf {name}<" in re.sub(r"</?(code|span)[^>]*>", "", commands)
+    settings = (built / "settings.html").read_text(encoding="utf-8")
+    for name in Settings.model_fields:
+        assert f'id="{name}"' in settings
+    names = (built / "api.html").read_text(encoding="utf-8")
+    for name in set(sononerf.__all__) - {"__version__"}:
+        assert f'id="sononerf.{name}"' in names
+
+
+def test_links_of_the_readme_lead_to_files():
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if "://" not in link]
+    assert len(links) > 10
+    for link in links:
+        assert (ROOT / link.partition("#")[0]).exists(), link
+
+
+@pytest.mark.slow
+def test_the_tutorial_runs(tmp_path):
+    """Every command of the tutorial, as it stands, in an empty folder."""
+    files = re.findall(r"```yaml\n# (\S+)\n(.*?)```", TUTORIAL, re.DOTALL)
+    for name, content in files:
+        (tmp_path / name).write_text(content, encoding="utf-8")
+    lines = "".join(re.findall(r"```sh\n(.*?)```", TUTORIAL, re.DOTALL))
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    done = subprocess.run(
+        ["bash", "-e", "-c", lines],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=1800,
+    )
+    assert done.returncode == 0, done.stderr
+    metrics = json.loads((tmp_path / "runs" / "egg" / "metrics.json").read_text())
+    assert metrics["geometry"]["fscore"]["0.002"] > 0.95
 
 
 def test_the_page_names_what_there_is():

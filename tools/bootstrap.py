@@ -1,12 +1,12 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: MIT
-"""Make a virtual environment in `.venv` once, then run the demo, the tests or the checks in it.
+"""Make a virtual environment in `.venv` once; run the demo, tests, checks, or build the manual.
 
-    python3 tools/bootstrap.py {demo|test|test-all|check} [ARGUMENT]...
+    python3 tools/bootstrap.py {demo|test|test-all|check|docs} [ARGUMENT]...
 
 Standard library only. Nothing is written outside this checkout. Further arguments go to the
-command: KEY=VALUE and options for the demo, pytest's for tests and checks. `TORCH_INDEX=URL`
-names the package index that torch, and torch alone, is taken from.
+command: KEY=VALUE and options for the demo, pytest's for tests and checks, Sphinx's for the
+manual. `TORCH_INDEX=URL` names the package index that torch, and torch alone, is taken from.
 """
 
 from __future__ import annotations  # so that an older Python gets as far as being told
@@ -23,7 +23,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 OLDEST_PYTHON = (3, 11)
 TORCH = "torch==2.13.0"
-COMMANDS = ("demo", "test", "test-all", "check")
+COMMANDS = ("demo", "test", "test-all", "check", "docs")
 PYTEST = ("-m", "pytest", "-n", "auto", "--maxprocesses", "4", "--dist", "loadfile")
 """The tests run one file per process, on at most four cores: each process takes 0.7 GiB."""
 DEMO_CONFIG = "configs/three_spheres.yaml"
@@ -140,6 +140,9 @@ def command_line(command: str, python: Path, root: Path, arguments: list[str]) -
         return [str(python), *PYTEST, *arguments]
     if command == "test-all":
         return [str(python), *PYTEST, "-m", "not slow", *arguments]
+    if command == "docs":
+        pages = [str(root / "docs"), str(root / "docs" / "_build")]
+        return [str(python), "-m", "sphinx", "-W", "--keep-going", "-q", *pages, *arguments]
     return ["bash", str(root / "tools" / "check"), *arguments]
 
 

@@ -48,7 +48,8 @@ class Prediction(Shown):
         poses: P of them.
         magnitude ((P, E, R, F) float32): The mean of rendered and traced levels.
         rendered ((P, E, R, F) float32): The field's own rendering.
-        range ((R,), m), frequency ((F,), Hz): Axes.
+        range ((R,), m): Of the slices.
+        frequency ((F,), Hz): Of the bins.
         traced_weight: Mean weight of the traced echoes.
         traced_fault: Why no echoes are traced off the surface.
         reference: Magnitude m0 of the reported decibels.

@@ -107,8 +107,10 @@ def _prediction(run: RunFolder, accelerator: str, progress: Progress) -> dict[st
 def _equal(stated: Any, found: Any) -> bool:
     """Tell whether two values agree; numbers within the tolerance."""
     if isinstance(found, (list, tuple, np.ndarray)):
-        return isinstance(stated, list) and all(
-            _equal(one, other) for one, other in zip(stated, list(found), strict=True)
+        return (
+            isinstance(stated, list)
+            and len(stated) == len(found)
+            and all(map(_equal, stated, list(found)))
         )
     if isinstance(stated, (int, float)) and isinstance(found, (int, float, np.number)):
         return math.isclose(stated, float(found), rel_tol=TOLERANCE, abs_tol=1e-9)

@@ -27,7 +27,7 @@ def copied(heard, poses, rows):
 
 
 @pytest.mark.parametrize("is_set", [False, True])
-def test_a_sound_fit_raises_no_doubt(heard, is_set):
+def test_a_sound_fit_gets_no_warning(heard, is_set):
     assert fit_warnings(heard.within(BODY) if is_set else heard, BODY, is_set=is_set) == []
 
 
