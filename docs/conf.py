@@ -34,6 +34,7 @@ extensions = [
 html_theme = "furo"
 html_title = f"sononerf {version}"
 html_copy_source = False
+html_show_copyright = False
 html_math_renderer = "mathml"
 exclude_patterns = ["_build"]
 myst_enable_extensions = ["dollarmath", "attrs_inline"]
@@ -70,7 +71,7 @@ def _section(name: str, model: type[Section]) -> str:
     for key, field in model.model_fields.items():
         key = field.alias or key
         note = re.search(rf"^    {key}: .*?#\s*(.*)$", source, re.MULTILINE)
-        default = "required" if field.is_required() else f"`{_plain(field.get_default())}`"
+        default = "required" if field.is_required() else f"`{_plain(field.get_default(call_default_factory=True))}`"
         allowed = " or ".join(dict.fromkeys(_allowed(described.get(key, {}))))
         lines.append(f"| `{key}` | {default} | {allowed} | {note[1] if note else ''} |")
     return "\n".join([*lines, ""])
@@ -95,14 +96,14 @@ def _allowed(schema: dict) -> list[str]:
     if kind not in ("number", "integer"):
         return [words.get(kind, "section")]
     signs = {"minimum": "≥", "exclusiveMinimum": ">", "maximum": "≤", "exclusiveMaximum": "<"}
-    limits = [f"{sign} {schema[word]:g}" for word, sign in signs.items() if word in schema]
+    limits = [f"{sign} {schema[word]:,}" for word, sign in signs.items() if word in schema]
     return [" ".join([kind, ", ".join(limits)]).strip()]
 
 
 def _formula(translator: Any, node: Any, *, display: bool) -> None:
     """Write a formula as MathML: browsers know it, and nothing is loaded from the network."""
     made = "".join(latex2mathml.tex2mathml(node.astext(), as_block=display))
-    translator.body.append(f'<div class="math">{made}</div>' if display else made)
+    translator.body.append(f'<div class="formula">{made}</div>' if display else made)
     raise nodes.SkipNode
 
 

@@ -13,10 +13,10 @@ from pathlib import Path
 from sononerf.errors import InputError
 
 UNSTATED = 0xFFFF_FFFF
-"""Size of samples that stands elsewhere in a WAV file of more than 4 GB, bytes."""
+"""Number of bytes in the header of a WAV file above 4 GB, whose size another chunk states."""
 MATLAB_SECONDS, MATLAB_SPEED = 2, 1e5
-"""Processor time for a MATLAB file, s, and how much of it is read at least, bytes/s. SciPy's import
-takes 0.5 s. Arrays are read at 75 MB/s or more, but small structs at 0.2 MB/s."""
+"""Processor time allowed for a MATLAB file, s, and least reading speed allowed, bytes/s. Importing
+SciPy takes 0.5 s. Arrays are read at 75 MB/s or more, small structs at 0.2 MB/s."""
 
 
 def require_regular(path: Path) -> None:

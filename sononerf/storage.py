@@ -38,7 +38,7 @@ WAYS_OUT = {
     errno.EIO: "the disk reports an input/output error; check the disk, choose another folder",
     errno.ENAMETOOLONG: "the name is too long; choose a shorter one",
 }
-"""What to do about an operating system's refusal, by its number."""
+"""Advice about an operating system's refusal, by its error number."""
 
 
 def storage_error(what: str, path: Path, error: OSError) -> StorageError:

@@ -12,7 +12,7 @@ from sononerf.errors import InputError
 from sononerf.input_files import require_regular
 
 MOST_BYTES = 200_000_000
-"""A larger file is no table of poses; it is refused before it is read."""
+"""Largest table of poses that is read, bytes."""
 
 
 def read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:

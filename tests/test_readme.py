@@ -124,4 +124,4 @@ def test_the_scene_of_a_file_is_there():
 
 
 def test_it_stays_short():
-    assert len(TEXT.splitlines()) <= 150
+    assert len(TEXT.splitlines()) <= 120

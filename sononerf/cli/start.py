@@ -19,7 +19,7 @@ AFTERWARDS = {
     "reconstruct": "the same command goes on with the refinement as it was last saved, if it was",
     "calibrate": "the same command keeps finished trials and does the rest anew",
 }
-"""What is told of each command after a signal; any other command begins anew."""
+"""Message after a signal, by command; any other command begins anew."""
 ANEW = "the same command begins anew"
 
 

@@ -194,8 +194,8 @@ def _crossing(rising: Floats, fraction: float) -> float:
 
 
 MOST_POSES = 1000
-"""How many training poses are asked, evenly over all, so that memory is bounded. More of them add
-less to the free space than an onset can be read to."""
+"""Number of training poses, at most, whose onsets are detected, evenly over all; it bounds the
+memory. Further poses add less to the free space than the accuracy of an onset."""
 
 
 @dataclass(frozen=True, eq=False)

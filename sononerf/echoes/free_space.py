@@ -26,9 +26,9 @@ from sononerf.compiled import compiled
 from sononerf.geometry.plane import Plane
 
 UNDETECTED = 0.05
-"""Fraction of the onsets that may be wrong together where a place is judged, and of outliers that
-are not detected per detected one, no unit. On a thin leaf, where every twelfth onset is late, 0.02
-blames right ones for ruling out what late ones hide."""
+"""Fraction of the onsets that may be wrong together where a place is judged, no unit; also the
+fraction of outliers that are expected to stay undetected. With 0.02, on a thin leaf where every
+twelfth onset is late, right onsets are blamed for ruling out what late ones hide."""
 SHARE = 0.5
 """Largest number of onsets that rule a place out, as a fraction of the onsets at whose range the
 place lies, no unit. Up to it the place is kept, and those that rule it out may all be late. Right
@@ -36,7 +36,7 @@ onsets meet at the place that they come from; late onsets scatter. Of a cone hea
 200 poses miss the tip. With 0.5 and 1 these are removed and no others; with 2 seven right ones go
 too."""
 AT_ONCE = 6_400_000
-"""Points times first echoes, so that memory does not grow with the poses."""
+"""Largest number of points times onsets in one array: memory then does not grow with the poses."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,8 +236,8 @@ def _possible(
 
 
 ACCURACY = 0.1
-"""Usual error of an onset's range, in range resolutions. Of simulated bodies half of all onsets are
-read to a twentieth of the resolution, and nearly all that are not late to a fifth."""
+"""Usual error of an onset's range, range resolutions. On simulated bodies half of all onsets err by
+less than a twentieth of the resolution, and nearly all that are not late by less than a fifth."""
 
 # Sizes of the search, not of what it finds: cells of the first lattice along the longest side, the
 # greatest number of pairs of a cell and an onset, and how often the half diagonal of the last cells

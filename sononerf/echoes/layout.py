@@ -33,10 +33,10 @@ AXES: dict[str, tuple[str, tuple[str, ...], tuple[int, ...]]] = {
     "frequency": ("float64", ("frequency",), ()),
 }
 UNITS = {"position": "m", "range": "m", "frequency": "Hz"}
-"""Of the arrays; the others are plain numbers."""
+"""Units of the arrays; arrays without one are plain numbers."""
 
 ANEW = "fetch the store again, or move its folder away and simulate or import it anew"
-"""What to do about damage that no single pose makes good."""
+"""Advice about damage that writing single poses again does not mend."""
 
 
 class DurableStore(LocalStore):

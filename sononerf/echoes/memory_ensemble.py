@@ -121,8 +121,7 @@ class Ensemble(ABC):
 
 
 LOUDEST = 1e18
-"""Largest magnitude of a spectrogram: the square of a larger one is no number of single
-precision."""
+"""Largest magnitude of a spectrogram: the square of a larger one overflows single precision."""
 
 
 def fault_of(spectrogram: Singles) -> str:

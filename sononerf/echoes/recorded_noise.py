@@ -22,10 +22,10 @@ from sononerf.head.decibels import EXCEEDED
 from sononerf.head.head import Head
 
 BEFORE = 2.0
-"""Noise is read where the first echo is this many range resolutions away or more: its rising flank
-and the nearest sidelobes lie closer."""
+"""Least distance, range resolutions, between the first echo and the slices in front of it that give
+the noise: the echo's rising flank and nearest sidelobes lie closer."""
 CELLS = 100
-"""Least number of slices, over all poses, that the noise of a receiver is read from."""
+"""Least number of slices, over all poses, that give the noise of a receiver."""
 
 
 def noise_rms(store: Ensemble, head: Head) -> Floats | None:

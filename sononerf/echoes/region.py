@@ -18,8 +18,8 @@ WITNESS_GAIN = 0.1
 """A pose is a witness of the places towards which its gain is at least this fraction of the best,
 no unit: 20 dB, beyond which an echo is easily below the threshold."""
 AGREEMENT = 0.6
-"""A place is taken where the power from its range is at least this fraction of the best place's, no
-unit. Above a half, for of two places that share an echo neither has more than that by chance."""
+"""Least power from the range of a place, over that of the best place, at which the place is taken,
+no unit. It is above 0.5, because two places that share an echo reach 0.5 by chance."""
 UNEXPLAINED = 0.02
 """Fraction of the power that may stay without a place, no unit. Bounces among the parts of a body
 arrive late and have no place of their own; they hold about as much."""

@@ -14,7 +14,7 @@ from sononerf.errors import NumericalError
 from sononerf.surface.start.volume import Volume
 
 SAME = 1e-6
-"""Triangles are the same where their corners' mean lies no farther apart, m."""
+"""Largest distance between the centroids of two triangles that count as the same, m."""
 
 
 @dataclass(frozen=True, eq=False)

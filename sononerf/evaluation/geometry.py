@@ -25,7 +25,7 @@ from sononerf.simulation.pool import computed
 from sononerf.surface.start.volume import Volume
 
 MANY = 64
-"""Training poses from which another process pays."""
+"""Number of training poses from which a process of its own saves time."""
 
 Kind = Literal["none", "rigid", "similarity"]
 
@@ -154,7 +154,8 @@ def _closest(
 
 
 MOST_TIMES = 30.0
-"""By how much truth and reconstruction may differ in size: less than metres and inches do."""
+"""Largest ratio of the sizes of truth and reconstruction, no unit: mistaking inches for metres
+gives 39."""
 
 
 def check_truth(found: trimesh.Trimesh, true: trimesh.Trimesh, kind: Kind, name: str) -> None:
@@ -197,11 +198,12 @@ def signed_error(mesh: trimesh.Trimesh, true: trimesh.Trimesh) -> Floats:
 
 
 BASELINE_VOXELS = 64
-"""Voxels of a baseline along the region's longest side: finer than the window in any scene of
-ours."""
+"""Number of voxels of a baseline along the region's longest side: finer than the analysis window in
+all shipped scenes."""
 
 BASELINE_SAMPLES = 20_000
-"""Samples of a baseline's surface: its F-score is then right to 0.004, and it is read to 0.01."""
+"""Number of samples of a baseline's surface: the F-score then errs by 0.004, and it is stated to
+0.01."""
 
 
 class Truth:

@@ -26,7 +26,7 @@ slip between two triangles. None is parallel to an axis, because many faces are.
 SMALLEST_PART = 0.01
 """Parts with less than this fraction of the largest part's area are not counted."""
 ROUNDING = 1e-9
-"""A volume below this fraction of a body's own volume is zero but for rounding."""
+"""Largest volume, as a fraction of a body's own, that counts as zero: it comes from rounding."""
 
 
 class Solid:

@@ -24,7 +24,8 @@ from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import DataSettings, FitSettings
 
 LEAST_STEPS = 60
-"""Least steps of an epoch: few poses give a shorter pass, and an epoch is then several passes."""
+"""Least number of steps of an epoch. If there are few poses, an epoch passes over them several
+times."""
 
 
 class EpochSampler(DistributedSampler[int]):

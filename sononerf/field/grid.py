@@ -17,7 +17,8 @@ from sononerf.field.lobe import CODE, LobeField, Lobes, Places
 from sononerf.field.lobe_correction import Correction
 
 SLIGHT = 1e-5
-"""A vertex is not read where its weight is less: places of a lattice are off by roundings."""
+"""Weight below which a vertex of the grid is not read: rounding moves places of a lattice by as
+much."""
 
 
 class _Product(torch.autograd.Function):

@@ -14,9 +14,9 @@ from torch import Tensor, nn
 from sononerf.field.lobe import CALM, CODE, CalmLayer, LobeField, hidden_layers
 
 PRIMES = (1, 2654435761, 805459861)
-"""What the numbers of a vertex along x, y and z are multiplied by; Müller et al. 2022, eq. 4."""
+"""Factors of the indices of a vertex along x, y and z; Müller et al. 2022, eq. 4."""
 CHUNK = 65_536
-"""How many places are read out at once."""
+"""Number of places that are evaluated at once; it bounds the memory."""
 
 
 class _Blend(torch.autograd.Function):

@@ -14,15 +14,17 @@ from sononerf.field.field import Field
 
 LOG_STRENGTH_FLOOR = -18.0
 QUIETEST = -5.0
-"""A lobe is left out where it is this much below its own peak, as a natural logarithm: -43 dB."""
+"""Natural logarithm of the gain, relative to the lobe's peak, below which a lobe is left out: -43
+dB."""
 CURVED_AFTER = 0.4
-"""Share of the fit after which places may be curved: before, they are not where they belong."""
+"""Fraction of the fit after which places may be curved, no unit. Earlier, places are not yet where
+they belong."""
 RADIUS_UNIT = 0.015
-"""What one unit of the learned number is in metres: how fast the radii are learned."""
+"""Radius of curvature per unit of the learned number, m. It sets how fast radii are learned."""
 CODE = 5
 """Numbers of a place before the coefficients: log strength, lobe vector (x, y, z), radius."""
 CALM = 0.1
-"""How far Adam's step moves a weight that all places share, beside one of a single vertex."""
+"""Length of Adam's step for a weight that all places share, relative to that of a single vertex."""
 
 
 class CalmLayer(nn.Linear):

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from sononerf.field.lobe import CALM, CalmLayer, hidden_layers
 
 LARGEST = 3.0
-"""No correction is larger, as a natural logarithm: 26 dB."""
+"""Largest correction, as a natural logarithm: 26 dB."""
 
 
 def harmonics(directions: Tensor) -> Tensor:

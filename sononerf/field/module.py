@@ -41,14 +41,13 @@ from sononerf.settings.schema import (
 )
 
 ENDLESS = 10**9
-"""Steps of a fit whose Trainer knows no end: the learning rate is never lowered."""
+"""Number of steps that is assumed if a Trainer sets no end: the learning rate then stays the
+same."""
 
 WORTH_THREADS = 40_000
-"""Places per step below which threads wait for one another longer than they compute.
-
-Measured on two cores: with 12,000 places two threads take three quarters of the time of one on an
-idle machine, and two and a half times as long as one where something else runs beside. That is of
-lobes; a network computes so much for a place that threads never wait."""
+"""Number of places per step below which several threads cost more than they save. On two cores and
+12,000 places, two threads take 0.75 of the time of one on an idle machine, and 2.5 times as long
+beside other work. The figure is for lobes; for a network several threads always save time."""
 
 
 def decibels(magnitude: Tensor, reference: float | Tensor) -> Tensor:

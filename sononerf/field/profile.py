@@ -16,12 +16,12 @@ from sononerf.field.renderer import Deposit, Possible, Renderer, Window, look_up
 from sononerf.head.head import Head
 
 KERNEL_SKIRT = 31e-6
-"""The kernel reaches so much further than the window, s: beam and ears lengthen an echo."""
+"""Length by which the kernel exceeds the window, s: beam and ears lengthen an echo."""
 KERNEL_FLOOR = -9.0
-"""What the squared kernel starts with beyond the window, as a natural logarithm."""
+"""Natural logarithm of the squared kernel beyond the window, at the start of the fit."""
 UNEVEN_FLOOR = -14.0
-"""The same of a kernel with two different sides: it is many times longer, and so much would sum up
-to a twentieth of an echo's energy."""
+"""KERNEL_FLOOR of a kernel whose two sides differ. Such a kernel is many times longer, and
+KERNEL_FLOOR would sum up to a twentieth of an echo's energy."""
 
 
 class ProfileRenderer(Renderer):

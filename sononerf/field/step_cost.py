@@ -17,8 +17,8 @@ from sononerf.field.range_slices import RangeSlices
 STATES = 4
 """Numbers kept per parameter, no unit: its value, its gradient, and Adam's two averages."""
 WORKSPACE = 2.0
-"""Memory of a backward pass over that of the values it needs, no unit: their gradients are as
-large."""
+"""Memory of a backward pass over the memory of the values it needs, no unit: gradients are as large
+as values."""
 
 
 @dataclass(frozen=True)

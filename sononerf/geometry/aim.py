@@ -9,11 +9,11 @@ from sononerf.array_types import Floats
 from sononerf.geometry.poses import Poses, euler_from_rotation, rotation_from_euler
 
 ASIDE = np.radians(45.0)
-"""Heads that look closer to the body than this, in the median, raise no question, rad. Bats aim
-within some degrees; a call is half as loud 30 to 40 degrees off."""
+"""Median angle between the heads' aim and the body above which a mistake is suspected, rad. Bats
+aim within some degrees; a call is half as loud 30 to 40 degrees off its axis."""
 EXPLAINED = np.radians(20.0)
-"""A mistake explains poses that look aside if without it they look closer to the body than this, in
-the median, rad."""
+"""Median angle between the heads' corrected aim and the body below which a suspected mistake counts
+as the explanation, rad."""
 
 
 def off_axis(poses: Poses, centre: Floats) -> Floats:

@@ -14,15 +14,15 @@ from sononerf.array_types import Bools, Floats, Ints
 from sononerf.geometry.raycast import winding_numbers
 
 FLAT = 1e-7
-"""A triangle lower than this share of its longest side has no area in single precision."""
+"""Height of a triangle over its longest side below which it has no area in single precision."""
 TWICE = 1e-6
-"""Vertices closer than this share of the surface's size stand at the same place."""
+"""Distance of two vertices, over the size of the surface, below which they are the same place."""
 MOST_BODIES = 2000
-"""So many of the largest bodies are searched for others inside them."""
+"""Number of bodies, the largest first, that are searched for others inside them."""
 MOST_POINTS = 1000
-"""So many vertices of a body are tried; it is inside another where all of them are."""
+"""Number of vertices of a body that are tested; a body is inside another if all of them are."""
 THIN = 1e-9
-"""A body whose volume is a smaller share of the cube of its length has no inside."""
+"""Volume of a body over the cube of its length below which it has no inside."""
 
 
 def surface_faults(vertices: ArrayLike, faces: ArrayLike) -> list[str]:

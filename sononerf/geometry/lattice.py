@@ -14,7 +14,7 @@ from skimage.measure import marching_cubes
 from sononerf.array_types import Bools, Floats, Singles
 
 MARGIN = 3
-"""Voxels around the box, so that a surface at its edge is closed by air."""
+"""Number of empty voxels around the box: they close a surface at its border."""
 
 
 @dataclass(frozen=True, eq=False)

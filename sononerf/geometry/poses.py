@@ -21,8 +21,8 @@ from sononerf.shown import Shown
 from sononerf.tables import number_in, read_rows
 
 ORTHOGONAL = 1e-3
-"""Largest error of a rotation's product with its transpose, no unit: of matrices in a table with
-four decimals."""
+"""Largest deviation of a rotation's product with its transpose from the identity, no unit: that of
+a table with four decimals."""
 CSV_COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
 
 

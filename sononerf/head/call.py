@@ -16,8 +16,8 @@ from sononerf.head.call_file import CallFile, contents, load_call
 from sononerf.settings.schema import CallSettings
 
 LOUD = 0.25
-"""A harmonic counts where it has this part of the loudest one's height: echoes that are fainter are
-not taken for onsets, whose level is a tenth of the power."""
+"""Height of a harmonic, over that of the loudest one, from which it counts. Fainter echoes are not
+taken for onsets, which are read at a tenth of the power."""
 
 
 def call_waveform(settings: CallSettings, sampling_rate: float) -> Floats:
@@ -296,8 +296,8 @@ def matched_filter(recordings: ArrayLike, call: ArrayLike, *, oversampling: int 
 
 
 EPSILON = 0.01
-"""Power spectrum of the call, over its greatest, below which the division is not exact: 20 dB, as
-far as a call counts as covering a frequency."""
+"""Power spectrum of the call, over its maximum, below which the division by it is regularised: -20
+dB, at which a call counts as covering a frequency."""
 
 
 def inverse_filter(recordings: ArrayLike, call: ArrayLike) -> Floats:

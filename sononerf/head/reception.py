@@ -30,9 +30,10 @@ logger = logging.getLogger("sononerf")
 
 FAR = 2.0  # factor between a window and the best one that is worth a warning
 FAINT = 1e-2
-"""A point echo is followed over time down to this, over its height at its own range."""
+"""Magnitude, over that at its own range, down to which a point echo is followed over time."""
 MOST = 4.0
-"""How much louder it may be at another time, where another harmonic is: 12 dB."""
+"""Largest magnitude of a point echo at another time, where another harmonic is, over that at its
+own range: 12 dB."""
 
 
 def row_duration(call: CallSettings, analysis: SpectrogramSettings, frequency: ArrayLike) -> Floats:

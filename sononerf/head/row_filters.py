@@ -48,13 +48,14 @@ WINDOW_LOBE = 2.0  # over its length: half the main lobe of its transform
 
 ORDER = 4
 BANDWIDTH = 1.019
-"""The gammatone's b over its equivalent rectangular bandwidth, order 4."""
+"""Parameter b of a gammatone of order 4 over its equivalent rectangular bandwidth."""
 PEAK = (ORDER - 1) / (2.0 * np.pi)  # where the envelope is greatest, over b
 HALF_HEIGHT = (0.222, 0.879)  # where it is above half of that, over b
 HALF_BANDWIDTH = 2.0 * math.sqrt(4.0 ** (1.0 / ORDER) - 1.0)  # of the transform, in b
 SKIRT = 3.0  # b from its middle the transform has fallen by 40 dB
 FLOOR = 1e-3
-"""The gammatone's envelope is cut off 60 dB below its peak, the reported dynamic range."""
+"""Gammatone envelope, over its peak, at which the filter is cut off: -60 dB, the reported dynamic
+range."""
 
 
 @dataclass(frozen=True, eq=False)

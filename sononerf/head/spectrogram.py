@@ -172,7 +172,8 @@ def _filtered(
 
 
 WIDEST = 8.0
-"""A gammatone's skirt is followed down to this part of its own frequency at most."""
+"""Lowest frequency to which the skirt of a gammatone is followed, as the fraction 1/WIDEST of its
+centre frequency."""
 
 
 class Smearing(NamedTuple):

@@ -22,7 +22,7 @@ FAINT_DB = 40.0
 """A channel counts as faint if its echoes are weaker than the strongest channel's by more, dB: ears
 that look apart differ by 20 to 30 dB."""
 LOOKED_AT = 16
-"""Number of pings whose samples are compared, no unit; a broken cable shows in all."""
+"""Number of pings whose samples are compared; a broken cable shows in all."""
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,8 @@ NED_TO_ENU = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
 DOWN_TO_UP = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
 CAMERA_TO_HEAD = ((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0))
 SLACK = 1e-3
-"""How far rotations and unit quaternions may be from exact ones, no unit: four printed digits."""
+"""Largest deviation of rotations and unit quaternions from exact ones, no unit: four printed
+digits."""
 
 
 def frame_matrices(settings: ImportSettings) -> tuple[Floats, Floats]:

@@ -22,15 +22,15 @@ from scipy.optimize import least_squares
 from sononerf.array_types import Floats
 
 DEGREE = 4
-"""Greatest degree of the polynomials, no unit: parts of a body 45 degrees apart are separated."""
+"""Largest degree of the polynomials, no unit: it separates parts of a body 45 degrees apart."""
 PER_COEFFICIENT = 4
 """Least number of pings for each coefficient, no unit."""
 PARTS = 6
-"""Into so many parts the pings are cut to be predicted by the others."""
+"""Number of parts of the pings; each part is predicted from the others (cross-validation)."""
 ROUNDS = 8
-"""Passes of the robust fit: by then weights move no more."""
+"""Number of passes of the robust fit; after these the weights no longer change."""
 RIDGE = 1e-3
-"""Pull of the coefficients to zero, no unit: one in a thousand pings."""
+"""Weight of the ridge penalty on the coefficients, no unit: that of one in a thousand pings."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from sononerf.settings.import_schema import ImportSettings, ReferenceSettings
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 SEARCH = 0.25
-"""The sphere's echo is looked for within this fraction of its distance, nearer and farther."""
+"""Half width of the search for the sphere's echo, as a fraction of the sphere's distance."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,12 +145,12 @@ def _peak(axis: Floats, power: Floats, top: NDArray[np.intp]) -> Floats:
 
 
 INAUDIBLE_DB = 140.0
-"""Absorption there and back beyond which nothing is looked for, dB: 24 bits record 144 dB."""
+"""Two-way absorption beyond which no echo is sought, dB: 24 bits record 144 dB."""
 SHORT = 0.1
-"""Up to this fraction of the pings may be shorter than the range that is looked at; they are named
-if echoes of the others come later."""
+"""Largest fraction of the pings that may be shorter than the analysed range; they are named if
+echoes of the others come later."""
 ASKED = 64
-"""So many pings, evenly over all, are asked for ranges and noise."""
+"""Number of pings, evenly over all, that determine ranges and noise."""
 
 
 def analysis_bytes(head: Head) -> float:

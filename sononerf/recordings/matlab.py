@@ -160,7 +160,7 @@ def vector(path: Path, where: dict[str, Any], name: str, size: int) -> Floats:
 
 
 MOST_TIMES = 2000
-"""A dataset may be so many times as large as its file: recordings do not pack better."""
+"""Largest size of a dataset over that of its file: recordings do not compress better."""
 
 
 @contextmanager

@@ -21,12 +21,14 @@ from sononerf.recordings.audio import Recording, as_float
 from sononerf.settings.import_schema import Channels
 
 GUARD = 64
-"""Samples on both sides of a cut that take up what a shift by part of a sample leaks."""
+"""Number of samples on both sides of a cut that take up the leakage of a shift by part of a
+sample."""
 STAYS = 3
-"""A clipped wave has so many samples, or more, that equal a neighbour at its greatest value."""
+"""Number of samples with the same greatest value as a neighbour from which a wave counts as
+clipped."""
 STEPS = 1000
-"""Least height of a wave over the steps of its numbers for it to be called clipped: a fainter one
-stays at the same number for long anyway."""
+"""Least height of a clipped wave over its quantisation step: a fainter wave repeats values
+anyway."""
 
 
 def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -> Floats:

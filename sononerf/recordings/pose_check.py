@@ -37,15 +37,15 @@ from sononerf.recordings.distance_model import Prediction, predict
 from sononerf.settings.import_schema import ImportSettings
 
 FEWEST = 12
-"""Fewer pings than this tell nothing."""
+"""Number of pings below which nothing can be tested."""
 MOST = 400
-"""Of more pings so many are asked, evenly."""
+"""Number of pings, at most, that are tested, evenly over all."""
 CLEARLY = 0.15
 """Least gain in log-likelihood per ping for another convention to be named."""
 AT_LEAST = 12.0
 """Least gain in log-likelihood of all pings: odds of e^12."""
 EQUAL = 0.95
-"""Another convention whose gain is this part of the best one's is named beside it."""
+"""Gain over that of the best convention from which another convention is named beside it."""
 FAR_APART, CLOSE = 100.0, 0.01
 """Spread of the poses over the median range beyond which a unit is wrong, no unit. A flight of a
 hundred metres past things one metre away is still right."""
@@ -61,15 +61,16 @@ MOST_CHANNELS = 8
 RANGE_FACTORS = tuple(float(f) for f in np.exp(np.linspace(-0.6, 0.6, 13)) if abs(f - 1.0) > 0.01)
 """Factors of all ranges, 10 % apart: those of a wrong sampling rate or speed of sound."""
 RANGES_CLEARLY = 0.5
-"""The same as CLEARLY for such a factor: of 120 sound sets two gained 0.3, and the others less."""
+"""CLEARLY for such a factor: of 120 sound sets two gained 0.3, and the others less."""
 ORDERS = 4
 """Number of random orders that the stated order of the poses is compared with."""
 XYZW = (QUATERNION[-1], *QUATERNION[:-1])
-"""Columns that hold w, x, y, z if numbers in the order x, y, z, w were named w, x, y, z."""
+"""Columns that hold w, x, y, z if numbers in the order x, y, z, w have the names w, x, y, z."""
 AIM_FLOOR = np.radians(20.0)
-"""Heads that look closer to the body than this do so equally well, rad."""
+"""Angle between aim and body below which all heads count as aiming equally well, rad."""
 AROUND = 0.15
-"""Least part of the directions' variance along their weakest axis for poses to be all around."""
+"""Least fraction of the directions' variance along their weakest axis from which poses count as all
+around."""
 
 
 @dataclass(frozen=True)

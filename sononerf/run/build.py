@@ -146,7 +146,7 @@ def results_folder(folder: Path) -> Iterator[None]:
 logger = logging.getLogger("sononerf")
 
 MOST_BYTES = 2_000_000_000
-"""A larger file is refused before it is read."""
+"""Largest file that is read, bytes."""
 Unit = Literal["m", "cm", "mm"]
 KINDS = (".ply", ".stl", ".obj", ".off", ".glb")
 

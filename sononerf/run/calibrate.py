@@ -44,13 +44,13 @@ from sononerf.surface.refine.support_search import (
 )
 
 STEPS = 20
-"""At most so many Gauss-Newton steps; they usually end earlier."""
+"""Largest number of Gauss-Newton steps; they usually end earlier."""
 SETTLED = 0.1
-"""Steps end when they are shorter than this, standard deviations."""
+"""Length of a step, standard deviations, below which the iteration ends."""
 DETERMINED = 0.25
 """Largest uncertainty of a length, range resolutions, at which an error counts as found."""
 DETERMINED_DB = 1.0
-"""The same of a gain, dB."""
+"""DETERMINED of a gain, dB."""
 DETERMINED_RESOLUTIONS = 1.0
 """Largest uncertainty of the turntable's radius, the support's height and the emitter's radius,
 range resolutions, at which they count as found."""

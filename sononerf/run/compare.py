@@ -30,11 +30,12 @@ from sononerf.surface.start.volume import Volume, vti_bytes
 logger = logging.getLogger("sononerf")
 
 HEARING = ("air", "ears", "call", "spectrogram")
-"""Sections in which two runs must not differ: else what differs is who listens."""
+"""Sections in which two runs must agree; otherwise the listeners differ, not the scenes."""
 VOXELS = 80
-"""Along the longest side."""
+"""Number of voxels along the longest side."""
 WRONG_WAY = 2.0
-"""So many times what the first has more the second must have more, for the order to look wrong."""
+"""Excess of the second run over the first, relative to that of the first over the second, from
+which the runs look swapped."""
 MOST_POSES = 400
 
 

@@ -39,7 +39,7 @@ ENOUGH_MEMORY, ENOUGH_DISK = 2e9, 2e9
 """Bytes that a run of the defaults needs: 1.3 GB of memory were measured, and stores of 400 poses
 with their runs take less than 1 GB."""
 PATIENCE = 60.0
-"""How long drawing may take before it counts as broken, s."""
+"""Time after which drawing counts as broken, s."""
 DRAW = (
     "import vtk; w = vtk.vtkRenderWindow(); w.SetOffScreenRendering(1); w.SetSize(8, 8);"
     "w.AddRenderer(vtk.vtkRenderer()); w.Render();"

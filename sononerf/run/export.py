@@ -30,9 +30,9 @@ from sononerf.surface.start.volume import Volume
 FileType = Literal["mat", "h5", "nc"]
 
 LARGEST = {"mat": 2**31 - 1, "nc": 2**31 - 4}
-"""Bytes that one array may have in MATLAB's format of version 5 and in NetCDF's of version 3."""
+"""Largest array, bytes, in MATLAB's format of version 5 and in NetCDF's of version 3."""
 HEAD = "MATLAB 5.0 MAT-file, written by sononerf"
-"""In place of the usual header, which holds the date: the same arrays give the same bytes."""
+"""Header without the usual date: the same arrays give the same bytes."""
 
 
 @dataclass(frozen=True, eq=False)

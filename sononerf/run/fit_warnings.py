@@ -15,17 +15,17 @@ LINE = (
     "surface may be drawn out around the line; fly another way as well"
 )
 MOSTLY = 0.5
-"""Fraction of a table or a region beyond which what is wrong with it is told, no unit: half, since
-a few repeated poses, or corners that nobody hears, do no harm."""
+"""Fraction of a table or a region above which a fault of it is reported, no unit. It is a half,
+since a few repeated poses, or corners out of every pose's reach, do no harm."""
 SOME = 0.25
-"""Fraction of the poses that hear a body beyond which too many hear nothing from the region, no
-unit. Of a body 70 mm beside the region 3 of 8 poses all around did, and of one within it none."""
+"""Fraction of the poses with an echo that may hear none from the region, no unit. Of a body 70 mm
+beside the region 3 of 8 poses all around heard none; of a body within it all heard one."""
 FEWEST = 8.0
-"""Mean distance between neighbouring places on a sphere around the region that poses face, in range
-resolutions, beyond which poses are too few. The shipped experiments have 1 to 6. Between such
-places nothing of a convex body sends sound straight back."""
+"""Mean distance between neighbouring places on a sphere around the region that poses face, range
+resolutions, above which poses are too few. The shipped experiments have 1 to 6. Between such places
+no part of a convex body reflects sound straight back."""
 SIDE = 8
-"""Number of places along each side of the region for which it is counted who can hear them."""
+"""Number of places along each side of the region whose distance from the poses is checked."""
 
 
 def fit_warnings(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:

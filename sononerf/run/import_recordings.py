@@ -36,12 +36,12 @@ logger = logging.getLogger("sononerf")
 
 SHOWN = 3  # pings in a picture
 NOT_HASHED = ("source", "licence")
-"""What does not change the echoes."""
+"""Keys that do not change the echoes."""
 WRITTEN_SECONDS = 0.01
 """Time to write one ping durably, s, on a usual disk."""
 COARSER = 1.5
-"""Range resolution over that of an impulse, no unit, from which on pulse compression is proposed:
-less would hardly be seen."""
+"""Range resolution over that of an impulse, no unit, from which pulse compression is proposed; a
+smaller gain would hardly be seen."""
 
 
 def echo_hash(understood: Understood) -> str:

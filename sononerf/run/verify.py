@@ -20,8 +20,8 @@ from sononerf.run.evaluate import EvaluationWork
 from sononerf.run.run_folder import RunFolder, flat
 
 TOLERANCE = 1e-3
-"""Numbers may differ by this part of themselves. On one machine they are equal to the last bit;
-other processors and versions of the libraries round otherwise."""
+"""Largest relative difference of two equal numbers. On one machine they agree to the last bit;
+other processors and versions of libraries round otherwise."""
 
 
 class TrueSurface(TypedDict, total=False):

@@ -21,7 +21,7 @@ from sononerf.run.simulate import store_path
 from sononerf.surface.mesh_files import confidence_of
 
 WAIT = 2.0
-"""How often a run's folder is looked at, s."""
+"""Interval at which a run's folder is checked for new files, s."""
 
 
 class View:

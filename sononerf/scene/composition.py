@@ -21,9 +21,9 @@ from sononerf.scene.scene import Scene
 logger = logging.getLogger("sononerf")
 
 LARGEST_SCALE = 1000.0
-"""As much as there is between the units in which meshes are drawn, mm and m."""
+"""Largest scale: the ratio of the units m and mm."""
 SQUARE = 1e-6
-"""By so much the columns of a rotation may miss being unit vectors square to one another."""
+"""Largest deviation of the columns of a rotation from orthogonal unit vectors."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ MAX_SETTINGS_BYTES = 1_000_000
 MAX_SETTINGS_DEPTH = 50
 SectionT = TypeVar("SectionT", bound=BaseModel)
 PLUGIN_NAMES = (("scene", "name"), ("field", "kind"), ("renderer", "kind"))
-"""Keys whose value decides what the options beside it mean."""
+"""Keys whose value determines the options beside them."""
 
 
 class _StrictLoader(yaml.SafeLoader):

@@ -20,8 +20,9 @@ from sononerf.simulation.workers import simulated
 FIRST = 30_000
 """Rays per pose of the first trial. With fewer a pose takes hardly less time."""
 MOST = 300_000
-"""Rays per pose beyond which no accuracy is sought. Sound that bounces between many bodies
-converges slowly: with this number ``ua`` has 0.8 dB, and 0.2 dB would take ten times as many."""
+"""Largest number of rays per pose that the search for an accuracy takes. Sound that bounces between
+many bodies converges slowly: with this number ``ua`` has 0.8 dB, and 0.2 dB would take ten times as
+many."""
 POSES = 8
 """Poses that are simulated twice in a trial, spread evenly over all of them."""
 CONVERGENCE = 0.6

@@ -28,7 +28,7 @@ WIDE = 5e-4
 """Width of a bundle, m, above which it may hold a mirror point of the next bounce that its ray does
 not show."""
 EXPLORE = 0.1
-"""What such a bundle may bring, as a fraction of what one with a mirror point brings."""
+"""Weight of such a bundle, as a fraction of that of one with a mirror point."""
 EARS_APART = 0.03
 """Distance between receivers, m, up to which the middle between them stands for each of them."""
 

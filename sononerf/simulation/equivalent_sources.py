@@ -40,8 +40,8 @@ REGULARISATION = 1e-8
 """Added to the normal equations, as a fraction of their mean diagonal. On a reconstructed mesh less
 of it lets the response ring; more of it loses accuracy."""
 DIPOLE = 0.1
-"""Share of its dipole in a source, of the one that makes it silent towards its back. 0.03 leaves
-some of the resonances, 1 makes the error half as great again."""
+"""Dipole moment of a source over that which makes it silent towards its back. 0.03 leaves some of
+the resonances; 1 makes the error half as great again."""
 CHECKS = 200
 """Points of the surface that are left out of the solution and give its error."""
 CONTROL = 100
@@ -57,8 +57,8 @@ FEW = 8
 LEAD = 2.5
 """Time kept before the first arrival, over the inverse width of the fall of the band."""
 PATH = 5.0
-"""Path that the response lasts for after the first arrival, in radii of a sphere around the scene.
-What comes later wraps around; for ``three_spheres`` it is 60 dB down."""
+"""Length of the path over which the response is kept after the first arrival, in radii of a sphere
+around the scene. Later sound wraps around; for ``three_spheres`` it is 60 dB down."""
 KEPT = 0.25
 """Fraction of the free memory that factorised equations may take where they are kept."""
 LARGEST_KA = 12.0

@@ -11,7 +11,7 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, SettingsError
 
 SHARD = ".shard-"
-"""What follows the name of an ensemble's store in those of its shards."""
+"""Part between the name of an ensemble's store and the number of a shard."""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,8 @@ MOST_WORKERS = 8
 WORTH_RAYS = 250_000
 """Rays of all poses from which other processes save time: fewer are traced before these start."""
 RAYS_FOR_OTHERS = 4_000
-"""What a pose counts if its engine traces no rays: 63 poses save time then."""
+"""Number of rays that a pose counts for if its engine traces none: from 63 poses on processes save
+time."""
 CONNECT_SECONDS = 30
 """Time to wait for a Dask scheduler, s; across a network it answers in one."""
 PATIENCE_SECONDS = 10

@@ -36,7 +36,7 @@ from sononerf.surface.start.read_out import (
 from sononerf.surface.surface import Surface, finished_surface
 
 UNREFINED: tuple[StartMethod, ...] = ("filled", "hull", "open", "sheet")
-"""Without refinement the first of these that gives a surface is taken."""
+"""Start methods in order: without refinement the first that gives a surface is taken."""
 REFINED: tuple[StartMethod, ...] = ("open", "filled", "hull", "sheet")
 """Start surfaces: the one that explains the validation poses best is refined, see
 :class:`~sononerf.surface.refine.refinement.Refinement`."""

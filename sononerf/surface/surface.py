@@ -140,14 +140,15 @@ def finished_surface(
 
 
 FACING = 0.1
-"""Least cosine between a triangle's normal and the way to a pose that it faces."""
+"""Least cosine between a triangle's normal and the direction to a pose for the triangle to face
+it."""
 UNSEEN_SHARE = 0.25
-"""Fraction of the area: if more than this cannot have been heard, the surface is one-sided."""
+"""Fraction of the area that cannot have been heard above which a surface is one-sided."""
 THIN_SHARE = 0.75
-"""Fraction of the area: if more than this is thin, the surface is a sheet."""
+"""Fraction of the area that is thin above which a surface is a sheet."""
 STANDING = 0.5
 """Height over the support up to which a triangle stands on it, range resolutions: sound does not
-tell such a gap from none."""
+resolve a smaller gap."""
 _LIFT = 1e-3  # of the root of a triangle's area: so far inside the search for the other side begins
 _POSES = 12  # tested at a time for whether they see a triangle, those that it faces best first
 _CHUNK = 4096  # triangles at a time, a bound of memory

@@ -36,7 +36,7 @@ NUMERIC_CLASSES = {
 }  # fmt: skip
 
 Field = Callable[[str], NDArray[Any] | None]
-"""Takes a dotted name inside the file; returns numbers as MATLAB has them, or None."""
+"""Takes a dotted name inside the file; returns the array as MATLAB stored it, or None."""
 
 
 def read_mat(path: Path) -> Directivity:
@@ -169,7 +169,7 @@ def _layout(path: Path, field: Field, structs: list[str]) -> Directivity:
 
 MOST_BYTES = 2_000_000_000
 MOST_DECLARED = 2000
-"""A file may declare so many times its own size: compression saves no more on measured data."""
+"""Largest declared size over the size of the file: compression of measured data saves no more."""
 NUMBERS = "biufc"
 
 

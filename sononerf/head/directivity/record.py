@@ -15,12 +15,12 @@ from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_sphere
 
 FADE = math.radians(10.0)
-"""Over this angle the gain falls to zero outside the measured area."""
+"""Angle outside the measured area over which the gain falls to zero, rad."""
 GAP = 3.0
-"""A triangle belongs to no measured area if its circumscribed circle is wider than this many times
-the usual one."""
+"""Width of a triangle's circumscribed circle, over the usual width, above which the triangle
+belongs to no measured area."""
 BACKGROUND = 2000
-"""Directions that fill the rest of the sphere, about 4.5 degrees apart."""
+"""Number of directions that fill the rest of the sphere, about 4.5 degrees apart."""
 LEAST_SPACING, MOST_SPACING = math.radians(0.5), math.radians(12.0)
 BULGE = 1e-4
 """The sphere is deformed by this fraction before it is triangulated. So the diagonals of the
@@ -135,10 +135,10 @@ def _portions(missed: Ints) -> tuple[Ints, int]:
 
 MOST_RECEIVERS = 256
 FEW = 3
-"""Fewer directions than this lie in one plane anyway."""
+"""Number of directions below which they always lie in one plane."""
 FLAT = 0.1
-"""Thickness of a set of directions over its width below which it is a plane, no unit: elevations of
-a few degrees beside azimuths all around."""
+"""Thickness of a set of directions over its width below which it counts as a plane, no unit.
+Elevations of a few degrees with azimuths all around are such a set."""
 
 
 @dataclass(frozen=True, eq=False)

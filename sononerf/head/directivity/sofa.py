@@ -26,7 +26,7 @@ from sononerf.head.ears import Ears
 EARS = ("SimpleFreeFieldHRIR", "SimpleFreeFieldHRTF", "GeneralTF")
 BEAM = "FreeFieldDirectivityTF"
 EMITTER = "emitter"
-"""A receiver of this description in a file of ours holds the gain of the emitter."""
+"""Description of the receiver that holds the gain of the emitter in SOFA files of sononerf."""
 METRES = ("", "m", "metre", "meter", "metres", "meters")
 DEGREES = ("", "degree", "degrees", "deg")
 
@@ -173,7 +173,7 @@ def _names(file: h5py.File, receivers: int) -> list[str]:
 
 
 NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable.%10d"
-"""What netCDF, on which SOFA rests, writes as the name of a mere dimension."""
+"""Name that netCDF, on which SOFA rests, gives to a dimension without a variable."""
 
 
 def directivity_of(ears: Ears, *, source: str = "settings") -> Directivity:

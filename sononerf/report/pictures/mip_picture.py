@@ -191,7 +191,7 @@ def maximum_intensity_projections(volume: Volume) -> dict[str, NDArray[np.floati
 LEVEL_COLOURS, DIFFERENCE_COLOURS = "magma", "RdBu_r"
 PANEL = 3.4  # inches, the longer side of one projection
 SILENT = np.array((0.80, 0.80, 0.80))
-"""Of a surface where nothing differs."""
+"""Colour of a surface without differences."""
 
 
 def difference_pngs(

@@ -23,27 +23,29 @@ from sononerf.surface.refine.optics import Heard, Optics
 from sononerf.surface.refine.visibility import listen, sight_of
 
 POSES = 8
-"""Per step."""
+"""Number of training poses per step."""
 ONSETS = 3.0
 """Weight of the misfit of onsets beside the mismatch, dB. Without it the edges of a box are cut
 off; with 30 the surface follows the errors of the onsets."""
 LAST = 0.2
-"""That of the last ones, as part of the first; between them a cosine."""
+"""Final step length over the initial one, no unit; cosine decay in between."""
 MOMENTUM = 0.8
-"""Part of the last direction that stays."""
+"""Decay rate per step of the running mean of the gradient, no unit."""
 MEMORY = 0.95
-"""Part of the running square of the gradient that stays."""
+"""Decay rate per step of the running mean of the squared gradient, no unit."""
 LOCAL = 0.1
-"""Floor of the local square, as part of its mean: where little is heard steps stay small."""
+"""Floor of the local mean square of the gradient, as a fraction of its mean over the surface: steps
+stay small where little is heard."""
 TANGENT = 0.2
-"""Part of the way to the neighbours' mean along the surface, each step; keeps triangles even."""
+"""Fraction of the tangential way to the neighbours' mean that a vertex moves per step; it keeps
+triangles even."""
 SIGHT = 4
-"""Steps for which the search structure of visibility is kept."""
+"""Number of steps for which the search structure of visibility is kept."""
 STANDS = 0.1
-"""Height over the support up to which a vertex stays on it, edges: surfaces are cut there to within
-a small part of an edge."""
+"""Height over the support up to which a vertex stays on it, edges. Surfaces are cut at the support
+to within a small part of an edge."""
 NEAR = 0.5
-"""A pose supports a vertex whose fade and spread at the lowest frequency are above this."""
+"""Fade and spread at the lowest frequency above which a pose supports a vertex."""
 
 
 class Descent:
@@ -309,6 +311,6 @@ STAGES = (
     Stage(smoothing=0.7, edge=0.5, blur=0.0, rate=0.02, steps=40, beyond="simulate"),
 )
 SHARP = 0.5
-"""Edge of the triangles where the surface is not blurred, shortest wavelengths. The first stage is
-done both blurred and sharp, and the surface that explains the validation poses better goes on.
-Blurring takes dents and necks away; it also takes edges, sheets and wires away."""
+"""Edge length of the triangles if the surface is not blurred, shortest wavelengths. The first stage
+runs both blurred and sharp, and the surface that explains the validation poses better continues.
+Blur removes dents and necks, but also edges, sheets and wires."""

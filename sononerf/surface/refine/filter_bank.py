@@ -22,8 +22,8 @@ from sononerf.head.head import Head
 from sononerf.simulation.impulse_response import between
 
 FINE = 5.0
-"""Least time bins per period of the highest frequency; quadratic splines between them err by
-0.3 %."""
+"""Least number of time bins per period of the highest frequency; quadratic splines between them err
+by 0.3 %."""
 
 
 class FilterBank:

@@ -16,9 +16,10 @@ BENDING = 0.5
 """Length over which curvature is averaged, shortest wavelengths."""
 
 TOLERANCE = 0.02
-"""Relative residual at which smoothing ends; the step need not be exact."""
+"""Relative residual at which the smoothing's conjugate gradients end; a step need not be exact."""
 MOST_ITERATIONS = 200
-"""Of the conjugate gradients; reached for smoothing lengths of a hundred edges."""
+"""Largest number of iterations of the conjugate gradients; smoothing lengths of a hundred edges
+reach it."""
 
 
 class MeshOperators:

@@ -17,18 +17,20 @@ from sononerf.head.decibels import ACTIVE_DB
 from sononerf.surface.refine.optics import Heard
 
 FLOOR_DB = 20.0
-"""What counts lies within this of a pose's loudest cell; fainter ones are later bounces."""
+"""Level below a pose's loudest cell down to which cells count, dB; fainter cells are later
+bounces."""
 CORRECTED_FLOOR_DB = 30.0
-"""The same where the simulator adds what physical optics lacks, such as later bounces."""
+"""FLOOR_DB where the simulator adds what physical optics lacks, such as later bounces, dB."""
 ALIKE_DB = 3.0
-"""Where the simulator differs by this from physical optics, a cell has half the weight."""
+"""Difference between simulator and physical optics at which a cell has half the weight, dB."""
 LOUD_DB = 16.0
-"""Cells within this of a pose's loudest tell the gain."""
+"""Level below a pose's loudest cell down to which cells determine the gain, dB."""
 LEARNING = 0.05
-"""Part of a step's finding that goes into the running gain and error."""
+"""Weight of one step in the running means of gain and error, no unit."""
 TRUST = 4.0
-"""Power of the usual error by which a frequency counts less. Where physical optics is wrong (ka
-below 10) the error stays large, and even a little of it biases the surface."""
+"""Exponent of a frequency's usual error, by whose inverse power the frequency is weighted. Where
+physical optics is wrong (ka below 10) the error stays large, and even a little of it biases the
+surface."""
 _DB = 20.0 / math.log(10.0)
 
 

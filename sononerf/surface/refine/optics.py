@@ -31,13 +31,14 @@ from sononerf.surface.refine.filter_bank import FilterBank, fast_length
 from sononerf.surface.refine.mesh_operators import tangents
 
 FADE_FREQUENCY = 0.25
-"""Below this part of the highest analysed frequency the fade falls no further; as in the
+"""Frequency below which the fade no longer falls, over the highest analysed frequency: as in the
 simulator, 25 of 100 kHz."""
 SILENT = 3.0
-"""Exponent of fade and spread at the lowest analysed frequency, beyond which a piece is left out:
-26 dB down; pieces there extinguish each other."""
+"""Exponent of fade and spread at the lowest analysed frequency above which a piece is left out: 26
+dB down. Such pieces cancel one another."""
 SPREAD = 5.0 / 52.0
-"""Variance of the path over a piece of area 1 and slope 1: between a hexagon and triangles."""
+"""Variance of the path over a piece of area 1 and slope 1: between that of a hexagon and that of a
+triangle."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -38,12 +38,12 @@ from sononerf.surface.start.read_out import StartMethod
 logger = logging.getLogger("sononerf")
 
 SIMULATED = 96
-"""Training poses for which a surface is simulated; each is drawn about three times."""
+"""Number of training poses for which a surface is simulated; each is drawn about three times."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
 TOLERATED = 1.15
-"""Objectives of validation poses that differ by less than this factor differ by chance. Up to it a
-later stage is preferred, and after the first stage a sheet, or else the blurred surface: of two
-that explain as much the smoother one."""
+"""Ratio of two objectives of validation poses below which they differ by chance. Within it, a later
+stage is preferred; after the first stage a sheet is preferred, or else the blurred surface, which
+is the smoother one."""
 STATE_VERSION = 2
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
 Way = Literal["blurred", "sharp", "sheet"]

@@ -15,20 +15,20 @@ from sononerf.geometry.plane import Plane
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
 
 CELL = 1.1
-"""Voxels' side over the wanted edge: marching cubes leave as many vertices as even triangles of
-that edge have."""
+"""Side of a voxel over the wanted edge: marching cubes then leave as many vertices as even
+triangles of that edge have."""
 BAND = 2
-"""Voxels on each side of the surface in which distances are taken."""
+"""Number of voxels on each side of the surface for which distances are computed."""
 RELAXING = 8
-"""Steps of tangential relaxation; marching cubes leave slivers."""
+"""Number of steps of tangential relaxation; marching cubes leave slivers."""
 RELAXED = 0.7
-"""Part of the way to the neighbours' mean in one of these steps."""
+"""Fraction of the way to the neighbours' mean that one of these steps moves a vertex."""
 LEAST = 1.5
-"""Side of the cube whose volume the smallest piece has that is kept, edges. Torn films leave crumbs
-below it."""
+"""Side of the cube with the volume of the smallest piece that is kept, edges. Torn films leave
+smaller crumbs."""
 LOST = 0.01
-"""Part of the old surface that may be missing from the new one, unless it is blurred; a sheet that
-is thinner than a voxel would be lost."""
+"""Largest fraction of the old surface that may be missing from the new one if it is not blurred. A
+sheet thinner than a voxel would be lost."""
 
 CHORD = 0.005
 """Depth of the middles of edges below the smooth surface, shortest wavelengths, above which

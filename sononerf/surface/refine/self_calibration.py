@@ -49,17 +49,18 @@ MOST_POSES = 60
 """Number of poses, at most, from which the errors that all poses share are found. More poses do not
 help, because the surface is known less well than this number of poses determines the errors."""
 GROUPS = 12
-"""Number of groups of neighbouring poses that uncertainties are taken from: each sees the surface
-from another side."""
+"""Number of groups of neighbouring poses that give the uncertainties: each hears the surface from
+another side."""
 FARTHER = 4
 """Number of times, at most, that a step of the shared errors is doubled while the error falls.
 Interference makes the derivatives of fine cells steep but short, and steps too small."""
 TURN = 0.01
-"""The same of an aim, rad: small against the beam's width."""
+"""Finite difference of an aim, rad: small against the beam's width."""
 LARGEST_STEP = 0.5
-"""Bound of one step of a length, range resolutions: the derivatives hold no farther."""
+"""Largest step of a length, range resolutions: beyond it the derivatives do not hold."""
 LEAST_DB = 0.5
-"""Differences below this have the weight of one of it: physical optics is no better."""
+"""Difference below which all differences have the same weight, dB: physical optics is no more
+accurate."""
 _DB = 20.0 / math.log(10.0)
 
 

@@ -25,15 +25,16 @@ from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.self_calibration import Calibrator
 
 UP = (0.0, 0.0, 1.0)
-"""Normal of a support that is looked for: a table is level."""
+"""Normal of a support that is searched for: a table is level."""
 MIDDLE = 0.5
-"""Where the upper part first begins, parts of the surface's height, no unit: a body and its image
-are equally high."""
+"""Height at which the upper part begins in the first search, as a fraction of the surface's height:
+a body and its image are equally high."""
 CUTS = (1.0, 2.0, 3.0)
-"""Where it begins then: so far above the first answer, range resolutions. The lower the better, as
-long as none of it is the image; the answers differ by as much as the height is uncertain."""
+"""Heights above the first answer at which the upper part begins afterwards, range resolutions.
+Lower is better as long as no part of the image is included; the spread of the answers is the
+uncertainty of the height."""
 NEAR = 3.0
-"""The second search reaches so far around the first answer, range resolutions."""
+"""Half width of the second search around the first answer, range resolutions."""
 
 
 def with_support(head: Head, height: float) -> Head:

@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     from sononerf.surface.refine.optics import Optics
 
 BOUNCES = 3
-"""As the simulator's default; what comes later is faint."""
+"""Number of bounces, the simulator's default; later ones are faint."""
 LATER_RAYS = 4_000
-"""Per pose, of the later bounces; only their power is used."""
+"""Number of rays per pose for later bounces; only their power is used."""
 FAINT = 3e-3
-"""Echoes below this part of the strongest are left out: 50 dB."""
+"""Magnitude over the strongest below which echoes are left out: -50 dB."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,8 +13,9 @@ from sononerf.surface.refine.mesh_operators import MeshOperators
 from sononerf.surface.refine.optics import SILENT, Heads, Optics, Pieces
 
 FREE = 0.25
-"""Shortest wavelengths in front of a piece in which nothing hides it: what is so close throws no
-shadow, and the other side of a thin sheet that was pushed through must not."""
+"""Distance in front of a piece within which nothing hides it, shortest wavelengths. Objects so
+close throw no shadow, and the other side of a thin sheet that was pushed through must not hide
+it."""
 
 
 def seen(sight: Occlusion, points: Floats, target: Floats, *, free: float) -> Bools:

@@ -29,7 +29,7 @@ SHARED = 1.6
 1.3 the points of nineteen touching spheres lie 0.9 mm too far out, with 2.0 0.3 mm; but with 2.0
 two spheres that stand close are joined."""
 COMPRESSION = 0.25
-"""Exponent of the power that a point weighs: quiet parts must count beside loud ones."""
+"""Exponent of the power in the weight of a point: quiet parts must count beside loud ones."""
 _FAINTEST = 1e-4  # fraction of a pose's greatest power; quieter sound is left out, to save time
 _BANDS = 5  # frequencies, evenly spread, whose power is averaged
 _CUTOFF = 2.5  # standard deviations after which the Gaussian is cut off
@@ -238,14 +238,14 @@ def _conjugate_gradients(
 
 
 REACH = 2.0
-"""Range resolutions around a point within which others are asked."""
+"""Distance from a point within which others are compared with it, range resolutions."""
 ALIGNED = 0.3
-"""Range resolutions that two points may lie off one smooth surface; how far the onset of a pose
-may lie from its evidence, as a standard deviation."""
+"""Distance that two points may lie off one smooth surface, range resolutions; also the standard
+deviation of the distance between a pose's onset and its evidence."""
 FEW = 0.3
-"""Power of agreeing points, over what is usual, that is little."""
+"""Power of agreeing points over the mean power at which the reliability is halved."""
 AT_ONSET = 0.7
-"""Reliability of evidence at its pose's own onset."""
+"""Reliability of a point at the onset of its own pose."""
 _WITNESSES = 4000  # points that are asked at most, a bound of time
 _CHUNK = 4000  # points at a time, a bound of memory
 

@@ -171,19 +171,19 @@ Belief = Literal["open", "filled", "hull"]
 the onsets leave closed. ``filled``: it does not. ``hull``: the onsets alone give the surface, which
 is exact for a convex body."""
 QUIET = 0.12
-"""Weight below which evidence is left out, no unit: -37 dB beside the loudest of a usual pose.
-What is quieter is mostly placed at random by the fit."""
+"""Weight below which evidence is left out, no unit: -37 dB relative to the loudest of a usual pose.
+The fit places most quieter sound at random."""
 SPAN = {"open": 2.4, "filled": 1.0}
-"""Range resolutions over which oriented points outweigh the onsets' bound, for each belief: over a
-gap that is wider the bound stays, if the winding number does not open it."""
+"""Length over which oriented points outweigh the onsets' bound, range resolutions, for each belief.
+Over a wider gap the bound stays, unless the winding number opens it."""
 BACKS = (0.02, 0.06)
-"""Negative winding number from which a place counts as outside, and the range over which its weight
-rises to the full one."""
+"""Negative winding number from which a place counts as outside, and the interval over which its
+weight rises to the maximum."""
 OPENING = 0.03
-"""Full weight of a place that is outside by its winding number; evidence has 1 at its point."""
+"""Weight of a place that is outside by its winding number; evidence has weight 1 at its point."""
 UNHEARD = 0.03
-"""A part is left out if its evidence per area is below this fraction of that of the part with most
-evidence."""
+"""Evidence of a part per area, over that of the part with most evidence, below which the part is
+left out."""
 _THICKER = 1.5  # voxels that each side of a thin part is moved outward, and the surface moved back:
 # two sides closer than the blur of their planes would cancel
 _BENDING = 1.0  # of a voxel; evidence at its point has 1: it sets the unit of all weights

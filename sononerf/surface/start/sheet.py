@@ -34,12 +34,12 @@ from sononerf.surface.start.evidence import ALIGNED
 from sononerf.surface.start.occupancy import Gathered
 
 THIN = 0.7
-"""Range resolutions: a place is thin if its other side is nearer than this. The sides of a sheet
+"""Distance of the other side below which a place is thin, range resolutions. The sides of a sheet
 share one echo, so neither is known to better than a fraction of the resolution."""
 MOST = 0.5
 """Least fraction of the evidence that lies on the sheet."""
 SMOOTH = 0.5
-"""Range resolutions over which a sheet bends as easily as evidence is dense."""
+"""Length over which a sheet bends as easily as the evidence is dense, range resolutions."""
 _LEAST = 0.05  # range resolutions, half of the least thickness; only keeps the sides apart
 _FACING = 0.3  # cosine to the plane's normal, below which evidence is of the rim
 _ROUNDS = 24  # of reweighting
