@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What can go wrong, each kind with the exit code that the command line ends with."""
+"""Errors of sononerf, each with the exit code of the command line."""
 
 from __future__ import annotations
 

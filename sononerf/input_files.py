@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is looked at before a file that a user names is read."""
+"""Checks of files that a user names, made before they are read."""
 
 from __future__ import annotations
 

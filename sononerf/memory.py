@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How much memory, and how many cores, this process may use."""
+"""Memory and cores that this process may use."""
 
 from __future__ import annotations
 

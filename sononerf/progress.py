@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How long work is shown: a bar in a terminal, plain lines elsewhere; always on stderr."""
+"""Progress of long work: a bar in a terminal, plain lines elsewhere; always on stderr."""
 
 from __future__ import annotations
 

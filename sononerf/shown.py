@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How objects show themselves in a notebook: as a table of numbers and a small picture."""
+"""Display of objects in a notebook: a table of numbers and a small picture."""
 
 from __future__ import annotations
 

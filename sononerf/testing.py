@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What holds for every scene, field and renderer: contract tests for the authors of plugins.
+"""Contract tests of scenes, fields and renderers, for the authors of plugins.
 
 Each function raises ``AssertionError`` with what was found and what is expected.
 """

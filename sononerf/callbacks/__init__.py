@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""What happens around the fit: previews, pictures, progress, checkpoints."""
+"""Callbacks of the fit: previews, pictures, progress, checkpoints."""

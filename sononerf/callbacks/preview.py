@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What each epoch shows: a coarse mesh, three projections, spectrograms of validation poses."""
+"""Previews after each epoch: a coarse mesh, three projections, spectrograms of validation poses."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a run shows in TensorBoard: scalars with units, pictures, meshes, settings, results."""
+"""TensorBoard: scalars with units, pictures, meshes, settings, results."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where the command `sononerf` starts: signals are caught before anything large is imported."""
+"""Entry point of the command `sononerf`: it catches signals before it imports anything large."""
 
 from __future__ import annotations
 

@@ -77,7 +77,7 @@ def threshold_factor(looks: float) -> float:
 
 
 class Levels(NamedTuple):
-    """What an echo must exceed."""
+    """Levels that an echo must exceed."""
 
     noise: Floats  # (..., 1) power of noise alone
     total: Floats  # (..., R) of noise, precursors, and what the first slice cuts
@@ -200,7 +200,7 @@ memory. Further poses add less to the free space than the accuracy of an onset."
 
 @dataclass(frozen=True, eq=False)
 class Onsets:
-    """What the asked poses heard.
+    """First echoes of the poses.
 
     Attributes:
         poses (P,): Their numbers in the store, ascending.

@@ -289,7 +289,7 @@ class Echoes(Shown):
 
     @property
     def calibrated(self) -> bool:
-        """Whether the level is absolute. That of a recording depends on its amplifier."""
+        """True if levels are absolute; those of a recording depend on its amplifier."""
         return bool(self.store.attributes.get("origin") == "simulated")
 
     @cached_property

@@ -41,7 +41,7 @@ AT_ONCE = 6_400_000
 
 @dataclass(frozen=True, eq=False)
 class EchoHull:
-    """Where something can be, for all that first echoes tell.
+    """Places that the first echoes leave: the complement of the free space.
 
     Attributes:
         emitters ((P, 3), m): Where each pose calls from, world frame.
@@ -78,7 +78,7 @@ class EchoHull:
 
     @property
     def undetected(self) -> int:
-        """How many poses are expected to be outliers among those of weight above zero."""
+        """Expected number of outliers among the onsets with weight above zero."""
         assert self.weight is not None
         detected = (np.isfinite(self.first) & (self.weight == 0.0)).any(axis=1).sum()
         return int(UNDETECTED * detected)
@@ -91,14 +91,14 @@ class EchoHull:
 
     @property
     def width(self) -> float:
-        """How far poses lie from the straight line that fits them best, at most, m."""
+        """Largest distance of a pose from the straight line that fits all poses best, m."""
         off = self.sources - self.sources.mean(axis=0)
         along = np.linalg.svd(off, full_matrices=False)[2][0]
         return float(np.linalg.norm(off - np.outer(off @ along, along), axis=1).max())
 
     @property
     def chunk(self) -> int:
-        """How many points are looked at in one go."""
+        """Number of points that are processed at once."""
         return max(AT_ONCE // max(self.first.size, 1), 1)
 
     def clearance(self, points: ArrayLike) -> tuple[Floats, NDArray[np.intp]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How a store lies on disk: zarr v3 arrays, their attributes, and a manifest of finished poses."""
+"""Layout of a store on disk: zarr v3 arrays, their attributes, and a manifest of finished poses."""
 
 from __future__ import annotations
 
@@ -282,7 +282,7 @@ MANIFEST_VERSION = 1
 
 @dataclass(frozen=True)
 class PoseRecord:
-    """What proves that a pose is there whole: its file's size and its content's SHA-256."""
+    """Evidence that a pose is complete: the size of its file and the SHA-256 of its content."""
 
     size: int
     sha256: str

@@ -17,7 +17,7 @@ from sononerf.head.decibels import RANGE_DB, active_level, compress, mae_db
 
 
 class Ensemble(ABC):
-    """What receivers heard at every pose; each pose is whole or missing.
+    """Spectrograms of receivers at every pose; each pose is complete or missing.
 
     Attributes:
         path: Names the ensemble in messages; its folder where it is on disk.
@@ -42,7 +42,7 @@ class Ensemble(ABC):
 
     @property
     def split(self) -> NDArray[np.int8]:
-        """What each pose is for, (P,): 0 train, 1 validation, 2 test."""
+        """Use of each pose, (P,): 0 training, 1 validation, 2 test."""
         return self._axes["split"].copy()
 
     @property
@@ -62,7 +62,7 @@ class Ensemble(ABC):
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """What the ensemble says of itself, a copy: settings, versions, units, c, m0 ..."""
+        """Attributes of the ensemble, as a copy: settings, versions, units, c, m0 ..."""
         return dict(self._attributes)
 
     def indices(self, split: Literal["train", "val", "test"]) -> Ints:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where something can be: which places the echoes leave, and the box around what explains them."""
+"""Region: the places that the echoes leave, and the box around those that explain the echoes."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ENOUGH = 2  # poses: one alone does not tell where on its ellipsoid an echo come
 
 
 class EchoRegion:
-    """What the asked poses say about places.
+    """Evidence of the poses about places.
 
     Args:
         heard: Power, detected echoes and onsets.

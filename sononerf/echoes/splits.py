@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which pings are for training, validation and test; repeated pings stay together."""
+"""Split of pings into training, validation and test; repeated pings stay together."""
 
 from __future__ import annotations
 

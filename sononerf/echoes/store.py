@@ -199,7 +199,7 @@ class EnsembleStore(Ensemble):
 
     @property
     def is_sealed(self) -> bool:
-        """Whether no pose is missing and what is computed of all poses is there too."""
+        """True if no pose is missing and the results over all poses are stored."""
         return "reference" in self._attributes and self._manifest.is_sealed and not self.missing()
 
     def damaged(self) -> list[int]:

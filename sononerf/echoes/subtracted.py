@@ -57,14 +57,14 @@ class SubtractedStore(EnsembleStore):
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """As of the whole, but for the loudness of what is left; its noise floor is not known."""
+        """Attributes of the whole, except for the loudness of the rest, without a noise floor."""
         unknown = dict.fromkeys(("noise_floor_mae_db", "noise_floor_mae_db_active", "noise"))
         given = super().attributes
         return {**given, **unknown, "reference": given["reference"] * self._part}
 
     @cached_property
     def _part(self) -> float:
-        """How loud the loudest training cell is beside that of the whole."""
+        """Level of the loudest training cell over that of the whole."""
         train = [int(index) for index in self.indices("train")]
         left = max(float(self.read_pose(index).max()) for index in train)
         if not left > 0.0:

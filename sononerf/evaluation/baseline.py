@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What needs no learned field: backprojected echoes, with and without phase, and a voxel fit."""
+"""Baselines without a learned field: backprojection with and without phase, and a voxel fit."""
 
 from __future__ import annotations
 

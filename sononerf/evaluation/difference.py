@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What two runs, or two true surfaces, differ in."""
+"""Differences between two runs, or between two true surfaces."""
 
 from __future__ import annotations
 

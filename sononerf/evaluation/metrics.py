@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How close a reconstructed surface is to the true one."""
+"""Metrics of a reconstructed surface against the true one."""
 
 from __future__ import annotations
 

@@ -90,7 +90,7 @@ class Solid:
 
     @cached_property
     def components(self) -> int:
-        """How many connected parts there are; bodies that overlap are one part.
+        """Number of connected parts; overlapping bodies are one part.
 
         A sheet is a part of its own. Parts below ``SMALLEST_PART`` are not counted.
         """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What every reflectivity field promises."""
+"""Interface of reflectivity fields."""
 
 from __future__ import annotations
 

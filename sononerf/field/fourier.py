@@ -15,7 +15,7 @@ from sononerf.field.field import Field
 
 
 class _Affine(nn.Module):
-    """What a batch normalisation amounts to when its statistics are never used."""
+    """Affine map: a batch normalisation whose statistics are never used."""
 
     def __init__(self, width: int) -> None:
         super().__init__()

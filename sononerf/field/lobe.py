@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a reflection lobe is, and the field that has one at every place."""
+"""Reflection lobes, and the field that has one at every place."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def along(vectors: Tensor, axes: Tensor) -> Tensor:
 
 
 class Places(NamedTuple):
-    """Where N places lie and from where they are looked at."""
+    """Positions of N places, and the directions in which they are seen."""
 
     positions: Tensor  # (N, 3) m
     directions: Tensor  # (..., N, 3) unit vectors, or (M, 3) of M pairs
@@ -61,7 +61,7 @@ class Places(NamedTuple):
 
 
 class Lobes(NamedTuple):
-    """What codes say, a column for each of N lobes."""
+    """Parameters of N lobes, one column for each."""
 
     strength: Tensor  # (1, N), natural logarithm
     vector: Tensor  # (3, N)

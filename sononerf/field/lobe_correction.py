@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a lobe cannot say: a small network that corrects its log strength."""
+"""Correction of a lobe's log strength by a small network."""
 
 from __future__ import annotations
 

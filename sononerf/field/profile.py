@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the ear really measures: a fine range profile seen through the analysis window."""
+"""Renderer `profile`: a fine range profile, seen through the analysis window."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ class ProfileRenderer(Renderer):
 
     @property
     def places_per_pose(self) -> int | None:
-        """How many places a step evaluates per pose."""
+        """Number of places that a step evaluates per pose."""
         return min(len(self._there()), self.points) if len(self.alive) else None
 
     @torch.no_grad()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What every renderer promises; gains from tables; range profiles on bins; the paper's renderer."""
+"""Interface of renderers; gains from tables; range profiles on bins; the paper's renderer."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class Renderer(nn.Module):
 
     @property
     def may_ask(self) -> bool:
-        """Whether to ask the device for a number costs nothing.
+        """True if reading a scalar does not synchronise the device.
 
         A GPU would wait for all that it was told before, so that a step has to do without.
         """
@@ -131,7 +131,7 @@ class Renderer(nn.Module):
 
     @property
     def places_per_pose(self) -> int | None:
-        """How many places a step evaluates per pose; None where that is not known beforehand."""
+        """Number of places that a step evaluates per pose; None if it is not known beforehand."""
         return None
 
     @torch.no_grad()

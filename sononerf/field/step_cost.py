@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a fit will need, measured on a part of its first batch."""
+"""Time and memory of a fit, measured on a part of its first batch."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ as values."""
 
 @dataclass(frozen=True)
 class StepCost:
-    """What one training step needs.
+    """Cost of one training step.
 
     Attributes:
         memory: Bytes of parameters and of what the backward pass needs.

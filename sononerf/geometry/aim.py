@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where heads look: poses that look away from a body, and the mistake that explains it."""
+"""Aim of heads: poses that look away from a body, and the mistake that explains it."""
 
 from __future__ import annotations
 

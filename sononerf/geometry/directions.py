@@ -114,7 +114,7 @@ class CapSpiral:
 
     @property
     def solid_angle(self) -> float:
-        """What one direction stands for, in sr."""
+        """Solid angle of one direction, sr."""
         return 2.0 * math.pi * self._depth / self.count
 
     @property

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is odd about a surface, one line each: it can be ensonified all the same."""
+"""Faults of a surface, one line each; such a surface can still be simulated."""
 
 from __future__ import annotations
 

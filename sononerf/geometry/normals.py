@@ -80,7 +80,7 @@ def total_curvature(mesh: trimesh.Trimesh, normals: Floats) -> Floats:
 def weight_gradients(
     corners: Floats,
 ) -> tuple[Floats, Floats]:
-    """How the weights of a triangle's second and third corner grow along it.
+    """Gradients of the barycentric weights of a triangle's second and third corner.
 
     Args:
         corners ((T, 3, 3), m): Of the triangles.

@@ -51,7 +51,7 @@ class Plane:
 
     @property
     def turn(self) -> Floats:
-        """What mirrors vectors (..., 3), by multiplication from either side: (3, 3), symmetric."""
+        """Matrix (3, 3) that mirrors vectors (..., 3) by multiplication from either side."""
         normal = np.asarray(self.normal)
         turn: Floats = np.eye(3) - 2.0 * np.outer(normal, normal)
         return turn

@@ -33,7 +33,7 @@ Reals: TypeAlias = Floats | Singles
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What rays hit first; one row per ray that hits anything.
+    """First hits of rays, one row per ray that hits anything.
 
     Attributes:
         ray (H,): Index of the ray, ascending.
@@ -57,7 +57,7 @@ class Hits:
 
 
 class _Engine(Protocol):
-    """What searches triangles, in coordinates of about unit size."""
+    """Search structure over triangles, in coordinates of about unit size."""
 
     def first(self, origins: Floats, directions: Floats) -> Ints: ...
 
@@ -293,7 +293,7 @@ class RayCaster:
         *,
         normals: Floats | None = None,
     ) -> Bools:
-        """Whether nothing stands between points and targets.
+        """True where nothing stands between points and targets.
 
         Args:
             points ((N, 3), m): On the surface or off it.
@@ -343,7 +343,7 @@ class Occlusion:
         )
 
     def blocked(self, points: Floats, targets: Floats) -> Bools:
-        """Whether the straight way from points to targets (N, 3), m, meets a triangle (N,)."""
+        """True where the segment from a point to its target (N,), m, meets a triangle, (N,)."""
         return self._engine.blocked(
             (points - self._middle) * self._scale, (targets - points) * self._scale
         )

@@ -185,7 +185,7 @@ def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> Floats:
 
 
 def sweep_rate(settings: CallSettings, frequency: ArrayLike) -> Floats:
-    r"""How fast the call sweeps over each frequency.
+    r"""Rate at which the call sweeps over each frequency.
 
     :math:`h |f_1 - f_0| / T` for harmonic :math:`h` of a linear sweep, :math:`|k| f^2 / h` of a
     hyperbolic one.

@@ -43,7 +43,7 @@ from sononerf.shown import Shown
 
 @dataclass(frozen=True, eq=False)
 class PointEcho:
-    """What the analysis makes of the echo of one point.
+    """Spectrogram of the echo of one point.
 
     Attributes:
         window (W,): Its power over range, averaged over the part of the band that the call has.
@@ -244,7 +244,7 @@ class Head(Shown):
 
     @property
     def sampling_rate(self) -> float:
-        """Of waveforms, Hz."""
+        """Sampling rate of waveforms, Hz."""
         return self.analysis.sampling_rate
 
     @cached_property
@@ -302,7 +302,7 @@ class Head(Shown):
 
     @property
     def lag(self) -> Singles | None:
-        """How much farther off (E, F, L, A), m, rows hear an echo, beam included; None: impulse."""
+        """Additional range (E, F, L, A), m, that rows hear, beam included; None for an impulse."""
         lag = self._smeared[1]
         return None if lag is None else lag * np.float32(self.speed_of_sound / 2.0)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How call and analysis suit one another: the echo of a point in each row, and warnings."""
+"""Match of call and analysis: the echo of a point in each row, and warnings."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ own range: 12 dB."""
 
 
 def row_duration(call: CallSettings, analysis: SpectrogramSettings, frequency: ArrayLike) -> Floats:
-    r"""How long a point echo lasts in a row of the dechirped spectrogram.
+    r"""Duration of a point echo in a row of the dechirped spectrogram.
 
     .. math:: \sqrt{T_w^2 + (B_w / |\dot f|)^2}
 

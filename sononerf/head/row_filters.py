@@ -83,7 +83,7 @@ class RowFilters:
 
     @property
     def reach(self) -> int:
-        """How many samples from its start on a frame reads."""
+        """Number of samples, from its start on, that a frame reads."""
         return self.origin + self.envelope.shape[1]
 
     def point_echo(self) -> Floats:
@@ -137,7 +137,7 @@ def band_parts(frequency: ArrayLike) -> Floats | None:
 
 
 def row_widths(settings: SpectrogramSettings, frequency: ArrayLike) -> tuple[Floats, Floats]:
-    """How long a row's envelope lasts and how wide its transform is, each above half its height.
+    """Duration of a row's envelope and bandwidth of its transform, each at half of its height.
 
     Args:
         settings: The analysis.

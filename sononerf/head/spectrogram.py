@@ -74,7 +74,7 @@ def _frames(settings: SpectrogramSettings, speed_of_sound: float) -> tuple[int, 
 def echo_samples(
     settings: SpectrogramSettings, speed_of_sound: float, longest_delay: float = 0.0
 ) -> int:
-    """How many samples from the emission on the last analysis frame needs.
+    """Number of samples from the emission on that the last analysis frame needs.
 
     Args:
         settings: The analysis.
@@ -177,7 +177,7 @@ centre frequency."""
 
 
 class Smearing(NamedTuple):
-    """What the rows hear of fine frequencies.
+    """Response of the rows to fine frequencies.
 
     Attributes:
         frequency ((N,), Hz): The fine ones, ascending.

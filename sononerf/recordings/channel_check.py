@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What each channel of a recording holds: its level, its noise, and how often it heard an echo."""
+"""Check of a recording's channels: level, noise, and how often each heard an echo."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-r"""How far the nearest point of a body is from any place, as first echoes tell it.
+r"""Model of the distance between a body's nearest point and any place, from first echoes.
 
 Half of the way from emitter to receiver over a far body is the distance :math:`d(m)` of the point
 :math:`m` half way between the two, but for :math:`b^2 / 8 d` with b the part of their separation
@@ -35,7 +35,7 @@ RIDGE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What the pings say of one another.
+    """First echoes of the pings as predicted from one another.
 
     Attributes:
         residual ((P, E), m): Measured less predicted; NaN where nothing was measured.

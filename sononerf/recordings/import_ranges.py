@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an import finds out by itself: the ranges to analyse, and the calibration."""
+"""Values that an import determines itself: the ranges to analyse, and the calibration."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SEARCH = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What the reference target says.
+    """Calibration from the echo of the reference target.
 
     Attributes:
         gain (E,): Factor that brings each receiver to the call's pressure at 1 m.

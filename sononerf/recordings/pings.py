@@ -140,7 +140,7 @@ class Cutter:
 
     @property
     def _tail(self) -> int:
-        """How many samples after the last one belong to an echo that begins there."""
+        """Number of samples after the last one that belong to an echo which begins there."""
         return 0 if self.call is None else len(self.call) - 1
 
     def clipped(self, index: int, first: int, last: int) -> Clipping:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-r"""Which convention of poses explains the first echoes best.
+r"""Test of pose conventions: which one explains the first echoes best.
 
 First echoes are compared under the convention that was stated and under others that people mix up.
 Three things tell them apart, each as a scale of errors s whose logarithm is summed over the pings,
@@ -75,7 +75,7 @@ around."""
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is wrong with poses, if anything.
+    """Faults of the poses, if there are any.
 
     Attributes:
         name: Of the convention that explains the echoes best; empty if it is the stated one.
@@ -292,7 +292,7 @@ def _order(head: Consistency, poses: Poses, ranges: Floats, own: Misfit) -> Verd
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """How badly poses explain first echoes.
+    """Misfit between poses and first echoes.
 
     Attributes:
         total: Sum of the logarithms of the scales of errors; less is better.
@@ -307,7 +307,7 @@ class Misfit:
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """How well poses explain the first echoes of a head.
+    """Consistency of poses with the first echoes of a head.
 
     Attributes:
         emitter ((3,), m): Head frame.

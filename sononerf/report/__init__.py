@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: MIT
-"""What people look at: pictures, projections and mesh files."""
+"""Pictures, projections, reports and mesh files."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What a run or a store holds, in a browser: mesh, volume, poses, echoes, and a head to drag."""
+"""Viewer of a run or a store in a browser: mesh, volume, poses, echoes, and a head to drag."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Viewer:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Address of the page."""
         return f"http://{HOST}:{self.server.get_port()}"
 
     def close(self) -> None:

@@ -242,7 +242,7 @@ def fit(
 
 @dataclass(frozen=True)
 class _Work:
-    """What is fitted to what, in how many steps."""
+    """Module, data and number of steps of a fit."""
 
     echoes: Echoes
     module: EchoModule

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What makes a fit useless, and can be told before it."""
+"""Warnings before a fit that cannot give a useful result."""
 
 from __future__ import annotations
 

@@ -52,7 +52,7 @@ class Fitted:
 
     @property
     def head(self) -> Head:
-        """What heard the echoes."""
+        """Head that heard the echoes."""
         assert self.module.head is not None  # it was made with one
         return self.module.head
 

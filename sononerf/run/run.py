@@ -44,7 +44,7 @@ class Run(Shown):
 
     @property
     def path(self) -> Path:
-        """Its folder."""
+        """Folder of the run."""
         return self._folder.path
 
     @property
@@ -59,12 +59,12 @@ class Run(Shown):
 
     @property
     def head(self) -> Head:
-        """What heard the echoes."""
+        """Head that heard the echoes."""
         return self._fitted.head
 
     @property
     def echoes(self) -> Echoes:
-        """What was fitted to.
+        """Echoes that were fitted.
 
         Raises:
             InputError: If the store is not where the settings say.
@@ -101,7 +101,7 @@ class Run(Shown):
 
     @property
     def metrics(self) -> Evaluation:
-        """What ``metrics.json`` holds: prediction, geometry, baseline, cost."""
+        """Content of ``metrics.json``: prediction, geometry, baseline, cost."""
         return Evaluation(self._folder.read_metrics())
 
     @cached_property

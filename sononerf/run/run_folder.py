@@ -129,7 +129,7 @@ class RunFolder:
 
     @cached_property
     def echoes(self) -> Echoes:
-        """What was fitted to; raises as :func:`sononerf.run.fitted.echoes_of`."""
+        """Echoes that were fitted; raises as :func:`sononerf.run.fitted.echoes_of`."""
         return echoes_of(self.fitted)
 
     @property
@@ -142,7 +142,7 @@ class RunFolder:
 
     @property
     def provenance(self) -> dict[str, Any]:
-        """What the run was made with; empty where the file is not there."""
+        """Versions, machine and sources of the run; empty if the file is missing."""
         file = self.path / "provenance.json"
         self.require_recorded(file, "fetch the run again, or repeat the fit with --overwrite")
         found = storage.read_json(file) if file.is_file() else {}
@@ -178,7 +178,7 @@ class RunFolder:
 
     @property
     def read_out(self) -> dict[str, Any]:
-        """How the reconstructed surface was read out.
+        """Settings with which the reconstructed surface was read out.
 
         Raises:
             InputError: If it is missing or damaged.
@@ -228,7 +228,7 @@ class RunFolder:
 
     @property
     def is_finished(self) -> bool:
-        """Whether all stages came to their end."""
+        """True if all stages are complete."""
         return all(self.is_done(stage) for stage in STAGES)
 
     def begin(self, stage: Literal["surface", "traced"]) -> None:

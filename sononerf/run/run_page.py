@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the page of a run shows: numbers, curves, surface, spectrograms, settings."""
+"""Page of a run: numbers, curves, surface, spectrograms, settings."""
 
 from __future__ import annotations
 

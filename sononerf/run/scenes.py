@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What scenes there are, and how they look."""
+"""List of the installed scenes, and their pictures."""
 
 from __future__ import annotations
 

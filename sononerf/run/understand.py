@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What recordings and settings say together, before anything is written."""
+"""Interpretation of recordings and their settings, before anything is written."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is ensonified: surfaces, materials and compositions; the public names for scene plugins."""
+"""Scenes: surfaces, materials and compositions; the public names for scene plugins."""
 
 from sononerf.scene.composition import Part, compose
 from sononerf.scene.material import Material

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How surfaces reflect: materials, and those that have a name."""
+"""Materials: how surfaces reflect."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BOUNDS = {
 
 @dataclass(frozen=True)
 class Material:
-    r"""How a surface reflects, at nodes over frequency.
+    r"""Reflection of a surface, at nodes over frequency.
 
     Between the nodes values run straight over the logarithm of frequency; beyond them they stay.
     A curve of one value holds at all nodes. Where the surface is strongly curved, lobe and strength
@@ -93,7 +93,7 @@ class Material:
 
     @property
     def rigid(self) -> bool:
-        """Whether it is a smooth surface that reflects all sound at all frequencies."""
+        """True if the surface is smooth and reflects all sound at all frequencies."""
         return (
             self.lobe_width is None
             and not math.isfinite(self.transition_curvature)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is ensonified: a surface, and how it reflects."""
+"""Scene: a surface and its materials."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What an import must know of recordings, beside air, ears, call and analysis."""
+"""Settings of an import, beside air, ears, call and analysis."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ReferenceSettings(Section):
 
 
 class ImportSettings(Section):
-    """How recordings and poses are to be read; paths are relative to the folder of the source.
+    """Format of recordings and poses; paths are relative to the folder of the source.
 
     Units have no default: the names of columns say them (``x_mm``, ``yaw_deg``), or ``length`` and
     ``angle`` do.

@@ -252,7 +252,7 @@ def load_settings(config: Path, overrides: Iterable[str] = ()) -> Settings:
 
 
 def is_assignment(config: Path) -> bool:
-    """Whether a settings file is none, but ``KEY=VALUE``."""
+    """True if a settings file is in fact an assignment ``KEY=VALUE``."""
     return "=" in str(config) and not config.is_file()
 
 

@@ -12,7 +12,7 @@ from sononerf.settings.section import Count, Name, Positive, Section, Seed, Vect
 
 
 class SceneSettings(Section):
-    """What is ensonified: a scene's name and what its factory takes."""
+    """The ensonified scene: its name, and the options of its factory."""
 
     name: Name
     options: dict[str, Any] = Field(default_factory=dict)
@@ -37,7 +37,7 @@ class SupportSettings(Section):
 
 
 class PoseSettings(Section):
-    """Where the calls are made from; both test sets are drawn apart from the training poses.
+    """Poses of the calls; validation and test poses are drawn apart from the training poses.
 
     On a ``sphere`` about the origin, on a ``cap`` of it about an axis, in a ``volume`` between
     two radii (within the cap, where an angle is set), on a ``cylinder`` about the z axis between

@@ -103,12 +103,12 @@ class EarSettings(Section):
 
     @property
     def is_directional(self) -> bool:
-        """Whether emitter or receivers hear one direction louder than another."""
+        """True if the gain of emitter or receivers depends on direction."""
         return self.directivity != "omnidirectional" or self.beam_radius > 0.0
 
 
 class CallSettings(Section):
-    """What is emitted: an impulse, a sweep of frequency with its harmonics, or a ``file``.
+    """The emitted call: an impulse, a sweep of frequency with its harmonics, or a ``file``.
 
     A ``preset`` fills the other keys with those of a published call; what is set beside it wins.
     The file is a WAV of one channel that holds one call from the start of the emission on.
@@ -235,7 +235,7 @@ class NoiseSettings(Section):
 
 
 class DataSettings(Section):
-    """Where the ensemble lies and how it is streamed."""
+    """Place of the ensemble, and how it is streamed."""
 
     store: Path | None = None
     background: Literal["scene"] | Path | None = None  # taken off as power; scene: what it marks
@@ -305,7 +305,7 @@ class PreviewSettings(Section):
 
 
 class PredictionSettings(Section):
-    """What a prediction is made of, beside the rendered field."""
+    """Components of a prediction, beside the rendered field."""
 
     traced: Literal["auto", "off"] = "auto"  # echoes off the mesh, as far as validation bears out
 

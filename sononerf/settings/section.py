@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What all sections of settings share: their strictness, and types with bounds."""
+"""Base of all sections of settings: their strictness, and types with bounds."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How many rays a scene needs: as many as make two simulations of a pose agree."""
+"""Number of rays for a wanted accuracy: that at which two simulations of a pose agree."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Which hits of rays can be heard and when they arrive, and which bundles are too coarse."""
+"""Audible hits of rays, their arrival times, and bundles that are too coarse."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ class Edges:
 
     @property
     def length(self) -> Floats:
-        """Of each edge (K,), m."""
+        """Length of each edge (K,), m."""
         return np.linalg.norm(self.ends[:, 1] - self.ends[:, 0], axis=1)
 
 

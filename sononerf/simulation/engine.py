@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the engines share: a scene, a head in air, and the way between them."""
+"""Base of all engines: a scene, a head in air, and the paths between them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the bundle around a ray lights, and how long the paths over it are."""
+"""Footprints: the area that the bundle around a ray lights, and the paths over it."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from sononerf.compiled import compiled
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """Of rays that hit a surface, by ray differentials [1]_.
+    """Footprints of rays that hit a surface, by ray differentials [1]_.
 
     Directions at the emitter are turned by u and v (rad) about two axes square to the ray.
 

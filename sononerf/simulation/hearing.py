@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What the ears make of sound that comes from points: beam, ears, air, and when it arrives."""
+"""Reception of sound from points: beam, ears, air, and arrival times."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from sononerf.simulation.impulse_response import (
 
 
 class Listener(Protocol):
-    """What takes the echoes of points one by one; see :meth:`Sound.add`."""
+    """Receiver of the echoes of points, one by one; see :meth:`Sound.add`."""
 
     def add(
         self, ear: int, delay: NDArray[Any], spread: NDArray[Any], strength: NDArray[Any]
@@ -34,7 +34,7 @@ class Listener(Protocol):
 
 
 class Sound:
-    """What the ears of one pose hear, while it is collected.
+    """Sound at the ears of one pose, while it is collected.
 
     Args:
         synthesis: Time bins.
@@ -59,7 +59,7 @@ class Sound:
 
 
 class Hearing:
-    """What a head hears of echoes of points.
+    """Response of a head to echoes of points.
 
     Args:
         head: Emitter, receivers and air.

@@ -80,7 +80,7 @@ class Synthesis:
 
     @property
     def frequency(self) -> Floats:
-        """Of the filters (K,), Hz."""
+        """Frequencies of the filters (K,), Hz."""
         return np.fft.rfftfreq(self.length, 1.0 / self.sampling_rate).astype(np.float64)
 
     def silence(self, dtype: Any = np.float32) -> Bins:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where the sound goes: rays from the emitter, bounce by bounce, each with what it stands for."""
+"""Paths of sound: rays from the emitter, bounce by bounce, each with its footprint."""
 
 from __future__ import annotations
 

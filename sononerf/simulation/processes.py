@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How other processes of this machine are started; light, so that it can be done first."""
+"""Start of worker processes; light, so that it can be done first."""
 
 from __future__ import annotations
 

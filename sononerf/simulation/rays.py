@@ -128,7 +128,7 @@ class Rays(Engine):
 
     @property
     def rays(self) -> int:
-        """How many are traced per pose, and as many again from the emitter's image."""
+        """Number of rays per pose; as many again start from the emitter's image."""
         return self._rays
 
     @rays.setter

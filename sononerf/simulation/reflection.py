@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How a surface reflects: a lobe about the mirror direction, a strength, a rest that goes on."""
+"""Reflection: a lobe about the mirror direction, its strength, and the remainder that continues."""
 
 from __future__ import annotations
 

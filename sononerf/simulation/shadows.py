@@ -199,7 +199,7 @@ class Shadow:
 
     @property
     def none(self) -> bool:
-        """Whether nothing throws a shadow on anything."""
+        """True if no body throws a shadow."""
         return self._pieces is None
 
     def level(self, points: Floats, triangle: Ints) -> Floats:

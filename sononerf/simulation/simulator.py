@@ -50,7 +50,7 @@ VERSION = 5  # to be raised when the same settings give other echoes: stores are
 
 
 class Simulator:
-    """What the receivers of a pose hear of a scene.
+    """Simulator of what the receivers of a pose hear of a scene.
 
     Args:
         engine: Brings the sound to the receivers; its head makes spectrograms of it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What engines share that solve the wave equation, one frequency after the other."""
+"""Base of the engines that solve the wave equation, one frequency after the other."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Heads:
     gains: Ears
 
     def __len__(self) -> int:
-        """How many poses there are, P."""
+        """Number of poses, P."""
         return len(self.emitters)
 
     def with_images(self, plane: Plane | None) -> Heads:

@@ -156,7 +156,7 @@ _CHUNK = 4096  # triangles at a time, a bound of memory
 
 @dataclass(frozen=True)
 class Openness:
-    """What kind of surface it is.
+    """Kind of a surface: closed, one-sided or a sheet.
 
     Attributes:
         unseen (T,): The triangles that no pose can have heard, or that are unknown, see

@@ -109,7 +109,7 @@ def confidence_png(
 
 @dataclass(frozen=True, eq=False)
 class ColourBar:
-    """What the colours of a mesh mean.
+    """Legend of the colours of a mesh.
 
     Attributes:
         title: What is shown, with its unit.

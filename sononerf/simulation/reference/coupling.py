@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What rigid spheres send to one another, by partial waves."""
+"""Scattering between rigid spheres, by partial waves."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Link:
 
 
 class Coupling:
-    """What spheres send to one another at one wavenumber.
+    """Scattering between spheres at one wavenumber.
 
     Waves are arrays (K, P): for each sphere the harmonics ``n, m`` at row ``n (n + 1) + m`` of its
     rows, each relative to its Hankel function on the sphere; P poses.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How badly a surface explains poses that it was not fitted to."""
+"""Error of a surface on poses that it was not fitted to."""
 
 from __future__ import annotations
 

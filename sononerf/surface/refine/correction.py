@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What physical optics lacks, found by simulating the echoes of one surface.
+"""Correction of physical optics, from the simulated echoes of one surface.
 
 Physical optics has no creeping waves, no multiple echoes and no soft shadows. On a surface that is
 almost right, the simulator gives these. The ratio of simulated to rendered magnitude there, cell by

@@ -215,7 +215,7 @@ class Descent:
 
 
 def poses_that_hear(mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics) -> Tensor:
-    """How many training poses see each vertex near the direction of a mirror, (V,)."""
+    """Number of training poses that see each vertex near the direction of a mirror, (V,)."""
     like = optics.get_buffer("wavenumber")
     faces = np.array(mesh.faces, dtype=np.int64)
     vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
@@ -246,7 +246,7 @@ _AROUND = 16  # vertices among which that of the other side is looked for
 
 
 class Sides:
-    """Which vertices of a sheet lie opposite each other; those of the rim have no partner.
+    """Opposite vertices of a sheet; those of the rim have no partner.
 
     Args:
         mesh: A closed sheet, m, whose sides do not cross.

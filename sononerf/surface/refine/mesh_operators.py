@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What is computed on a mesh whose vertices move: areas, curvature, smoothing."""
+"""Operators on a mesh whose vertices move: areas, curvature, smoothing."""
 
 from __future__ import annotations
 

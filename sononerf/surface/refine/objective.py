@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""How far rendered spectrograms are from the measured ones, and what is learned of the level."""
+"""Error between rendered and measured spectrograms, and the learned level."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Level:
 
     @property
     def weight(self) -> Tensor:
-        """How much ears and frequencies count (E, F): by the usual error, the smaller the more."""
+        """Weight of ears and frequencies (E, F), falling with their usual error."""
         weight = self.error.clamp_min(0.25 * float(self.error.median())) ** -TRUST
         return weight / weight.mean()
 

@@ -56,7 +56,7 @@ class Heard:
 
 @dataclass(frozen=True, eq=False)
 class Heads:
-    """Where sound comes from and where it is heard. Each pose is there W times, way after way.
+    """Emitters and receivers. Each pose appears W times, once for each way of the sound.
 
     Without a support there is one way, from the emitter to the ears. On a support there are four:
     emitter and ears stand for themselves or are mirrored.
@@ -82,7 +82,7 @@ class Heads:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """What some poses hear of a surface, one row per way of a pose and vertex.
+    """Echoes of surface pieces at some poses, one row per way of a pose and vertex.
 
     Attributes:
         pose, vertex (Q,): Which way of which pose, a row of :class:`Heads`; which vertex.

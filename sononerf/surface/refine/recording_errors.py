@@ -60,7 +60,7 @@ class Calibration:
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """What was found, and how well.
+    """Estimated errors of a recording and their uncertainties.
 
     Attributes:
         calibration: The errors.

@@ -173,7 +173,7 @@ class Refinement:
 
     @property
     def done(self) -> bool:
-        """Whether nothing is left to do."""
+        """True if nothing is left to do."""
         return self.stage >= len(self.stages)
 
     def advance(self) -> float:

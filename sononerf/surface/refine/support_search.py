@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Where the support is that a body stands on, found from a surface that was fitted without it.
+"""Search for the support under a body, from a surface that was fitted without it.
 
 A support is a mirror. Without it a fit takes the image for a part of the body that hangs below the
 support. The upper part of the surface is surely body. It is heard together with its image in

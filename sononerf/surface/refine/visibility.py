@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""What of a surface the emitter and the ears of poses see, and how that is rendered."""
+"""Visibility of a surface from emitter and ears, and its rendering."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _visible(
     emitters: Tensor,
     ears: Tensor,
 ) -> Tensor:
-    """How far emitter and each ear see the candidates, (Q, E) float32, softened by neighbours."""
+    """Visibility of candidates from emitter and each ear, (Q, E) float32, softened by neighbours."""
     free = FREE * optics.wavelength
     points = vertices[vertex].detach().cpu().numpy()
     of = pose.cpu().numpy()
