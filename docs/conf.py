@@ -71,9 +71,10 @@ def _section(name: str, model: type[Section]) -> str:
     for key, field in model.model_fields.items():
         key = field.alias or key
         note = re.search(rf"^    {key}: .*?#\s*(.*)$", source, re.MULTILINE)
-        default = "required" if field.is_required() else f"`{_plain(field.get_default(call_default_factory=True))}`"
-        allowed = " or ".join(dict.fromkeys(_allowed(described.get(key, {}))))
-        lines.append(f"| `{key}` | {default} | {allowed} | {note[1] if note else ''} |")
+        default = "required" if field.is_required() else
+        f"`{_plain(field.get_default(call_default_factory=True))}`" allowed = " or
+        ".join(dict.fromkeys(_allowed(described.get(key, {})))) lines.append(f"| `{key}` |
+        {default} | {allowed} | {note[1] if note else ''} |")
     return "\n".join([*lines, ""])
 
 

@@ -83,7 +83,7 @@ _HOMES = {
     "refine": "surface.reconstruction",
     "simulate": "simulation.ensemble",
 }
-"""Where the public names are; each is imported when it is first asked for."""
+"""Modules of the public names; each is imported at its first use."""
 
 
 def __getattr__(name: str) -> object:

@@ -62,7 +62,7 @@ def require_recorded(folder: Path, file: Path, remedy: str) -> None:
     A file that no checksum is known of, as in runs of older versions, passes.
 
     Args:
-        folder: Of the run.
+        folder: Folder of the run.
         file: In this folder, or elsewhere, where nothing is recorded.
         remedy: What the user can do.
 

@@ -66,7 +66,7 @@ def expect(value: object, kind: type, name: str) -> None:
     Args:
         value: What was given.
         kind: What is expected.
-        name: Of the argument, for the message.
+        name: Name of the argument, for the message.
 
     Raises:
         InputError: If it is of another kind.

@@ -274,7 +274,7 @@ def read_json(path: Path) -> Any:
 
 
 def append_line(path: Path, text: str) -> None:
-    """Append one line of text to a file, durably; the file is created where there is none.
+    """Append one line of text to a file, durably; the file is created if it does not exist.
 
     A line that a crash tore is closed first, so that it swallows none that follows. Readers
     tell torn lines by a checksum of their own.
@@ -335,7 +335,7 @@ def _checksum_field(body: str) -> str:
 
 
 def remove_file(path: Path) -> None:
-    """Remove a file, durably; nothing happens where there is none.
+    """Remove a file, durably; a missing file is no error.
 
     Raises:
         StorageError: If it cannot be removed.
@@ -398,7 +398,7 @@ def probe_writable(folder: Path) -> list[Path]:
         with suppress(OSError):
             probe.unlink(missing_ok=True)
         remove_if_empty(created)
-        # The user asked for the folder, and never heard of the probe.
+        # The user knows the folder, not the probe file.
         if isinstance(error, StorageError) and isinstance(error.__cause__, OSError):
             raise storage_error("cannot be written", folder, error.__cause__) from error.__cause__
         raise

@@ -84,7 +84,7 @@ def check_field(field: str | FieldFactory, **options: Any) -> Field:
     some = made.select(places, directions, torch.tensor([0, 2]))
     _close(some, found[:, [0, 2]], "select differs from the reflectivity at these frequencies")
     alone = torch.cat([made(places[n : n + 1], directions[n : n + 1]) for n in range(5)])
-    _close(alone, found[:5], "a place answers otherwise when it is asked alone")
+    _close(alone, found[:5], "a place has another value when it is evaluated alone")
     outside = places + 1.0
     _holds(not bool(made(outside, directions).abs().any()), "it is not zero outside the region")
     _has_gradients(found, made)
@@ -109,7 +109,7 @@ def check_renderer(
 
     Args:
         renderer: Its name, where its package is installed, or its factory.
-        field: Of what it renders; needed where it works with some fields alone.
+        field: Field that it renders; needed where it works with some fields alone.
         options: Its keyword arguments.
 
     Returns:
@@ -135,10 +135,10 @@ def check_renderer(
     _holds(bool((found > 0).any()), "a field that reflects is silent")
     bins = torch.tensor([0, 2])
     some = made(heard, position, rotation, rows, bins)
-    _close(some, found[..., bins], "it differs at these frequencies when they are asked alone")
+    _close(some, found[..., bins], "it differs at these frequencies when they are evaluated alone")
     if not made.whole_poses:
         few = made(heard, position, rotation, rows[:, 3:6])
-        _close(few, found[:, :, 3:6], "it differs at these slices when they are asked alone")
+        _close(few, found[:, :, 3:6], "it differs at these slices when they are evaluated alone")
     _has_gradients(found, heard)
     before = made(heard, position, rotation, rows).square().sum()
     made.calibrate(found.detach(), 2 * found.detach())

@@ -158,7 +158,7 @@ class CheckpointCallback(lightning.Callback):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        """Save when it is time, or when asked to stop."""
+        """Save when it is time, or before stopping."""
         del pl_module, outputs, batch, batch_idx
         if trainer.is_last_batch or trainer.global_step >= self._total:
             # Saved after the epoch: Lightning would go on from here without its end, and would

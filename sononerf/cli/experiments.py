@@ -91,7 +91,7 @@ def simulate(
         raise SettingsError("--shard takes no --preview and no --waveforms; give these without it")
     if workers is not None and scheduler is not None:
         raise SettingsError("--workers and --scheduler exclude each other; give one")
-    # A folder that cannot be written is told before minutes of simulation.
+    # A folder that cannot be written is reported before minutes of simulation.
     with results_folder(preview) if preview is not None else nullcontext():
         store = run(
             settings,

@@ -23,7 +23,7 @@ from sononerf.errors import SettingsError
 @app.command()
 def scenes(
     name: Annotated[
-        str | None, typer.Argument(help="One of them, to be told of its options.")
+        str | None, typer.Argument(help="Name of a scene, to list its options.")
     ] = None,
     as_json: Json = False,
     preview: Annotated[Path | None, typer.Option(help="Draw every scene into this folder.")] = None,

@@ -204,7 +204,7 @@ class Onsets:
 
     Attributes:
         poses (P,): Their numbers in the store, ascending.
-        range ((R,), m): Of the slices.
+        range ((R,), m): Range of the slices.
         power (P, E, R): Averaged over the band.
         heard (P, E, R): Which slices hold an echo.
         first ((P, E), m): Range of the first echo; minus infinity where there is none, or where it
@@ -218,7 +218,7 @@ class Onsets:
     first: Floats
 
     def chance(self, resolution: float) -> float:
-        """Return the probability that noise alone makes so many onsets.
+        """Return the probability that noise alone makes at least this number of onsets.
 
         Args:
             resolution (m): Range resolution: as many slices as it is long share their noise.
@@ -230,14 +230,14 @@ class Onsets:
 
 
 def asked_poses(store: Ensemble) -> Ints:
-    """Return the numbers of the training poses that are asked, ascending."""
+    """Return the numbers of the training poses that are analysed, ascending."""
     train = np.asarray(store.indices("train"))
     chosen = np.linspace(0, len(train) - 1, min(MOST_POSES, len(train))).round().astype(int)
     return np.asarray(train[chosen])
 
 
 def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = None) -> Onsets:
-    """Detect the echoes of a sealed ensemble's asked poses.
+    """Detect the echoes of a sealed ensemble's analysed poses.
 
     Args:
         store: The ensemble.

@@ -56,7 +56,7 @@ class Echoes(Shown):
         box ((2, 3), m): Lower and upper corner of where the body must be, see :meth:`within`.
 
     Attributes:
-        positions ((P, 3), m): Of the head, world frame.
+        positions ((P, 3), m): Places of the head, world frame.
         rotations (P, 3, 3): Head to world.
         training, validation (...,): Poses that a surface is refined on and compared on. Where the
             store has no validation poses, some of its training poses validate.

@@ -109,8 +109,8 @@ class EchoHull:
 
         Returns:
             clearance ((N,), m): Negative where a pose says that nothing is there, and below the
-                support; plus infinity where none speaks. Its slope is at most one. So many poses
-                as :attr:`undetected` may say so in vain.
+                support; plus infinity without evidence. Its slope is at most one. Up to
+                :attr:`undetected` contradicting poses are ignored.
             pose (N,): The pose that says so.
         """
         where = np.asarray(points, dtype=np.float64)
@@ -176,7 +176,7 @@ def _behind(
 
     Args:
         points ((N, 3), m): World frame.
-        emitters, receivers ((P, 3), (P, E, 3), m): Of the poses.
+        emitters, receivers ((P, 3), (P, E, 3), m): Emitters and receivers of the poses.
         first ((P, E), m): Ranges.
         axes (P, 3): Where the poses look.
         within: Cosine of the angle around the axis outside which an echo tells nothing.
@@ -212,7 +212,7 @@ def _possible(
         cells ((N, 3), m): Their middles.
         emitters, receivers, first, axes, within: As of :func:`_behind`.
         wanted (P, E): Which onsets are wanted.
-        few: So many onsets may rule a cell out, or
+        few: Number of onsets that may rule a cell out, or
         share: this fraction of those at whose range it lies.
         reach (m): How far a cell reaches.
     """

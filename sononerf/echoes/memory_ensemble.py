@@ -138,7 +138,7 @@ class MemoryEnsemble(Ensemble):
     """An ensemble in memory. At first all its poses are missing.
 
     Args:
-        positions ((P, 3), m): Of the head, world frame.
+        positions ((P, 3), m): Places of the head, world frame.
         rotations (P, 3, 3): Head to world.
         split (P,): 0 train, 1 validation, 2 test.
         range ((R,), m): One-way distances of the slices.

@@ -83,7 +83,7 @@ def seal_recorded(
     Args:
         store: No pose is missing.
         head: What heard them.
-        poses: Of the store.
+        poses: Poses of the store.
         split (P,): What each pose is for.
         silent: What to say if no training pose heard anything.
 

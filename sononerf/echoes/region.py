@@ -32,7 +32,7 @@ NOISE = (
     "call louder or from nearer, or check scene, poses, range limits and noise"
 )
 
-# Sizes of the search: poses asked for their power, looks from coarse to fine, cells along the
+# Sizes of the search: poses that give power, passes from coarse to fine, cells along the
 # longest side in each of them, passes over the power, and places looked at in one go.
 POSES, LOOKS, COARSE, ROUNDS, CHUNK = 200, 4, 28, 4, 2048
 ENOUGH = 2  # poses: one alone does not tell where on its ellipsoid an echo comes from

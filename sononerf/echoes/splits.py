@@ -70,7 +70,7 @@ def draw_split(
     Args:
         poses: P of them.
         validation, heldout: How many poses; a twentieth and a tenth where None, at most 10 and 20.
-        seed: Of the draw.
+        seed: Seed of the draw.
         where: The table, for messages.
 
     Returns:

@@ -85,7 +85,7 @@ class EnsembleStore(Ensemble):
     ) -> EnsembleStore:
         """Make a store with its axes and poses whole, or open the same one for more poses.
 
-        The group's own file comes last, so that a half-made store is none.
+        The group's own file comes last, so that an unfinished store is not taken for one.
 
         Args:
             path: A folder that is a store, is empty, or is not there.

@@ -88,7 +88,7 @@ def coherent_backprojection(
               y_{p,e}\left(\frac{|x - x_p| + |x - x_{p,e}|}{c}\right)\right|
 
     with :math:`y` the pulse-compressed recordings,
-    :func:`sononerf.head.call.matched_filter`. It asks for poses that are right to a
+    :func:`sononerf.head.call.matched_filter`. It needs poses that are right to a
     fraction of a wavelength.
 
     Args:
@@ -398,7 +398,7 @@ def _sorted(
 
     Args:
         index (X, Y, Z): Overwritten.
-        power (X, Y, Z): Of the voxels.
+        power (X, Y, Z): Powers of the voxels.
         x_out, y_out, z_out, x_back, y_back, z_back (m²): See :func:`_squares`.
         first, step (m): Range of the first bin, and from one to the next.
         bins: Their number.
@@ -440,8 +440,8 @@ def volume_of(store: Ensemble, name: str, numbers: Ints, *given: Any) -> Volume:
 
     Args:
         store: Where the spectrograms are.
-        name: Of ``BASELINES``.
-        numbers (P,): Of the poses.
+        name: Name in ``BASELINES``.
+        numbers (P,): Numbers of the poses.
         given: Further arguments of the baseline.
     """
     heard = (store.read_pose(int(number)) for number in numbers)

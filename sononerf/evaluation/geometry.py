@@ -47,7 +47,7 @@ class Registration:
 
     Attributes:
         matrix (4, 4): From the reconstruction's frame to the true one, lengths in m.
-        scale: Of lengths; 1 for a rigid motion.
+        scale: Scale of lengths; 1 for a rigid motion.
     """
 
     matrix: Floats
@@ -79,7 +79,7 @@ def register(
         found: Reconstruction, m.
         truth: True surface, any unit if ``kind`` is ``similarity``.
         kind: No motion; rotation and translation; and one scale.
-        seed: Of the samples. The same seed gives the same motion.
+        seed: Seed of the samples. The same seed gives the same motion.
 
     Returns:
         registration: Identity for ``none``.
@@ -166,7 +166,7 @@ def check_truth(found: trimesh.Trimesh, true: trimesh.Trimesh, kind: Kind, name:
         true: True surface, m.
         kind: What will lay the reconstruction over it: a similarity has any size, and a motion
             any place.
-        name: Of the true surface, for the message.
+        name: Name of the true surface, for the message.
 
     Raises:
         InputError: If the sizes differ by more than ``MOST_TIMES``, or the two boxes do not meet.
@@ -260,7 +260,7 @@ def baseline_volume(
     Where there are many poses it is done in another process, and this thread waits.
 
     Args:
-        name: Of ``BASELINES``.
+        name: Name in ``BASELINES``.
         echoes: Measured spectrograms; they are read one after the other.
         lower, upper ((3,), m): Corners of the region.
         stop: Ends it early when set.

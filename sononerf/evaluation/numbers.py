@@ -107,7 +107,7 @@ def compare_prediction(prediction: Prediction, echoes: Echoes) -> Evaluation:
     """Compare a prediction with what its poses measured.
 
     Args:
-        prediction: Of poses of the echoes.
+        prediction: Prediction of poses of the echoes.
         echoes: What was measured.
 
     Returns:

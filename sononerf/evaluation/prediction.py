@@ -48,8 +48,8 @@ class Prediction(Shown):
         poses: P of them.
         magnitude ((P, E, R, F) float32): The mean of rendered and traced levels.
         rendered ((P, E, R, F) float32): The field's own rendering.
-        range ((R,), m): Of the slices.
-        frequency ((F,), Hz): Of the bins.
+        range ((R,), m): Range of the slices.
+        frequency ((F,), Hz): Frequencies of the bins.
         traced_weight: Mean weight of the traced echoes.
         traced_fault: Why no echoes are traced off the surface.
         reference: Magnitude m0 of the reported decibels.
@@ -88,8 +88,8 @@ def predict(
         model: Fitted.
         surface: Reconstructed from echoes; one whose weights are known already; or None.
         poses: P of them.
-        options: Of the simulator that traces: keys of the section ``simulation`` of the settings;
-            engine and number of rays are replaced.
+        options: Options of the simulator that traces: keys of the section ``simulation`` of the
+            settings; engine and number of rays are replaced.
         accelerator: What to render on: ``auto``, ``cpu`` or ``gpu``.
         progress: Where to show it; on stderr where None.
 
@@ -219,7 +219,7 @@ def ranked(measured_db: ArrayLike, predicted_db: ArrayLike) -> Ints:
 
 
 def evenly(order: Ints, count: int) -> Ints:
-    """Return so many of an order (P,), evenly spaced from the first to the last."""
+    """Return ``count`` of an order (P,), evenly spaced from the first to the last."""
     places = np.linspace(0.0, len(order) - 1.0, count)
     chosen: Ints = order[np.floor(places + 0.5).astype(np.int64)]
     return chosen

@@ -259,7 +259,7 @@ class Nearest:
     def _within(self, points: Floats, bound: Floats, order: NDArray[np.intp]) -> Floats:
         """Return distances up to a bound for each point, infinite where it is farther.
 
-        Neighbours are asked about one after another, so that what one needs is still at hand.
+        Neighbours follow one another, so that their data are still in the cache.
         """
         from vtkmodules.vtkCommonCore import reference
         from vtkmodules.vtkCommonDataModel import vtkGenericCell

@@ -41,7 +41,7 @@ class Traced:
         gain_db ((E, F), dB): Level that is added to the traced echoes.
         weight (F,): Weight of the traced echoes in the mean with the rendered ones, 0 to 1.
         fault: Why no echoes can be traced off the surface; empty where they can.
-        simulator: Of the surface, with what it has solved for; made anew where None.
+        simulator: Simulator of the surface, with what it has solved for; made anew where None.
     """
 
     mesh: trimesh.Trimesh
@@ -76,13 +76,13 @@ def learn_traced(
         model: What is rendered.
         echoes: What was measured.
         mesh: The surface, m.
-        simulation: Of the surface's echoes; engine and number of rays are replaced.
-        seed: Of the rays.
+        simulation: Simulation of the surface's echoes; engine and number of rays are replaced.
+        seed: Seed of the rays.
         accelerator: What the field is rendered on.
         progress: Where to show it.
 
     Returns:
-        traced: Of weight zero where there are no validation poses, or nothing can be traced off the
+        traced: Weight zero where there are no validation poses, or nothing can be traced off the
             surface; ``fault`` then says why.
 
     Raises:
@@ -126,7 +126,7 @@ def for_single_poses(traced: Traced, head: Head, simulation: SimulationSettings)
     Args:
         traced: The surface.
         head: What hears.
-        simulation: Of the surface's echoes; engine and number of rays are replaced.
+        simulation: Simulation of the surface's echoes; engine and number of rays are replaced.
     """
     if not traced.weight.any():
         return traced
@@ -214,8 +214,8 @@ def regress_weight(measured_db: ArrayLike, rendered_db: ArrayLike, traced_db: Ar
     solution is the median of :math:`(m - r) / (t - r)`, weighted by :math:`|t - r|`.
 
     Args:
-        measured_db, rendered_db, traced_db ((..., F), dB): Of poses that neither prediction was
-            fitted to.
+        measured_db, rendered_db, traced_db ((..., F), dB): Levels of poses that neither prediction
+            was fitted to.
 
     Returns:
         weight (F,): 0 to 1; zero where both predictions are equal.

@@ -36,7 +36,7 @@ class EpochSampler(DistributedSampler[int]):
     stream: as a ``DistributedSampler`` this one is not replaced by Lightning.
 
     Args:
-        steps: Of an epoch.
+        steps: Steps of an epoch.
         done: Returns how many steps were done, in all epochs.
     """
 

@@ -35,7 +35,7 @@ class Field(nn.Module):
     learning_rate: float = 1e-3
     """What Adam starts with where the settings name no rate."""
     costly: bool = False
-    """Whether a place asks for so many operations that any number of them is worth threads."""
+    """True if one place needs so many operations that threads always save time."""
     half_precision: bool = False
     """Whether layers may multiply in half precision; the module sets it."""
 
@@ -59,7 +59,7 @@ class Field(nn.Module):
 
         Args:
             places ((N, 3), m): Vertices of a lattice that may hold something.
-            spacing (m): Of that lattice.
+            spacing (m): Spacing of that lattice.
         """
         cell = self.resolution
         size = ((self.region[1] - self.region[0]) / cell).ceil().long() + 1
@@ -136,7 +136,7 @@ class Field(nn.Module):
         return None
 
     def code_of_lattice(self, lattice: Tensor, which: Tensor | None) -> Tensor | None:
-        """Return what :meth:`code` does, for places that will be asked for again and again.
+        """Return what :meth:`code` does, for places that are evaluated repeatedly.
 
         Args:
             lattice ((L, 3), m): The same tensor as long as the places are the same: how it is read
@@ -155,7 +155,7 @@ class Field(nn.Module):
         Args:
             positions ((N, 3), m): Places, world frame.
             sources ((P, 3), m): Emitters of several poses.
-            code ((N, C) or None): Of :meth:`code`; found out where None.
+            code ((N, C) or None): Code of :meth:`code`; found out where None.
 
         Returns:
             audible (P, N): False only where the answer may be left out.
@@ -179,7 +179,7 @@ class Field(nn.Module):
             bins ((B,) int or None): Which frequencies; all where None.
             place ((M,) int or None): Which place each direction is for, so that what a place is
                 need be found out once for all directions; each its own where None.
-            code ((N, C) or None): Of :meth:`code`; found out where None.
+            code ((N, C) or None): Code of :meth:`code`; found out where None.
 
         Returns:
             reflectivity ((M, B) float or complex): As of :meth:`select`.
@@ -202,7 +202,7 @@ class Field(nn.Module):
         return within & self.occupancy[index[..., 0], index[..., 1], index[..., 2]]
 
     def outside(self, lattice: Tensor) -> Tensor | None:
-        """Return where places do not lie in the region, for places asked for again and again.
+        """Return where places lie outside the region, for places that are evaluated repeatedly.
 
         Args:
             lattice ((L, 3), m): The same tensor as long as the places are the same: the answer is

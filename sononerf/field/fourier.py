@@ -99,7 +99,9 @@ class FourierField(Field):
         second = 5 * 20 if inputs == "angles" else first
         self.register_buffer("_first", math.pi * math.sqrt(2.0) ** torch.arange(octaves))
         turns = math.pi * math.sqrt(2.0) ** torch.arange(told)
-        self.register_buffer("_turns", turns, persistent=False)  # of a file: told by its settings
+        self.register_buffer(
+            "_turns", turns, persistent=False
+        )  # the settings of a file determine them
         self.register_buffer("_second", math.pi * 2.0 ** torch.arange(20))
         affine = (lambda n: _Affine(n)) if inputs == "angles" else (lambda _: nn.Identity())
         self.enter = affine(first)

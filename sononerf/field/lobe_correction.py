@@ -54,7 +54,7 @@ class Correction(nn.Module):
 
     Args:
         region ((2, 3), m): Lower and upper corner of the box, world frame.
-        spacing (m): Of the field that is corrected.
+        spacing (m): Spacing of the field that is corrected.
         width: Width of the two hidden layers.
         count: Number of frequencies.
     """

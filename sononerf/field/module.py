@@ -207,9 +207,9 @@ class EchoModule(lightning.LightningModule):
 
         Args:
             checkpoint_path: A checkpoint that a Trainer wrote.
-            arguments: Of the class, in place of those that were saved: ``field`` or ``renderer``
-                where these were no names. Lightning's ``map_location`` and ``weights_only`` change
-                nothing.
+            arguments: Arguments of the class, in place of those that were saved: ``field`` or
+                ``renderer`` where these were no names. Lightning's ``map_location`` and
+                ``weights_only`` change nothing.
 
         Raises:
             InputError: If the file is missing, damaged, or holds more than plain data.

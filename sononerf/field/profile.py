@@ -313,7 +313,7 @@ class ProfileRenderer(Renderer):
         """Return the ways of sound from emitters (P, 3) to places and back.
 
         Returns:
-            ways: Each with the places (P, 3), m, whose directions from a place the field is told,
+            ways: Each with the places (P, 3), m, whose directions from a place are the input,
                 and whether out and back go directly (0) or by the support (1). The two ways that
                 meet the support once take the same time from one place to another, so they add up
                 in phase: they stand here once, see :meth:`_paths`. The mirror that sends sound from

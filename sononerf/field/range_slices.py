@@ -64,7 +64,7 @@ class PoseReader:
 
 
 class SliceStream(Dataset[RangeSlices]):
-    """The training batches; item k is batch k, whoever asks and in whatever order.
+    """The training batches; item k is batch k, in any process and in any order.
 
     Args:
         store: A sealed ensemble.

@@ -103,7 +103,7 @@ class Renderer(nn.Module):
     def may_ask(self) -> bool:
         """True if reading a scalar does not synchronise the device.
 
-        A GPU would wait for all that it was told before, so that a step has to do without.
+        Reading a scalar lets a GPU finish all queued work first, so a step must do without.
         """
         return self.log_gain.device.type == "cpu"
 
@@ -119,7 +119,7 @@ class Renderer(nn.Module):
 
         Args:
             field: What is rendered.
-            possible: Which places the echoes leave possible; asked at the first step and at
+            possible: Which places the echoes leave possible; evaluated at the first step and at
                 refinements.
             step: Number of the training step.
 
@@ -270,7 +270,7 @@ class ShellRenderer(Renderer):
         region ((2, 3), m): Lower and upper corner of the box that holds the field.
         head: What heard the spectra.
         directions: Number of directions over the forward hemisphere.
-        direction: What the field is told: the direction from each place to the head, or, as the
+        direction: Input of the field: the direction from each place to the head, or, as the
             published code does, the sensor's own look direction (reversed) for all places of a
             call.
         call_spectrum: Whether each frequency has a gain of its own.

@@ -21,7 +21,7 @@ def off_axis(poses: Poses, centre: Floats) -> Floats:
 
     Args:
         poses: P of them.
-        centre ((3,), m): Of the body.
+        centre ((3,), m): Centre of the body.
     """
     to_body = centre - poses.positions
     distance = np.linalg.norm(to_body, axis=1)
@@ -34,7 +34,7 @@ def aim_fault(poses: Poses, centre: Floats) -> str:
 
     Args:
         poses: P of them.
-        centre ((3,), m): Of the body.
+        centre ((3,), m): Centre of the body.
     """
     if not len(poses):
         return ""

@@ -134,7 +134,7 @@ class CapSpiral:
 
         Args:
             towards (B, 3): Axes of the cones, unit vectors.
-            half_angle ((B,), rad): Of the cones.
+            half_angle ((B,), rad): Half angle of the cones.
         """
         rows, columns = PATCHES
         edge, turn = np.arange(rows + 1) / rows, (np.arange(columns) + 0.5) / columns
@@ -270,7 +270,7 @@ def spread_points(mesh: trimesh.Trimesh, count: int) -> tuple[Floats, Floats]:
 
     Returns:
         points ((N, 3), m): On the triangles.
-        normals (N, 3): Of the smooth surface, outward unit vectors.
+        normals (N, 3): Normals of the smooth surface, outward unit vectors.
 
     References:
         .. [1] T. F. Gonzalez, "Clustering to minimize the maximum intercluster distance",

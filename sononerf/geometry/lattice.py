@@ -52,7 +52,7 @@ class Lattice:
         return np.asarray(~inner.all(axis=1))
 
     def spread(self, points: Floats, values: Floats, deviation: float = 0.0) -> Singles:
-        """Add values (N,) of points onto the voxels around them, and blur by so many voxels."""
+        """Add values (N,) of points to the voxels around them, and blur by a number of voxels."""
         place = self.coordinates(points)
         base = np.floor(place).astype(np.intp)
         fraction = place - base
@@ -88,7 +88,7 @@ def level_surface(
         spacing (m): Between centres.
 
     Returns:
-        mesh: Of positive volume if it is closed.
+        mesh: Positive volume if it is closed.
     """
     vertices, faces, _, _ = marching_cubes(
         grid.astype(np.float32), level, gradient_direction="ascent", allow_degenerate=False

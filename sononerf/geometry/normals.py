@@ -61,8 +61,8 @@ def total_curvature(mesh: trimesh.Trimesh, normals: Floats) -> Floats:
         normals (T, 3, 3): From :func:`corner_normals`.
 
     Returns:
-        curvature ((T,), 1/m): Of a sphere, the square root of 2 over its radius; of a triangle
-            without area, 0.
+        curvature ((T,), 1/m): Curvature of a sphere, the square root of 2 over its radius; of a
+            triangle without area, 0.
 
     References:
         .. [1] S. Rusinkiewicz, "Estimating curvatures and their derivatives on triangle meshes",
@@ -83,7 +83,7 @@ def weight_gradients(
     """Gradients of the barycentric weights of a triangle's second and third corner.
 
     Args:
-        corners ((T, 3, 3), m): Of the triangles.
+        corners ((T, 3, 3), m): Corners of the triangles.
 
     Returns:
         second, third ((T, 3), 1/m): Gradients in the triangle's plane; of a triangle without area,
@@ -128,13 +128,13 @@ def enclosing_balls(corners: Floats, label: Ints, count: int) -> tuple[Floats, F
     """Return balls that hold all triangles: one for each body, and more where that is tighter.
 
     Args:
-        corners ((T, 3, 3), m): Of the triangles.
+        corners ((T, 3, 3), m): Corners of the triangles.
         label (T,): Which body they belong to.
-        count: At most so many balls, one or more.
+        count: Largest number of balls, one or more.
 
     Returns:
-        centres ((B, 3), m): Of the balls.
-        radii ((B,), m): Of the balls.
+        centres ((B, 3), m): Centres of the balls.
+        radii ((B,), m): Radii of the balls.
     """
     middles = corners.mean(axis=1)
 

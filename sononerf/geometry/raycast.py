@@ -138,10 +138,10 @@ def _hits_of(
 
     Args:
         found (N,): The triangle that each ray hits first, below zero where it hits none.
-        origins ((N, 3) or (1, 3), m), directions (N, 3): Of the rays.
+        origins ((N, 3) or (1, 3), m), directions (N, 3): Origins of the rays.
         planes (T, 6): First corner (m) and unit normal of each triangle.
         smooth ((T, 5, 3) float32): Gradients, and the smooth normal at the first corner.
-        corners ((T, 3, 3), m): Of the triangles.
+        corners ((T, 3, 3), m): Corners of the triangles.
     """
     ray, count = np.zeros(len(found), np.int64), 0
     for i in range(len(found)):
@@ -207,7 +207,7 @@ def _sight(
         points, normals ((N, 3), m): Where sight begins, and which way it is lifted; no normals
             (0, 3) lift it towards the targets.
         targets ((N, 3) or (1, 3), m): Where it ends.
-        middle ((3,), m), scale (1/m), lift (m): Of the caster.
+        middle ((3,), m), scale (1/m), lift (m): Attributes of the caster.
     """
     origins = np.zeros((len(points), 3), np.float32)
     spans = np.zeros((len(points), 3), np.float32)
@@ -363,7 +363,7 @@ def winding_numbers(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) ->
     are inside out. Of an open surface it is the share of the directions that it fills, in sixths.
 
     Args:
-        vertices ((V, 3), m): Of the surface.
+        vertices ((V, 3), m): Vertices of the surface.
         faces (T, 3): Its triangles, counter-clockwise from outside.
         points ((N, 3), m): The places.
 

@@ -30,8 +30,8 @@ def attach(head: NamesFiles, folder: Path) -> None:
     """Copy the files that a head names into a folder, if they are not there yet.
 
     Args:
-        head: Of the run or the store.
-        folder: Of the run or the store.
+        head: Head of the run or the store.
+        folder: Folder of the run or the store.
 
     Raises:
         InputError: If a file cannot be read.

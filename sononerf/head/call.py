@@ -40,7 +40,7 @@ def call_waveform(settings: CallSettings, sampling_rate: float) -> Floats:
 
     Args:
         settings: The call.
-        sampling_rate (Hz): Of the waveform.
+        sampling_rate (Hz): Sampling rate of the waveform.
 
     Returns:
         waveform (N,): One sample of height 1 for an impulse; never higher than 1 for a sweep; of a
@@ -90,7 +90,7 @@ def covered(settings: CallSettings, frequency: ArrayLike) -> Bools:
 
     Args:
         settings: The call.
-        frequency ((F,), Hz): Frequencies asked about.
+        frequency ((F,), Hz): Frequencies of the result.
 
     Returns:
         covered (F,): Whether a harmonic sweeps over it; an impulse covers all, a file what lies
@@ -112,7 +112,7 @@ def has_ghosts(settings: CallSettings, frequency: ArrayLike) -> bool:
 
     Args:
         settings: The call.
-        frequency ((F,), Hz): Of the rows.
+        frequency ((F,), Hz): Frequencies of the rows.
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "file":
@@ -164,7 +164,7 @@ def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> Floats:
         frequency ((F,), Hz): Above zero.
 
     Returns:
-        delay ((F,), s): Of the first harmonic that sweeps over the frequency, or else of the
+        delay ((F,), s): Delay of the first harmonic that sweeps over the frequency, or else of the
             nearest end of a sweep; zero for an impulse. Other harmonics that sweep over it too are
             heard farther off, as :func:`sononerf.head.reception.effective_window` has it, so that
             no echo is heard in front of the first one.

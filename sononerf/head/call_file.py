@@ -48,11 +48,11 @@ class CallFile:
     Attributes:
         waveform (N,): From the file's first sample on, which is the start of the emission; its
             greatest is 1.
-        sampling_rate (Hz): Of the file.
+        sampling_rate (Hz): Sampling rate of the file.
         frequency ((K,), Hz): Ascending.
         delay ((K,), s): When each is emitted.
         is_covered (K,): Whether it is emitted.
-        bandwidth (Hz): Of the window that it was looked at through.
+        bandwidth (Hz): Bandwidth of the window that it was looked at through.
     """
 
     waveform: Floats

@@ -43,7 +43,7 @@ def piston(directions: Floats, radius: float, frequency: Floats) -> Floats:
 
     Args:
         directions (L, A, 3): Unit vectors, head frame.
-        radius (m): Of the piston; 0 is the same in all directions.
+        radius (m): Radius of the piston; 0 is the same in all directions.
         frequency ((F,), Hz): Any.
 
     Returns:
@@ -66,7 +66,7 @@ def ear(directions: Floats, side: float, settings: EarSettings, frequency: Float
 
     It hears best towards its axis, as a Gaussian of the angle from it whose width falls with the
     square root of frequency (``width_deg`` at 50 kHz). A spectral notch rises from 30 kHz (straight
-    down) over 60 kHz to 90 kHz (straight up), so that elevation can be told from the spectrum.
+    down) over 60 kHz to 90 kHz (straight up), so that the spectrum depends on elevation.
 
     Args:
         directions (L, A, 3): Unit vectors, head frame; elevation is that of the row.
@@ -108,7 +108,7 @@ class Ears:
         ears ((E, F, L, A) float32): Gain of each receiver; all of them may share one table in
             memory.
         emitter ((3,), m): Head frame.
-        positions ((E, 3), m): Of the receivers, head frame.
+        positions ((E, 3), m): Places of the receivers, head frame.
     """
 
     azimuth: Floats
@@ -377,7 +377,7 @@ def _bilinear(
     Args:
         values (D, F): All azimuths of the first elevation, and so on.
         directions (N, 3): Unit vectors.
-        elevation, azimuth: Of the grid: the first node (rad), nodes per radian, their number.
+        elevation, azimuth: Axes of the grid: the first node (rad), nodes per radian, their number.
     """
     width, frequencies = azimuth[2], values.shape[1]
     gain = np.zeros((len(directions), frequencies), np.float32)

@@ -113,7 +113,7 @@ class Head(Shown):
     """Emitter and receivers in air, the call, and the analysis that makes spectrograms.
 
     Two synthetic ears, an impulse and the analysis of the paper by default. What costs time is
-    computed when it is first asked for, and kept.
+    computed at its first use, and kept.
 
     Args:
         ears: Places and directivities of emitter and receivers, m and degrees, head frame: keys of
@@ -125,7 +125,7 @@ class Head(Shown):
         air: Speed of sound and absorption: section ``air``, such as ``{"temperature_c": 20}``.
         analysis: Filters, hop, range limits, Hz and m: section ``spectrogram``, such as
             ``{"frequency_min": 20e3, "frequency_max": 90e3, "range_max": 1.0}``.
-        noise: Of the receivers: section ``noise``, such as ``{"snr_db": 20}``.
+        noise: Noise of the receivers: section ``noise``, such as ``{"snr_db": 20}``.
         support: A rigid plane that the body stands on, m, world frame: section ``support``, such as
             ``{"point": (0, 0, -0.05)}``; none by default.
 
@@ -222,7 +222,7 @@ class Head(Shown):
         """Return emitters (..., 3) and receivers (..., E, 3), m, world frame.
 
         Args:
-            positions ((..., 3), m): Of the head, world frame.
+            positions ((..., 3), m): Places of the head, world frame.
             rotations (..., 3, 3): Head to world.
         """
         at, turn = np.asarray(positions, np.float64), np.asarray(rotations, np.float64)
@@ -342,7 +342,7 @@ class Head(Shown):
             impulse_responses (E, S): Pressure for a call that is one sample of height 1. They
                 should have ``samples`` samples; of shorter ones, down to the last frame of an
                 impulse, the last rows lack what the window lets in from behind.
-            seed: Of the pose; the noise is drawn from it.
+            seed: Seed of the pose; the noise is drawn from it.
 
         Returns:
             waveform (E, S): From the start of the emission on.

@@ -30,8 +30,9 @@ def target_gain(target_strength_db: float, distance: float) -> float:
     """Echo of a small target, as a part of the call's pressure at 1 m.
 
     Args:
-        target_strength_db (dB): Of the echo at 1 m from the target, over the pressure that falls on
-            it; 20 log10(radius / 2 m) of a rigid sphere that is large against the wavelength [1]_.
+        target_strength_db (dB): Target strength of the echo at 1 m from the target, over the
+            pressure that falls on it; 20 log10(radius / 2 m) of a rigid sphere that is large
+            against the wavelength [1]_.
         distance (m): From emitter and ear to the target.
 
     Returns:
@@ -73,7 +74,7 @@ def noise_level(settings: NoiseSettings, power: Floats, analysis: SpectrogramSet
 
     Args:
         settings: The ratio, which must be set.
-        power (E,): Of the echo that it is relative to, from :func:`loudest_power`.
+        power (E,): Power of the reference echo, from :func:`loudest_power`.
         analysis: Sampling rate and band: of white noise's power, the band holds its share of all
             frequencies up to half the sampling rate.
 
@@ -92,7 +93,7 @@ def draw_noise(level: Floats, samples: int, *, seed: int) -> Floats:
     Args:
         level (E,): Standard deviations.
         samples: Per ear.
-        seed: Of the pose; what else is drawn from it is independent of the noise.
+        seed: Seed of the pose; what else is drawn from it is independent of the noise.
 
     Returns:
         noise (E, samples): Unit of ``level``.

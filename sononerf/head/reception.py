@@ -49,7 +49,7 @@ def row_duration(call: CallSettings, analysis: SpectrogramSettings, frequency: A
     Args:
         call: What is emitted.
         analysis: Window and sampling rate.
-        frequency ((F,), Hz): Of the rows.
+        frequency ((F,), Hz): Frequencies of the rows.
 
     Returns:
         duration ((F,), s): Two-way: times ``c / 2`` it is a width in range.
@@ -72,7 +72,7 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
 
     Returns:
         window: Samples. For an impulse shorter is always better, so it is the window that is set; a
-            gammatone's is not asked for.
+            gammatone's is not needed.
 
     Examples:
         >>> call = CallSettings(kind="linear", duration=3e-3)
@@ -86,7 +86,7 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
 
 
 def within_band(analysis: SpectrogramSettings) -> Floats:
-    """Return the rows' frequencies, the outermost drawn to the ends of the band asked for."""
+    """Return the rows' frequencies, the outermost moved to the ends of the wanted band."""
     return np.clip(frequency_axis(analysis), analysis.frequency_min, analysis.frequency_max)
 
 

@@ -63,12 +63,12 @@ class RowFilters:
     """The filters of an analysis.
 
     Attributes:
-        frequency ((F,), Hz): Of the rows, ascending.
+        frequency ((F,), Hz): Frequencies of the rows, ascending.
         envelope (F, W): Over the samples that a frame reads, 1 at its greatest or almost.
         origin: First of these samples, from the frame's start; the ones before the emission are
             silent.
-        centre: Of the envelopes, samples from the frame's start: the frame's time.
-        length: Of the Hamming window that is as wide as the mean over the band, samples.
+        centre: Centre of the envelopes, samples from the frame's start: the frame's time.
+        length: Length of the Hamming window that is as wide as the mean over the band, samples.
         band ((float, float), Hz): What the rows let through.
         looks: How many independent values of noise there are in a mean over the band.
     """
@@ -119,7 +119,7 @@ def band_mean(values: NDArray[Any], frequency: ArrayLike) -> NDArray[Any]:
     """Return the mean over frequency, each row with its part of the band.
 
     Args:
-        values (..., F): Of the rows.
+        values (..., F): Values of the rows.
         frequency ((F,), Hz): Ascending; where its steps are equal this is the mean.
     """
     part = band_parts(frequency)
@@ -141,7 +141,7 @@ def row_widths(settings: SpectrogramSettings, frequency: ArrayLike) -> tuple[Flo
 
     Args:
         settings: The analysis.
-        frequency ((F,), Hz): Of the rows.
+        frequency ((F,), Hz): Frequencies of the rows.
 
     Returns:
         duration: (F,), s.
@@ -155,7 +155,7 @@ def row_widths(settings: SpectrogramSettings, frequency: ArrayLike) -> tuple[Flo
     return np.full(f.shape, WINDOW_DURATION * length), np.full(f.shape, WINDOW_BANDWIDTH / length)
 
 
-@lru_cache(maxsize=16)  # asked for by everything that reads a row; no one may write to the arrays
+@lru_cache(maxsize=16)  # all readers of rows share the arrays; nobody may write to them
 def row_filters(settings: SpectrogramSettings) -> RowFilters:
     """Return the filters of an analysis.
 

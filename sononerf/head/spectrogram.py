@@ -42,7 +42,7 @@ def range_axis(settings: SpectrogramSettings, speed_of_sound: float) -> Floats:
 
     Args:
         settings: The analysis; frames start every ``hop`` samples from the emission on.
-        speed_of_sound (m/s): Of the medium.
+        speed_of_sound (m/s): Speed of the medium.
 
     Returns:
         range ((R,), m): Those within ``range_min`` to ``range_max``.
@@ -78,7 +78,7 @@ def echo_samples(
 
     Args:
         settings: The analysis.
-        speed_of_sound (m/s): Of the medium.
+        speed_of_sound (m/s): Speed of the medium.
         longest_delay (s): The greatest by which a frequency's row is advanced; 0 for an impulse.
 
     Returns:
@@ -109,7 +109,7 @@ def spectrogram(
     Args:
         echo (E, S): Pressure from the emission on, at the sampling rate of the settings.
         settings: The analysis.
-        speed_of_sound (m/s): Of the medium.
+        speed_of_sound (m/s): Speed of the medium.
         delay ((F,), s): Emission time of each frequency, zero or more; all at once where it is left
             out.
 

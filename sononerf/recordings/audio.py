@@ -30,7 +30,7 @@ def read_audio(path: Path) -> tuple[float, NDArray[Any]]:
     """Read a sound file.
 
     Args:
-        path: Of a kind in :data:`SUFFIXES`; a WAV is mapped, not loaded, where it can be.
+        path: File of a kind in :data:`SUFFIXES`; a WAV is mapped, not loaded, where it can be.
 
     Returns:
         sampling_rate (Hz): As the file says.

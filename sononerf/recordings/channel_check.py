@@ -34,7 +34,7 @@ class Channel:
             Minus infinity if the channel is silent.
         noise_db (dB): The quietest tenth of its ranges over its own loudest echo; the median.
         heard: In how many pings it heard an echo.
-        asked: In how many it was looked for.
+        asked: Number of pings that were checked.
     """
 
     level_db: float

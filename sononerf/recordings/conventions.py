@@ -197,8 +197,8 @@ def turntable_poses(angle: Floats, height: Floats, *, radius: float, clockwise: 
     """Poses of a fixed sensor beside a turning object, seen from the object.
 
     Args:
-        angle ((P,), rad): Of the turntable.
-        height ((P,), m): Of the sensor; z of the world.
+        angle ((P,), rad): Angle of the turntable.
+        height ((P,), m): Height of the sensor; z of the world.
         radius (m): From the axis to the sensor.
         clockwise: Whether growing angles turn the object clockwise, seen from above. The sensor
             then goes about the object counter-clockwise.

@@ -183,7 +183,7 @@ def found_ranges(
 
     Returns:
         limits: ``range_min`` and ``range_max``, m.
-        power (P, E, R): Of some pings over all ranges, averaged over frequency.
+        power (P, E, R): Powers of some pings over all ranges, averaged over frequency.
 
     Raises:
         InputError: If the recordings are too short, or begin too late, for limits that are set.
@@ -247,7 +247,7 @@ def found_ranges(
 
 
 def _widest(window: int, count: int, delay: float, metre: float) -> float:
-    """Return the greatest range (m) whose frame lies in so many samples."""
+    """Return the greatest range (m) whose frame lies within ``samples``."""
     return (count - np.ceil(delay) - 1.0 - window / 2.0) * metre
 
 
@@ -263,7 +263,7 @@ def calibrated(
         recording: All pings.
         wanted: What to apply.
         head: Gains, places, air, call and analysis.
-        folder: Of background and reference.
+        folder: Folder of background and reference.
 
     Returns:
         cutter: Cuts and calibrates pings.

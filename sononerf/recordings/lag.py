@@ -63,10 +63,10 @@ def find_lag(
     """Return by how many rows poses are too early for their pings, and the standard deviation.
 
     Args:
-        poses: Of all pings, in the order of recording.
+        poses: Poses of all pings, in the order of recording.
         first ((N, E), m): Ranges of the first echoes of some pings; not finite where there is none.
         heard (N,): Rows of these pings.
-        consistency: Of the head.
+        consistency: Consistency of the head.
         shown: Called once per lag that is tried.
 
     Returns:

@@ -78,7 +78,7 @@ class Verdict:
     """Faults of the poses, if there are any.
 
     Attributes:
-        name: Of the convention that explains the echoes best; empty if it is the stated one.
+        name: Name of the convention that explains the echoes best; empty if it is the stated one.
         message: One line for the user; empty if nothing is wrong.
         gain: How much better, in log-likelihood.
     """
@@ -269,7 +269,7 @@ def _scaled_ranges(head: Consistency, poses: Poses, ranges: Floats, own: Misfit)
 
 
 def _order(head: Consistency, poses: Poses, ranges: Floats, own: Misfit) -> Verdict:
-    """Return by how much the poses explain the echoes better than the same poses in other orders.
+    """Return the gain of the stated order of the poses over random orders.
 
     The verdict is empty if few echoes contradict the others, because then the order is right, or
     it makes no difference.
@@ -297,7 +297,7 @@ class Misfit:
     Attributes:
         total: Sum of the logarithms of the scales of errors; less is better.
         count: Number of errors in the sum.
-        prediction: Of each ping by the others.
+        prediction: Prediction of each ping by the others.
     """
 
     total: float

@@ -32,7 +32,7 @@ def echo_wav(
         magnitude (E, R, F): Linear; of more than two receivers the first two sound.
         range_m ((R,), m): Range axis.
         frequency_hz ((F,), Hz): Frequency axis.
-        speed_of_sound (m/s): Of the echoes.
+        speed_of_sound (m/s): Speed of the echoes.
     """
     heard = np.asarray(magnitude, dtype=np.float64)[:2]
     ranges, frequencies = np.asarray(range_m, dtype=float), np.asarray(frequency_hz, dtype=float)

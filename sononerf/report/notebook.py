@@ -50,7 +50,7 @@ def png_of(thing: object, **options: Any) -> bytes | None:
     """Return the picture of an object as a PNG file; None where it has none.
 
     Args:
-        thing: Of a scene and a surface the mesh is drawn, of echoes and a prediction the
+        thing: The mesh of a scene or a surface is drawn, of echoes and a prediction the
             spectrogram of one pose.
         options: ``pose``, its number; of echoes also ``prediction``, which is drawn beside.
     """

@@ -53,7 +53,7 @@ class Viewer:
     """A page in the browser, served to this machine alone until it is closed.
 
     Args:
-        title: Of the page.
+        title: Title of the page.
         port: Where it is served; the next free one where it is taken.
 
     Raises:

@@ -170,7 +170,7 @@ def true_mesh(
     """Return ``evaluation.truth``, or else the scene's own surface; None where neither is known.
 
     Args:
-        settings: Of the experiment.
+        settings: Settings of the experiment.
         stated: Attributes of the store, or provenance of the run, that state the frame of the file.
 
     Raises:
@@ -189,7 +189,7 @@ def read_truth(path: Path, unit: Unit = "m") -> trimesh.Trimesh:
 
     Args:
         path: PLY, STL, OBJ, OFF or GLB.
-        unit: Of its numbers.
+        unit: Unit of its numbers.
 
     Raises:
         InputError: If it is missing, of another kind, damaged, empty or not finite.

@@ -279,7 +279,7 @@ def describe(
     """Return what was found and what is not determined, one line each.
 
     Args:
-        head, store, mesh: Of the run.
+        head, store, mesh: Head, store and mesh of the run.
         estimate: What was found.
         kinds: What was looked for.
     """

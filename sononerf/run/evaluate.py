@@ -34,8 +34,8 @@ class EvaluationWork:
             else the surface of its scene.
         registration: What lays the reconstruction over the truth; ``evaluation.registration`` where
             None.
-        unit: Of the numbers in the file; ``evaluation.unit`` where None.
-        frame: Of the file; ``evaluation.frame`` where None.
+        unit: Unit of the numbers in the file; ``evaluation.unit`` where None.
+        frame: Frame of the file; ``evaluation.frame`` where None.
     """
 
     def __init__(

@@ -65,7 +65,7 @@ def file_bytes(
     Args:
         file_type: Kind of file.
         arrays: By their names in the file.
-        attributes: Of the whole file.
+        attributes: Attributes of the whole file.
 
     Raises:
         ResourceError: If an array is too large for the kind of file.
@@ -155,7 +155,7 @@ def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName 
         output: The file.
         what: Which part. ``auto``: echoes of a store; of a run the mesh or the points, as the
             suffix says, else the prediction.
-        frame: Of places and directions; the original one of recordings for ``auto``.
+        frame: Frame of places and directions; the original one of recordings for ``auto``.
 
     Returns:
         output: The file that was written.

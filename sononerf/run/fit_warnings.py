@@ -32,7 +32,7 @@ def fit_warnings(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:
     """Return what speaks against a fit, one line each; nothing where all is well.
 
     Args:
-        echoes: Of the fit.
+        echoes: Echoes of the fit.
         region ((2, 3), m): Lower and upper corner.
         is_set: Whether the region was set, not found from the echoes.
     """

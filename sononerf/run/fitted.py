@@ -39,8 +39,8 @@ class Fitted:
     Attributes:
         module: Field and renderer.
         hull: Free space in front of the onsets of the training poses.
-        settings: Of the experiment.
-        echo_hash: Of the echoes that were fitted to.
+        settings: Settings of the experiment.
+        echo_hash: Echo hash of the echoes that were fitted to.
         folder: The run's.
     """
 

@@ -84,7 +84,7 @@ class Siren(Field):
     Args:
         region ((2, 3), m): Lower and upper corner of the box.
         frequency ((F,), Hz): Frequencies of the answer.
-        width, depth: Of the hidden layers.
+        width, depth: Width and depth of the hidden layers.
         omega: What the sines' arguments are multiplied by.
     """
 
@@ -152,7 +152,7 @@ class LatticeRenderer(Renderer):
     Args:
         region ((2, 3), m): Lower and upper corner of the box that holds the field.
         head: What heard the spectra.
-        spacing (m): Of the lattice.
+        spacing (m): Spacing of the lattice.
     """
 
     lattice: Tensor
@@ -218,7 +218,7 @@ def new_plugin(kind: Kind, name: str, folder: Path | None = None) -> list[Path]:
 
     Args:
         kind: What it is.
-        name: Of distribution, module and plugin; in the last two, ``-`` becomes ``_``.
+        name: Name of distribution, module and plugin; in the last two, ``-`` becomes ``_``.
         folder: Where to; ``name`` in the working directory by default.
 
     Returns:

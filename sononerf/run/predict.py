@@ -83,7 +83,7 @@ def predict(
         run: A fitted run.
         split: Which poses of the ensemble.
         poses_csv: Poses of the user's instead; see :func:`read_poses`.
-        frame: Of these poses.
+        frame: Frame of these poses.
         output: Folder of the results; ``RUN/prediction`` where None.
         pictures: How many poses are drawn: from the best to the worst where they were measured,
             else from the first to the last.

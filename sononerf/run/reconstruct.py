@@ -111,7 +111,7 @@ def _version() -> dict[str, str]:
 
 
 def _metadata(file: Path) -> dict[str, str] | None:
-    """Return what a state says of itself; None where there is none, or it is damaged."""
+    """Return the description of a saved state; None if it is missing or damaged."""
     try:
         with safe_open(str(file), "pt") as opened:
             return opened.metadata() or {}

@@ -273,7 +273,7 @@ class RunFolder:
         The fit then goes on from its last checkpoint, and the stages after it are done again.
 
         Args:
-            settings: Of the fit that is asked for.
+            settings: Settings of the fit that is asked for.
         """
         if not self.config.is_file():
             return

@@ -146,7 +146,7 @@ def draw_scenes(folder: Path) -> tuple[list[Path], list[str]]:
     """Draw every scene that needs no options.
 
     Args:
-        folder: Of the pictures, ``NAME.png`` each.
+        folder: Folder of the pictures, ``NAME.png`` each.
 
     Returns:
         written: The pictures.
@@ -180,9 +180,9 @@ def draw_ensemble(settings: Settings, store: Ensemble, folder: Path) -> list[Pat
     The first pose of all where none is for the test.
 
     Args:
-        settings: Of the ensemble.
+        settings: Settings of the ensemble.
         store: Complete.
-        folder: Of the pictures.
+        folder: Folder of the pictures.
 
     Returns:
         written: ``scene.png`` and ``pose_0000.png``, numbered as in the store.

@@ -79,7 +79,7 @@ def _own_background(settings: Settings) -> tuple[Path, Scene]:
 
 
 def open_ensemble(settings: Settings, path: Path) -> EnsembleStore:
-    """Open a simulated ensemble, less its surroundings where that is asked for."""
+    """Open a simulated ensemble, without its surroundings if the settings say so."""
     background = background_path(settings)
     return EnsembleStore.open(path) if background is None else SubtractedStore(path, background)
 
@@ -87,11 +87,11 @@ def open_ensemble(settings: Settings, path: Path) -> EnsembleStore:
 def open_or_simulate(
     settings: Settings, *, workers: int | None = None, progress: Progress | None = None
 ) -> Echoes:
-    """Open or simulate the echoes, and take the surroundings off where that is asked for.
+    """Open or simulate the echoes, and subtract the surroundings if the settings say so.
 
     As :func:`simulate`, whose errors it raises.
     """
-    # What is wrong with the background is told before minutes of simulation.
+    # A fault of the background is reported before minutes of simulation.
     background = background_path(settings)
     if background is not None and settings.data.background != "scene":
         EnsembleStore.open(background)
@@ -216,6 +216,6 @@ def write_waveforms(
     told = {name: plain[name] for name in HEAD_SECTIONS}
     told["import"] = {"source": f"simulated, scene {settings.scene.name}" if settings.scene else ""}
     storage.commit_text(folder / OWN_SETTINGS, str(yaml.safe_dump(told, sort_keys=False)))
-    # The table comes last: without it the folder is none to import.
+    # The table comes last: without it the folder cannot be imported.
     storage.commit_text(folder / "poses.csv", pose_table(poses, names, split))
     return [folder / "poses.csv", folder / OWN_SETTINGS, folder / names[0]]

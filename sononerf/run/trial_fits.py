@@ -32,7 +32,7 @@ def least_error(error_at: Callable[[int], float]) -> tuple[float, float]:
 
     Args:
         error_at: Error at a whole number of steps from the stated value; infinite where there is no
-            surface. It is asked at -1, 0 and 1 and then on the side that is better.
+            surface. It is evaluated at -1, 0 and 1 and then on the side that is better.
 
     Returns:
         at, deviation: Steps. The deviation is infinite where the least error is at an end.
@@ -62,7 +62,7 @@ def fitted_error(settings: Settings, store: Path, run: Path, progress: Progress)
     A fit that is finished is not done again, and an interrupted one goes on.
 
     Args:
-        settings: Of a run, whose field, fit and reconstruction are taken.
+        settings: Settings of a run, whose field, fit and reconstruction are taken.
         store: What is fitted to.
         run: Folder of the fit.
         progress: Where to show it.

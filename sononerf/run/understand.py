@@ -56,10 +56,10 @@ class Understood:
         settings: Air, ears, call and analysis, complete.
         wanted: How it was read.
         cutter: Cuts and calibrates pings.
-        head: Of these settings.
+        head: Head of these settings.
         pings (P,): Which of the recording's pings are kept.
-        poses: Of all pings of the recording.
-        split ((P,) int8): Of the kept pings.
+        poses: Poses of all pings of the recording.
+        split ((P,) int8): Split of the kept pings.
         clipped: How many pings are rejected.
         channels: What each receiver's channel holds.
         lengths ((N,), s): Shortest and longest ping, from the emission on.

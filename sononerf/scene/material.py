@@ -38,7 +38,7 @@ class Material:
         lobe_width ((K,), rad, or None): Standard deviation of the lobe about the mirror direction;
             None for a smooth surface, which has none of its own: its shape alone decides what it
             sends where.
-        strength ((K,), 1): Of what is heard of a hit, relative to a rigid surface.
+        strength ((K,), 1): Strengths of what is heard of a hit, relative to a rigid surface.
         reflection ((K,), 1): What is kept of the pressure when the sound travels on after a bounce,
             0 to 1.
         curved_lobe_width ((K,), rad, or None): Lobe of strongly curved places; None where it is the

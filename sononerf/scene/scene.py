@@ -122,7 +122,7 @@ class Scene(Shown):
 
         Args:
             path: The file.
-            unit: Of its numbers. GLB and glTF are in metres; for others it must be given.
+            unit: Unit of its numbers. GLB and glTF are in metres; for others it must be given.
             options: Others of the scene ``mesh``: ``scale``, ``centre``, ``material``,
                 ``materials``; ``sononerf scenes mesh`` explains them.
 
@@ -223,7 +223,7 @@ def load_scene(
     """Build a scene by its name.
 
     Args:
-        name: Of an entry point of the group ``sononerf.scenes``.
+        name: Name of an entry point of the group ``sononerf.scenes``.
         options: Keyword arguments of its factory.
         source: Where the settings were read from, for messages.
 

@@ -17,7 +17,7 @@ class CallPreset:
     """A call.
 
     Attributes:
-        keys: Of the section ``call``, with their values.
+        keys: Keys of the section ``call``, with their values.
         about: One line: whose call, and when it is emitted.
         source: Publications, and which numbers are typical values only.
     """
@@ -101,7 +101,7 @@ def window_of(analysis: dict[str, Any]) -> int:
 
     It gives 64 at 1 MHz for up to 100 kHz.
     """
-    if not {"sampling_rate", "frequency_max"} <= analysis.keys():  # told as a fault of its own
+    if not {"sampling_rate", "frequency_max"} <= analysis.keys():  # another check reports it
         return 64
     periods = 6.4 * analysis["sampling_rate"] / analysis["frequency_max"]
     return int(2 ** max(round(math.log2(periods)), 3))

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Entry points: scenes, fields and renderers, ours and everyone's, through one door.
 
-A plugin is imported only when it is asked for by name, so a broken one hurts nobody else.
+A plugin is imported only when its name is used, so a broken one affects nothing else.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def registered(group: str) -> list[Plugin]:
 
 
 def load(group: str, name: str) -> Callable[..., Any]:
-    """Import the one plugin that is asked for.
+    """Import one plugin by its name.
 
     Raises:
         SettingsError: If the name is unknown, or two distributions claim it.

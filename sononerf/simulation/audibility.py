@@ -40,7 +40,7 @@ class Audibility:
     Attributes:
         wavenumber (rad/m): At the frequency that bundles must resolve.
         farthest (m): Longest detour that is heard.
-        radius (m): Of the scene.
+        radius (m): Radius of the scene.
         bounces: How often a ray may hit.
     """
 
@@ -84,10 +84,11 @@ def _judge(
 
     Args:
         audible, doubt (H,): Changed in place.
-        distance, rise, detour, stiffness (H,): Of :class:`Ways` to the listener.
-        tube ((H,), m²/sr): Of the footprint.
-        solid_angle ((H,) or (1,), sr): Of the cells.
-        k (rad/m), farthest (m): Of :class:`Audibility`.
+        distance, rise, detour, stiffness (H,): Distance, rise, detour and stiffness of
+            :class:`Ways` to the listener.
+        tube ((H,), m²/sr): Tube of the footprint.
+        solid_angle ((H,) or (1,), sr): Solid angle of the cells.
+        k (rad/m), farthest (m): As in :class:`Audibility`.
         explore (1/m): What a wide bundle may bring, over its level.
     """
     for i in range(len(distance)):
@@ -124,7 +125,7 @@ class Arrival:
         scene: What is ensonified.
 
     Attributes:
-        radius (m): Of a sphere around the scene.
+        radius (m): Radius of a sphere around the scene.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -167,7 +168,7 @@ def silence_before(echo: Floats, first: Floats, *, sampling_rate: float) -> Floa
     Args:
         echo (E, S): Pressure from the emission on.
         first ((E,), s): First possible arrival at each ear.
-        sampling_rate (Hz): Of the echo.
+        sampling_rate (Hz): Sampling rate of the echo.
 
     Returns:
         echo (E, S): Zero up to 26 us before the first arrival, whole from there on.

@@ -27,7 +27,8 @@ class Edges:
         away (K, 3): Unit vectors off the surface.
         inward (K, 3): Unit vectors from the edge along one of its faces.
         normal (K, 3): Outward normals of that face.
-        open_angle ((K,), rad): Of the air around the edge: pi for a plane, 2 pi where a sheet ends.
+        open_angle ((K,), rad): Angle of the air around the edge: pi for a plane, 2 pi where a
+            sheet ends.
         triangle (K,): That face.
     """
 
@@ -115,7 +116,7 @@ def wedge_directivity(
         inward, normal (N, 3): Unit vectors along one face and out of it, square to the edge.
         open_angle ((N,), rad): :math:`\theta_w`, of the air around the edge.
         to_source, to_receiver ((N, 3), m): From the point.
-        fade ((F,), 1/m): Of the mirror over the detour.
+        fade ((F,), 1/m): Decay over the detour from the mirror's path.
 
     Returns:
         directivity (N, F): Finite everywhere.
@@ -170,7 +171,7 @@ class Diffraction:
 
     Args:
         scene: Mesh and materials.
-        caster: Of the mesh.
+        caster: Caster of the mesh.
         reflections: The materials at the nodes.
     """
 
@@ -208,7 +209,7 @@ class Diffraction:
 
         Args:
             hearing: Head and air.
-            position ((3,), m): Of the head.
+            position ((3,), m): Place of the head.
             rotation (3, 3): Head to world.
             points: How many, spaced evenly over all that diffracts.
             offset: In [0, 1), shifts them.

@@ -74,7 +74,7 @@ class Engine:
         """Do at once what can be done for all poses at once.
 
         Args:
-            positions ((P, 3), m): Of the head, world frame.
+            positions ((P, 3), m): Places of the head, world frame.
             rotations (P, 3, 3): Head to world.
             progress: Takes how many parts are done and how many there are.
         """
@@ -83,9 +83,9 @@ class Engine:
         """Pressure at both ears for a call that is one sample of height 1.
 
         Args:
-            position ((3,), m): Of the head, world frame.
+            position ((3,), m): Place of the head, world frame.
             rotation (3, 3): Head to world.
-            seed: Of whatever is random.
+            seed: Seed of all random numbers.
 
         Returns:
             echo (E, S): From the emission to the end of the last analysis frame.

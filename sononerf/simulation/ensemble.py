@@ -68,7 +68,7 @@ def simulate(
 
     Args:
         scene: What is ensonified.
-        poses: Of the head, P of them.
+        poses: Poses of the head, P of them.
         head: What calls and hears; the default head where None.
         split (P,): What each pose is for: ``"train"``, ``"val"`` or ``"test"``, or 0, 1, 2. Where
             None, a twentieth of the poses validates and a tenth is held out (10 and 20 at most),
@@ -359,9 +359,9 @@ def spectrograms(
 
     Args:
         simulator: Scene and head.
-        positions ((P, 3), m): Of the head, world frame.
+        positions ((P, 3), m): Places of the head, world frame.
         rotations (P, 3, 3): Head to world.
-        seed: Of the rays.
+        seed: Seed of the rays.
         done: Called after each pose.
     """
     found: dict[int, Singles] = {}

@@ -77,7 +77,7 @@ class Ways:
 
     Attributes:
         distance ((H,), m): From the hits to the listener.
-        cosine (H,): Of the angle between the mirrored ray and the way to the listener.
+        cosine (H,): Cosines of the angle between the mirrored ray and the way to the listener.
         rise ((H,) float32): Cosine between that way and the outward normal.
         detour ((H,) float32, m): By how much the path is longer than the mirror's; zero or more.
         spread ((H,) float32, m): Standard deviation of the path's length over the cell.
@@ -104,10 +104,10 @@ def ways_to(
     """Return what :class:`Ways` is made of: distance, cosine, and the rest as (4, H).
 
     Args:
-        rows ((H, 19) float32): Of a footprint.
+        rows ((H, 19) float32): Rows of a footprint.
         points, flat, mirrored (H, 3): See :class:`Bounce`.
         listener ((3,), m): Where the hits are heard.
-        solid_angle ((H,) or (1,), sr): Of the cells, taken as squares.
+        solid_angle ((H,) or (1,), sr): Solid angle of the cells, taken as squares.
     """
     count = len(rows)
     distance, cosine = np.zeros(count), np.zeros(count)
@@ -215,7 +215,8 @@ def land(
         bundles ((H, 12) float32): How the rays move square to themselves over u and v (m/rad), and
             how their directions turn; three components each.
         incoming (H, 3): Directions of the rays.
-        normals, flat (H, 3): Of the smooth surface and of the triangle, unit vectors on any side.
+        normals, flat (H, 3): Normals of the smooth surface and of the triangle, unit vectors on
+            any side.
         gradients ((H, 4, 3) float32): As of :class:`Hits`.
 
     Returns:

@@ -41,7 +41,7 @@ class Sound:
         ears: How many, E.
 
     Attributes:
-        bins: Of each ear.
+        bins: Bins of each ear.
         heard: Whether any echo was added.
     """
 
@@ -67,8 +67,8 @@ class Hearing:
 
     Attributes:
         ears: Gains at the nodes of the synthesis.
-        absorption ((F,), dB/m): Of the air at the nodes.
-        speed_of_sound (m/s): Of the air.
+        absorption ((F,), dB/m): Absorption of the air at the nodes.
+        speed_of_sound (m/s): Speed of the air.
         image: The plane in which the emitter is mirrored, see :meth:`from_image`; None where the
             emitter itself calls.
     """
@@ -139,7 +139,7 @@ class Hearing:
             spread ((N,), m): Standard deviation of the whole path's length over what a point stands
                 for.
             level ((N, F) or (N, 1), m): The beam's gain is part of it.
-            position ((3,), m): Of the head.
+            position ((3,), m): Place of the head.
             rotation (3, 3): Head to world.
             shaded: A second sound, indices (M,) of points that are partly hidden, and what passes
                 of them (M, F). The second sound takes the imaginary part, to be heard a quarter

@@ -60,9 +60,9 @@ class Synthesis:
         basis ((K, F) complex128): The same times ``j f`` in Hz, for what surfaces send back.
         odd_hats ((K, F) complex128): As ``hats``, for strengths that are odd functions of
             frequency, as imaginary parts are.
-        sampling_rate (Hz): Of the echo.
+        sampling_rate (Hz): Sampling rate of the echo.
         samples: Length of the echo, S.
-        length: Of the transform, at the sampling rate.
+        length: Length of the transform, at the sampling rate.
     """
 
     nodes: Floats
@@ -219,10 +219,10 @@ def _lay(
     """Add echoes to bins in place; return the first and the last place, in bins.
 
     Args:
-        values (B, F): Of the bins.
+        values (B, F): Values of the bins.
         start (L + 1,): First row of each level.
         delay, spread, strength: See :func:`deposit`.
-        rate (Hz): Of the finest bins.
+        rate (Hz): Rate of the finest bins.
         last (bins): What comes no sooner is left out.
     """
     earliest, latest = math.inf, -math.inf
@@ -309,12 +309,12 @@ def _filter(
     """Add what the filters make of one level of bins to a spectrum (K / part,), in place.
 
     Args:
-        spectrum (K / part,): Of the echo.
+        spectrum (K / part,): Spectrum of the echo.
         half (size // 2 + 1, F): Spectra of the bins.
         basis (K, F): The filters.
         size: Number of bins.
         part: One over the part of the record that is filtered.
-        width: Of these bins, in finest ones.
+        width: Width of these bins, in finest ones.
     """
     finest = OVERSAMPLING * 2.0 * (len(spectrum) - 1)  # bins at the level of the finest
     for k in range(len(spectrum)):

@@ -65,9 +65,9 @@ class Outlines:
             ends ((K, 2, 3), m): The obstacle lies on the left as one goes from the first to the
                 second.
             away (K, 3): Unit vectors off the surface.
-            body (K,): Of each edge.
-            radius ((K,), m): Of the surface's curvature along the way from the place; zero where it
-                is sharp.
+            body (K,): Body of each edge.
+            radius ((K,), m): Radius of the surface's curvature along the way from the place; zero
+                where it is sharp.
         """
         return _outline(
             place, self._normals, self._height, self._pairs, self._may, self._rim, self._sharp,
@@ -97,12 +97,12 @@ def _outline(
 
     Args:
         place ((3,), m): From where they are seen.
-        normals (T, 3): Of the triangles.
-        height ((T,), m): Of their planes over the origin.
+        normals (T, 3): Normals of the triangles.
+        height ((T,), m): Height of their planes over the origin.
         pairs (K, 2): Triangles at each edge; at a rim, twice the same.
         may, rims, sharp (K,): Whether an edge may be an outline, is a rim, has no radius.
         edges ((K, 2, 3), m): Ends.
-        middles ((T, 3), m): Of the triangles.
+        middles ((T, 3), m): Middles of the triangles.
         second, third ((T, 3), 1/m): Gradients of the weights of their corners.
         bend (T, 2, 3): By how much the smooth normals there differ from that at the first corner.
         bodies (T,): Which body they belong to.

@@ -38,7 +38,7 @@ class Bounce:
         flat (H, 3): Normals of the triangles, on the side of the ray.
         mirrored (H, 3): Where a mirror would send them.
         length ((H,), m): From the emitter along the path.
-        footprint: Of the bundles.
+        footprint: Footprint of the bundles.
         triangles (H, n): Which were hit, this one last.
         hidden: Whether the rays went through an obstacle as if it were not there.
     """
@@ -119,7 +119,7 @@ def aim(emitter: Floats, centre: Floats, radius: float) -> tuple[Floats, float]:
 
     Args:
         emitter, centre ((3,), m): The point, and the ball's middle.
-        radius (m): Of the ball.
+        radius (m): Radius of the ball.
 
     Returns:
         axis ((3,), m): Towards the middle, not normalised.
@@ -216,7 +216,7 @@ def echo_paths(
         judge: Takes hits; returns which of them (H,) can be heard at all, and how much of each (H,)
             may be wrong for the size of its cell, in any unit, zero where it is small enough.
         beyond: See :func:`trace`.
-        index (N,): Of the first rays, those that may hit anything; all where not given.
+        index (N,): Index of the first rays, those that may hit anything; all where not given.
 
     Yields:
         bounce: Audible hits of cells that are left as they are.

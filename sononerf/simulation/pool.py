@@ -29,8 +29,8 @@ class TaskError(SonoNerfError):
     """A task failed in a worker.
 
     Attributes:
-        number: Of the task.
-        exit_code: Of the error that the worker raised.
+        number: Number of the task.
+        exit_code: Exit code of the error that the worker raised.
     """
 
     def __init__(self, number: int, text: str, exit_code: int) -> None:
@@ -106,7 +106,7 @@ def computed(
     If a worker is killed, its tasks are sent to another one.
 
     Args:
-        function: Of a module; workers import it.
+        function: Function of a module; workers import it.
         thing: What all tasks need; each worker is sent it once, and forgets it afterwards.
         tasks: What else the function takes, by a number; sent one by one.
         workers: How many processes.

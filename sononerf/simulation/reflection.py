@@ -33,10 +33,10 @@ class Reflection:
     """A material at the frequencies of a simulation.
 
     Attributes:
-        fade ((F,), 1/m): Of a smooth surface, over the detour from the mirror's path.
+        fade ((F,), 1/m): Decay of a smooth surface over the detour from the mirror's path.
         lobe_width ((F,), rad): Standard deviation of the lobe; of a smooth surface, not used.
-        strength ((F,), 1): Of what is heard of a hit.
-        kept ((F,), 1): Of the pressure after a bounce.
+        strength ((F,), 1): Strengths of what is heard of a hit.
+        kept ((F,), 1): Pressure after a bounce, over that before it.
         curved_lobe_width, curved_strength (F,): The same where the surface is strongly curved.
         diffraction ((F,), 1): Strength of edges and strongly curved places as sources of their own.
         material: What these are the values of.
@@ -70,7 +70,8 @@ class Reflection:
         :func:`unfaded` makes good what that takes.
 
         Args:
-            cosine (N,): Of the angle between the mirror direction and that towards the listener.
+            cosine (N,): Cosines of the angle between the mirror direction and that towards the
+                listener.
             detour ((N,), m): From :meth:`Bounce.detour`.
             curvature ((N,), 1/m): Total curvature at the hits.
 
@@ -134,7 +135,7 @@ def unfaded(frequency: Floats, *, speed_of_sound: float) -> tuple[Floats, Comple
 
     Args:
         frequency ((F,), Hz): Zero or more.
-        speed_of_sound (m/s): Of the air.
+        speed_of_sound (m/s): Speed of the air.
 
     Returns:
         fade ((F,), 1/m): :math:`\epsilon k`, over the detour.
@@ -154,7 +155,7 @@ def coarse_gain(bend: Singles) -> Singles:
     :math:`b / 12`, and the bend's as a loss of :math:`e^{-b^2 / 720}`: variances over a square.
 
     Args:
-        bend ((N, F) float32, rad): Of a cell.
+        bend ((N, F) float32, rad): Bend of a cell.
 
     Returns:
         gain ((N, F) float32): One where cells are fine; no more than that of 10 rad, beyond which
@@ -180,7 +181,7 @@ def leave(directions: Floats, flat: Floats, points: Floats, lift: float) -> tupl
         lift (m): How far above them the rays start.
 
     Returns:
-        origins ((N, 3), m): Of the rays.
+        origins ((N, 3), m): Origins of the rays.
         directions (N, 3): Unit vectors.
     """
     origins, onward = np.zeros((len(points), 3)), np.zeros((len(points), 3))
@@ -205,7 +206,8 @@ def lobe_exponent(cosine: Floats, lobe_width: Floats) -> Floats:
     """Logarithm of the lobe, ``-theta**2 / (2 w**2)``.
 
     Args:
-        cosine (N,): Of the angle theta between the mirror direction and that towards the listener.
+        cosine (N,): Cosines of the angle theta between the mirror direction and that towards the
+            listener.
         lobe_width ((F,) or (N, F), rad): Standard deviations.
 
     Returns:

@@ -70,12 +70,12 @@ class Shadow:
     What passes is the same over a cell of the surface, and solved for where it is asked for.
 
     Args:
-        outlines: Of the scene.
-        caster: Of the scene.
+        outlines: Outlines of the scene.
+        caster: Caster of the scene.
         place ((3,), m): Emitter or ear.
         wavenumber ((F,), 1/m): At the nodes.
-        speed_of_sound (m/s): Of the air.
-        size (m): Of the scene.
+        speed_of_sound (m/s): Speed of the air.
+        size (m): Size of the scene.
 
     References:
         .. [1] A. Rubinowicz, "Thomas Young and the theory of diffraction", Nature 180, 1957.
@@ -269,10 +269,10 @@ def _lay(
         bodies (N,): On which body the points lie.
         start (N + 1,): Where the pieces of each point begin among those reached.
         reached (R,): Pieces that may send something there.
-        middles, alongs, behinds, owners, curves: Of the pieces; see :class:`_Pieces`.
-        bins: Their number.
-        step (m): Their width.
-        cell, longest, waist: Of the shadow.
+        middles, alongs, behinds, owners, curves: Attributes of the pieces; see :class:`_Pieces`.
+        bins: Number of bins.
+        step (m): Width of a bin.
+        cell, longest, waist: Attributes of the shadow.
 
     Returns:
         laid (4, U, bins): The angle swept, and weights of the powers of Pekeris' function.

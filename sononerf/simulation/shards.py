@@ -49,7 +49,7 @@ def take_shards(store: EnsembleStore, path: Path) -> None:
     """Take what is missing of an ensemble from its shards.
 
     Args:
-        store: Of the whole ensemble, opened for writing.
+        store: Store of the whole ensemble, opened for writing.
         path: Its folder; those of the shards are beside it.
 
     Raises:

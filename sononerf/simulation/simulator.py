@@ -142,7 +142,7 @@ class Simulator:
         """Let the engine do its work for all poses at once, and show how far it is.
 
         Args:
-            positions ((P, 3), m): Of the head, world frame.
+            positions ((P, 3), m): Places of the head, world frame.
             rotations (P, 3, 3): Head to world.
             progress: Where to show it.
         """

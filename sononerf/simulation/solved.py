@@ -170,7 +170,7 @@ class Solved(Engine):
         """Scattered pressure at the ears at one frequency.
 
         Args:
-            wavenumber (1/m): Of sound in air; its imaginary part is not positive.
+            wavenumber (1/m): Wavenumber of sound in air; its imaginary part is not positive.
             poses: Where emitters and ears are, and their gains.
 
         Returns:
@@ -190,7 +190,7 @@ class Solved(Engine):
         Poses that are no finite numbers are left out; :meth:`echo` refuses them.
 
         Args:
-            positions ((P, 3), m): Of the head, world frame.
+            positions ((P, 3), m): Places of the head, world frame.
             rotations (P, 3, 3): Head to world.
             progress: Takes how many frequencies are done and how many there are.
         """

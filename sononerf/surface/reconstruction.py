@@ -126,7 +126,8 @@ def refine(
         surface: The start.
         echoes: What was measured; the surface is fitted to the training poses and compared on the
             validation poses.
-        options: Of the simulator that corrects: keys of the section ``simulation`` of the settings.
+        options: Options of the simulator that corrects: keys of the section ``simulation`` of the
+            settings.
         seed: Order of the poses.
         accelerator: What to compute on: ``auto``, ``cpu`` or ``gpu``.
         state: Where an interrupted refinement of the same surface and echoes goes on, see

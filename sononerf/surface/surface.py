@@ -42,7 +42,7 @@ class Surface(Shown):
         mesh: World frame, m.
         volume: The field's energy, or its loudness for an iso-surface; None without a field.
         method: How the surface was found, or the start that was refined.
-        level: Of an iso-surface, in the unit of the volume; None for other methods.
+        level: Level of an iso-surface, in the unit of the volume; None for other methods.
         openness: What kind of surface it is; None for an iso-surface and for one of your own.
         confidence ((V,) int32 or None): How many poses heard the surface around each vertex.
         refined: True where the refined mesh explains the validation poses better than its start.

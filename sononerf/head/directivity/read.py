@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A directivity from a file of any known format, told apart by its content; tables of text."""
+"""Reading of a directivity from a file, whose format its content shows; tables of text."""
 
 from __future__ import annotations
 

@@ -150,9 +150,10 @@ class Directivity:
         directions (M, 3): Unit vectors from the head to where sound comes from or goes to, in any
             order.
         frequency ((F,), Hz): Ascending.
-        gains (E, M, F): Of each receiver, zero or more.
-        beam ((M, F) or None): Of the emitter; None where the file has none.
-        places ((E, 3) or None, m): Of the receivers; None where the file does not state them.
+        gains (E, M, F): Gains of each receiver, zero or more.
+        beam ((M, F) or None): Beam of the emitter; None where the file has none.
+        places ((E, 3) or None, m): Places of the receivers; None where the file does not state
+            them.
 
     Raises:
         InputError: If shapes do not fit, or a value is not allowed.

@@ -203,7 +203,7 @@ def write_sofa(path: Path, directivity: Directivity, *, title: str = "directivit
     Args:
         path: The file.
         directivity: What is written.
-        title: Of the file.
+        title: Title of the file.
     """
     gains, places = directivity.gains, directivity.places
     names = [f"receiver {number}" for number in range(len(gains))]

@@ -19,7 +19,7 @@ def curves_picture(
     Args:
         curves: Steps and errors, dB, by their names.
         floors: Errors, dB, that no prediction can fall below, by their names.
-        kind: Of the file.
+        kind: Kind of the file.
     """
     with figure(6.4, 3.4, 130) as drawn:
         axes = drawn.subplots()

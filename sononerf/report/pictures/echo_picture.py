@@ -36,7 +36,7 @@ HIT_MAP = "plasma"
 # What is fainter than the loudest hit by more than this is not drawn.
 HIT_RANGE_DB = 40.0
 EARS = ((46, 125, 50), (21, 101, 192))  # left, right
-MOST_ROWS = 3  # receivers; of more of them, so many are drawn, evenly chosen
+MOST_ROWS = 3  # number of receivers, at most, that are drawn, evenly chosen
 SIZE = (760, 800)
 # Of the head and of its look, as shares of the picture's height.
 HEAD, LOOK = 0.022, 0.25
@@ -68,11 +68,11 @@ def echo_png(
         points ((N, 3), m): Where sound was reflected towards the ears, world frame; none is
             allowed.
         level_db ((N,), dB): How loud each is heard; drawn below the loudest.
-        position ((3,), m): Of the head, world frame.
+        position ((3,), m): Place of the head, world frame.
         rotation (3, 3): Head to world.
         echo (E, S): Pressure at the receivers from the emission on, over that of the call at 1 m.
             Two of them are the left and the right ear.
-        sampling_rate (Hz): Of the echo.
+        sampling_rate (Hz): Sampling rate of the echo.
         spectrogram_db ((E, R, F), dB): 0 dB is silence.
         range_m ((R,), m): Range axis, ascending; drawn only around what sounds.
         frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
@@ -199,7 +199,7 @@ def hits_image(
         points ((N, 3), m): Hits, world frame; those behind something are hidden, and the faintest
             left out.
         relative_db ((N,), dB): Their levels below the loudest, zero at most.
-        position ((3,), m): Of the head.
+        position ((3,), m): Place of the head.
         rotation (3, 3): Head to world.
         receivers: How many hear; of two, the head has ears.
         size (int, int): Width and height in pixels.

@@ -46,7 +46,7 @@ def figure(
     *,
     layout: Literal["constrained", "compressed"] | None = "constrained",
 ) -> Iterator[Any]:
-    """Open a figure of so many inches in our style; draw in the block, then take its pixels.
+    """Open a figure of this size (inches) in our style; draw in the block, then take its pixels.
 
     To find a layout takes twice as long as to draw.
     """

@@ -161,7 +161,8 @@ def sides_png(
     """Draw meshes from four sides through the same cameras, one mesh per row.
 
     Args:
-        rows: Of each row a title, the mesh, its colours as of :func:`mesh_png`, and what they mean.
+        rows: For each row a title, the mesh, its colours as of :func:`mesh_png`, and what they
+            mean.
         size (int, int): Width and height of each view in pixels.
     """
     for title, mesh, *_ in rows:

@@ -74,7 +74,7 @@ def mip_picture(
         labels (str, str): Names of the two axes.
         title: One line above.
         scale: Decibels below the greatest value (10 log10, 40 dB shown), or linear from zero.
-        kind: Of the file.
+        kind: Kind of the file.
     """
     values = _scaled(projection, scale)
     low, high = _limits(values, scale)

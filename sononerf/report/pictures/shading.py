@@ -111,11 +111,11 @@ def draw_mesh(
     Args:
         pixels (H, W, 3): Colours in 0 to 1.
         mesh: Metres.
-        camera: Of the same width and height as the pixels.
+        camera: Camera of the same width and height as the pixels.
         colour ((3,) or (V, 3)): Colour in 0 to 1, one for all or one per vertex.
 
     Returns:
-        nearness ((H, W), m): Of what was drawn; minus infinity where nothing was.
+        nearness ((H, W), m): Nearness of what was drawn; minus infinity where nothing was.
     """
     height, width = pixels.shape[:2]
     local = (np.asarray(mesh.vertices) - camera.centre) @ camera.axes.T

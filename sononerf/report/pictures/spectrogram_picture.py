@@ -24,7 +24,7 @@ from sononerf.report.pictures.figure import (
 MARGIN = 0.02
 """Range that is shown before the first and after the last active cell, m."""
 LEVEL_MAP, DIFFERENCE_MAP = "magma", "RdBu_r"
-MOST_ROWS = 8  # receivers; of more of them, so many are drawn, evenly chosen
+MOST_ROWS = 8  # number of receivers, at most, that are drawn, evenly chosen
 # Inches: what labels need on each side of the panels, between them, and for a colour bar.
 LEFT, TOP, BOTTOM, GAP = 0.76, 0.48, 0.46, 0.13
 BAR, BAR_GAP, BAR_WIDTH = 0.82, 0.08, 0.19
@@ -49,7 +49,7 @@ def spectrogram_picture(
         range_m ((R,), m): Range axis, ascending; drawn only around what sounds.
         frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
         title: One line above.
-        kind: Of the file.
+        kind: Kind of the file.
     """
     given = (measured_db, predicted_db, range_m, frequency_hz)
     with _drawn(*given, title, 130) as drawn:
@@ -307,10 +307,10 @@ def pings_png(
         waveforms (sequence of (E, S) float): From the emission on.
         spectrograms (sequence of (E, R, F) float): Linear magnitude.
         labels: Names of these pings.
-        sampling_rate (Hz): Of the waveforms.
+        sampling_rate (Hz): Sampling rate of the waveforms.
         range_m ((R,), m): Ascending.
         frequency_hz ((F,), Hz): Ascending.
-        poses: Of all pings; the first ones are marked.
+        poses: Poses of all pings; the first ones are marked.
     """
     rows = len(labels)
     with figure(10.5, 3.4 + 2.2 * rows, 100, layout="constrained") as drawn:

@@ -173,7 +173,7 @@ class _Edges:
     Attributes:
         ends (Q, 2): Vertices.
         sides (T, 3): Edge opposite to each corner.
-        length ((Q,), m): Of each.
+        length ((Q,), m): Length of each.
         pair (Q, 2): Its two triangles; -1 where there are not just two.
     """
 

@@ -51,7 +51,7 @@ def potentials(corners: Floats, normals: Floats, slopes: Floats, points: Floats)
     :math:`1/R`, :math:`R`, :math:`z/R^3` and :math:`z/R`. In the plane itself the third is 0.
 
     Args:
-        corners ((N, 3, 3), m): Of the triangles.
+        corners ((N, 3, 3), m): Corners of the triangles.
         normals (N, 3): Unit vectors.
         slopes ((N, 3, 3), 1/m): Gradients of the corners' functions.
         points ((N, K, 3), m): On none of the edges.
@@ -200,7 +200,7 @@ class Panels:
     Attributes:
         vertices ((V, 3), m): Unknowns are the pressures here.
         faces (T, 3): Anticlockwise as seen from outside.
-        area ((T,), m2): Of the triangles.
+        area ((T,), m2): Area of the triangles.
         normals (T, 3): Outward unit vectors.
         slopes ((T, 3, 3), 1/m): Gradients of the three corners' linear functions.
         ends (Q, 2): Vertices of the edges.

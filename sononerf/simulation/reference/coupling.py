@@ -28,7 +28,7 @@ class Ball:
 
     Attributes:
         centre ((3,), m): World frame.
-        radius (m): Of its surface.
+        radius (m): Radius of its surface.
     """
 
     centre: Floats
@@ -42,7 +42,7 @@ class Link:
     Attributes:
         one, two: Numbers of the spheres; the axis points from the first to the second.
         length (m): Between the centres.
-        polar, azimuth (rad): Of the axis.
+        polar, azimuth (rad): Angles of the axis.
     """
 
     one: int
@@ -61,7 +61,7 @@ class Coupling:
     Args:
         balls: The spheres.
         degrees: Highest degree of each.
-        wavenumber (1/m): Of sound in air.
+        wavenumber (1/m): Wavenumber of sound in air.
         links: The axes between them.
         turns (list of list of (2 n + 1, 2 n + 1) float64): Wigner's matrices of each link by
             degree.

@@ -26,9 +26,9 @@ class Elements:
     Attributes:
         points ((N, 3), m): Their middles.
         corners ((N, 3, 3), m): Seen from the middles.
-        triangle (N,): Of the mesh.
-        area ((N,), m2): Of each.
-        normals (N, 3): Of the smooth surface, unit vectors.
+        triangle (N,): Triangle of the mesh.
+        area ((N,), m2): Area of each.
+        normals (N, 3): Normals of the smooth surface, unit vectors.
         heard (N, E): Whether emitter and ear see them.
     """
 

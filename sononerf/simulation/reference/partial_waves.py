@@ -23,7 +23,7 @@ def log_outgoing(degree: int, argument: Complexes) -> tuple[Complexes, Complexes
         argument ((X,) complex128): Not zero.
 
     Returns:
-        logarithm ((N + 1, X) complex128): Of the function, up to multiples of 2 pi j.
+        logarithm ((N + 1, X) complex128): Logarithm of the function, up to multiples of 2 pi j.
         slope ((N + 1, X) complex128): Derivative over function.
     """
     logarithm = np.zeros((degree + 1, len(argument)), dtype=np.complex128)
@@ -43,7 +43,7 @@ def legendre(degree: int, cosine: Floats) -> Floats:
 
     Args:
         degree: Highest, N.
-        cosine (X,): Of the polar angle.
+        cosine (X,): Cosines of the polar angle.
 
     Returns:
         values (N + 1, N + 1, X): By order m, then by degree n; zero where n < m. Times exp(j m phi)
@@ -92,10 +92,11 @@ def wigner(degree: int, angles: list[float]) -> list[Floats]:
 
     Args:
         degree: n.
-        angles (list of float, rad): Of the turns.
+        angles (list of float, rad): Angles of the turns.
 
     Returns:
-        matrices (list of (2 n + 1, 2 n + 1) float64): Of exp(-j angle J_y), orders ascending.
+        matrices (list of (2 n + 1, 2 n + 1) float64): Matrices of exp(-j angle J_y), orders
+            ascending.
     """
     m = np.arange(-degree, degree + 1)
     off = 0.5 * np.sqrt(degree * (degree + 1) - m[:-1] * (m[:-1] + 1.0))

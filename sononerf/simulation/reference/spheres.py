@@ -111,7 +111,7 @@ class Spheres(Solved):
         """Highest degree of each sphere's partial waves.
 
         Args:
-            wavenumber (1/m): Of sound in air.
+            wavenumber (1/m): Wavenumber of sound in air.
             nearest: Distance of the nearest emitter or ear from a sphere's centre, over its radius.
         """
         found = []
@@ -156,7 +156,7 @@ class Spheres(Solved):
         """Scattered pressure at points, of an emitter that sends alike in all directions.
 
         Args:
-            wavenumber (1/m): Of sound in air; its imaginary part is not positive.
+            wavenumber (1/m): Wavenumber of sound in air; its imaginary part is not positive.
             emitter ((3,), m): World frame; its pressure is 1 at 1 m.
             points ((X, 3), m): World frame, outside the spheres or on them.
 

@@ -38,7 +38,7 @@ class Comparison:
         echoes: What was measured.
         optics: The head.
         onsets: Onsets of the training poses.
-        seed: Of the rays.
+        seed: Seed of the rays.
     """
 
     def __init__(self, echoes: Echoes, optics: Optics, onsets: OnsetRanges, seed: int) -> None:

@@ -37,10 +37,10 @@ class Correction:
     Args:
         optics: Renders.
         mesh: The surface, m.
-        simulator: Of the same surface.
+        simulator: Simulator of the same surface.
         echoes: Where the poses are.
-        numbers (N,): Of the poses.
-        seed: Of the simulated rays.
+        numbers (N,): Numbers of the poses.
+        seed: Seed of the simulated rays.
     """
 
     def __init__(

@@ -58,11 +58,11 @@ class Descent:
         smoothing (m): Length over which steps are smoothed.
         rate: Length of the first steps over the length of smoothing: how much the surface may tilt.
         later: To be added as power.
-        correction: Of the start, by the simulator.
+        correction: Correction of the start, by the simulator.
         onsets: Where the surface must begin.
         sheet: Whether it is a sheet, whose sides are kept apart.
-        band: Of a :class:`Stage`.
-        seed: Of poses and rays.
+        band: As in :class:`Stage`.
+        seed: Seed of poses and rays.
     """
 
     def __init__(
@@ -111,8 +111,8 @@ class Descent:
         """Do one step.
 
         Args:
-            number: Of the step, counted from the first of all stages: it decides the poses.
-            part: Of the stage that is behind us, 0 to 1.
+            number: Number of the step, counted from the first of all stages: it decides the poses.
+            part: Completed fraction of the stage, 0 to 1.
 
         Returns:
             mismatch (dB): Mean over the poses, before the step.
@@ -281,10 +281,10 @@ class Stage:
 
     Attributes:
         smoothing: Length over which steps are smoothed.
-        edge: Of the triangles.
-        blur: Of the signed distance before the stage.
+        edge: Edge of the triangles.
+        blur: Blur of the signed distance before the stage.
         rate: Length of the first steps, smoothing lengths.
-        steps: Of descent.
+        steps: Steps of descent.
         band: Over how much of the frequencies power is averaged before it is compared, 0 to 1. A
             surface that is off by more than a fraction of a wavelength interferes in other ways
             than the true one; averaged, it shows how much comes from which range.

@@ -31,13 +31,13 @@ class FilterBank:
 
     Args:
         head: Its call and analysis.
-        nodes ((N,), Hz): Of the synthesis: odd multiples of half their spacing.
+        nodes ((N,), Hz): Nodes of the synthesis: odd multiples of half their spacing.
         soft (Hz): Frequency below which the fade of smooth surfaces falls no further.
 
     Attributes:
         kept_nodes (N',): Which of the nodes matter for the analysed band.
         finer: Time bins per sample.
-        spacing (Hz): Of the nodes.
+        spacing (Hz): Spacing of the nodes.
     """
 
     def __init__(self, head: Head, nodes: Floats, soft: float) -> None:
@@ -65,7 +65,7 @@ class FilterBank:
         """Power of echoes in each frame and row.
 
         Args:
-            strength ((Q,) float32): Of the echoes.
+            strength ((Q,) float32): Strengths of the echoes.
             at ((Q,) float32): When they come, in samples from the start of the first frame.
             weight ((Q, N') float32): At the kept nodes.
             receiver (Q,): Who hears them.

@@ -21,10 +21,10 @@ class LaterBounces:
     """Later bounces off one surface.
 
     Args:
-        optics: What hears.
+        optics: Head, filters and wavelengths.
         mesh: The surface, m.
-        echoes: Of whose poses.
-        seed: Of the rays.
+        echoes: Their poses hear the bounces.
+        seed: Seed of the rays.
     """
 
     def __init__(self, optics: Optics, mesh: trimesh.Trimesh, echoes: Echoes, *, seed: int) -> None:

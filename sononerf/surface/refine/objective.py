@@ -81,7 +81,7 @@ def measured(echoes: Echoes, numbers: list[int], heard: Heard) -> tuple[Tensor, 
     Returns:
         magnitude ((P, E, W, F) float32): Zero beyond the axis.
         inside (P, 1, W, 1): Rows on the axis.
-        loudest ((P,) float32): Of each whole pose.
+        loudest ((P,) float32): Loudest level of each whole pose.
     """
     wholes = [echoes.magnitude(number) for number in numbers]
     width, count = heard.power.shape[2], wholes[0].shape[1]
@@ -113,9 +113,9 @@ def mismatch(
         later ((P, E, W, F) float32): Power of the later bounces.
         found: From :func:`measured`.
         level: Gains and weights.
-        corrected (simulated, rendered, both (P, E, W, F) float32): Of a surface nearby: their
-            difference in decibels is added to what is rendered. Cells count less, the larger it is;
-            the frequencies' weights are not needed then.
+        corrected (simulated, rendered, both (P, E, W, F) float32): Echoes of a surface nearby:
+            their difference in decibels is added to what is rendered. Cells count less, the larger
+            it is; the frequencies' weights are not needed then.
         learn: Whether gains and errors are brought up to date.
         band: Power is averaged over so much of the frequencies first, 0 to 1.
     """
@@ -222,7 +222,7 @@ class OnsetRanges:
     Args:
         hull: Onsets; those of weight zero take no part.
         resolution (m): Range resolution of the analysis.
-        seed: Of the order in which poses are drawn.
+        seed: Seed of the order in which poses are drawn.
     """
 
     def __init__(self, hull: EchoHull, resolution: float, seed: int) -> None:

@@ -63,7 +63,7 @@ class Heads:
 
     Attributes:
         emitters ((W P, 3), m): Their places.
-        ears ((W P, E, 3), m): Of the ears.
+        ears ((W P, E, 3), m): Places of the ears.
         emitting, hearing (W P, 3, 3): Head to world, of emitter and ears; those of images mirror.
         poses: P.
     """
@@ -184,7 +184,7 @@ class Optics(nn.Module):
 
         Args:
             points, area (..., 3): Places (m) and vector areas (m²).
-            bending ((..., 6), 1/m): Of the smooth surface.
+            bending ((..., 6), 1/m): Bending of the smooth surface.
             emitters, ears ((..., 3), m): Where the sound comes from, where it is heard.
 
         Returns:
@@ -266,7 +266,7 @@ class Optics(nn.Module):
             points, area, bending ((V, 3), (V, 3), (V, 6) float32): The surface.
             pose, vertex (Q,): Which pieces which way of a pose hears.
             visible ((Q, E) float32): How far emitter and ear see them, 0 to 1.
-            heads: Of the poses, float32.
+            heads: Heads of the poses, float32.
         """
         emitters, ears = heads.emitters, heads.ears
         place, normal, bent = points[vertex], area[vertex], bending[vertex]

@@ -99,7 +99,7 @@ class Body:
         """Return magnitudes (P, E, R, F) on the whole axis.
 
         Args:
-            positions, rotations ((P, 3), (P, 3, 3)): Of the heads, m.
+            positions, rotations ((P, 3), (P, 3, 3)): Places and rotations of the heads, m.
             stretch, late ((P,), (P,)): Factor on paths, and m added to them.
         """
         optics = self.optics

@@ -130,7 +130,7 @@ class Refinement:
             faint, and a gain would hide that. Otherwise gains are learned from the first stage on.
         optics: The head; its device is that of the computation.
         simulate: Makes the simulator of a surface, for the stages that are corrected by it.
-        seed: Of the order of poses and of traced rays.
+        seed: Seed of the order of poses and of traced rays.
         stages: From coarse to fine; ``STAGES`` where None.
 
     Attributes:

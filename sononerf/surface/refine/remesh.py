@@ -109,7 +109,7 @@ def finer(
     Returns:
         finer: The mesh itself where its edges' middles lie deep by less than :data:`CHORD` on
             average.
-        values (V',): Of its vertices.
+        values (V',): Values of its vertices.
 
     References:
         .. [1] A. Vlachos et al., "Curved PN triangles", I3D 2001.
@@ -144,7 +144,7 @@ def signed_distance(
 
     Args:
         mesh: Closed bodies, which may overlap; cavities are filled.
-        spacing (m): Of the lattice.
+        spacing (m): Spacing of the lattice.
         margin: Voxels around the surface.
 
     Returns:

@@ -50,7 +50,7 @@ class Tracer:
         optics: Head, air, call and analysis.
         mesh: The surface, m.
         rays: Per pose.
-        seed: Of the pattern of rays.
+        seed: Seed of the pattern of rays.
     """
 
     def __init__(self, optics: Optics, mesh: trimesh.Trimesh, *, rays: int, seed: int) -> None:

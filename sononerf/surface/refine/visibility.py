@@ -22,7 +22,7 @@ def seen(sight: Occlusion, points: Floats, target: Floats, *, free: float) -> Bo
     """Which points (N, 3) on the surface are seen from targets (N, 3), m.
 
     Args:
-        sight: Of the surface.
+        sight: Search structure of the surface.
         points, target ((N, 3), m): World frame.
         free (m): So much of the way, from the point on, cannot be blocked.
     """
@@ -37,7 +37,7 @@ def sight_of(optics: Optics, vertices: Floats, faces: Ints) -> Occlusion:
 
     Args:
         optics: Knows the support.
-        vertices ((V, 3), m): Of the surface.
+        vertices ((V, 3), m): Vertices of the surface.
         faces (T, 3): Its triangles.
     """
     if optics.plane is None:
@@ -60,11 +60,12 @@ def listen(
 
     Args:
         optics: The head.
-        operators: Of the surface.
+        operators: Operators on the surface.
         vertices, area, bending ((V, 3), (V, 3), (V, 6) float64): Places, vector areas and
             curvature.
-        sight: Of the same surface, or of one a little earlier; see :func:`sight_of`.
-        positions, rotations ((P, 3), (P, 3, 3) float64): Of the heads.
+        sight: Search structure of the same surface, or of one a little earlier; see
+            :func:`sight_of`.
+        positions, rotations ((P, 3), (P, 3, 3) float64): Places and rotations of the heads.
 
     Returns:
         pieces: What is heard.
@@ -111,7 +112,7 @@ def _visible(
     emitters: Tensor,
     ears: Tensor,
 ) -> Tensor:
-    """Visibility of candidates from emitter and each ear, (Q, E) float32, softened by neighbours."""
+    """Visibility of candidates from emitter and ears, (Q, E) float32, softened by neighbours."""
     free = FREE * optics.wavelength
     points = vertices[vertex].detach().cpu().numpy()
     of = pose.cpu().numpy()

@@ -158,7 +158,7 @@ def signed_distance(
     """Return the signed distance, positive outside.
 
     Args:
-        weight (X, Y, Z): Of the targets, from 0 to 1.
+        weight (X, Y, Z): Weight of the targets, from 0 to 1.
         target ((X, Y, Z), voxels): Signed distance by the evidence.
         bound ((X, Y, Z), voxels): What the distance must not lie below.
         pull: Weight of the distance to the bound.
@@ -258,7 +258,7 @@ def reliability(evidence: Evidence, hull: EchoHull, resolution: float) -> Floats
     makes, are heard elsewhere from every pose.
 
     Args:
-        evidence: Of all poses.
+        evidence: Evidence of all poses.
         hull: The onsets of the same poses.
         resolution (m): Range resolution.
     """
@@ -317,7 +317,7 @@ def poses_that_heard(
 
     Args:
         mesh: Normals outward, m.
-        evidence: Of all poses.
+        evidence: Evidence of all poses.
         resolution (m): Range resolution.
 
     Returns:

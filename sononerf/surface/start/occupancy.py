@@ -236,7 +236,7 @@ def gather_evidence(
         places ((N, 3), m): Where it is not silent.
         hull: Free space in front of the onsets.
         lower, upper ((3,), m): The region.
-        spacing (m): Of the voxels.
+        spacing (m): Spacing of the voxels.
         resolution (m): Range resolution of the analysis.
 
     Raises:

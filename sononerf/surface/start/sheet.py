@@ -57,7 +57,7 @@ class _Frame:
     Attributes:
         centre, axes ((3,), (3, 3)): Origin, m, and the directions along, across and above as
             columns.
-        lower (2,): Of the grid, m.
+        lower (2,): Lower corner of the grid, m.
         step: m.
         depth (U, V, Z): Greatest depth below the onsets, m, positive inside.
         heights (Z,): m.
