@@ -14,6 +14,7 @@ from typing import Any, get_args
 import typer
 from docutils import nodes
 from docutils.utils.math import latex2mathml
+from pydantic.fields import FieldInfo
 from typer.cli import get_docs_for_click
 
 from sononerf import __version__
@@ -71,17 +72,22 @@ def _section(name: str, model: type[Section]) -> str:
     for key, field in model.model_fields.items():
         key = field.alias or key
         note = re.search(rf"^    {key}: .*?#\s*(.*)$", source, re.MULTILINE)
-        default = "required" if field.is_required() else
-        f"`{_plain(field.get_default(call_default_factory=True))}`" allowed = " or
-        ".join(dict.fromkeys(_allowed(described.get(key, {})))) lines.append(f"| `{key}` |
-        {default} | {allowed} | {note[1] if note else ''} |")
+        default = _plain(field)
+        allowed = " or ".join(dict.fromkeys(_allowed(described.get(key, {}))))
+        lines.append(f"| `{key}` | {default} | {allowed} | {note[1] if note else ''} |")
     return "\n".join([*lines, ""])
 
 
-def _plain(value: object) -> str:
+def _plain(field: FieldInfo) -> str:
+    """Return the default of a key as Markdown."""
+    if field.is_required():
+        return "required"
+    if field.default_factory_takes_validated_data:
+        return "follows from other keys"
+    value = field.get_default(call_default_factory=True)
     if isinstance(value, Section):
-        return "its own section"
-    return "not set" if value is None else str(value).replace("|", "\\|")
+        return "see its own section"
+    return "not set" if value is None else f"`{value}`".replace("|", "\\|")
 
 
 def _allowed(schema: dict) -> list[str]:

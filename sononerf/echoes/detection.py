@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
 r"""Echoes against noise: an ordered-statistic detector with a constant false-alarm rate.
 
-Two things that are no echoes are heard in front of the first one. *Noise* lies at all ranges of a
+Two kinds of sound precede the first echo. *Noise* lies at all ranges of a
 pose alike. *Precursors* come with an echo and rise and fall with it: the rising flank of the
 analysis window, and in recordings the sidelobes of pulse compression. The level of both is taken
-from the data as an ordered statistic, as in OS-CFAR [1]_, for an echo that lies among the reference
-cells does not move it:
+from the data as an ordered statistic, as in OS-CFAR [1]_, because an echo among the reference cells
+does not move it:
 
 .. math::
 
@@ -51,11 +51,11 @@ FALSE_ALARMS = 1e-6
 """Probability that a range slice of noise alone is taken for an echo, no unit. An ensemble of 400
 poses has some ten thousand independent slices per ear, and one false onset hides a place."""
 RANK = 0.1
-"""Which quantile is the level of noise and precursors, no unit. Echoes may fill nine tenths of the
+"""Quantile that is the level of noise and precursors, no unit. Echoes may fill nine tenths of the
 range axis, and nine tenths of the poses may have other echoes in front of their loudest."""
 ONSET = 0.1
-"""Fraction of an echo's power at which its range is read, no unit. So early in the rise a second
-echo that follows within the window has not begun."""
+"""Fraction of an echo's power at which its range is read, no unit. This early in the rise, a second
+echo within the window has not begun."""
 
 DYNAMIC_RANGE = 1e-8
 """Least threshold over the loudest power of all poses, no unit: 80 dB, what 14 bits record. Without
@@ -66,7 +66,7 @@ def threshold_factor(looks: float) -> float:
     """Return the threshold over the quantile of noise power.
 
     Args:
-        looks: How many independent values each power is the average of.
+        looks: Number of independent values in each average of power.
 
     Examples:
         >>> round(threshold_factor(1.0))  # ln(1e-6) / ln(0.9)
@@ -79,8 +79,8 @@ def threshold_factor(looks: float) -> float:
 class Levels(NamedTuple):
     """Levels that an echo must exceed."""
 
-    noise: Floats  # (..., 1) power of noise alone
-    total: Floats  # (..., R) of noise, precursors, and what the first slice cuts
+    noise: Floats  # (..., 1) threshold of noise alone
+    total: Floats  # (..., R) threshold of noise, precursors, and echoes that the first slice cuts
 
 
 def threshold_levels(power: Floats, looks: float) -> Levels:
@@ -89,7 +89,7 @@ def threshold_levels(power: Floats, looks: float) -> Levels:
     Args:
         power (..., R): Power averaged over frequency: of all poses and ears that are compared, over
             range.
-        looks: How many independent values each is the average of.
+        looks: Number of independent values in each average.
     """
     factor = threshold_factor(looks)
     noise = factor * np.quantile(power, RANK, axis=-1, keepdims=True)
@@ -113,7 +113,7 @@ def threshold_levels(power: Floats, looks: float) -> Levels:
 
 
 def _is_top(power: Floats) -> Bools:
-    """Tell which slices are louder than those beside them, (..., R); the last may be one."""
+    """Return which slices are louder than their neighbours, (..., R); the last one may be."""
     top = np.zeros(power.shape, dtype=bool)
     top[..., 1:-1] = (power[..., 1:-1] >= power[..., :-2]) & (power[..., 1:-1] > power[..., 2:])
     top[..., -1] = power[..., -1] > power[..., -2]
@@ -145,7 +145,7 @@ def onsets(
     """Return where the first echo of each row is, in slices from the first one, (N,).
 
     The range is read where the power has risen to a tenth of the echo's, or to the threshold of
-    noise where that is more, and moved by what a point echo needs from there to its middle.
+    noise where that is more, and moved by the distance from there to the middle of a point echo.
 
     Args:
         power (N, R): Power over range.
@@ -176,7 +176,7 @@ def onsets(
 
 
 def _flank(window: Floats) -> tuple[Floats, float]:
-    """Return the rise of a point echo up to its first top, from zero to one, and its own range."""
+    """Return the rise of a point echo to its first maximum, from zero to one, and its own range."""
     if np.allclose(window, window[::-1]):
         tops = np.flatnonzero(window == window.max())
         first, middle = int(tops[0]), float(tops.mean())
@@ -205,10 +205,9 @@ class Onsets:
     Attributes:
         poses (P,): Their numbers in the store, ascending.
         range ((R,), m): Range of the slices.
-        power (P, E, R): Averaged over the band.
+        power (P, E, R): Power, averaged over the band.
         heard (P, E, R): Which slices hold an echo.
-        first ((P, E), m): Range of the first echo; minus infinity where there is none, or where it
-            is cut.
+        first ((P, E), m): Range of the first echo; minus infinity without an echo, or if it is cut.
     """
 
     poses: Ints
@@ -225,7 +224,7 @@ class Onsets:
         """
         extent = len(self.range) * float(self.range[1] - self.range[0])
         tries = self.first.size * extent / resolution
-        # As many or more of a Poisson distribution.
+        # The upper tail of a Poisson distribution.
         return float(gammainc(np.isfinite(self.first).sum(), FALSE_ALARMS * tries))
 
 
@@ -241,9 +240,9 @@ def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = No
 
     Args:
         store: The ensemble.
-        echo: What the analysis makes of one point.
-        nearest ((P, E), m): Least range of a possible echo. What is heard before it is
-            clutter. All ranges count where None.
+        echo: Echo of one point after the analysis.
+        nearest ((P, E), m): Least range of a possible echo; earlier sound is clutter. All ranges
+            count where None.
     """
     poses = asked_poses(store)
     axis = np.asarray(store.range, dtype=np.float64)

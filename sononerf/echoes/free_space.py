@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""The space that first echoes leave: nothing lies nearer to a pose than what it heard first.
+"""Free space: no part of a body lies nearer to a pose than the pose's first echo.
 
 The point of a body that is nearest to a pose faces it, be it part of a smooth surface, an edge or a
-corner, so it always answers. What is nearer than a pose's first echo is therefore empty, whatever
-the body's shape and however silent its faces are from elsewhere. What all poses leave is to sound
-what the visual hull [1]_ is to silhouettes: for a convex body, heard from all around, its surface.
-An onset that is known to be wrong has weight zero and rules nothing out.
+corner, so it always sends an echo. All places nearer than a pose's first echo are therefore empty,
+whatever the body's shape. The remaining volume is to sound what the visual hull [1]_ is to
+silhouettes: for a convex body, heard from all around, its boundary is the surface. An onset that is
+known to be wrong has weight zero and rules nothing out.
 
 References:
     .. [1] A. Laurentini, "The visual hull concept for silhouette-based image understanding", 1994.
@@ -44,15 +44,15 @@ class EchoHull:
     """Places that the first echoes leave: the complement of the free space.
 
     Attributes:
-        emitters ((P, 3), m): Where each pose calls from, world frame.
-        receivers ((P, E, 3), m): Where its ears are.
+        emitters ((P, 3), m): Places of the emitter at each pose, world frame.
+        receivers ((P, E, 3), m): Places of the ears.
         first ((P, E), m): Range of the first echo that each ear heard: half of the way out and
-            back; minus infinity where it tells nothing.
-        axes (P, 3): Which way each head looks, unit vectors.
-        within: A pose speaks for places towards which the cosine to its axis is at least this.
-        weight ((P, E) or None): How far each first echo is trusted, from 0, an outlier that tells
-            nothing, to 1; all of them where None.
-        plane: The support, below which nothing is; None where there is none.
+            back; minus infinity without evidence.
+        axes (P, 3): Looking directions of the heads, unit vectors.
+        within: Least cosine between a pose's axis and the direction to a place that its onset can
+            rule out.
+        weight ((P, E) or None): Weight of each first echo, from 0 (outlier) to 1; all 1 where None.
+        plane: The support, below which there is no body; None if there is no support.
     """
 
     emitters: Floats
@@ -108,10 +108,10 @@ class EchoHull:
             points ((N, 3), m): World frame.
 
         Returns:
-            clearance ((N,), m): Negative where a pose says that nothing is there, and below the
-                support; plus infinity without evidence. Its slope is at most one. Up to
+            clearance ((N,), m): Negative where an onset rules the point out, and below the support;
+                plus infinity without evidence. Its slope is at most one. Up to
                 :attr:`undetected` contradicting poses are ignored.
-            pose (N,): The pose that says so.
+            pose (N,): The pose with this onset.
         """
         where = np.asarray(points, dtype=np.float64)
         chunk = self.chunk
@@ -123,13 +123,13 @@ class EchoHull:
     def behind(self, points: Floats) -> Floats:
         """Return how far points lie behind each first echo, (N, P, E) m.
 
-        Plus infinity where it tells nothing of them.
+        Plus infinity where it has no evidence about them.
         """
         return _behind(np.ascontiguousarray(points), *self._onsets)
 
     @property
     def _onsets(self) -> tuple[Floats, Floats, Floats, Floats, float]:
-        """What says how far places lie behind first echoes: see :func:`_behind`."""
+        """Arrays of the onsets: arguments of :func:`_behind`."""
         looks = np.broadcast_to(self.axes, self.emitters.shape)
         parts = (self.emitters, self.receivers, self.trusted, looks)
         emitters, receivers, first, axes = (np.array(part, dtype=np.float64) for part in parts)
@@ -156,7 +156,7 @@ def _distance(point: Floats, place: Floats) -> float:
 def _is_beside(
     point: Floats, emitter: Floats, axis: Floats, within: float, distance: float
 ) -> bool:
-    """Whether a point lies outside the cone that an emitter hears."""
+    """True if a point lies outside the cone in which an emitter is heard."""
     ahead = 0.0
     for k in range(3):
         ahead += (point[k] - emitter[k]) * axis[k]
@@ -178,8 +178,8 @@ def _behind(
         points ((N, 3), m): World frame.
         emitters, receivers ((P, 3), (P, E, 3), m): Emitters and receivers of the poses.
         first ((P, E), m): Ranges.
-        axes (P, 3): Where the poses look.
-        within: Cosine of the angle around the axis outside which an echo tells nothing.
+        axes (P, 3): Looking directions of the poses.
+        within: Cosine of the angle to the axis beyond which an onset rules nothing out.
     """
     found = np.full((len(points), *first.shape), np.inf)
     for n in range(len(points)):
@@ -239,7 +239,8 @@ ACCURACY = 0.1
 """Usual error of an onset's range, range resolutions. On simulated bodies half of all onsets err by
 less than a twentieth of the resolution, and nearly all that are not late by less than a fifth."""
 
-# Sizes of the search, not of what it finds: cells of the first lattice along the longest side, the
+# Sizes of the search, which do not change its result: cells of the first lattice along the longest
+# side, the
 # greatest number of pairs of a cell and an onset, and how often the half diagonal of the last cells
 # is halved down to the error of an onset.
 COARSE, MOST_PAIRS, LEVELS = 24, 1.2e8, 4
@@ -249,14 +250,15 @@ OCTANTS = np.stack(np.meshgrid(*[[-0.25, 0.25]] * 3, indexing="ij"), axis=-1).re
 def weighted(hull: EchoHull, resolution: float, within: Floats | None = None) -> EchoHull:
     """Return the hull with weight zero for onsets that the others contradict.
 
-    A first echo comes from some place at its range that all other poses leave free to hold
-    something. Where there is none, one of them is wrong. An onset is *late* if the nearest point of
-    a body answered too faintly to be detected, as the edge of a thin sheet does beside the flash of
-    its face: then it rules out places that several others heard. It is *early* if noise was taken
-    for an echo: then many others rule out all places at its range.
+    A first echo comes from a place at its range that no other onset rules out. If there is no such
+    place, one of these onsets is wrong. An onset is *late* if the echo of a body's nearest point
+    was too faint to be detected, such as the edge of a thin sheet beside the flash of its face; it
+    then rules out places that several others heard. An onset is *early* if noise was taken for an
+    echo; many others then rule out all places at its range.
 
-    Each onset without an origin looks for the places at its range that the fewest others rule out,
-    and these, n of them, get a blame of 1/n. An onset is an outlier if its blame reaches the number
+    For each onset without an origin, the places at its range that the fewest others rule out are
+    found, and each of these n others gets a blame of 1/n. An onset is an outlier if its blame
+    reaches the number
     of ears, as if it alone contradicted a whole pose. The most blamed ones, down to half of the
     greatest blame, are removed, and so on until none is left. An onset whose places are all ruled
     out by more than a few, and by more than half as many as agree on the place (``SHARE``), is an

@@ -33,9 +33,9 @@ NOISE = (
 )
 
 # Sizes of the search: poses that give power, passes from coarse to fine, cells along the
-# longest side in each of them, passes over the power, and places looked at in one go.
+# longest side in each of them, passes over the power, and places that are processed at once.
 POSES, LOOKS, COARSE, ROUNDS, CHUNK = 200, 4, 28, 4, 2048
-ENOUGH = 2  # poses: one alone does not tell where on its ellipsoid an echo comes from
+ENOUGH = 2  # poses: an echo of one pose alone may come from any place of an ellipsoid
 
 
 class EchoRegion:
@@ -43,7 +43,7 @@ class EchoRegion:
 
     Args:
         heard: Power, detected echoes and onsets.
-        hull: What the onsets leave; of the same poses.
+        hull: Places that the onsets of the same poses leave.
         ears: Gains of emitter and ears.
         rotations (P, 3, 3): Head to world.
         resolution (m): Range resolution.
@@ -77,7 +77,7 @@ class EchoRegion:
 
         Args:
             points ((N, 3), m): Places, world frame.
-            tolerance (m): How far a place speaks for its surroundings.
+            tolerance (m): Radius of the surroundings that a place stands for.
         """
         return self._inside(points, tolerance / 4) & self._energy(points, tolerance)[1]
 
@@ -131,7 +131,8 @@ class EchoRegion:
         Raises:
             NumericalError: If the echoes of no two poses meet anywhere.
         """
-        # A flight along a line or on one side still hears so far ahead, and to the sides.
+        # The box of a flight along a line or on one side: as far ahead as it hears, and to the
+        # sides.
         looks = np.array([[3, 0, 0], [3, 2, 0], [3, -2, 0], [3, 0, 2], [3, 0, -2]])  # 34 degrees
         looks = looks / np.linalg.norm(looks, axis=1, keepdims=True)
         last = self.range[self.heard.shape[1] - 1 - self.heard[:, ::-1].argmax(axis=1)]
@@ -155,10 +156,10 @@ class EchoRegion:
     def needed(self, points: Floats, tolerance: float) -> Bools:
         """Return the places that explain the echoes, the best focused first, (N,).
 
-        Places out in the open lie at the range of some echo of many poses, but the echoes do not
-        agree there. So the places where they agree best are taken, what they explain is taken out,
-        and the rest is looked at anew, until little is left. Last come the origins of onsets that
-        have none yet, however faint their echoes are.
+        Places in free air also lie at the range of echoes of many poses, but the echoes do not
+        agree there. So the places with the best agreement are taken, the sound that they explain is
+        removed, and the rest is examined again until little is left. Finally the origins of onsets
+        without one are added, however faint their echoes are.
         """
         keep = np.zeros(len(points), dtype=bool)
         inside = self._inside(points, tolerance)
@@ -223,7 +224,7 @@ def echo_extent(power: Floats, axis: Floats, looks: float, margin: float) -> tup
     Args:
         power (P, E, R): Power averaged over frequency.
         axis ((R,), m): Ranges of the slices.
-        looks: How many independent values each power is the average of.
+        looks: Number of independent values in each average of power.
         margin (m): Added on both sides.
 
     Returns:

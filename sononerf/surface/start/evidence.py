@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: MIT
-"""Oriented evidence: where on its lines of sight each pose hears a field, and how loudly.
+"""Oriented evidence: places on its lines of sight from which each pose hears the field.
 
-The fit brings the *sound* of a field to its range within a tenth of a millimetre. The places that
-make it need not lie there, because places closer than the range resolution share one echo. So each
+The fit brings the *sound* of a field to its range within a tenth of a millimetre. The places of the
+field may lie elsewhere, because places closer than the range resolution share one echo. So each
 place is moved to the mean range of the sound around it, on the line of sight through the mean of
 that sound. The result is a point of the surface whose normal looks at the pose.
 """
@@ -42,8 +42,8 @@ class Evidence:
     Attributes:
         points ((G, 3), m): World frame.
         normals (G, 3): Unit vectors towards the poses.
-        weight (G,): Compressed power of the echo without spreading; at most 1, which half of the
-            poses reach with the loudest that they hear.
+        weight (G,): Compressed power of the echo without spreading, at most 1; the loudest point of
+            half of the poses reaches 1.
         pose (G,): Which pose hears it.
     """
 
@@ -66,11 +66,11 @@ def locate_sound(
     resolution: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> Evidence:
-    """Listen to a field from where it was heard, and put its sound at its ranges.
+    """Return the places from which poses hear a field, as points at the ranges of its sound.
 
     Args:
-        field: What was fitted.
-        places ((N, 3), m): Where it is not silent.
+        field: The fitted field.
+        places ((N, 3), m): Places that are not silent.
         sources ((P, 3), m): Half way between emitter and ears of each pose.
         resolution (m): Range resolution; points of one pose in one cube of this side become one.
         progress: Called with the poses done and the poses in all.
@@ -89,7 +89,8 @@ def locate_sound(
         index = field.audible(places, emitter[None])[0].nonzero()[:, 0]
         unit = ray[index] / distance[index, None]
         response, lead = field.echo(places[index], unit, bands)
-        # The power at the pose decides what is heard; without spreading it is what there is.
+        # The power at the pose decides which places are heard; the power without spreading is their
+        # weight.
         power = response.abs().square().mean(-1)
         heard = power / distance[index] ** 4
         loud = heard > _FAINTEST * heard.max() if len(heard) else heard > 0
@@ -149,7 +150,7 @@ def _moved(
 _ROBUST = 1.5  # voxels, scale of Cauchy's loss: evidence farther off the surface hardly counts
 _OUTER, _INNER = 4, 40  # rounds of reweighting, steps of conjugate gradients in each
 _COARSEST = 12  # least voxels along an axis of the coarsest grid
-_ACCURACY = 1e-3  # of the residual's norm, where conjugate gradients stop
+_ACCURACY = 1e-3  # relative residual at which conjugate gradients stop
 
 
 def signed_distance(
@@ -160,7 +161,7 @@ def signed_distance(
     Args:
         weight (X, Y, Z): Weight of the targets, from 0 to 1.
         target ((X, Y, Z), voxels): Signed distance by the evidence.
-        bound ((X, Y, Z), voxels): What the distance must not lie below.
+        bound ((X, Y, Z), voxels): Lower bound of the distance.
         pull: Weight of the distance to the bound.
         empty (X, Y, Z): Weight with which a place is outside.
         bending: Weight of the squared Laplacian.
@@ -246,16 +247,16 @@ FEW = 0.3
 """Power of agreeing points over the mean power at which the reliability is halved."""
 AT_ONSET = 0.7
 """Reliability of a point at the onset of its own pose."""
-_WITNESSES = 4000  # points that are asked at most, a bound of time
-_CHUNK = 4000  # points at a time, a bound of memory
+_WITNESSES = 4000  # largest number of points that are compared; it bounds the time
+_CHUNK = 4000  # points at a time; it bounds the memory
 
 
 def reliability(evidence: Evidence, hull: EchoHull, resolution: float) -> Floats:
-    """Return how far each point is believed, (G,) from 0 to 1.
+    """Return the reliability of each point, (G,) from 0 to 1.
 
-    Sound that a pose hears from a surface is heard by other poses from the same smooth surface, and
-    the first sound of a pose comes from what is nearest to it. Later bounces, and what interference
-    makes, are heard elsewhere from every pose.
+    Several poses hear sound from one smooth surface, and the first sound of a pose comes from the
+    point nearest to it. Later bounces and results of interference appear at other places for each
+    pose.
 
     Args:
         evidence: Evidence of all poses.
@@ -278,7 +279,7 @@ def reliability(evidence: Evidence, hull: EchoHull, resolution: float) -> Floats
 
 
 def _agreement(evidence: Evidence, resolution: float) -> Floats:
-    """Return the fraction of the power around that lies on one smooth surface, if it is enough."""
+    """Return the fraction of the surrounding power on one smooth surface, if it is enough."""
     points, normals = evidence.points, evidence.normals
     count = len(points)
     # Evenly over all poses: points come pose by pose.
@@ -304,7 +305,7 @@ def _agreement(evidence: Evidence, resolution: float) -> Floats:
 
 
 _ALIKE = 0.5  # cosine of the greatest angle between the normals of a vertex and of a point
-_PAIRS = 2_000_000  # vertices times points at a time, a bound of memory
+_PAIRS = 2_000_000  # vertices times points at a time; it bounds the memory
 
 
 def poses_that_heard(
