@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The fast engine: rays over several bounces, summed as Kirchhoff's integral."""
+"""Engine `rays`: rays over several bounces, summed as Kirchhoff's integral."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
 from sononerf.simulation.reflection import coarse_gain, unfaded
 from sononerf.simulation.shadows import LEAST, Shadow, behind, passing
 
-HIDDEN_SHARE = 0.15  # as many rays again, for what lies behind obstacles
+HIDDEN_SHARE = 0.15  # as many rays again, for surfaces behind obstacles
 HIDDEN_DIVIDED = 0.4  # of these, kept as above
-DIVIDED_SHARE = 0.6  # of the rays, kept for where a few would be noise
-FINE = 0.3  # rad; a cell over which the path bends by less lacks nothing
+DIVIDED_SHARE = 0.6  # fraction of the rays that is kept where a few would be noise
+FINE = 0.3  # rad; a cell over which the path bends by less is fine enough
 SILENT = 7.0  # e to the minus this is -61 dB
-BALLS = 32  # that hold the scene between them; rays that miss all of them are not traced
+BALLS = 32  # number of balls that enclose the scene; rays that miss all of them are not traced
 
 
 class Rays(Engine):
@@ -172,7 +172,7 @@ class Rays(Engine):
         *,
         seed: int,
     ) -> None:
-        """Tell a listener what is heard after the first bounce; edges are left out."""
+        """Pass the echoes of the first bounce to a listener; edges are left out."""
         first, second, _ = np.random.default_rng(seed).random(3)
         paths = self._paths(position, rotation, (first, second), self.bounces)
         for bounce in gathered(bounce for bounce in paths if bounce.number > 1):
@@ -210,7 +210,7 @@ class Rays(Engine):
             for place in self.hearing.places(position, rotation)[1]:
                 heard, gain, _, _ = self._heard(bounce, place)
                 total[heard] += np.square(gain * level[heard]).mean(axis=1)
-            # Of one size: a divided cell is smaller than a whole one.
+            # Cells of one size alone: a divided cell is smaller than a whole one.
             points.append(bounce.points)
             strength.append(np.sqrt(total) / bounce.solid_angle)
         return np.concatenate(points), np.concatenate(strength)
@@ -255,7 +255,7 @@ class Rays(Engine):
         offset: tuple[float, float],
         shadow: Shadow,
     ) -> Iterator[Bounce]:
-        """First hits behind obstacles, as if these were not there."""
+        """Return the first hits behind obstacles, as if the obstacles were not there."""
         outlines = self._outlines
         if shadow.none or outlines is None:
             return
@@ -286,11 +286,11 @@ class Rays(Engine):
             yield replace(bounce, hidden=True)
 
     def _listeners(self, position: Floats, rotation: Floats) -> Floats:
-        """Places (L, 3) that between them tell what any ear can hear, m, world frame."""
+        """Return places (L, 3) that together stand for all ears, m, world frame."""
         _, ears = self.hearing.places(position, rotation)
         if np.ptp(ears, axis=0).max() < EARS_APART:
             return np.asarray(ears.mean(axis=0, keepdims=True))
-        # One for all within a ball of that size about it.
+        # One place stands for all ears within a ball of that size.
         chosen: list[Floats] = []
         for ear in ears:
             if all(np.linalg.norm(ear - other) >= EARS_APART / 2.0 for other in chosen):
@@ -344,9 +344,9 @@ class Rays(Engine):
         Singles,
         tuple[Ints, NDArray[np.complex64]] | None,
     ]:
-        """Which hits an ear hears (N,), by what gain (N, F), and their paths' spread (N,), m.
+        """Return which hits an ear hears (N,), their gain (N, F), and their paths' spread (N,), m.
 
-        At last which of these are shaded (M,), and what passes of them (M, F), or None.
+        The last two are the shaded hits (M,) and the transmitted fraction (M, F), or None.
         """
         ways = bounce.ways_to(ear)
         heard = (ways.rise > 0.0) & (ways.detour < self._farthest)
@@ -374,7 +374,7 @@ class Rays(Engine):
         lit: Shadow | None,
         shadow: Shadow | None,
     ) -> tuple[Bools, tuple[Ints, NDArray[np.complex64]] | None]:
-        """Which hits pass obstacles, and what passes of those near an outline."""
+        """Return which hits pass obstacles, and the transmission of those near an outline."""
         points, triangle = bounce.points.take(near, axis=0), bounce.triangles[near, -1]
         if lit is None or shadow is None:
             return seen, None

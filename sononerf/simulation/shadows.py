@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The sound that passes obstacles: shadows that fade with the Fresnel zone."""
+"""Shadows: the sound that passes obstacles, fading with the Fresnel zone."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ LONGEST = 0.4 / NODE_SPACING
 STEPS = 12
 """Steps per wavelength in which detours are sorted."""
 LAYERS = 3
-"""Surfaces that a ray through an obstacle may pass: into it, out of it, and one more."""
+"""Number of surfaces that a ray through an obstacle may pass: into it, out of it, and one more."""
 UNKNOWN = -2
-"""Number of a cell that has not been solved for."""
+"""Index of a cell that has not been solved for."""
 LEAST = 0.02
 """Obstacle factor below which nothing is heard, -34 dB."""
 PEKERIS = (-0.2660 - 0.1478j, 0.1392 + 0.2246j, -0.0010 - 0.0536j)
@@ -48,9 +48,10 @@ class _Pieces:
 
 
 class Shadow:
-    r"""By how much obstacles change the sound between one place and the surface.
+    r"""Change of the sound between one place and the surface by obstacles.
 
-    Fresnel's integral over what an obstacle leaves free, as one along its outline [1]_: with
+    Fresnel's integral over the area that an obstacle leaves free, as an integral along its outline
+    [1]_: with
     :math:`\varphi` the angle about the straight way and :math:`\delta` the detour over the outline,
 
     .. math:: T = H + \frac{1}{2 \pi} \oint e^{-j k \delta}\, d\varphi
@@ -58,8 +59,8 @@ class Shadow:
     where :math:`H` is one in the light and zero in the shadow. At a straight border it is the knife
     edge: -6 dB on the border, a fading shadow on one side, overshoot on the other.
 
-    A smooth obstacle of the radius :math:`a` along the way sends more around itself, by what the
-    rigid surface adds to a knife edge [2]_, per length of the outline
+    More sound passes around a smooth obstacle of the radius :math:`a` along the way. The rigid
+    surface adds to a knife edge [2]_, per length of the outline,
 
     .. math:: -\frac{m}{\sqrt{\pi}\, d'} q^*(m \vartheta)\, e^{-j k \delta}, \qquad
         m = (k a / 2)^{1/3}, \quad 1 / d' = 1 / d_1 + 1 / d_2
@@ -175,11 +176,11 @@ class Shadow:
     def passed(
         self, points: Floats, triangle: Ints
     ) -> tuple[NDArray[np.int32], NDArray[np.complex64]]:
-        """Return the row (N,) of each point in a table (C, F) of what passes; -1: no outline near.
+        """Return the row (N,) of each point in a table (C, F) of transmission; -1: no outline near.
 
         Args:
             points ((N, 3), m): On the surface.
-            triangle (N,): On which.
+            triangle (N,): Triangles that the points lie on.
         """
         if self._pieces is None or len(points) == 0:
             return np.full(len(points), -1, dtype=np.int32), self._table
@@ -203,7 +204,7 @@ class Shadow:
         return self._pieces is None
 
     def level(self, points: Floats, triangle: Ints) -> Floats:
-        """Return the most that passes (N,) at any frequency to points in the shadow."""
+        """Return the largest transmission (N,) over frequency to points in the shadow."""
         row, table = self.passed(points, triangle)
         most = np.append(np.abs(table).max(axis=1, initial=0.0), 0.0)
         level: Floats = most[row]
@@ -261,14 +262,14 @@ def _lay(
     longest: float,
     waist: float,
 ) -> tuple[Floats, Ints]:
-    """Sort what pieces of an outline send to points by its detour.
+    """Sort the sound from pieces of an outline to points by its detour.
 
     Args:
-        points ((N, 3), m): Where sound arrives.
-        place ((3,), m): Where it comes from.
-        bodies (N,): On which body the points lie.
-        start (N + 1,): Where the pieces of each point begin among those reached.
-        reached (R,): Pieces that may send something there.
+        points ((N, 3), m): Points that sound reaches.
+        place ((3,), m): Origin of the sound.
+        bodies (N,): Bodies that the points lie on.
+        start (N + 1,): Index of each point's first piece in ``reached``.
+        reached (R,): Pieces whose sound may reach the points.
         middles, alongs, behinds, owners, curves: Attributes of the pieces; see :class:`_Pieces`.
         bins: Number of bins.
         step (m): Width of a bin.
@@ -276,7 +277,7 @@ def _lay(
 
     Returns:
         laid (4, U, bins): The angle swept, and weights of the powers of Pekeris' function.
-        used (U,): The points that any piece sends something to.
+        used (U,): Points that sound of some piece reaches.
     """
     table = np.zeros((4, len(points), bins))
     is_used = np.zeros(len(points), np.bool_)
@@ -338,7 +339,7 @@ def _lay(
             curve = curves[piece]
             if curve == 0.0:
                 continue
-            # How far the way is in the shadow, as an angle by which sound bends.
+            # Depth of the way in the shadow, as the angle by which sound bends.
             length = 2.0 * math.sqrt(length)
             reduced = before * after / (before + after)
             bent = cross / max(length, 1e-300) / reduced
@@ -362,18 +363,18 @@ def passing(
     heard_table: NDArray[np.complex64],
     is_seen: Bools,
 ) -> tuple[Bools, Ints, NDArray[np.complex64]]:
-    """Return what passes obstacles on the ways to points and from there on.
+    """Return the transmission past obstacles on the ways to points and on from there.
 
     Args:
         lit, heard (N,): Rows of each point in the tables, from :meth:`Shadow.passed`.
-        lit_table, heard_table (C, F): What passes from the emitter, and to the ear.
-        is_lit: Whether nothing stands between the emitter and any point.
-        is_seen (N,): Whether nothing stands between a point and the ear.
+        lit_table, heard_table (C, F): Transmission from the emitter, and to the ear.
+        is_lit: True if nothing stands between the emitter and any point.
+        is_seen (N,): True if nothing stands between a point and the ear.
 
     Returns:
-        passes (N,): Whether a point is heard.
-        dim (M,): Which of those that are heard are near an outline, counted among them.
-        passed (M, F): What passes of these.
+        passes (N,): True if a point is heard.
+        dim (M,): Indices of the points near an outline among those that are heard.
+        passed (M, F): Transmission to these.
     """
     frequencies = lit_table.shape[1]
     passes = np.zeros(len(lit), np.bool_)
@@ -410,7 +411,7 @@ def _product(real: Floats, factor: Complexes) -> Complexes:
 def behind(
     caster: RayCaster, outlines: Outlines, hits: Hits, directions: Floats
 ) -> tuple[Hits, Floats]:
-    """Return what rays would hit beyond the first obstacle, and the whole ways (M,) there, m."""
+    """Return the hits of rays beyond the first obstacle, and the whole ways (M,) there, m."""
     ray, points, length = hits.ray, hits.points, hits.distance
     found: list[tuple[Hits, Floats]] = []
     for _ in range(LAYERS):

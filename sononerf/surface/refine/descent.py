@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Stages of a refinement: vertices move along their normals until the mesh sounds as measured."""
+"""Stages of a refinement: vertices move along their normals until the echoes agree."""
 
 from __future__ import annotations
 
@@ -53,14 +53,14 @@ class Descent:
 
     Args:
         mesh: Start, m.
-        echoes, optics, level: What was measured, what hears, and gains, which are brought up to
-            date.
+        echoes, optics, level: Measurement, head, and gains, which are updated.
         smoothing (m): Length over which steps are smoothed.
-        rate: Length of the first steps over the length of smoothing: how much the surface may tilt.
-        later: To be added as power.
+        rate: Length of the first steps over the smoothing length; it bounds the tilt of the
+            surface.
+        later: Later bounces, added as power.
         correction: Correction of the start, by the simulator.
-        onsets: Where the surface must begin.
-        sheet: Whether it is a sheet, whose sides are kept apart.
+        onsets: Onsets, the least range of the surface.
+        sheet: True for a sheet, whose sides are kept apart.
         band: As in :class:`Stage`.
         seed: Seed of poses and rays.
     """
@@ -99,19 +99,19 @@ class Descent:
         self._sight: Occlusion | None = None
         self._later, self._correction, self._onsets = later, correction, onsets
         self.rate, self.band = rate, band
-        if optics.plane is not None:  # nothing below it is body, and what stands on it stays there
+        if optics.plane is not None:  # no vertex goes below it, and vertices on it stay there
             self._stands = optics.plane.height(self.vertices) < STANDS * edge
         self._sides = Sides(mesh, APART * optics.wavelength) if sheet else None
 
     def mesh(self) -> trimesh.Trimesh:
-        """Return the surface as it is now."""
+        """Return the present surface."""
         return trimesh.Trimesh(self.vertices.cpu().numpy().copy(), self.faces, process=False)
 
     def step(self, number: int, part: float) -> float:
         """Do one step.
 
         Args:
-            number: Number of the step, counted from the first of all stages: it decides the poses.
+            number: Number of the step, counted over all stages; it determines the poses.
             part: Completed fraction of the stage, 0 to 1.
 
         Returns:
@@ -143,11 +143,11 @@ class Descent:
         return error
 
     def render(self, numbers: list[int]) -> tuple[Heard | None, Tensor, Tensor]:
-        """Render poses of the surface as it is now.
+        """Render poses of the present surface.
 
         Returns:
             heard: None where no pose hears any of it.
-            points, areas ((V, 3) float32): Leaves that gradients run to, about the middle of the
+            points, areas ((V, 3) float32): Leaves of the gradients, relative to the middle of the
                 surface.
         """
         area = self.operators.areas(self.vertices)
@@ -168,7 +168,7 @@ class Descent:
         return self.optics.render(points, areas, pieces, heads), points, areas
 
     def _gradient(self, number: int, normals: Tensor) -> tuple[Tensor | None, float]:
-        """Gradient along the normals (V, 1), and the mean mismatch in dB."""
+        """Return the gradient along the normals (V, 1), and the mean mismatch in dB."""
         source = self._correction or self.echoes
         numbers = source.batch(self.seed, number, POSES).tolist()
         heard, points, areas = self.render(numbers)
@@ -194,7 +194,7 @@ class Descent:
         return (total * normals).sum(1, keepdim=True), float(errors.detach().mean())
 
     def state(self) -> dict[str, Tensor]:
-        """Return everything that changes, and the mesh it began with, as plain tensors."""
+        """Return the whole state, and the initial mesh, as plain tensors."""
         return {
             "start": self._start.cpu(),
             "faces": torch.as_tensor(self.faces),
@@ -206,7 +206,7 @@ class Descent:
         }
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Take over a state of a descent on the same mesh."""
+        """Load the state of a descent on the same mesh."""
         self.vertices, self._seen, self.direction, self.square = (
             state[name].to(self.vertices) for name in ("vertices", "seen", "direction", "square")
         )
@@ -242,7 +242,7 @@ APART = 0.15
 """Least thickness of a sheet, shortest wavelengths. A thinner one sounds the same, but its sides
 could change places, and each would hide the other."""
 _OPPOSED = -0.5  # cosine between the normals of two sides, at most
-_AROUND = 16  # vertices among which that of the other side is looked for
+_AROUND = 16  # number of vertices among which the opposite one is searched for
 
 
 class Sides:
@@ -266,7 +266,7 @@ class Sides:
         """Return the vertices (V, 3), moved outward where the sides are too close.
 
         Args:
-            vertices ((V, 3), m): As they are now.
+            vertices ((V, 3), m): Present places.
             normals (V, 3): Outward unit vectors.
         """
         one, other = (part.to(vertices.device) for part in (self._vertex, self._other))
@@ -285,12 +285,13 @@ class Stage:
         blur: Blur of the signed distance before the stage.
         rate: Length of the first steps, smoothing lengths.
         steps: Steps of descent.
-        band: Over how much of the frequencies power is averaged before it is compared, 0 to 1. A
-            surface that is off by more than a fraction of a wavelength interferes in other ways
-            than the true one; averaged, it shows how much comes from which range.
-        beyond: What is added to the first bounce by physical optics: nothing; the power of later
-            bounces, traced off the surface that the stage starts from, or those that were traced
-            last; or the correction by the simulator, see :mod:`sononerf.surface.refine.correction`.
+        band: Fraction of the frequencies over which power is averaged before the comparison, 0 to
+            1. The interference of a surface that is off by more than a fraction of a wavelength
+            differs from that of the true one; the average shows how much power comes from each
+            range.
+        beyond: Addition to the first bounce by physical optics: nothing; the power of later
+            bounces, traced off the initial surface of the stage, or those that were traced last; or
+            the correction by the simulator, see :mod:`sononerf.surface.refine.correction`.
     """
 
     smoothing: float

@@ -39,13 +39,13 @@ class Level:
 
     Args:
         ears, rows: E and F.
-        like: Whose device they lie on.
+        like: A tensor on the wanted device.
 
     Attributes:
         gain ((E, F) float32): Logarithm of measured over rendered magnitude.
-        error ((E, F) float32, dB): Mean over active cells.
-        steps: How often they were brought up to date.
-        learns: No gain, or one for each ear and frequency.
+        error ((E, F) float32, dB): Mean error over active cells.
+        steps: Number of updates.
+        learns: Whether there is no gain, or one for each ear and frequency.
     """
 
     def __init__(self, ears: int, rows: int, like: Tensor) -> None:
@@ -55,16 +55,16 @@ class Level:
         self.learns: Literal["none", "each"] = "each"
 
     def reset(self) -> None:
-        """Forget everything that was learned."""
+        """Reset all estimates."""
         self.gain, self.error = torch.zeros_like(self.gain), torch.full_like(self.error, 4.0)
         self.steps = 0
 
     def state(self) -> dict[str, Tensor]:
-        """Return everything as plain tensors."""
+        """Return the state as plain tensors."""
         return {"gain": self.gain, "error": self.error, "steps": torch.tensor(self.steps)}
 
     def load(self, state: dict[str, Tensor]) -> None:
-        """Take a state over."""
+        """Load a state."""
         self.gain, self.error = state["gain"].to(self.gain), state["error"].to(self.error)
         self.steps = int(state["steps"])
 
@@ -76,7 +76,7 @@ class Level:
 
 
 def measured(echoes: Echoes, numbers: list[int], heard: Heard) -> tuple[Tensor, Tensor, Tensor]:
-    """Return what poses measured on the rows that were rendered.
+    """Return the measurement of poses on the rendered rows.
 
     Returns:
         magnitude ((P, E, W, F) float32): Zero beyond the axis.
@@ -106,18 +106,18 @@ def mismatch(
     learn: bool,
     band: float = 0.0,
 ) -> Tensor:
-    """Mean absolute difference in compressed decibels over the active cells of each pose (P,).
+    """Return the mean absolute difference over the active cells of each pose (P,), reported dB.
 
     Args:
-        heard: What was rendered of the first bounce.
+        heard: Rendered first bounce.
         later ((P, E, W, F) float32): Power of the later bounces.
         found: From :func:`measured`.
         level: Gains and weights.
         corrected (simulated, rendered, both (P, E, W, F) float32): Echoes of a surface nearby:
             their difference in decibels is added to what is rendered. Cells count less, the larger
             it is; the frequencies' weights are not needed then.
-        learn: Whether gains and errors are brought up to date.
-        band: Power is averaged over so much of the frequencies first, 0 to 1.
+        learn: True to update gains and errors.
+        band: Fraction of the frequencies over which power is averaged first, 0 to 1.
     """
     magnitude, inside, loudest = found
     power = heard.power if later is None else heard.power + later
@@ -148,7 +148,7 @@ def mismatch(
 
 
 def over_band(power: Tensor, part: float) -> Tensor:
-    """Return power (P, E, W, F) averaged over the frequencies around, a part of all of them."""
+    """Return power (P, E, W, F), averaged over a fraction of the frequencies around each."""
     half = round(part * power.shape[3]) // 2
     if not half:
         return power
@@ -182,12 +182,12 @@ def _learn(
 
 
 def on_rows(wholes: list[Tensor], row: Tensor, like: Tensor) -> Tensor:
-    """Return the range slices of whole spectrograms from given rows on.
+    """Return range slices of whole spectrograms, from given first rows on.
 
     Args:
         wholes (list of (E, R, F) float32): One per pose.
-        row (P,): Each pose's first row; may lie before the axis.
-        like ((P, E, W, F) Tensor): Whose width and device the result has.
+        row (P,): First row of each pose; may lie before the axis.
+        like ((P, E, W, F) Tensor): A tensor with the wanted width and device.
 
     Returns:
         parts ((P, E, W, F) float32): Zero beyond the axis.
@@ -207,11 +207,11 @@ SCALE = 0.19
 """Misfit at which Huber's loss turns linear, range resolutions. At 0.1, the accuracy of the
 detector, the onsets outweigh the spectrograms: the Chamfer distance of ua rises from 0.94 mm to
 1.25 mm (means of two seeds of the refinement)."""
-_POSES = 64  # drawn per step, to bound the time
+_POSES = 64  # number that is drawn per step; it bounds the time
 
 
 class OnsetRanges:
-    """The onsets of the training poses, to compare surfaces with.
+    """Onsets of the training poses, for comparison with a surface.
 
     The nearest point of a body always sends an echo, even if it is an edge or a corner. So the
     least range over the surface must be the onset. Physical optics alone does not ensure this: if a
