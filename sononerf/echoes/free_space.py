@@ -210,7 +210,7 @@ def _possible(
 
     Args:
         cells ((N, 3), m): Their middles.
-        emitters, receivers, first, axes, within: As of :func:`_behind`.
+        emitters, receivers, first, axes, within: As in :func:`_behind`.
         wanted (P, E): Which onsets are wanted.
         few: Number of onsets that may rule a cell out, or
         share: this fraction of those at whose range it lies.

@@ -94,7 +94,7 @@ def coherent_backprojection(
     Args:
         waveforms (iterable of (E, S) float): Recordings from the start of the emission on, one per
             pose in order; read one at a time.
-        poses, lower, upper: As of :func:`backprojection`.
+        poses, lower, upper: As in :func:`backprojection`.
         head: Whose call was emitted.
         spacing (m): Voxel size; a quarter of the shortest wavelength shows all there is.
 

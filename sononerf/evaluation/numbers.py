@@ -70,7 +70,7 @@ def evaluate(
         echoes: Give the baselines backprojection and voxel fit; left out where None.
         registration: What lays the reconstruction over the truth first: ``none``, ``rigid`` or
             ``similarity``.
-        progress: Where to show it; on stderr where None.
+        progress: Display of progress; on stderr where None.
 
     Returns:
         evaluation: ``chamfer_m``, ``fscore`` and the others of

@@ -91,7 +91,7 @@ def predict(
         options: Options of the simulator that traces: keys of the section ``simulation`` of the
             settings; engine and number of rays are replaced.
         accelerator: What to render on: ``auto``, ``cpu`` or ``gpu``.
-        progress: Where to show it; on stderr where None.
+        progress: Display of progress; on stderr where None.
 
     Raises:
         InputError: If the surface does not know its echoes, or a pose is too far from the region

@@ -79,7 +79,7 @@ def learn_traced(
         simulation: Simulation of the surface's echoes; engine and number of rays are replaced.
         seed: Seed of the rays.
         accelerator: What the field is rendered on.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Returns:
         traced: Weight zero where there are no validation poses, or nothing can be traced off the

@@ -182,7 +182,7 @@ class Field(nn.Module):
             code ((N, C) or None): Code of :meth:`code`; found out where None.
 
         Returns:
-            reflectivity ((M, B) float or complex): As of :meth:`select`.
+            reflectivity ((M, B) float or complex): As in :meth:`select`.
             lead ((M,), m): A place that stands for a piece of curved surface answers off its axis
                 from another point of it, which lies this much nearer.
         """

@@ -47,7 +47,7 @@ def row_duration(call: CallSettings, analysis: SpectrogramSettings, frequency: A
     a Gaussian filter and a linear sweep that gives exactly this.
 
     Args:
-        call: What is emitted.
+        call: The emitted call.
         analysis: Window and sampling rate.
         frequency ((F,), Hz): Frequencies of the rows.
 
@@ -67,7 +67,7 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
     analysed frequencies that the call covers.
 
     Args:
-        call: What is emitted.
+        call: The emitted call.
         analysis: Sampling rate and frequencies.
 
     Returns:
@@ -101,7 +101,7 @@ def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> Float
     """Point echo in each row of the dechirped spectrogram, as a window over the received time.
 
     Args:
-        call: What is emitted.
+        call: The emitted call.
         analysis: Filters and frequencies.
 
     Returns:
@@ -163,7 +163,7 @@ def warn_of_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
     """Log one line for each way in which call and analysis do not suit one another.
 
     Args:
-        call: What is emitted.
+        call: The emitted call.
         analysis: Window and band.
     """
     warn_of_band(call, analysis)

@@ -204,7 +204,7 @@ def smearing(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
     weighted with the squares of the filter's transform and of the call's spectrum.
 
     Args:
-        call: What is emitted.
+        call: The emitted call.
         analysis: Filters and frequencies.
     """
     return (_of_gammatones if analysis.kind == "gammatone" else _of_a_window)(call, analysis)

@@ -179,7 +179,7 @@ def found_ranges(
         recording: All pings.
         given: Keys of the analysis that are set; limits that are not among them follow from the
             echoes.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Returns:
         limits: ``range_min`` and ``range_max``, m.

@@ -104,7 +104,7 @@ def calibrate(
         source: Folder of a run with a surface; for the lag, a store too.
         output: The corrected store; the source's own store is left as it is.
         kinds: Which errors, of :data:`KINDS`, or :data:`LAG` alone.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Raises:
         SettingsError: If a kind is unknown, or the poses are not those of a turntable (``radius``)

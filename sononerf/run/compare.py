@@ -59,7 +59,7 @@ def compare_runs(
         first, second: Fitted runs; the difference is the first without the second.
         output: Folder of the results; ``FIRST/compare-<name of SECOND>`` where None.
         accelerator: What to render on.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Returns:
         folder: With ``comparison.json``; both volumes over their common maximum and their
@@ -121,7 +121,7 @@ def compare_runs_of(
     Args:
         first, second: The difference is the first without the second.
         accelerator: What to render on.
-        progress: Where to show it; on stderr where None.
+        progress: Display of progress; on stderr where None.
     """
     progress = progress or Progress()
     runs = [first, second]

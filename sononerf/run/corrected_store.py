@@ -37,7 +37,7 @@ def write_corrected(
         echoes: With the errors. The support of their head is the right one already.
         output: The corrected store.
         found: The errors.
-        progress: Where to show it.
+        progress: Display of progress.
     """
     store, head = echoes.store, changed_head(echoes.head, beam_radius=found.beam_radius)
     sections = head.plain()

@@ -134,9 +134,9 @@ def evaluate(
 
     Args:
         run: A run that was reconstructed.
-        truth, registration, unit, frame: As of :class:`EvaluationWork`.
+        truth, registration, unit, frame: As in :class:`EvaluationWork`.
         begun: An evaluation of this run that goes on already.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Returns:
         metrics: All of ``metrics.json``.

@@ -62,7 +62,7 @@ def finish(
     Args:
         run: A fitted run.
         accelerator: What to render on.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Returns:
         metrics: ``RUN/metrics.json``.
@@ -184,7 +184,7 @@ def fit(
         overwrite: Move a folder that is there aside.
         workers: Processes that simulate.
         finishes: True also runs the stages after the fit, see :func:`sononerf.run.fit.finish`.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Returns:
         run: With ``model.safetensors`` and ``model.json``.

@@ -92,7 +92,7 @@ def read_recordings(
         options: Sections of the import's settings, such as ``{"air": {"temperature_c": 20},
             "ears": {"directivity": "omnidirectional"}, "import": {"frame": "ned"}}``.
         settings_file: Settings of the import; ``import.yaml`` beside the recordings where None.
-        progress: Where to show it; on stderr where None.
+        progress: Display of progress; on stderr where None.
 
     Returns:
         echoes: Complete. What the first echoes say against the poses is logged as a warning.
@@ -129,7 +129,7 @@ def import_understood(
     Args:
         known: What was understood.
         output: The store.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Raises:
         NumericalError, StorageError, IncompatibleError: As :func:`read_recordings`.

@@ -88,7 +88,7 @@ def predict(
         pictures: How many poses are drawn: from the best to the worst where they were measured,
             else from the first to the last.
         accelerator: What to render on.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Returns:
         folder: With ``spectrograms.npz`` and pictures.

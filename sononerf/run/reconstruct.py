@@ -48,7 +48,7 @@ def refine_surface(
         run: Keeps the state until the refinement is done.
         surface: Read out of its field.
         accelerator: What to compute on.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Raises:
         InputError, IncompatibleError: If the run's echoes are not there, or are others.
@@ -163,7 +163,7 @@ def reconstruct(
         method: How the surface is read out; the settings' where None.
         output: Folder of the results; ``RUN/reconstruction`` where None.
         accelerator: What the surface is refined on.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Raises:
         NumericalError: If the field has no surface.

@@ -43,7 +43,7 @@ def report(
         figures: Also write curves, projections and spectrograms of one run as files of this kind,
             into the folder ``figures`` beside the page.
         output: File of the page; ``RUN/report.html`` of one run, ``report.html`` of several.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Returns:
         page: The file. What a run has not come to yet is named with the command that makes it.

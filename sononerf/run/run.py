@@ -126,7 +126,7 @@ class Run(Shown):
             traced: True also traces echoes off the surface: some seconds for the first pose, then
                 some tenths of a second for each. The field alone takes some hundredths.
             accelerator: What to render on: ``auto``, ``cpu`` or ``gpu``.
-            progress: Where to show it; on stderr where None.
+            progress: Display of progress; on stderr where None.
 
         Raises:
             InputError: If a pose is too far from the region for anything to be heard.

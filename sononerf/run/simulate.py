@@ -128,7 +128,7 @@ def simulate(
         shard: Which of how many; the whole ensemble where None.
         workers: Processes; as many as there are cores, at most 8, where None.
         scheduler: Address of a Dask scheduler to use instead.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Returns:
         store: Complete, or the shard; opened for reading.
@@ -177,7 +177,7 @@ def write_waveforms(
         settings: The experiment; its scene is needed.
         folder: Empty, or not there.
         scene: Another one than the settings'.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Returns:
         written: Table, settings, and the first WAV file.

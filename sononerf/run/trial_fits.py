@@ -65,7 +65,7 @@ def fitted_error(settings: Settings, store: Path, run: Path, progress: Progress)
         settings: Settings of a run, whose field, fit and reconstruction are taken.
         store: What is fitted to.
         run: Folder of the fit.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Returns:
         error: Infinite where there is no surface.

@@ -101,7 +101,7 @@ def understand(
         settings_file: Sections ``import``, ``air``, ``ears``, ``call``, ``spectrogram``;
             ``import.yaml`` beside the recordings where None, if it is there.
         overrides: ``KEY=VALUE``.
-        progress: Where to show it.
+        progress: Display of progress.
 
     Raises:
         SettingsError: If a key or value is not allowed, or settings and recordings contradict one

@@ -47,7 +47,7 @@ def verify(
     Args:
         path: A run that was evaluated.
         accelerator: What to render on.
-        progress: Where to show it.
+        progress: Display of progress.
         true: As it was given to :func:`sononerf.run.evaluate.evaluate`.
 
     Returns:

@@ -80,7 +80,7 @@ def simulate(
         shard: Which of how many; the whole ensemble where None. It needs ``output``.
         workers: Processes; as many as there are cores, at most 8, where None.
         scheduler: Address of a Dask scheduler to use instead.
-        progress: Where to show it; on stderr where None.
+        progress: Display of progress; on stderr where None.
 
     Returns:
         echoes: Complete, or the shard.

@@ -217,7 +217,7 @@ def land(
         incoming (H, 3): Directions of the rays.
         normals, flat (H, 3): Normals of the smooth surface and of the triangle, unit vectors on
             any side.
-        gradients ((H, 4, 3) float32): As of :class:`Hits`.
+        gradients ((H, 4, 3) float32): As in :class:`Hits`.
 
     Returns:
         rows ((H, 19) float32): The :class:`Footprint`.

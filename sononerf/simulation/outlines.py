@@ -109,7 +109,7 @@ def _outline(
         least (1/m): Curvature of an edge that bends the other way.
 
     Returns:
-        outline: As of :meth:`Outlines.seen_from`.
+        outline: As in :meth:`Outlines.seen_from`.
     """
     front = np.zeros(len(normals), np.bool_)
     for i in range(len(normals)):

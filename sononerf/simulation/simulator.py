@@ -144,7 +144,7 @@ class Simulator:
         Args:
             positions ((P, 3), m): Places of the head, world frame.
             rotations (P, 3, 3): Head to world.
-            progress: Where to show it.
+            progress: Display of progress.
         """
         if len(positions) and self.engine.parts:
             with progress.task("solving", self.engine.parts) as task:

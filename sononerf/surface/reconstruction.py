@@ -55,10 +55,10 @@ def reconstruct(
 
     Args:
         model: Fitted to the echoes.
-        echoes: What was fitted to, or its free space.
+        echoes: The fitted echoes, or their free space.
         options: Keys of the section ``reconstruction`` of the settings, such as ``{"spacing":
             0.002, "method": "hull"}`` or ``{"method": "isosurface", "level": 0.5}``.
-        progress: Where to show it; on stderr where None.
+        progress: Display of progress; on stderr where None.
 
     Returns:
         surface: Not refined.
@@ -124,7 +124,7 @@ def refine(
 
     Args:
         surface: The start.
-        echoes: What was measured; the surface is fitted to the training poses and compared on the
+        echoes: Measured echoes; the surface is fitted to the training poses and compared on the
             validation poses.
         options: Options of the simulator that corrects: keys of the section ``simulation`` of the
             settings.
@@ -133,7 +133,7 @@ def refine(
         state: Where an interrupted refinement of the same surface and echoes goes on, see
             :meth:`sononerf.surface.refine.refinement.Refinement.state`.
         after_step: Called after each step with the refinement and the step's mismatch, dB.
-        progress: Where to show it; on stderr where None.
+        progress: Display of progress; on stderr where None.
 
     Returns:
         surface: The best one; the start where none explains the validation poses better.
@@ -219,6 +219,6 @@ def _one_thread() -> Iterator[None]:
 
 @contextmanager
 def _shown(progress: Progress) -> Iterator[Callable[[int, int], None]]:
-    """Show how far a field is read out."""
+    """Show the progress of the read-out."""
     with progress.task("reconstructing", 1000) as task, torch.inference_mode():
         yield lambda done, total: task.advance(1000 * done // total - task.done)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A reconstructed surface: its mesh, what is known about it, and where it is open."""
+"""A reconstructed surface: its mesh, its confidence, and its openings."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ class Surface(Shown):
     Attributes:
         mesh: World frame, m.
         volume: The field's energy, or its loudness for an iso-surface; None without a field.
-        method: How the surface was found, or the start that was refined.
+        method: Method of the surface, or the start that was refined.
         level: Level of an iso-surface, in the unit of the volume; None for other methods.
-        openness: What kind of surface it is; None for an iso-surface and for one of your own.
+        openness: Kind of surface; None for an iso-surface and for one of your own.
         confidence ((V,) int32 or None): How many poses heard the surface around each vertex.
         refined: True where the refined mesh explains the validation poses better than its start.
         error_db (dB): Objective of the refinement on validation poses; None without a refinement.
@@ -112,11 +112,11 @@ def finished_surface(
 
     Args:
         mesh: A start surface or a refined one, m.
-        method: How its start was found.
-        reading: Evidence that the start was made of; without it the mesh stays whole.
-        confidence ((V,) int32): How many poses heard each vertex; counted in the evidence where
-            None.
-        echoes, refined, error_db, faults: As of :class:`Surface`.
+        method: Method of its start.
+        reading: Evidence of the start; without it the mesh stays whole.
+        confidence ((V,) int32): Number of poses that heard each vertex; counted in the evidence
+            where None.
+        echoes, refined, error_db, faults: As in :class:`Surface`.
     """
     known: dict[str, Any] = {"echoes": echoes, "reading": reading}
     known |= {"refined": refined, "error_db": error_db, "faults": faults}
@@ -149,9 +149,9 @@ THIN_SHARE = 0.75
 STANDING = 0.5
 """Height over the support up to which a triangle stands on it, range resolutions: sound does not
 resolve a smaller gap."""
-_LIFT = 1e-3  # of the root of a triangle's area: so far inside the search for the other side begins
-_POSES = 12  # tested at a time for whether they see a triangle, those that it faces best first
-_CHUNK = 4096  # triangles at a time, a bound of memory
+_LIFT = 1e-3  # depth at which the search for the other side begins, over the root of the area
+_POSES = 12  # poses that are tested at a time, those that a triangle faces best first
+_CHUNK = 4096  # triangles at a time; it bounds the memory
 
 
 @dataclass(frozen=True)
@@ -180,14 +180,14 @@ class Openness:
 def judge_openness(
     mesh: trimesh.Trimesh, sources: Floats, *, resolution: float, plane: Plane | None = None
 ) -> Openness:
-    """Tell a body's skin from an open surface.
+    """Return whether a surface is a closed body, one-sided or a sheet.
 
     A support mirrors sound, so that poses also hear from their images. A triangle that stands on
-    the support counts as seen: nothing hears it, but the support tells where it is.
+    the support counts as seen: no pose hears it, but the support gives its place.
 
     Args:
         mesh: A closed reconstruction, normals outward, m.
-        sources ((P, 3), m): Where it was heard from.
+        sources ((P, 3), m): Places of the poses.
         resolution (m): Range resolution of the analysis.
         plane: The support; None where there is none.
     """
@@ -234,21 +234,20 @@ def _seen(caster: RayCaster, middles: Floats, normals: Floats, sources: Floats) 
 def known_part(
     mesh: trimesh.Trimesh, heard: NDArray[np.int32], hull: EchoHull, *, resolution: float
 ) -> Bools:
-    """Tell which part of a surface that was heard from one side is known.
+    """Return which triangles of a surface that was heard from one side are known. These are the
+    triangles that two poses heard. A triangle between such triangles is also known if it lies within
+    one range resolution behind an onset. Between means in their convex hull, or as little out of it as
+    one smooth surface may be.
 
-    That is what two poses heard. Between such places a triangle is also known if it lies where the
-    onsets end. Between them is in their convex hull, or as little out of it as one smooth surface
-    may be. Where the onsets end is no deeper than a range resolution behind one of them.
+        Args:
+            mesh: m.
+            heard ((V,) int32): How many poses heard the surface around each vertex, see
+                :func:`~sononerf.surface.start.evidence.poses_that_heard`.
+            hull: The onsets.
+            resolution (m): Range resolution of the analysis.
 
-    Args:
-        mesh: m.
-        heard ((V,) int32): How many poses heard the surface around each vertex, see
-            :func:`~sononerf.surface.start.evidence.poses_that_heard`.
-        hull: The onsets.
-        resolution (m): Range resolution of the analysis.
-
-    Returns:
-        known: (T,).
+        Returns:
+            known: (T,).
     """
     middles = np.asarray(mesh.triangles_center, dtype=np.float64)
     bounded = hull.clearance(middles)[0] < resolution

@@ -161,7 +161,7 @@ def sides_png(
     """Draw meshes from four sides through the same cameras, one mesh per row.
 
     Args:
-        rows: For each row a title, the mesh, its colours as of :func:`mesh_png`, and what they
+        rows: For each row a title, the mesh, its colours as in :func:`mesh_png`, and what they
             mean.
         size (int, int): Width and height of each view in pixels.
     """

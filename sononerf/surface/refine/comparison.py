@@ -27,7 +27,7 @@ _DB = 20.0 / math.log(10.0)
 
 
 class Comparison:
-    """Compare surfaces by the validation poses and the onsets.
+    """Comparison of surfaces by the validation poses and the onsets.
 
     The mean error of validation poses, traced off the surface by the simulator's rays, and the
     misfit of the onsets as in the descent. A pose counts by the square root of its loudest cell:
@@ -47,13 +47,12 @@ class Comparison:
         self.poses = echoes.validation[chosen.astype(np.int64)]
 
     def objective(self, mesh: trimesh.Trimesh, level: Level, *, smooth: bool) -> float:
-        """Return how badly a surface explains what was heard, dB; infinite if all poses are silent.
+        """Return the error of a surface on the validation poses, dB; infinite if all are silent.
 
         Args:
             mesh: m.
             level: Its gains are applied.
-            smooth: Whether the vertices lie on a smooth surface, and coarse triangles may be
-                divided.
+            smooth: True if the vertices lie on a smooth surface; coarse triangles are then divided.
 
         Raises:
             SonoNerfError: If no echoes can be traced off the surface.

@@ -2,8 +2,8 @@
 """Correction of physical optics, from the simulated echoes of one surface.
 
 Physical optics has no creeping waves, no multiple echoes and no soft shadows. On a surface that is
-almost right, the simulator gives these. The ratio of simulated to rendered magnitude there, cell by
-cell, corrects what is rendered of a surface nearby. This is defect correction [1]_, known in
+almost right, the simulator provides these. The ratio of simulated to rendered magnitude there, cell
+by cell, corrects the rendering of a surface nearby. This is defect correction [1]_, known in
 engineering design as space mapping [2]_: a fast model with gradients is aligned with an accurate
 one without.
 
@@ -38,7 +38,7 @@ class Correction:
         optics: Renders.
         mesh: The surface, m.
         simulator: Simulator of the same surface.
-        echoes: Where the poses are.
+        echoes: Echoes with the poses.
         numbers (N,): Numbers of the poses.
         seed: Seed of the simulated rays.
     """
@@ -75,11 +75,11 @@ class Correction:
         return rng.choice(self.numbers, min(size, len(self.numbers)), replace=False)
 
     def magnitudes(self, numbers: list[int], heard: Heard) -> tuple[Tensor, Tensor]:
-        """Return what is simulated and what is rendered of the surface.
+        """Return simulated and rendered echoes of the surface.
 
         Args:
             numbers: Poses.
-            heard: Whose rows are taken.
+            heard: A rendering with the wanted rows.
 
         Returns:
             simulated, rendered ((P, E, W, F) float32): Linear; zero beyond the axis.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From echoes with a strength per frequency node to the power in the rows of a spectrogram.
+"""Filter bank: power in the rows of a spectrogram from echoes with a strength per frequency node.
 
 Echoes are laid into time bins per node; the bins' spectra, each with the part of the spectrum that
 its node stands for, are added up; each row of the spectrogram is a filter of that, with its own,
@@ -27,7 +27,7 @@ by 0.3 %."""
 
 
 class FilterBank:
-    """Filters of one call and analysis, made when a length is first asked for.
+    """Filters of one call and analysis, computed at the first use of a length.
 
     Args:
         head: Its call and analysis.
@@ -35,7 +35,7 @@ class FilterBank:
         soft (Hz): Frequency below which the fade of smooth surfaces falls no further.
 
     Attributes:
-        kept_nodes (N',): Which of the nodes matter for the analysed band.
+        kept_nodes (N',): Indices of the nodes that the analysed band needs.
         finer: Time bins per sample.
         spacing (Hz): Spacing of the nodes.
     """
@@ -66,10 +66,10 @@ class FilterBank:
 
         Args:
             strength ((Q,) float32): Strengths of the echoes.
-            at ((Q,) float32): When they come, in samples from the start of the first frame.
+            at ((Q,) float32): Arrival times, in samples from the start of the first frame.
             weight ((Q, N') float32): At the kept nodes.
-            receiver (Q,): Who hears them.
-            receivers, frames: How many there are.
+            receiver (Q,): Index of the receiver.
+            receivers, frames: Numbers of receivers and frames.
 
         Returns:
             power ((receivers, frames, F) float32): Gradients run to strength and time.

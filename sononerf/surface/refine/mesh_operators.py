@@ -128,7 +128,7 @@ class MeshOperators:
 
         Args:
             vertices, normals (V, 3): Places (m) and outward unit normals.
-            passes: How often they are averaged over neighbours.
+            passes: Number of averages over neighbours.
 
         Returns:
             bending ((V, 6), 1/m): Components xx, yy, zz, xy, xz, yz of the symmetric tensor that
@@ -185,5 +185,5 @@ def tangents(normals: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def smoothing_passes(wavelength: float, edge: float) -> int:
-    """Return how often curvature is averaged over neighbours, for a wavelength and an edge, m."""
+    """Return the number of averages of curvature, from wavelength and edge, m."""
     return max(1, round(2.0 * (BENDING * wavelength / edge) ** 2))

@@ -43,7 +43,7 @@ triangle."""
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """Rendered spectrograms of some poses, over the ranges at which there is anything.
+    """Rendered spectrograms of some poses, over the ranges that hold echoes.
 
     Attributes:
         power ((P, E, W, F) float32): Squared magnitude; gradients flow through it.
@@ -85,10 +85,10 @@ class Pieces:
     """Echoes of surface pieces at some poses, one row per way of a pose and vertex.
 
     Attributes:
-        pose, vertex (Q,): Which way of which pose, a row of :class:`Heads`; which vertex.
+        pose, vertex (Q,): Row of :class:`Heads`, one for each way of a pose; vertex.
         weight ((Q, E, N) float32): Gains, absorption, spread, fade and visibility at the nodes.
-        reach ((Q, E) float32): Fade and spread at the lowest analysed frequency, 0 to 1: how near a
-            piece is to its mirror point.
+        reach ((Q, E) float32): Fade and spread at the lowest analysed frequency, 0 to 1; 1 at a
+            mirror point.
     """
 
     pose: Tensor
@@ -101,7 +101,7 @@ class Optics(nn.Module):
     """Physical optics of one head; constant tensors move with the module.
 
     Args:
-        head: What hears; its noise is left out.
+        head: The head; its noise is left out.
         hearing: Gains at the nodes of a synthesis; those of the simulator where None.
 
     Attributes:
@@ -180,12 +180,12 @@ class Optics(nn.Module):
     def near_mirror(
         self, points: Tensor, area: Tensor, bending: Tensor, emitters: Tensor, ears: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return which pieces send sound towards an ear, and what dims them.
+        """Return which pieces send sound towards an ear, and their attenuation.
 
         Args:
             points, area (..., 3): Places (m) and vector areas (m²).
             bending ((..., 6), 1/m): Bending of the smooth surface.
-            emitters, ears ((..., 3), m): Where the sound comes from, where it is heard.
+            emitters, ears ((..., 3), m): Places of emitters and ears.
 
         Returns:
             facing (...,): Both are above the surface.
@@ -260,12 +260,12 @@ class Optics(nn.Module):
         visible: Tensor,
         heads: Heads,
     ) -> Pieces:
-        """Weigh pieces: everything of the sum but path, obliquity and area.
+        """Return pieces with their weights: all factors of the sum but path, obliquity and area.
 
         Args:
             points, area, bending ((V, 3), (V, 3), (V, 6) float32): The surface.
-            pose, vertex (Q,): Which pieces which way of a pose hears.
-            visible ((Q, E) float32): How far emitter and ear see them, 0 to 1.
+            pose, vertex (Q,): Way of a pose, and the vertex that it hears.
+            visible ((Q, E) float32): Visibility from emitter and ear, 0 to 1.
             heads: Heads of the poses, float32.
         """
         emitters, ears = heads.emitters, heads.ears
@@ -314,7 +314,7 @@ class Optics(nn.Module):
         v = place[:, None] - ears[pieces.pose]
         d1, d2 = u.norm(dim=1), v.norm(dim=2)
         both = (u / d1[:, None])[:, None] + v / d2[:, :, None]
-        # What comes by different ways adds up in phase.
+        # Sound by different ways adds up in phase.
         pose, poses = pieces.pose % heads.poses, heads.poses
         strength = -(both * normal[:, None]).sum(2) * 0.5 / (self.speed_of_sound * d1[:, None] * d2)
         rate = self.analysis.sampling_rate
@@ -367,7 +367,7 @@ class Optics(nn.Module):
         return power.unflatten(0, (poses, self.ears))
 
     def _span(self, path: Tensor, pose: Tensor, poses: int) -> tuple[int, Tensor]:
-        """Return how many frames hold all echoes of any pose, and the first of each pose."""
+        """Return the number of frames that holds any pose's echoes, and each pose's first."""
         hop, window = self.analysis.hop, self._reads
         late, early = path.amax(1), path.amin(1)
         huge = torch.full((poses,), torch.inf, device=path.device, dtype=path.dtype)

@@ -47,9 +47,9 @@ is the smoother one."""
 STATE_VERSION = 2
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
 Way = Literal["blurred", "sharp", "sheet"]
-"""How a surface goes through the stages: with the blur and the edges of each stage; without blur on
-fine triangles; or as a sheet, whose triangles stay as they are because a signed distance on voxels
-would tear it."""
+"""Way of a surface through the stages: with the blur and the edges of each stage; without blur on
+fine triangles; or as a sheet, whose triangles are kept because a signed distance on voxels would
+tear it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,9 @@ class Refined:
 
     Attributes:
         mesh: m.
-        gain (E, F): What rendered magnitudes are multiplied by, learned on training poses.
-        confidence (V,): How many training poses see each vertex near the direction of a mirror.
+        gain (E, F): Factor of rendered magnitudes, learned on training poses.
+        confidence (V,): Number of training poses that see each vertex near the direction of a
+            mirror.
         start: Name of the start that was refined.
         kept: True where the refined surface explains the validation poses better than the start.
         error_db: Objective on validation poses, see
@@ -93,9 +94,9 @@ def refine(
     """Refine start surfaces against echoes.
 
     Args:
-        starts, echoes, simulate, seed: As of :class:`Refinement`.
+        starts, echoes, simulate, seed: As in :class:`Refinement`.
         optics: On the device of the computation; that of the echoes' head on the CPU where None.
-        state: Where an interrupted refinement of the same starts and echoes goes on.
+        state: State of an interrupted refinement of the same starts and echoes, which resumes.
         after_step: Called after each step with the refinement and the step's mismatch, dB.
     """
     work = Refinement(starts, echoes, optics or Optics(echoes.head), simulate=simulate, seed=seed)
@@ -119,12 +120,12 @@ def _ways(starts: Iterable[str]) -> list[Way]:
 
 
 class Refinement:
-    """Refine step by step; between any two steps it can be stopped, saved and taken up again.
+    """Refinement, step by step; between any two steps it can be stopped, saved and resumed.
 
     Args:
-        meshes: Where to start, m; of several the one that explains the validation poses best. One
-            that is called ``sheet`` is a sheet: it takes part in the first stage beside the best of
-            the others.
+        meshes: Start surfaces, m; the one that explains the validation poses best is refined. A
+            start with the name ``sheet`` takes part in the first stage beside the best of the
+            others.
         echoes: Measured spectrograms and onsets; the surface must begin at the onsets. If their
             level is absolute, gains are learned in the last stage alone: a rough surface is too
             faint, and a gain would hide that. Otherwise gains are learned from the first stage on.
@@ -134,7 +135,7 @@ class Refinement:
         stages: From coarse to fine; ``STAGES`` where None.
 
     Attributes:
-        history: As of :class:`Refined`, so far.
+        history: As in :class:`Refined`, so far.
         newest: The surface that the last entry of the history tells of; None before the first, and
             after a state was taken over.
     """
@@ -165,7 +166,7 @@ class Refinement:
         self.history: list[dict[str, Any]] = []
         self.faults: list[str] = []
         self.newest: trimesh.Trimesh | None = None
-        self._rivals: list[trimesh.Trimesh] = []  # what the first stage made in each way
+        self._rivals: list[trimesh.Trimesh] = []  # results of the first stage, by way
         self._descent: Descent | None = None
         self._later: LaterBounces | None = None
         self._source = 0  # the candidate whose later bounces are added
@@ -228,7 +229,7 @@ class Refinement:
         self.stage += 1
 
     def _best_way(self) -> tuple[trimesh.Trimesh, float]:
-        """Go on in the best way; return what the first stage made in it, and its objective."""
+        """Continue in the best way; return its result of the first stage, and its objective."""
         found = [one["objective_db"] for one in self.history]
         best = int(np.argmin(found))
         if self.ways[0] == "blurred" and found[0] <= TOLERATED * found[best]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A closed surface made anew from its signed distance: even triangles, pieces split and merged."""
+"""Remeshing of a closed surface by its signed distance: even triangles, pieces split and merged."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def remesh(
         edge (m): Mean length of the edges.
         blur (m): Standard deviation of a Gaussian over the signed distance; it removes dents, bumps
             and necks of this size.
-        plane: The support: what stands on it keeps standing, for it is blurred with its image.
+        plane: The support; bodies on it are blurred with their images, so that they stay on it.
 
     Returns:
         surface: None where the mesh is open or would lose thin parts, or nothing is left.
@@ -178,13 +178,13 @@ def _of_body(
     places = lower + spacing * np.argwhere(near)
     away, nearest = cKDTree(points, balanced_tree=False, compact_nodes=False).query(places)
     height = ((places - points[nearest]) * normals[nearest]).sum(axis=1)
-    # Beside the edge of the nearest piece of surface its plane says too little.
+    # Beside the edge of the nearest piece of surface its plane is not enough.
     aside = np.sqrt(np.maximum(away**2 - height**2, 0.0)) > spacing
     height = np.where(aside, np.copysign(away, height), height)
     farthest = (BAND + 0.5) * spacing
     distance = np.full(shape, farthest, dtype=np.float32)
     distance[near] = np.clip(height, -farthest, farthest)
-    # What cannot be reached from the outside is inside.
+    # Voxels that cannot be reached from the outside are inside.
     labels, _ = ndimage.label(distance > 0)
     enclosed = (distance > 0) & (labels != labels[0, 0, 0])
     distance[enclosed] = -distance[enclosed]

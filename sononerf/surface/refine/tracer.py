@@ -32,8 +32,8 @@ class Later:
     """Echoes of one pose after the first bounce.
 
     Attributes:
-        ear (N,): Which ear hears it.
-        delay ((N,), s): From the emission.
+        ear (N,): Index of the ear.
+        delay ((N,), s): Time since the emission.
         weight ((N, F) float32): Strength at the nodes that the optics keep, with spread and
             absorption.
     """
@@ -68,7 +68,7 @@ class Tracer:
         return spectrograms(self._simulator, positions, rotations, seed=self._seed)
 
     def later(self, position: Floats, rotation: Floats) -> Later:
-        """Return what a pose hears after the first bounce."""
+        """Return the echoes of a pose after the first bounce."""
         found, engine = _Collected(self._nodes), self._simulator.engine
         assert isinstance(engine, Rays)
         engine.later(found, position, rotation, seed=self._seed)
@@ -91,7 +91,7 @@ class _Nodes:
 
 
 class _Collected:
-    """Keeps echoes with what spread and air leave of them."""
+    """Listener that keeps echoes, attenuated by spread and air."""
 
     def __init__(self, nodes: _Nodes) -> None:
         self._nodes = nodes

@@ -19,12 +19,12 @@ it."""
 
 
 def seen(sight: Occlusion, points: Floats, target: Floats, *, free: float) -> Bools:
-    """Which points (N, 3) on the surface are seen from targets (N, 3), m.
+    """Return which points (N, 3) on the surface are seen from targets (N, 3), m.
 
     Args:
         sight: Search structure of the surface.
         points, target ((N, 3), m): World frame.
-        free (m): So much of the way, from the point on, cannot be blocked.
+        free (m): Length of the way, from the point on, that cannot be blocked.
     """
     span = target - points
     distance = np.sqrt(np.einsum("nd,nd->n", span, span))[:, None]
@@ -33,7 +33,7 @@ def seen(sight: Occlusion, points: Floats, target: Floats, *, free: float) -> Bo
 
 
 def sight_of(optics: Optics, vertices: Floats, faces: Ints) -> Occlusion:
-    """Return what hides places from one another: a surface, on a support with its image.
+    """Return the search structure of a surface, on a support with its image.
 
     Args:
         optics: Knows the support.
@@ -56,7 +56,7 @@ def listen(
     positions: Tensor,
     rotations: Tensor,
 ) -> tuple[Pieces, Heads, Tensor]:
-    """Find what poses hear of a surface.
+    """Return the pieces of a surface that poses hear.
 
     Args:
         optics: The head.
@@ -68,7 +68,7 @@ def listen(
         positions, rotations ((P, 3), (P, 3, 3) float64): Places and rotations of the heads.
 
     Returns:
-        pieces: What is heard.
+        pieces: The pieces that are heard.
         heads: About the middle of the surface, float32, as :meth:`Optics.render` wants them.
         middle ((3,), m): To be taken off the vertices before they are rendered.
     """
@@ -90,7 +90,7 @@ def _candidates(
     bending: Tensor,
     heads: Heads,
 ) -> tuple[Tensor, Tensor]:
-    """Which poses could hear which vertices (Q,), (Q,), if nothing stood in between."""
+    """Return pairs of pose and vertex (Q,), (Q,) that could hear each other without obstacles."""
     emitters, middles = heads.emitters, heads.ears.mean(1)
     towards = 0.5 * (emitters + middles)
     facing = towards @ area.T > (points * area).sum(1)

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: MIT
-r"""Estimate where the body is from the onsets and the fitted field, and extract its surface.
-
-Three kinds of evidence meet in one signed distance, see :mod:`sononerf.surface.start.evidence`:
+r"""Occupancy: the body's place from onsets and fitted field, and its surface. Three kinds of
+evidence enter one signed distance, see :mod:`sononerf.surface.start.evidence`:
 
 - *oriented points*: the field's sound, put at its range on the line of sight of each pose, weighted
   by how well other poses and the onsets agree with it;
-- *free space*: what lies in front of an onset is empty, and with no other evidence the body reaches
+- *free space*: places in front of an onset are empty, and with no other evidence the body reaches
   as far as the onsets let it;
 - *winding number*: where that of the oriented points is negative, mostly backs of surfaces are
   seen. Such a place is outside, even if the onsets allow a body there (a hollow, a gap).
@@ -40,15 +39,15 @@ _BLUR = 1.5  # voxels over which normals are averaged to find out where opposite
 
 
 def thinness(lattice: Lattice, points: Floats, normals: Floats, weight: Floats) -> Singles:
-    """Return where the other side of the body is so close that both would cancel, from 0 to 1.
+    """Return where the body is so thin that its two sides would cancel, from 0 to 1.
 
-    There the blurred normals are short beside the blurred weights, or point the other way behind a
-    point. In a narrow gap they do so in front of it.
+    At such places the blurred normals are short relative to the blurred weights, or are reversed
+    behind a point. In a narrow gap they are reversed in front of it.
 
     Args:
         lattice: The voxels.
         points, normals (G, 3): Oriented points, m and unit vectors.
-        weight (G,): How far they are believed.
+        weight (G,): Their weights.
 
     Returns:
         thin: (X, Y, Z).
@@ -77,12 +76,12 @@ def thinness(lattice: Lattice, points: Floats, normals: Floats, weight: Floats) 
 def planes(
     lattice: Lattice, points: Floats, normals: Floats, weight: Floats
 ) -> tuple[Singles, Singles]:
-    """Return how far voxels near points are known, and their distance to the planes.
+    """Return the weight of the evidence at voxels near points, and their distance to its planes.
 
     Args:
         lattice: The voxels.
         points, normals (G, 3): Oriented points, m and unit vectors.
-        weight (G,): How far they are believed.
+        weight (G,): Their weights.
 
     Returns:
         known (X, Y, Z): From 0 to 1.
@@ -109,7 +108,7 @@ def planes(
 
 
 def winding_of(lattice: Lattice, points: Floats, normals: Floats, weight: Floats) -> Singles:
-    """Return the winding number of oriented points, each place of the surface counted once.
+    """Return the winding number of oriented points; each part of the surface counts once.
 
     Args:
         lattice: The voxels.
@@ -167,8 +166,9 @@ def winding_number(flux: Sequence[Singles]) -> Singles:
 
 
 Belief = Literal["open", "filled", "hull"]
-"""How far the field's sound is believed. ``open``: the winding number opens hollows and gaps that
-the onsets leave closed. ``filled``: it does not. ``hull``: the onsets alone give the surface, which
+"""Weight of the field's sound beside the onsets. ``open``: the winding number opens hollows and
+gaps that the onsets leave closed. ``filled``: it does not. ``hull``: the onsets alone give the
+surface, which
 is exact for a convex body."""
 QUIET = 0.12
 """Weight below which evidence is left out, no unit: -37 dB relative to the loudest of a usual pose.
@@ -190,7 +190,7 @@ _BENDING = 1.0  # of a voxel; evidence at its point has 1: it sets the unit of a
 _NEGLIGIBLE = 1e-3  # weight of a point that is left out of the planes, to save time
 _LEAST = 30  # voxels of the smallest surface
 _RESOLVED = 8  # voxels of the smallest part
-_CONTRADICTED = 4.0  # range resolutions; if every place lies so far in front, the onsets are wrong
+_CONTRADICTED = 4.0  # range resolutions; if all places lie farther in front, onsets are wrong
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,11 +199,11 @@ class Gathered:
 
     Attributes:
         evidence: The oriented points.
-        weight (G,): How far they are believed, from 0 to 1: their own weight times their
-            reliability.
-        points ((G, 3), m): Where they stand on the lattice: moved outward where the body is thin.
+        weight (G,): Weights of the points, from 0 to 1: their own weight times their reliability.
+        points ((G, 3), m): Places of the points on the lattice, moved outward where the body is
+            thin.
         lattice: The voxels.
-        thin (X, Y, Z): How far the body is thin, from 0 to 1.
+        thin (X, Y, Z): Thinness of the body, from 0 to 1.
         bound ((X, Y, Z), voxels): Signed distance of the boundary of free space; no body lies below
             it.
         hull: The free space.
@@ -229,11 +229,11 @@ def gather_evidence(
     spacing: float,
     resolution: float,
 ) -> Gathered:
-    """Return what the field and the onsets tell about a region.
+    """Return the evidence of field and onsets about a region.
 
     Args:
-        field: What was fitted.
-        places ((N, 3), m): Where it is not silent.
+        field: The fitted field.
+        places ((N, 3), m): Places that are not silent.
         hull: Free space in front of the onsets.
         lower, upper ((3,), m): The region.
         spacing (m): Spacing of the voxels.
@@ -262,7 +262,7 @@ def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> trimesh.Tr
 
     Args:
         known: The evidence.
-        belief: How far the field's sound is believed, see ``Belief``.
+        belief: Weight of the field's sound, see ``Belief``.
 
     Raises:
         NumericalError: If the onsets contradict one another: no place is left by nearly all of
@@ -356,16 +356,16 @@ _COARSER = 4  # voxels between the places of the first look; only saves time
 
 
 def clearance_grid(hull: EchoHull, lattice: Lattice) -> Floats:
-    """Return how far each voxel lies behind the onsets, (X, Y, Z) m; exact near zero.
+    """Return the distance of each voxel behind the onsets, (X, Y, Z) m; exact near zero.
 
     Args:
-        hull: What the onsets leave.
+        hull: Places that the onsets leave.
         lattice: The voxels.
 
     Returns:
-        clearance ((X, Y, Z), m): Its slope is at most one, so voxels that a coarse look finds far
-            from zero need no second one. At most the diagonal of the lattice, where no pose says
-            anything.
+        clearance ((X, Y, Z), m): Its slope is at most one, so voxels that a coarse pass finds far
+            from zero need no second one. At most the diagonal of the lattice, where there is no
+            evidence.
     """
     far = lattice.spacing * float(np.linalg.norm(lattice.shape))
     coarse = [np.unique(np.append(np.arange(0, n, _COARSER), n - 1)) for n in lattice.shape]

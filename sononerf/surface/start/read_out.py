@@ -33,7 +33,7 @@ _FAINTEST = (
 _CHUNK = 16_384  # places at a time, a bound of memory
 
 StartMethod = Literal["open", "filled", "hull", "sheet"]
-"""How a start surface is found. The first three are the surface of the occupancy
+"""Method of a start surface. The first three are the surface of the occupancy
 (:mod:`sononerf.surface.start.occupancy`); ``sheet`` is one thin body
 (:mod:`sononerf.surface.start.sheet`)."""
 Method = Literal["open", "filled", "hull", "sheet", "isosurface"]
@@ -125,7 +125,7 @@ def read_isosurface(
     """Return an iso-surface of a field's loudness, the volume it lies in, and its level.
 
     Args:
-        field, spacing, directions, progress: As of :func:`read_field`.
+        field, spacing, directions, progress: As in :func:`read_field`.
         level: Value of the volume on the surface; by Otsu's rule where "auto".
         smoothing (m): Side of a box over which the volume is averaged first, an odd number of
             voxels; the published code of the paper takes 9 of 5 mm.
@@ -164,7 +164,7 @@ def energy_volume(field: Field, spacing: float, directions: int) -> Volume:
     """Return the energy of a field on a grid over its region.
 
     Args:
-        field: What was fitted.
+        field: The fitted field.
         spacing (m): Voxel size.
         directions: Size of the spherical lattice that is summed over where the field has no lobes.
     """

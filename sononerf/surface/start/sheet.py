@@ -132,7 +132,7 @@ def fit_sheet(known: Gathered) -> trimesh.Trimesh:
 
 
 def _framed(known: Gathered) -> _Frame:
-    """Return the grid over what the onsets leave, above its plane."""
+    """Return the grid over the places that the onsets leave, above its plane."""
     lattice = known.lattice
     inside = lattice.origin + lattice.spacing * np.argwhere(known.bound < 0)
     if len(inside) < 4:
@@ -153,7 +153,7 @@ def _framed(known: Gathered) -> _Frame:
 
 
 def _hull_heights(frame: _Frame) -> tuple[Bools, Floats, Floats]:
-    """Return which columns the hull fills, and from where to where, (U V,) each, m."""
+    """Return which columns the hull fills, with the lower and upper end, (U V,) each, m."""
     inside = frame.depth > 0
     first = frame.heights[inside.argmax(axis=2)]
     last = frame.heights[::-1][inside[:, :, ::-1].argmax(axis=2)]
