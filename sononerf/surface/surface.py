@@ -234,12 +234,13 @@ def _seen(caster: RayCaster, middles: Floats, normals: Floats, sources: Floats) 
 def known_part(
     mesh: trimesh.Trimesh, heard: NDArray[np.int32], hull: EchoHull, *, resolution: float
 ) -> Bools:
-    """Return which triangles of a surface that was heard from one side are known. These are the
-    triangles that two poses heard. A triangle between such triangles is also known if it lies within
-    one range resolution behind an onset. Between means in their convex hull, or as little out of it as
-    one smooth surface may be.
+    """Return which triangles of a surface that was heard from one side are known.
 
-        Args:
+    These are the triangles that two poses heard. A triangle between such triangles is also known if
+    it lies within one range resolution behind an onset. Between means in their convex hull, or as
+    little out of it as one smooth surface may be.
+
+    Args:
             mesh: m.
             heard ((V,) int32): How many poses heard the surface around each vertex, see
                 :func:`~sononerf.surface.start.evidence.poses_that_heard`.

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: MIT
-r"""Occupancy: the body's place from onsets and fitted field, and its surface. Three kinds of
-evidence enter one signed distance, see :mod:`sononerf.surface.start.evidence`:
+r"""Occupancy: the body's place from onsets and fitted field, and its surface.
+
+Three kinds of evidence enter one signed distance, see :mod:`sononerf.surface.start.evidence`:
 
 - *oriented points*: the field's sound, put at its range on the line of sight of each pose, weighted
   by how well other poses and the onsets agree with it;
