@@ -64,7 +64,7 @@ def require_recorded(folder: Path, file: Path, remedy: str) -> None:
     Args:
         folder: Folder of the run.
         file: In this folder, or elsewhere, where nothing is recorded.
-        remedy: What the user can do.
+        remedy: Advice to the user.
 
     Raises:
         InputError: If its content is another one.

@@ -64,8 +64,8 @@ def expect(value: object, kind: type, name: str) -> None:
     """Refuse a value of another kind.
 
     Args:
-        value: What was given.
-        kind: What is expected.
+        value: The given value.
+        kind: The expected kind.
         name: Name of the argument, for the message.
 
     Raises:

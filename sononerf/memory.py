@@ -50,7 +50,7 @@ def require_memory(needed: float, what: str, remedy: str) -> None:
     Args:
         needed: Bytes.
         what: The work, for the message.
-        remedy: What the user can do.
+        remedy: Advice to the user.
 
     Raises:
         ResourceError: With the memory needed and the memory free.
@@ -68,9 +68,9 @@ def require_disk(needed: float, folder: Path, what: str, remedy: str) -> None:
 
     Args:
         needed: Bytes.
-        folder: Where they go; it need not be there.
+        folder: Their folder; it need not exist.
         what: The files, for the message.
-        remedy: What the user can do.
+        remedy: Advice to the user.
 
     Raises:
         ResourceError: With the space needed and the space free.

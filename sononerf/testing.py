@@ -38,7 +38,7 @@ def check_scene(scene: str | Callable[..., Scene], **options: Any) -> Scene:
         options: Its arguments.
 
     Returns:
-        scene: What was made.
+        scene: The object under test.
     """
 
     def made() -> Scene:
@@ -62,7 +62,7 @@ def check_field(field: str | FieldFactory, **options: Any) -> Field:
         options: Its keyword arguments.
 
     Returns:
-        field: What was made.
+        field: The object under test.
     """
     torch.manual_seed(0)
     made = make_field(field, REGION, HEAD, options)
@@ -113,7 +113,7 @@ def check_renderer(
         options: Its keyword arguments.
 
     Returns:
-        renderer: What was made.
+        renderer: The object under test.
     """
     made = make_renderer(renderer, REGION, HEAD, options)
     torch.manual_seed(1)

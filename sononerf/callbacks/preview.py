@@ -36,12 +36,12 @@ class PreviewCallback(lightning.Callback):
 
     Args:
         folder: The run.
-        every_epochs: How often.
+        every_epochs: Number of epochs between two previews.
         voxels: Along the region's longest side.
         directions: Spherical lattice for fields without lobes.
 
     Attributes:
-        volume, mesh: What was read out last; None where there was nothing.
+        volume, mesh: Last read-out; None if there was no surface.
     """
 
     def __init__(self, folder: Path, *, every_epochs: int, voxels: int, directions: int) -> None:
@@ -93,7 +93,7 @@ class SurfaceImages(Shown):
     """Shows the preview: projections with axes, the mesh, and its distance from the truth.
 
     Args:
-        preview: What was read out; it must run before.
+        preview: Callback with the read-out; it must run before.
         truth: The true surface, m; None where it is not known.
     """
 

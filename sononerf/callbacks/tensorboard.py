@@ -210,7 +210,7 @@ def serve(run: Path) -> str:
     """Serve TensorBoard for a run on 127.0.0.1 until this process ends.
 
     Returns:
-        url: Where it is.
+        url: Its address.
 
     Raises:
         ResourceError: If it cannot be started.

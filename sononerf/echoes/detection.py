@@ -149,7 +149,7 @@ def onsets(
 
     Args:
         power (N, R): Power over range.
-        levels: What an echo exceeds.
+        levels: Levels that an echo exceeds.
         window ((W,) float or callable): Power of a point echo over range, its own range in the
             middle; or what gives it for a row and the slice of its echo's greatest power.
         fineness: Spacing of its values in slices.
@@ -206,7 +206,7 @@ class Onsets:
         poses (P,): Their numbers in the store, ascending.
         range ((R,), m): Range of the slices.
         power (P, E, R): Power, averaged over the band.
-        heard (P, E, R): Which slices hold an echo.
+        heard (P, E, R): True for slices with an echo.
         first ((P, E), m): Range of the first echo; minus infinity without an echo, or if it is cut.
     """
 

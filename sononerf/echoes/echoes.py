@@ -51,7 +51,7 @@ class Echoes(Shown):
 
     Args:
         store: Poses, splits, axes and spectrograms, in memory or on disk.
-        head: What heard them.
+        head: The head that heard them.
         hull: The free space, where it is known already; found from the onsets where None.
         box ((2, 3), m): Lower and upper corner of where the body must be, see :meth:`within`.
 
@@ -98,8 +98,8 @@ class Echoes(Shown):
             spectrograms (P, E, R, F): Linear magnitude over the ranges ``head.range`` and the
                 frequencies ``head.frequency``.
             poses: P of them.
-            head: What heard them.
-            split (P,): What each pose is for: ``"train"``, ``"val"`` or ``"test"``, or 0, 1, 2.
+            head: The head that heard them.
+            split (P,): Use of each pose: ``"train"``, ``"val"`` or ``"test"``, or 0, 1, 2.
                 Where None, a twentieth of the poses validates and a tenth is held out (10 and 20 at
                 most), drawn at random with seed 0.
             calibrated: True if magnitudes are sound pressure over that of the call at 1 m. Else one

@@ -211,10 +211,10 @@ def _possible(
     Args:
         cells ((N, 3), m): Their middles.
         emitters, receivers, first, axes, within: As in :func:`_behind`.
-        wanted (P, E): Which onsets are wanted.
+        wanted (P, E): Mask of the wanted onsets.
         few: Number of onsets that may rule a cell out, or
         share: this fraction of those at whose range it lies.
-        reach (m): How far a cell reaches.
+        reach (m): Half diagonal of a cell.
     """
     found = np.zeros(len(cells), np.bool_)
     for n in range(len(cells)):
@@ -266,7 +266,7 @@ def weighted(hull: EchoHull, resolution: float, within: Floats | None = None) ->
     left for the fine cells.
 
     Args:
-        hull: What the onsets leave.
+        hull: Places that the onsets leave.
         resolution (m): Range resolution.
         within ((2, 3), m): Box that holds the body; found from the onsets where None.
     """
@@ -345,7 +345,7 @@ def _cells(
     They are halved until half their diagonal is the least, m.
 
     Returns:
-        against (N, P E): Which onsets rule a cell out.
+        against (N, P E): True where an onset rules a cell out.
         meets (N, W): At which wanted onsets' range it lies.
     """
     lower, upper = box

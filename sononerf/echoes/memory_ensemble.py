@@ -210,7 +210,7 @@ def seal(
     Args:
         ensemble: No pose is missing.
         again: By number of a test pose, what the same pose heard another time, (E, R, F).
-        silent: What to say if no training pose heard anything.
+        silent: Message if no training pose heard anything.
         noise ((E, F) or None): Its root mean square, where it is known.
 
     Raises:

@@ -33,7 +33,7 @@ def noise_rms(store: Ensemble, head: Head) -> Floats | None:
 
     Args:
         store: Its training poses are read.
-        head: What heard them.
+        head: The head that heard them.
 
     Returns:
         noise: None where the first slices hold echoes already.
@@ -60,7 +60,7 @@ def heard_again(magnitude: NDArray[np.floating], noise: Floats, seed: int) -> Si
     is below is noise, and is drawn anew.
 
     Args:
-        magnitude (E, R, F): What it heard.
+        magnitude (E, R, F): Its spectrogram.
         noise (E, F): Root mean square.
         seed: The same seed gives the same noise.
     """
@@ -82,10 +82,10 @@ def seal_recorded(
 
     Args:
         store: No pose is missing.
-        head: What heard them.
+        head: The head that heard them.
         poses: Poses of the store.
-        split (P,): What each pose is for.
-        silent: What to say if no training pose heard anything.
+        split (P,): Use of each pose: 0 training, 1 validation, 2 test.
+        silent: Message if no training pose heard anything.
 
     Raises:
         NumericalError: If no training pose heard anything.

@@ -36,7 +36,7 @@ def split_of(poses: Poses, split: ArrayLike | None, *, where: str = "split") -> 
         poses: P of them.
         split (P,): Names (``"train"``, ``"val"``, ``"test"``) or numbers; drawn at random with seed
             0 where None, see :func:`draw_split`.
-        where: What to call it in messages.
+        where: Its name in messages.
 
     Raises:
         InputError: If a name or a number is unknown, the length is another, or none trains.
@@ -69,7 +69,8 @@ def draw_split(
 
     Args:
         poses: P of them.
-        validation, heldout: How many poses; a twentieth and a tenth where None, at most 10 and 20.
+        validation, heldout: Numbers of poses; a twentieth and a tenth where None, at most 10 and
+            20.
         seed: Seed of the draw.
         where: The table, for messages.
 

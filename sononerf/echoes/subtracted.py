@@ -22,8 +22,8 @@ class SubtractedStore(EnsembleStore):
     more power alone than together leaves silence.
 
     Args:
-        path: What was heard of target and surroundings.
-        background: What was heard of the surroundings alone.
+        path: Store of target and surroundings.
+        background: Store of the surroundings alone.
 
     Raises:
         InputError: If there is no such store, one is damaged, or a pose is missing.

@@ -48,7 +48,7 @@ def backprojection(
         spectrograms (iterable of (E, R, F) float): Linear magnitude, one per pose in order; read
             one at a time.
         poses: P of them.
-        head: What heard the spectrograms.
+        head: The head that heard the spectrograms.
         lower, upper ((3,), m): The box.
         spacing (m): Voxel size.
 
@@ -149,7 +149,7 @@ def range_profiles(
     Args:
         spectrograms (iterable of (E, R, F) float): Linear magnitude, one per pose; read one at a
             time.
-        shape (P, E, R): What is expected.
+        shape (P, E, R): The expected shape.
 
     Raises:
         ValueError: If there are more, fewer or other ones.
@@ -302,7 +302,7 @@ def voxel_fit(
         spectrograms, poses, head, lower, upper, spacing: As of
             :func:`sononerf.evaluation.baseline.backprojection`; the emitter is near the ears
             against the ranges.
-        passes: How often all poses are gone through.
+        passes: Number of passes over all poses.
 
     Returns:
         volume: Power per voxel, as heard at one metre; zero where no recorded range reaches.
@@ -439,7 +439,7 @@ def volume_of(store: Ensemble, name: str, numbers: Ints, *given: Any) -> Volume:
     """Return the volume of a baseline; a function that other processes can import.
 
     Args:
-        store: Where the spectrograms are.
+        store: Store of the spectrograms.
         name: Name in ``BASELINES``.
         numbers (P,): Numbers of the poses.
         given: Further arguments of the baseline.

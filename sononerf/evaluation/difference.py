@@ -26,7 +26,7 @@ class Comparison:
         difference: First without second.
         strongest ((3,) or None, m): Where the difference is greatest; None where it is nowhere
             above zero.
-        score: How great it is at most: fraction of the common maximum.
+        score: Greatest difference, as a fraction of the common maximum.
         poses: At how many poses both were heard.
     """
 
@@ -42,7 +42,7 @@ def compare(first: Volume, second: Volume) -> Comparison:
     """Compare two volumes, place by place.
 
     Args:
-        first, second: What is heard from each place, on one grid.
+        first, second: Loudness of each place, on one grid.
 
     Raises:
         ValueError: If the grids differ.

@@ -212,7 +212,7 @@ class Truth:
     Args:
         true: The true surface, m.
         mesh: The reconstruction, m.
-        kind: What lays the reconstruction over the truth; baselines are moved alike.
+        kind: Motion that lays the reconstruction over the truth; baselines are moved alike.
     """
 
     def __init__(self, true: trimesh.Trimesh, mesh: trimesh.Trimesh, kind: Kind) -> None:

@@ -68,8 +68,8 @@ def evaluate(
         surface: Reconstructed, m.
         truth: The true surface, m; of a scene with a background also the target alone is compared.
         echoes: Give the baselines backprojection and voxel fit; left out where None.
-        registration: What lays the reconstruction over the truth first: ``none``, ``rigid`` or
-            ``similarity``.
+        registration: Motion that lays the reconstruction over the truth first: ``none``, ``rigid``
+            or ``similarity``.
         progress: Display of progress; on stderr where None.
 
     Returns:
@@ -108,7 +108,7 @@ def compare_prediction(prediction: Prediction, echoes: Echoes) -> Evaluation:
 
     Args:
         prediction: Prediction of poses of the echoes.
-        echoes: What was measured.
+        echoes: The measured echoes.
 
     Returns:
         evaluation: ``mae_db``, ``rendered_mae_db`` and others, beside ``mean_predictor_mae_db`` and

@@ -90,7 +90,7 @@ def predict(
         poses: P of them.
         options: Options of the simulator that traces: keys of the section ``simulation`` of the
             settings; engine and number of rays are replaced.
-        accelerator: What to render on: ``auto``, ``cpu`` or ``gpu``.
+        accelerator: Device to render on: ``auto``, ``cpu`` or ``gpu``.
         progress: Display of progress; on stderr where None.
 
     Raises:

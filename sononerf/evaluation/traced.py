@@ -73,12 +73,12 @@ def learn_traced(
     regression on the validation poses. Held-out poses take no part.
 
     Args:
-        model: What is rendered.
-        echoes: What was measured.
+        model: The fitted model.
+        echoes: The measured echoes.
         mesh: The surface, m.
         simulation: Simulation of the surface's echoes; engine and number of rays are replaced.
         seed: Seed of the rays.
-        accelerator: What the field is rendered on.
+        accelerator: Device that renders the field.
         progress: Display of progress.
 
     Returns:
@@ -125,7 +125,7 @@ def for_single_poses(traced: Traced, head: Head, simulation: SimulationSettings)
 
     Args:
         traced: The surface.
-        head: What hears.
+        head: The head.
         simulation: Simulation of the surface's echoes; engine and number of rays are replaced.
     """
     if not traced.weight.any():

@@ -72,14 +72,14 @@ class EchoDataModule(lightning.LightningDataModule):
     devices changes it, and a fit that is resumed meets the batches that are left.
 
     Args:
-        echoes: What is fitted to.
+        echoes: The echoes to fit.
         options: Sizes of batches and epochs, and the seed: keys of the section ``fit`` of the
             settings, such as ``{"batch_poses": 8, "steps_per_epoch": 100}``. Those of the module
             that is fitted where None.
         whole_poses: True for batches of whole poses, False for batches of single slices; what the
             renderer of the module wants where None.
         workers: Processes that prepare batches.
-        memory_bytes: How much of the echoes may be kept in memory.
+        memory_bytes: Largest part of the echoes that is kept in memory, bytes.
 
     Raises:
         SettingsError: If an option is not allowed.

@@ -76,7 +76,7 @@ def make_renderer(
     Args:
         renderer: Name of a plugin, factory, or renderer.
         region ((2, 3), m): Lower and upper corner.
-        head: What heard the echoes.
+        head: The head that heard the echoes.
         options: Keyword arguments of the factory.
 
     Raises:

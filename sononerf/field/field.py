@@ -83,7 +83,7 @@ class Field(nn.Module):
 
         Args:
             step: Number of the training step, from 0.
-            total: How many steps the fit has.
+            total: Number of steps of the fit.
         """
         del step, total
 
@@ -113,7 +113,7 @@ class Field(nn.Module):
         Args:
             positions ((N, 3), m): Places, world frame.
             directions (..., N, 3): Unit vectors to the emitter, for any number of poses at once.
-            bins ((B,) int or None): Which frequencies; all where None.
+            bins ((B,) int or None): Indices of the frequencies; all where None.
 
         Returns:
             reflectivity: (..., N, B) float or complex.
@@ -141,7 +141,7 @@ class Field(nn.Module):
         Args:
             lattice ((L, 3), m): The same tensor as long as the places are the same: how it is read
                 may be kept.
-            which ((N,) int or None): Which of the places; all where None.
+            which ((N,) int or None): Indices of the places; all where None.
 
         Returns:
             code: (N, C) or None.
@@ -176,8 +176,8 @@ class Field(nn.Module):
         Args:
             positions ((N, 3), m): Places, world frame.
             directions (M, 3): Unit vectors to the emitter.
-            bins ((B,) int or None): Which frequencies; all where None.
-            place ((M,) int or None): Which place each direction is for, so that what a place is
+            bins ((B,) int or None): Indices of the frequencies; all where None.
+            place ((M,) int or None): Index of the place of each direction, so that what a place is
                 need be found out once for all directions; each its own where None.
             code ((N, C) or None): Code of :meth:`code`; found out where None.
 

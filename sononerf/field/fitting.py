@@ -76,15 +76,15 @@ def fit(
     A Trainer of your own does as well: ``trainer.fit(model, EchoDataModule(echoes))``.
 
     Args:
-        echoes: What is fitted to.
+        echoes: The echoes to fit.
         model: Field and renderer; a default one for these echoes where None.
         data: Streams the echoes; with the module's options where None.
-        options: How it is fitted: keys of the section ``fit`` of the settings, such as ``{"epochs":
-            40}``; of a model that is given, its own.
-        callbacks: What happens around the fit.
-        logger: Where scalars and pictures go.
-        folder: Where Lightning and its callbacks write by default.
-        checkpoint: Where the fit goes on; from the beginning where None.
+        options: Options of the fit: keys of the section ``fit`` of the settings, such as
+            ``{"epochs": 40}``; of a model that is given, its own.
+        callbacks: Lightning callbacks.
+        logger: Logger of scalars and pictures.
+        folder: Default folder of Lightning and its callbacks.
+        checkpoint: Checkpoint that the fit resumes; None starts anew.
         accelerator, devices, num_nodes: As of Lightning's Trainer.
 
     Returns:

@@ -114,7 +114,7 @@ class GridField(LobeField):
         region ((2, 3), m): Lower and upper corner of the box, world frame.
         frequency ((F,), Hz): Frequencies of the answer.
         spacing (m): Vertex spacing of the finest level; found from ``vertices`` where None.
-        vertices: How many vertices the finest level may have where ``spacing`` is None.
+        vertices: Largest number of vertices of the finest level where ``spacing`` is None.
         finest, coarsest (m): Bounds of the spacing that is found.
         levels: Number of grids, each twice as coarse as the one before.
         rank: Number of spectra that places add by coefficients of their own; at most one less than

@@ -51,7 +51,7 @@ class HashField(LobeField):
         region ((2, 3), m): Lower and upper corner of the box, world frame.
         frequency ((F,), Hz): Frequencies of the answer.
         finest (m): Vertex spacing of the finest level.
-        growth: How much coarser each level is than the next.
+        growth: Ratio of the spacing of a level to that of the next finer one.
         levels: Number of levels.
         features: Numbers per vertex and level.
         log2_entries: A level has at most two to the power of this many entries.

@@ -90,8 +90,8 @@ class Correction(nn.Module):
             positions ((N, 3), m): Places, world frame.
             directions ((..., N, 3) or (M, 3)): Unit vectors to the emitter; the latter with
                 ``place``.
-            bins ((B,) int or None): Which frequencies; all where None.
-            place ((M,) int or None): Which place each direction is for.
+            bins ((B,) int or None): Indices of the frequencies; all where None.
+            place ((M,) int or None): Index of the place of each direction.
 
         Returns:
             correction: (..., N, B) or (M, B).

@@ -63,21 +63,21 @@ class EchoModule(lightning.LightningModule):
     was given as an object has to be given again.
 
     Args:
-        field: What is learned: the name of a plugin, such as ``"grid"``, ``"fourier"`` or
+        field: The learned field: the name of a plugin, such as ``"grid"``, ``"fourier"`` or
             ``"hash"``; a factory; or a field.
-        renderer: How it is heard: the name of a plugin, ``"profile"`` or ``"shell"``; a factory; or
+        renderer: Its renderer: the name of a plugin, ``"profile"`` or ``"shell"``; a factory; or
             a renderer.
         reference: Magnitude m0 of the reported decibels.
         region ((2, 3), m): Lower and upper corner of the box that holds the field; that of a field
             object where None.
-        head: What heard the echoes, or what ``Head.plain`` says of it; needed unless field and
-            renderer are objects.
+        head: The head that heard the echoes, or what ``Head.plain`` says of it; needed unless
+            field and renderer are objects.
         field_options, renderer_options: Keyword arguments of the factories.
-        options: How it is fitted: keys of the section ``fit`` of the settings, such as
+        options: Options of the fit: keys of the section ``fit`` of the settings, such as
             ``{"learning_rate": 0.05, "loss": "l2", "schedule": "staircase", "seed": 1}``.
-        dynamic_range_db: How far below the loudest cell the fit's own compression starts; the
-            head's (``analysis``) where None.
-        possible: Which places the echoes leave possible.
+        dynamic_range_db: Level below the loudest cell at which the fit's own compression starts;
+            the head's (``analysis``) where None.
+        possible: Test of places against the echoes.
 
     Attributes:
         head: As given; None where field and renderer are objects and it was not.
@@ -164,7 +164,7 @@ class EchoModule(lightning.LightningModule):
         """Return an unfitted module whose region and loudness are those of echoes.
 
         Args:
-            echoes: What will be fitted to.
+            echoes: The echoes to fit.
             field, renderer, field_options, renderer_options, options: As of the class.
             region ((2, 3), m): Lower and upper corner; where None, the box of the echoes
                 (:meth:`sononerf.Echoes.within`), or found from the echoes.

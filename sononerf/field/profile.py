@@ -42,11 +42,12 @@ class ProfileRenderer(Renderer):
 
     Args:
         region ((2, 3), m): Lower and upper corner of the box that holds the field.
-        head: What heard the spectra.
+        head: The head that heard the spectra.
         oversampling: Bins of the profile per range slice.
-        points: How many places a step evaluates at most; more are drawn by their running energy.
+        points: Largest number of places that a step evaluates; more are drawn by their running
+            energy.
         uniform: Share of the drawn places that are drawn uniformly.
-        start: How many places the first lattice may have. It is as often twice as coarse as the
+        start: Largest number of places of the first lattice. It is as often twice as coarse as the
             field as that takes, and is refined around what is alive.
         prune_every: Steps between two looks at which places are alive, and whether the lattice is
             refined; 0 never does.
@@ -345,7 +346,7 @@ class ProfileRenderer(Renderer):
             out, back ((3, M), m): Places, each in the head of its pose, as the emitter and as the
                 ears hear them: the places or their images. If they differ, sound takes the way
                 where they change roles too, and both add up.
-            bins (B,): Which frequencies.
+            bins (B,): Indices of the frequencies.
 
         Returns:
             known (E, B, M): By beam, ears, air and spreading.

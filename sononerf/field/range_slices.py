@@ -40,8 +40,8 @@ class PoseReader:
     """Spectrograms of a store, kept in memory up to a bound, the oldest given up first.
 
     Args:
-        store: Where they lie.
-        memory_bytes: How much may be kept.
+        store: Store of the spectra.
+        memory_bytes: Largest number of bytes that are kept.
     """
 
     def __init__(self, store: Ensemble, memory_bytes: int) -> None:
@@ -68,13 +68,13 @@ class SliceStream(Dataset[RangeSlices]):
 
     Args:
         store: A sealed ensemble.
-        split: Which poses.
+        split: Split whose poses are used.
         whole_poses: Batches of whole poses, or of single slices of any poses.
         batch: Poses or slices per batch, over all devices together.
-        batch_frequencies: How many frequencies a batch holds; all where None.
+        batch_frequencies: Number of frequencies of a batch; all where None.
         seed: Turns the order.
-        memory_bytes: How much of the ensemble may be kept in memory.
-        share (int, int): Which part of each batch this device gets, and of how many parts.
+        memory_bytes: Largest part of the ensemble that is kept in memory, bytes.
+        share (int, int): Index of this device, and number of devices that divide each batch.
         silent_share: Which part of the silent slices is met at all, drawn once by the seed; single
             slices alone.
         silent_below: Magnitude that no cell of a silent slice reaches.
@@ -178,11 +178,11 @@ class WholePoses(Dataset[RangeSlices]):
     """Poses one by one with all ranges and frequencies, for validation, tests and prediction.
 
     Args:
-        positions ((P, 3), m): Where the head is.
+        positions ((P, 3), m): Places of the head.
         rotations (P, 3, 3): Head to world.
         ranges, frequencies: Lengths of the axes.
-        reader: Where measured spectra come from; none are returned without it.
-        numbers ((P,) int or None): Which poses of the store they are; counted from 0 where None.
+        reader: Reader of measured spectra; none are returned without it.
+        numbers ((P,) int or None): Numbers of the poses in the store; counted from 0 where None.
     """
 
     def __init__(

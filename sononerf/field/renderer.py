@@ -57,7 +57,7 @@ class Renderer(nn.Module):
 
     Args:
         region ((2, 3), m): Lower and upper corner of the box that holds the field.
-        head: What heard the spectra.
+        head: The head that heard the spectra.
 
     Attributes:
         points_evaluated: Number of points at which the field was evaluated in training. Pictures
@@ -118,8 +118,8 @@ class Renderer(nn.Module):
         """Choose where the field is evaluated next; called before each training step.
 
         Args:
-            field: What is rendered.
-            possible: Which places the echoes leave possible; evaluated at the first step and at
+            field: The field to render.
+            possible: Test of places against the echoes; evaluated at the first step and at
                 refinements.
             step: Number of the training step.
 
@@ -151,11 +151,11 @@ class Renderer(nn.Module):
         """Render.
 
         Args:
-            field: What is rendered.
-            position ((P, 3), m): Where the head is.
+            field: The field to render.
+            position ((P, 3), m): Place of the head.
             rotation (P, 3, 3): Head to world.
-            rows (P, R): Which range slices of each pose.
-            bins ((B,) int or None): Which frequencies; all where None.
+            rows (P, R): Indices of the range slices of each pose.
+            bins ((B,) int or None): Indices of the frequencies; all where None.
 
         Returns:
             magnitude (P, E, R, B): Linear.
@@ -268,7 +268,7 @@ class ShellRenderer(Renderer):
 
     Args:
         region ((2, 3), m): Lower and upper corner of the box that holds the field.
-        head: What heard the spectra.
+        head: The head that heard the spectra.
         directions: Number of directions over the forward hemisphere.
         direction: Input of the field: the direction from each place to the head, or, as the
             published code does, the sensor's own look direction (reversed) for all places of a

@@ -25,7 +25,7 @@ def fibonacci_sphere(count: int) -> Floats:
     """Return unit vectors on a spiral from +z to -z, each standing for the same solid angle.
 
     Args:
-        count: How many, one or more.
+        count: Number of directions, one or more.
 
     Returns:
         directions (D, 3): Unit vectors.
@@ -43,7 +43,7 @@ def fibonacci_cap(
     """Return unit vectors on a spiral that fills the cap around an axis; equal areas, stratified.
 
     Args:
-        count: How many, one or more.
+        count: Number of directions, one or more.
         axis (3,): The cap's middle; any length but zero.
         half_angle (rad): From the axis to the cap's rim, 0 to pi.
         offset ((2,), 1): Two numbers in [0, 1): the first shifts every direction within its ring's
@@ -63,7 +63,7 @@ class Cells:
     Attributes:
         middles (2, N): Share and turn.
         sides (2, 2, N): Two sides, each in share and turn.
-        parts: How many of them make up one cell of the spiral.
+        parts: Number of them in one cell of the spiral.
     """
 
     middles: Floats
@@ -93,7 +93,7 @@ class CapSpiral:
     the parallelogram between neighbours is a cell of it, and cells can be divided evenly.
 
     Attributes:
-        count: How many directions.
+        count: Number of directions.
         axis (3,): The cap's middle; any length but zero.
         half_angle (rad): From the axis to the cap's rim, 0 to pi.
         offset ((2,), 1): Shift within the ring's area, and turn of the whole pattern.
@@ -266,7 +266,7 @@ def spread_points(mesh: trimesh.Trimesh, count: int) -> tuple[Floats, Floats]:
 
     Args:
         mesh: The surface.
-        count: How many points, N.
+        count: Number of points, N.
 
     Returns:
         points ((N, 3), m): On the triangles.

@@ -129,7 +129,7 @@ def enclosing_balls(corners: Floats, label: Ints, count: int) -> tuple[Floats, F
 
     Args:
         corners ((T, 3, 3), m): Corners of the triangles.
-        label (T,): Which body they belong to.
+        label (T,): Index of each triangle's body.
         count: Largest number of balls, one or more.
 
     Returns:

@@ -70,8 +70,8 @@ class Plane:
 
         Returns:
             mesh: Those and their images, one after the other.
-            kept (T,): Which faces of the mesh are kept; None if it reaches below the plane and was
-                cut.
+            kept (T,): True for faces of the mesh that are kept; None if it reaches below the plane
+                and was cut.
 
         Raises:
             InputError: If nothing of the mesh is above the plane.

@@ -83,7 +83,7 @@ class Poses(Shown):
         """Return level poses on a spiral around the origin that look at it, each a little off.
 
         Args:
-            count: How many.
+            count: Number of poses.
             radius (m): Distance from the origin.
             aim_jitter (rad): Standard deviation of the two turns about the head's own y and z axes.
             generator: Draws the turns; one of seed 0 where None.
@@ -104,7 +104,7 @@ class Poses(Shown):
 
         Args:
             positions ((P, 3), m): World frame.
-            target ((3,), m): What is looked at.
+            target ((3,), m): Point that poses look at.
 
         Raises:
             InputError: If shapes do not fit, or a position is the target.
@@ -215,7 +215,7 @@ def look_at(positions: ArrayLike, target: ArrayLike) -> Floats:
 
     Args:
         positions ((..., 3), m): World frame.
-        target ((3,) or (..., 3), m): What is looked at.
+        target ((3,) or (..., 3), m): Point that poses look at.
 
     Returns:
         rotations (..., 3, 3): Head to world, roll 0; straight up or down, yaw is 0.

@@ -206,7 +206,7 @@ def _sight(
     Args:
         points, normals ((N, 3), m): Where sight begins, and which way it is lifted; no normals
             (0, 3) lift it towards the targets.
-        targets ((N, 3) or (1, 3), m): Where it ends.
+        targets ((N, 3) or (1, 3), m): Ends of the lines of sight.
         middle ((3,), m), scale (1/m), lift (m): Attributes of the caster.
     """
     origins = np.zeros((len(points), 3), np.float32)
@@ -236,7 +236,7 @@ class RayCaster:
     Attributes:
         face_normals (T, 3): Unit normals of the flat triangles; of one without area, zero.
         curvature ((T,), 1/m): Total curvature of the smooth surface.
-        lift (m): How far above its triangle a ray starts from a hit.
+        lift (m): Height above its triangle at which a ray starts from a hit.
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
@@ -274,7 +274,7 @@ class RayCaster:
         """Return what each ray hits first; rays that hit nothing are left out.
 
         Args:
-            origins ((N, 3), m): Where the rays start.
+            origins ((N, 3), m): Origins of the rays.
             directions (N, 3): Unit vectors.
 
         Returns:
@@ -297,7 +297,7 @@ class RayCaster:
 
         Args:
             points ((N, 3), m): On the surface or off it.
-            targets ((N, 3) or (3,), m): What is looked for.
+            targets ((N, 3) or (3,), m): Places whose visibility is tested.
             normals (N, 3): Where points lie on the surface: unit normals of their triangles, on the
                 side from which they are seen. The points are lifted along them, or else towards the
                 targets.

@@ -50,7 +50,7 @@ class CallFile:
             greatest is 1.
         sampling_rate (Hz): Sampling rate of the file.
         frequency ((K,), Hz): Ascending.
-        delay ((K,), s): When each is emitted.
+        delay ((K,), s): Time of emission of each.
         is_covered (K,): Whether it is emitted.
         bandwidth (Hz): Bandwidth of the window that it was looked at through.
     """

@@ -114,7 +114,7 @@ def mae_db(
     Args:
         a, b ((P, ...), dB): Spectrograms.
         active: Whether only those cells count that reach ``active_db`` in either.
-        active_db (dB): What makes a cell active; one number, or one that is broadcast to a
+        active_db (dB): Level from which a cell is active; one number, or one that is broadcast to a
             spectrogram.
 
     Returns:

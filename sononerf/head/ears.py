@@ -277,7 +277,7 @@ def analysed_ears(
 
     Returns:
         ears: At the analysis' frequencies.
-        lag ((E, F, L, A) float32 or None, s): How much too late each ear hears an echo, beam
+        lag ((E, F, L, A) float32 or None, s): Delay of an echo at each ear, beam
             included; None for an impulse.
     """
     return _analysed(settings, call, analysis, directivity_content(settings))

@@ -48,7 +48,7 @@ class PointEcho:
     Attributes:
         window (W,): Its power over range, averaged over the part of the band that the call has.
         spacing (m): Between these values.
-        looks: How many independent values there are among the frequencies.
+        looks: Number of independent values among the frequencies.
         rows ((F, W) or None): The same of each row, which the window is the sum of; None where all
             rows are about alike. If low rows swell more slowly, an echo without high frequencies
             does so too.

@@ -69,8 +69,8 @@ class RowFilters:
             silent.
         centre: Centre of the envelopes, samples from the frame's start: the frame's time.
         length: Length of the Hamming window that is as wide as the mean over the band, samples.
-        band ((float, float), Hz): What the rows let through.
-        looks: How many independent values of noise there are in a mean over the band.
+        band ((float, float), Hz): Pass band of the rows.
+        looks: Number of independent values of noise in a mean over the band.
     """
 
     frequency: Floats

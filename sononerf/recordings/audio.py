@@ -155,9 +155,9 @@ class Recording:
     """Pings as they were recorded, and the table that says where each of them was.
 
     Attributes:
-        path: Where it was read from, for messages.
+        path: Path of the source, for messages.
         sampling_rate: Hz.
-        labels: What each of the P pings is called in messages.
+        labels: Name of each of the P pings in messages.
         emission ((P,), s): When the call of each ping left, counted from the first sample that
             :attr:`read` gives. Negative where the recording began later.
         until ((P,) or None, s): When the next call in the same file left; infinite where there is
@@ -167,7 +167,7 @@ class Recording:
         columns: Poses as in the table, in its own frame.
         settings: What the source itself says of ``air``, ``ears`` and ``call``: plain data by
             section.
-        notes: What was understood and may surprise, one line each.
+        notes: Interpretations that may surprise, one line each.
     """
 
     path: Path

@@ -48,7 +48,7 @@ def channels_of(power: Floats, looks: float) -> list[Channel]:
 
     Args:
         power (P, E, R): Averaged over frequency.
-        looks: How many independent values each power is the average of.
+        looks: Number of independent values in each average of power.
     """
     heard = (power > threshold_levels(power, looks).total).any(axis=-1).sum(axis=0)
     loud = np.median(power.max(axis=-1), axis=0)
@@ -86,7 +86,7 @@ def check_channels(recording: Recording, channels: Channels | None) -> None:
 
     Args:
         recording: All pings.
-        channels: Which channels become receivers; all where None.
+        channels: Channels that become receivers; all where None.
 
     Raises:
         InputError: Naming the channels.

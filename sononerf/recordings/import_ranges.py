@@ -62,7 +62,7 @@ def calibrate(
     with :math:`d_e, d_r` from emitter and receiver to the surface and G the gains straight ahead.
 
     Args:
-        echo (E, S): What the receivers heard of it, from the emission on.
+        echo (E, S): Its echo at the receivers, from the emission on.
         reference: The target.
         head: Gains, places, air, call and analysis; its range limits do not matter.
 
@@ -261,7 +261,7 @@ def calibrated(
 
     Args:
         recording: All pings.
-        wanted: What to apply.
+        wanted: Settings to apply.
         head: Gains, places, air, call and analysis.
         folder: Folder of background and reference.
 

@@ -36,8 +36,8 @@ def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -
 
     Args:
         samples (E, S): As they are on disk.
-        emission: When the call left, in samples from the first one on; between two of them too.
-        count: How many samples, N.
+        emission: Time of the call's emission, in samples from the first one on; need not be whole.
+        count: Number of samples, N.
         first: The first of them, counted from the emission.
 
     Returns:
@@ -84,7 +84,7 @@ class Cutter:
 
     Attributes:
         recording: All pings.
-        channels: Which channels become receivers; see :func:`mix`.
+        channels: Channels that become receivers; see :func:`mix`.
         delay (s): Added to the time of every emission.
         gain (E,): Factor of each receiver.
         background ((E, S) or None): Echoes of the surroundings alone, from the emission on, before
@@ -127,7 +127,7 @@ class Cutter:
 
         Args:
             index: Number of the ping.
-            count: How many samples N.
+            count: Number of samples, N.
             first: The first of them, counted from the emission.
         """
         whole = count + self._tail
@@ -174,7 +174,7 @@ class Clipping:
 
     Attributes:
         peak (2 E,): As a fraction of full scale, or in the unit of the recording.
-        stays (2 E,): How many samples of that value stand beside another one.
+        stays (2 E,): Number of samples of that value beside another one.
         step: Between two numbers of the recording; 0 of floats.
     """
 

@@ -80,7 +80,7 @@ class Verdict:
     Attributes:
         name: Name of the convention that explains the echoes best; empty if it is the stated one.
         message: One line for the user; empty if nothing is wrong.
-        gain: How much better, in log-likelihood.
+        gain: Gain in log-likelihood.
     """
 
     name: str = ""

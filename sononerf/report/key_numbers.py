@@ -17,10 +17,10 @@ class KeyNumber:
     """A number of ``metrics.json``.
 
     Attributes:
-        label: What it is, with its unit.
+        label: Its name, with its unit.
         key: Its keys in the file, from the outside in, separated by slashes.
         factor: From the file's unit to the label's.
-        form: How it is written.
+        form: Format of the number.
     """
 
     label: str

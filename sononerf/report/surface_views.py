@@ -35,7 +35,7 @@ class SurfaceViews:
 
     Args:
         mesh: The reconstruction, m.
-        confidence ((V,) int32 or None): How many poses heard each vertex.
+        confidence ((V,) int32 or None): Number of poses that heard each vertex.
         truth: The true surface in the frame of the reconstruction, m; None where it is not known.
         limit (m): Error of the strongest colour.
     """

@@ -54,7 +54,7 @@ class Viewer:
 
     Args:
         title: Title of the page.
-        port: Where it is served; the next free one where it is taken.
+        port: Port of the page; the next free one if it is taken.
 
     Raises:
         ResourceError: If the extra ``view`` is not installed.

@@ -101,7 +101,7 @@ def module_for(
 
     Args:
         settings: Field, renderer and fit.
-        head: What heard the echoes.
+        head: The head that heard the echoes.
         region ((2, 3), m): Lower and upper corner; of a small box where None.
         reference: Magnitude m0 of the reported decibels.
 

@@ -71,9 +71,9 @@ class Calibrated:
 
     Attributes:
         store: Complete; opened for reading.
-        estimate: What was taken off.
-        lines: What was found, one line each.
-        warnings: What the echoes do not determine.
+        estimate: The errors that were removed.
+        lines: Results, one line each.
+        warnings: Errors that the echoes do not determine.
     """
 
     store: EnsembleStore
@@ -103,7 +103,7 @@ def calibrate(
     Args:
         source: Folder of a run with a surface; for the lag, a store too.
         output: The corrected store; the source's own store is left as it is.
-        kinds: Which errors, of :data:`KINDS`, or :data:`LAG` alone.
+        kinds: Errors of :data:`KINDS`, or :data:`LAG` alone.
         progress: Display of progress.
 
     Raises:
@@ -280,8 +280,8 @@ def describe(
 
     Args:
         head, store, mesh: Head, store and mesh of the run.
-        estimate: What was found.
-        kinds: What was looked for.
+        estimate: The estimated errors.
+        kinds: Kinds of errors that were sought.
     """
     found, deviation, error = estimate.calibration, estimate.deviation, estimate.error_db
     away = store.positions[store.indices("train")] - mesh.centroid

@@ -58,7 +58,7 @@ def compare_runs(
     Args:
         first, second: Fitted runs; the difference is the first without the second.
         output: Folder of the results; ``FIRST/compare-<name of SECOND>`` where None.
-        accelerator: What to render on.
+        accelerator: Device to render on.
         progress: Display of progress.
 
     Returns:
@@ -120,7 +120,7 @@ def compare_runs_of(
 
     Args:
         first, second: The difference is the first without the second.
-        accelerator: What to render on.
+        accelerator: Device to render on.
         progress: Display of progress; on stderr where None.
     """
     progress = progress or Progress()

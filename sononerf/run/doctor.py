@@ -54,10 +54,10 @@ class Finding:
     """One thing that was looked at.
 
     Attributes:
-        name: What it is.
-        found: What was found.
+        name: Its name.
+        found: The finding.
         good: Whether all works with it as it should.
-        remedy: What brings what is missing; empty where nothing is.
+        remedy: Advice on how to get a missing item; empty if nothing is missing.
     """
 
     name: str
@@ -70,7 +70,7 @@ def examine(folder: Path | None = None) -> list[Finding]:
     """Look at what this machine has.
 
     Args:
-        folder: Where runs would be written; the working directory where None.
+        folder: Folder of future runs; the working directory where None.
     """
     looks: tuple[Callable[[], Finding], ...] = (
         _python,

@@ -32,8 +32,8 @@ class EvaluationWork:
         run: A fitted run.
         truth: File of the true surface; ``evaluation.truth`` of the run's settings where None, or
             else the surface of its scene.
-        registration: What lays the reconstruction over the truth; ``evaluation.registration`` where
-            None.
+        registration: Motion that lays the reconstruction over the truth;
+            ``evaluation.registration`` where None.
         unit: Unit of the numbers in the file; ``evaluation.unit`` where None.
         frame: Frame of the file; ``evaluation.frame`` where None.
     """

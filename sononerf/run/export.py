@@ -153,7 +153,7 @@ def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName 
     Args:
         source: A store, or the folder of a run.
         output: The file.
-        what: Which part. ``auto``: echoes of a store; of a run the mesh or the points, as the
+        what: Part to export. ``auto``: echoes of a store; of a run the mesh or the points, as the
             suffix says, else the prediction.
         frame: Frame of places and directions; the original one of recordings for ``auto``.
 

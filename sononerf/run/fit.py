@@ -61,7 +61,7 @@ def finish(
 
     Args:
         run: A fitted run.
-        accelerator: What to render on.
+        accelerator: Device to render on.
         progress: Display of progress.
 
     Returns:
@@ -178,9 +178,9 @@ def fit(
     Args:
         settings: The experiment.
         path: The run's folder.
-        accelerator: What to fit on.
-        devices: How many.
-        num_nodes: How many machines.
+        accelerator: Device to fit on.
+        devices: Number of devices.
+        num_nodes: Number of machines.
         overwrite: Move a folder that is there aside.
         workers: Processes that simulate.
         finishes: True also runs the stages after the fit, see :func:`sononerf.run.fit.finish`.

@@ -127,7 +127,7 @@ def import_understood(
     """Write what was understood, and say what the first echoes say of the poses.
 
     Args:
-        known: What was understood.
+        known: The interpretation of recordings and settings.
         output: The store.
         progress: Display of progress.
 

@@ -85,7 +85,7 @@ class Siren(Field):
         region ((2, 3), m): Lower and upper corner of the box.
         frequency ((F,), Hz): Frequencies of the answer.
         width, depth: Width and depth of the hidden layers.
-        omega: What the sines' arguments are multiplied by.
+        omega: Factor of the sines' arguments.
     """
 
     learning_rate = 1e-3
@@ -151,7 +151,7 @@ class LatticeRenderer(Renderer):
 
     Args:
         region ((2, 3), m): Lower and upper corner of the box that holds the field.
-        head: What heard the spectra.
+        head: The head that heard the spectra.
         spacing (m): Spacing of the lattice.
     """
 
@@ -217,9 +217,9 @@ def new_plugin(kind: Kind, name: str, folder: Path | None = None) -> list[Path]:
     """Write a plugin with one scene, field or renderer: two files that install, and their test.
 
     Args:
-        kind: What it is.
+        kind: Kind of plugin.
         name: Name of distribution, module and plugin; in the last two, ``-`` becomes ``_``.
-        folder: Where to; ``name`` in the working directory by default.
+        folder: Folder of the package; ``name`` in the working directory by default.
 
     Returns:
         written: All at once, or none.

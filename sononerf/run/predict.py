@@ -81,13 +81,13 @@ def predict(
 
     Args:
         run: A fitted run.
-        split: Which poses of the ensemble.
+        split: Split whose poses are predicted.
         poses_csv: Poses of the user's instead; see :func:`read_poses`.
         frame: Frame of these poses.
         output: Folder of the results; ``RUN/prediction`` where None.
-        pictures: How many poses are drawn: from the best to the worst where they were measured,
-            else from the first to the last.
-        accelerator: What to render on.
+        pictures: Number of poses that are drawn: from the best to the worst where they were
+            measured, else from the first to the last.
+        accelerator: Device to render on.
         progress: Display of progress.
 
     Returns:

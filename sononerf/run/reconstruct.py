@@ -47,7 +47,7 @@ def refine_surface(
     Args:
         run: Keeps the state until the refinement is done.
         surface: Read out of its field.
-        accelerator: What to compute on.
+        accelerator: Device to compute on.
         progress: Display of progress.
 
     Raises:
@@ -160,9 +160,9 @@ def reconstruct(
         spacing (m): Voxel size; the settings' where None.
         level ("auto" or None): A number asks for an iso-surface of this level; the settings' where
             None.
-        method: How the surface is read out; the settings' where None.
+        method: Method of the read-out; that of the settings where None.
         output: Folder of the results; ``RUN/reconstruction`` where None.
-        accelerator: What the surface is refined on.
+        accelerator: Device that refines the surface.
         progress: Display of progress.
 
     Raises:

@@ -125,7 +125,7 @@ class Run(Shown):
             poses: P of them.
             traced: True also traces echoes off the surface: some seconds for the first pose, then
                 some tenths of a second for each. The field alone takes some hundredths.
-            accelerator: What to render on: ``auto``, ``cpu`` or ``gpu``.
+            accelerator: Device to render on: ``auto``, ``cpu`` or ``gpu``.
             progress: Display of progress; on stderr where None.
 
         Raises:
@@ -165,7 +165,7 @@ def compare(first: Prediction | Run, second: Echoes | Run) -> Evaluation | Compa
 
     Args:
         first: A prediction of poses of the echoes; or a run with what is looked for.
-        second: What was measured; or a run without what is looked for.
+        second: The measured echoes; or a run without the target.
 
     Returns:
         found: Of a prediction its errors, ``mae_db`` and others; of runs what the first sends back

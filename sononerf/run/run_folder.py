@@ -105,7 +105,7 @@ class RunFolder:
         """Hold the run against other processes; within one process it can be held repeatedly.
 
         Args:
-            output: Where results go; outside of the run's folder no lock is needed.
+            output: Folder of the results; outside the run's folder no lock is needed.
 
         Raises:
             LockedError: If another process holds the run.

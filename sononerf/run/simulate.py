@@ -125,7 +125,7 @@ def simulate(
         settings: The experiment.
         scene: Another one than the settings'.
         output: The store; ``data/<scene>-<hash>`` where None.
-        shard: Which of how many; the whole ensemble where None.
+        shard: Number of the shard and of all shards; the whole ensemble where None.
         workers: Processes; as many as there are cores, at most 8, where None.
         scheduler: Address of a Dask scheduler to use instead.
         progress: Display of progress.

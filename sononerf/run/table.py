@@ -20,7 +20,7 @@ def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
 
     Args:
         paths: Runs.
-        csv: Where all numbers of ``metrics.json`` go, one line per run, in its units.
+        csv: File for all numbers of ``metrics.json``, one line per run, in its units.
 
     Raises:
         InputError: If one is no run, or its numbers are damaged.

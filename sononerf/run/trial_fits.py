@@ -63,7 +63,7 @@ def fitted_error(settings: Settings, store: Path, run: Path, progress: Progress)
 
     Args:
         settings: Settings of a run, whose field, fit and reconstruction are taken.
-        store: What is fitted to.
+        store: The store to fit.
         run: Folder of the fit.
         progress: Display of progress.
 

@@ -54,17 +54,17 @@ class Understood:
         form: Format of the source.
         recording: All pings that were read.
         settings: Air, ears, call and analysis, complete.
-        wanted: How it was read.
+        wanted: Settings of the import.
         cutter: Cuts and calibrates pings.
         head: Head of these settings.
-        pings (P,): Which of the recording's pings are kept.
+        pings (P,): Numbers of the pings that are kept.
         poses: Poses of all pings of the recording.
         split ((P,) int8): Split of the kept pings.
-        clipped: How many pings are rejected.
-        channels: What each receiver's channel holds.
+        clipped: Number of rejected pings.
+        channels: State of each receiver's channel.
         lengths ((N,), s): Shortest and longest ping, from the emission on.
-        calibration: What was applied, as plain data.
-        notes: What may surprise.
+        calibration: The applied calibration, as plain data.
+        notes: Interpretations that may surprise.
     """
 
     form: str

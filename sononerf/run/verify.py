@@ -46,12 +46,12 @@ def verify(
 
     Args:
         path: A run that was evaluated.
-        accelerator: What to render on.
+        accelerator: Device to render on.
         progress: Display of progress.
         true: As it was given to :func:`sononerf.run.evaluate.evaluate`.
 
     Returns:
-        checked: How many ``files`` and ``numbers`` hold.
+        checked: Numbers of ``files`` and ``numbers`` that hold.
 
     Raises:
         InputError: If a file is missing or is not as it was written, or a number is missing; one

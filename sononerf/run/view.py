@@ -29,7 +29,7 @@ class View:
 
     Args:
         path: A run, finished or not, or a store.
-        port: Where the page is served; the next free one where it is taken.
+        port: Port of the page; the next free one if it is taken.
 
     Raises:
         InputError: If it is neither.

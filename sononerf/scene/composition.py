@@ -32,7 +32,7 @@ class Part:
 
     Attributes:
         scene: Stays as it is.
-        position ((3,), m): Where its origin comes to lie.
+        position ((3,), m): Place of its origin.
         rotation (3, 3): From its own frame to the world's.
         scale (1): Above 0, at most 1000.
         material: For all of it; its own where None.

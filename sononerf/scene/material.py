@@ -39,7 +39,7 @@ class Material:
             None for a smooth surface, which has none of its own: its shape alone decides what it
             sends where.
         strength ((K,), 1): Strengths of what is heard of a hit, relative to a rigid surface.
-        reflection ((K,), 1): What is kept of the pressure when the sound travels on after a bounce,
+        reflection ((K,), 1): Pressure after a bounce, over that before it,
             0 to 1.
         curved_lobe_width ((K,), rad, or None): Lobe of strongly curved places; None where it is the
             same.

@@ -58,7 +58,7 @@ class Scene(Shown):
     Attributes:
         mesh: Metres, world frame; bodies may overlap.
         material: One for all of it, or one for each of its parts.
-        part (T,): Which of the materials each triangle is of, where there are several.
+        part (T,): Index of each triangle's material, if there are several.
         background (T,): True where a triangle is surroundings and not the target. It sounds all the
             same.
         to_original (4, 4): From the scene's frame, m, to the frame and unit of the file that it was
@@ -225,7 +225,7 @@ def load_scene(
     Args:
         name: Name of an entry point of the group ``sononerf.scenes``.
         options: Keyword arguments of its factory.
-        source: Where the settings were read from, for messages.
+        source: Name of the settings' source, for messages.
 
     Returns:
         scene: Checked.

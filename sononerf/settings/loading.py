@@ -325,8 +325,8 @@ def refuse_truths(
     """Refuse yes and no where a number is meant; pydantic takes them for 1 and 0.
 
     Args:
-        given: What the settings say.
-        taken: What pydantic made of it.
+        given: The settings as they were given.
+        taken: The settings after pydantic's validation.
         source, prefix: Where it was read from, and the dotted key of all of it, for messages.
 
     Raises:

@@ -87,7 +87,7 @@ def call(owner: str, factory: Callable[..., Any], *given: Any, **options: Any) -
     """Call a plugin's factory.
 
     Args:
-        owner: What the plugin is called, for the message.
+        owner: Name of the plugin, for the message.
         factory: It.
         given, options: Its arguments.
 
@@ -113,9 +113,9 @@ def check_options(
 
     Args:
         factory: Its annotated keyword arguments are what may be set.
-        options: What the settings say.
+        options: Options of the settings.
         where: Dotted key of the options, for messages.
-        given: How many leading arguments the caller passes itself.
+        given: Number of leading arguments that the caller passes.
 
     Returns:
         options: Every argument with its value, converted to its annotation.
@@ -138,7 +138,7 @@ def describe_options(factory: Callable[..., Any], *, given: int = 0) -> list[dic
 
     Args:
         factory: Its annotated keyword arguments are what may be set.
-        given: How many leading arguments the caller passes itself.
+        given: Number of leading arguments that the caller passes.
 
     Returns:
         rows: ``name``; ``default``, plain data, or None where there is none; ``needed``, where it

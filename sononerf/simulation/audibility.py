@@ -41,7 +41,7 @@ class Audibility:
         wavenumber (rad/m): At the frequency that bundles must resolve.
         farthest (m): Longest detour that is heard.
         radius (m): Radius of the scene.
-        bounces: How often a ray may hit.
+        bounces: Largest number of hits of a ray.
     """
 
     wavenumber: float
@@ -89,7 +89,7 @@ def _judge(
         tube ((H,), m²/sr): Tube of the footprint.
         solid_angle ((H,) or (1,), sr): Solid angle of the cells.
         k (rad/m), farthest (m): As in :class:`Audibility`.
-        explore (1/m): What a wide bundle may bring, over its level.
+        explore (1/m): Weight of a wide bundle, over its level.
     """
     for i in range(len(distance)):
         angle = solid_angle[i if len(solid_angle) > 1 else 0]
@@ -122,7 +122,7 @@ class Arrival:
     """The shortest ways from an emitter over the surface of a scene to an ear.
 
     Args:
-        scene: What is ensonified.
+        scene: The ensonified scene.
 
     Attributes:
         radius (m): Radius of a sphere around the scene.

@@ -211,7 +211,7 @@ class Diffraction:
             hearing: Head and air.
             position ((3,), m): Place of the head.
             rotation (3, 3): Head to world.
-            points: How many, spaced evenly over all that diffracts.
+            points: Number of points, spaced evenly over all edges that diffract.
             offset: In [0, 1), shifts them.
 
         Returns:

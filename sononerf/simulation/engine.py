@@ -18,12 +18,12 @@ class Engine:
     """From a pose to what the ears hear of a scene.
 
     Args:
-        scene: What is ensonified.
+        scene: The ensonified scene.
         hearing: Head and air.
 
     Attributes:
         reflections: The scene's materials at the nodes of the synthesis.
-        note: What a user should know about how this scene is simulated; empty for nothing.
+        note: Note to the user about the simulation of this scene; may be empty.
         prepares: Whether :meth:`prepare` does all the work, so that nothing is left for other
             processes.
     """

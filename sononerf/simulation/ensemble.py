@@ -67,17 +67,18 @@ def simulate(
     there, simulates what is missing, and seals.
 
     Args:
-        scene: What is ensonified.
+        scene: The ensonified scene.
         poses: Poses of the head, P of them.
-        head: What calls and hears; the default head where None.
-        split (P,): What each pose is for: ``"train"``, ``"val"`` or ``"test"``, or 0, 1, 2. Where
+        head: The head; the default head where None.
+        split (P,): Use of each pose: ``"train"``, ``"val"`` or ``"test"``, or 0, 1, 2. Where
             None, a twentieth of the poses validates and a tenth is held out (10 and 20 at most),
             drawn at random with seed 0.
         output: Folder of the store. The echoes are kept in memory where None.
         options: Engine, accuracy and seed: keys of the section ``simulation`` of the settings, such
             as ``{"accuracy_db": 0.4, "bounces": 1, "seed": 1}``.
         about: Further attributes of the ensemble, plain data.
-        shard: Which of how many; the whole ensemble where None. It needs ``output``.
+        shard: Number of the shard and of all shards; the whole ensemble where None. It needs
+            ``output``.
         workers: Processes; as many as there are cores, at most 8, where None.
         scheduler: Address of a Dask scheduler to use instead.
         progress: Display of progress; on stderr where None.
@@ -332,7 +333,7 @@ def simulate_ensemble(
     Args:
         simulator: Scene and head.
         poses: All poses of the ensemble.
-        indices: Which of them to simulate.
+        indices: Indices of those to simulate.
         write: Takes an index and its spectrogram (E, R, F); called here, one at a time.
         seed_of: Gives the seed of a pose by its index.
         workers: Processes on this machine; one means this process. Where None, as many as there are

@@ -86,7 +86,7 @@ class Sources(Solved):
     the unknowns of boundary elements, so this engine solves the low band of :class:`Hybrid`.
 
     Args:
-        scene: What is ensonified; closed and rigid.
+        scene: The ensonified scene; closed and rigid.
         hearing: Head and air.
         most: Sources at the highest frequency. With the area of the surface they say which it is.
         fall: See :class:`Solved`.

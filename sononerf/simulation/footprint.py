@@ -22,12 +22,13 @@ class Footprint:
         rows ((H, 19) float32): All of the attributes, hit by hit.
 
     Attributes:
-        shift ((2, 3, H) float32, m/rad): How the hit moves on the surface over u and over v.
+        shift ((2, 3, H) float32, m/rad): Derivative of the hit point by u and by v.
         square ((3, H) float32, m²/rad²): Products of the shifts: of the first with itself, the
             second with itself, of both.
         bend ((3, H) float32, m/rad²): How the path to the hit bends over u twice, v twice, u and v,
             on a flat surface.
-        curving ((3, H) float32, m/rad²): How far the surface falls off from the flat one, likewise.
+        curving ((3, H) float32, m/rad²): Second derivatives of the surface's distance from its
+            tangent plane, likewise.
         onward ((2, H) float32, m/rad): Shifts along the mirrored ray.
         sink ((H,) float32): Cosine between the ray and the outward normal, below zero.
         tube ((H,) float32, m²/sr): Cross-section of the bundle.
@@ -79,7 +80,7 @@ class Ways:
         distance ((H,), m): From the hits to the listener.
         cosine (H,): Cosines of the angle between the mirrored ray and the way to the listener.
         rise ((H,) float32): Cosine between that way and the outward normal.
-        detour ((H,) float32, m): By how much the path is longer than the mirror's; zero or more.
+        detour ((H,) float32, m): Excess of the path over that by the mirror point; zero or more.
         spread ((H,) float32, m): Standard deviation of the path's length over the cell.
         stiffness ((H,) float32, m/rad²): The greater eigenvalue of :math:`|H|`.
     """
@@ -106,7 +107,7 @@ def ways_to(
     Args:
         rows ((H, 19) float32): Rows of a footprint.
         points, flat, mirrored (H, 3): See :class:`Bounce`.
-        listener ((3,), m): Where the hits are heard.
+        listener ((3,), m): Place of the listener.
         solid_angle ((H,) or (1,), sr): Solid angle of the cells, taken as squares.
     """
     count = len(rows)
@@ -188,8 +189,8 @@ def onto(rows: Singles, turned: Singles, further: Ints, distance: Floats) -> Sin
 
     Args:
         rows, turned: From :func:`land`.
-        further (N,): Which of them hit anything.
-        distance ((N,), m): How far on.
+        further (N,): Indices of those that hit anything.
+        distance ((N,), m): Distance to the hit.
     """
     bundles = np.zeros((len(further), 12), np.float32)
     for i in range(len(further)):
@@ -221,7 +222,7 @@ def land(
 
     Returns:
         rows ((H, 19) float32): The :class:`Footprint`.
-        turned ((H, 6) float32): How the mirrored directions turn.
+        turned ((H, 6) float32): Derivatives of the mirrored directions.
         flat (H, 3): The triangles' normals on the side of the ray.
         mirrored (H, 3): Unit vectors.
     """

@@ -38,7 +38,7 @@ class Sound:
 
     Args:
         synthesis: Time bins.
-        ears: How many, E.
+        ears: Number of ears, E.
 
     Attributes:
         bins: Bins of each ear.
@@ -164,7 +164,7 @@ class Hearing:
         """Return the pressure at the ears for a call that is one sample of height 1.
 
         Args:
-            sound: What was collected.
+            sound: The collected sound.
             basis ((K, F) complex128): Filters of the synthesis; its ``basis``, for what surfaces
                 send back, where not given.
 

@@ -82,7 +82,7 @@ def hybrid(
     """Return the hybrid engine, or the rays alone where the low band cannot be solved for.
 
     Args:
-        scene: What is ensonified.
+        scene: The ensonified scene.
         hearing: Head and air.
         sources: The most that may be used, which bounds the time.
         frequency_min (Hz): The lowest that is analysed.

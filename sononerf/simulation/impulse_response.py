@@ -55,7 +55,7 @@ class Synthesis:
     """Time bins, frequency nodes and the filters that join them.
 
     Attributes:
-        nodes ((F,), Hz): Where strengths are wanted.
+        nodes ((F,), Hz): Frequencies of the strengths.
         hats ((K, F) complex128): Spectrum that each node stands for.
         basis ((K, F) complex128): The same times ``j f`` in Hz, for what surfaces send back.
         odd_hats ((K, F) complex128): As ``hats``, for strengths that are odd functions of
@@ -114,7 +114,7 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
 
     Args:
         settings: The analysis the echo is made for.
-        samples: How long the echo is to be, S.
+        samples: Length of the echo, S.
 
     Returns:
         synthesis: Time bins, nodes and filters.
@@ -223,7 +223,7 @@ def _lay(
         start (L + 1,): First row of each level.
         delay, spread, strength: See :func:`deposit`.
         rate (Hz): Rate of the finest bins.
-        last (bins): What comes no sooner is left out.
+        last (bins): Arrival time from which on echoes are left out.
     """
     earliest, latest = math.inf, -math.inf
     for i in range(len(delay)):

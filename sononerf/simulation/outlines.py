@@ -20,7 +20,7 @@ class Outlines:
         mesh: The scene.
 
     Attributes:
-        body (T,): Which connected part a triangle belongs to.
+        body (T,): Index of each triangle's connected part.
         closed (T,): Whether that part has no rim.
         several: Whether there is more than one part, or any that is not convex.
     """
@@ -104,8 +104,8 @@ def _outline(
         edges ((K, 2, 3), m): Ends.
         middles ((T, 3), m): Middles of the triangles.
         second, third ((T, 3), 1/m): Gradients of the weights of their corners.
-        bend (T, 2, 3): By how much the smooth normals there differ from that at the first corner.
-        bodies (T,): Which body they belong to.
+        bend (T, 2, 3): Difference of the smooth normals there from that at the first corner.
+        bodies (T,): Index of each triangle's body.
         least (1/m): Curvature of an edge that bends the other way.
 
     Returns:

@@ -31,15 +31,15 @@ class Bounce:
 
     Attributes:
         number: n, the first hit being 1.
-        solid_angle (float or (H,) float64, sr): What each ray stands for.
-        ray (H,): Which of the emitted rays.
+        solid_angle (float or (H,) float64, sr): Solid angle of each ray.
+        ray (H,): Index of the emitted ray.
         emitted (H, 3): Their directions from the emitter.
-        points ((H, 3), m): Where they hit.
+        points ((H, 3), m): Hit points.
         flat (H, 3): Normals of the triangles, on the side of the ray.
-        mirrored (H, 3): Where a mirror would send them.
+        mirrored (H, 3): Mirror directions.
         length ((H,), m): From the emitter along the path.
         footprint: Footprint of the bundles.
-        triangles (H, n): Which were hit, this one last.
+        triangles (H, n): Indices of the triangles hit so far, this one last.
         hidden: Whether the rays went through an obstacle as if it were not there.
     """
 
@@ -147,10 +147,10 @@ def trace(
 
     Args:
         caster: The surface.
-        emitter ((3,), m): Where all rays start.
+        emitter ((3,), m): Origin of all rays.
         directions (N, 3): Unit vectors.
-        bounces: How often a ray may hit.
-        solid_angle (sr): What each ray stands for.
+        bounces: Largest number of hits of a ray.
+        solid_angle (sr): Solid angle of each ray.
         beyond: Takes what is hit first and all directions (N, 3); returns what is to count as hit
             instead, and how far it is from the emitter (M,), m.
 
@@ -209,9 +209,9 @@ def echo_paths(
 
     Args:
         caster: The surface.
-        emitter ((3,), m): Where all rays start.
+        emitter ((3,), m): Origin of all rays.
         cap: First rays, world frame.
-        bounces: How often a ray may hit.
+        bounces: Largest number of hits of a ray.
         extra: At most so many rays come to the first ones.
         judge: Takes hits; returns which of them (H,) can be heard at all, and how much of each (H,)
             may be wrong for the size of its cell, in any unit, zero where it is small enough.

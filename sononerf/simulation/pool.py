@@ -45,7 +45,7 @@ class _Worker:
     Attributes:
         process, pipe: Each worker has a pipe of its own: if it dies, nobody waits for the rest of
             its answer.
-        tasks: What it has been sent and has not answered; it computes the first one.
+        tasks: Tasks that were sent and are unanswered; it computes the first one.
         ready: Whether it holds the object that the tasks are about.
     """
 
@@ -107,10 +107,11 @@ def computed(
 
     Args:
         function: Function of a module; workers import it.
-        thing: What all tasks need; each worker is sent it once, and forgets it afterwards.
-        tasks: What else the function takes, by a number; sent one by one.
-        workers: How many processes.
-        what: What a number counts, for messages.
+        thing: Common argument of all tasks; it is sent once to each worker, which drops it at the
+            end.
+        tasks: Further arguments of the function, by number; sent one by one.
+        workers: Number of processes.
+        what: Name of one task, for messages.
         stop: Ends it when set.
 
     Raises:

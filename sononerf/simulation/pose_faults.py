@@ -25,7 +25,7 @@ def check_poses(
     """Refuse poses that lie inside the surface, or not above the support.
 
     Args:
-        scene: What is ensonified.
+        scene: The ensonified scene.
         poses: To be checked.
         offsets ((K, 3), m): Further points of the head that must be outside, such as emitter and
             ears; head frame.
@@ -67,9 +67,9 @@ def check_reach(
     """Warn of poses that no echo can reach within the range limits.
 
     Args:
-        scene: What is ensonified.
+        scene: The ensonified scene.
         poses: To be checked.
-        bounces: How often sound may hit.
+        bounces: Largest number of hits.
         range_min, range_max (m): The limits of the spectrograms.
 
     Raises:
@@ -97,7 +97,7 @@ def check_aim(scene: Scene, poses: Poses, *, is_directional: bool) -> None:
     """Warn of poses that look away from the scene, and of poses that are all the same.
 
     Args:
-        scene: What is ensonified.
+        scene: The ensonified scene.
         poses: To be checked.
         is_directional: Whether it matters which way the head looks.
     """

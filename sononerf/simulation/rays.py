@@ -62,12 +62,12 @@ class Rays(Engine):
     through it. Shadows of later bounces are sharp.
 
     Args:
-        scene: What is ensonified.
+        scene: The ensonified scene.
         hearing: Head and air.
         rays: Per pose.
-        bounces: How often a ray may hit.
+        bounces: Largest number of hits of a ray.
         diffraction_points: Per pose, where a material diffracts.
-        band (K,): By how much each frequency of the synthesis is multiplied; all whole where not
+        band (K,): Factor of each frequency of the synthesis; 1 for all where not
             given.
     """
 

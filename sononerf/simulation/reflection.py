@@ -39,7 +39,7 @@ class Reflection:
         kept ((F,), 1): Pressure after a bounce, over that before it.
         curved_lobe_width, curved_strength (F,): The same where the surface is strongly curved.
         diffraction ((F,), 1): Strength of edges and strongly curved places as sources of their own.
-        material: What these are the values of.
+        material: Material of these values.
     """
 
     fade: Floats
@@ -178,7 +178,7 @@ def leave(directions: Floats, flat: Floats, points: Floats, lift: float) -> tupl
         directions (N, 3): Unit vectors.
         flat (N, 3): Unit normals of the triangles, on the side of the ray.
         points ((N, 3), m): On the triangles.
-        lift (m): How far above them the rays start.
+        lift (m): Height of the rays' origins above them.
 
     Returns:
         origins ((N, 3), m): Origins of the rays.

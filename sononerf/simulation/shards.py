@@ -20,7 +20,7 @@ class Shard:
 
     Attributes:
         number: From 1 on.
-        count: How many there are.
+        count: Number of all.
     """
 
     number: int

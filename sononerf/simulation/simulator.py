@@ -56,7 +56,7 @@ class Simulator:
         engine: Brings the sound to the receivers; its head makes spectrograms of it.
 
     Attributes:
-        head: What hears.
+        head: The head.
     """
 
     def __init__(self, engine: Engine) -> None:
@@ -68,8 +68,8 @@ class Simulator:
         """Return the simulator of a scene and a head.
 
         Args:
-            scene: What is ensonified.
-            head: What hears. Of a scene on its support the part above it is ensonified together
+            scene: The ensonified scene.
+            head: The head. Of a scene on its support the part above it is ensonified together
                 with its image: a rigid plane is exactly that.
             options: The engine and what bounds its work.
 
@@ -121,7 +121,7 @@ class Simulator:
 
         Args:
             mesh: m.
-            head: What hears.
+            head: The head.
             options: Engine and number of rays are replaced.
             rays: Per pose.
         """

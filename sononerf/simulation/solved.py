@@ -113,9 +113,9 @@ class Solved(Engine):
     around; for ``three_spheres`` it is more than 80 dB below the greatest pressure.
 
     Args:
-        scene: What is ensonified.
+        scene: The ensonified scene.
         hearing: Head and air.
-        frequency_max (Hz): Where the response has fallen to zero.
+        frequency_max (Hz): Frequency at which the response has fallen to zero.
         fall: That over the frequency from which on it falls.
 
     Attributes:
@@ -171,7 +171,7 @@ class Solved(Engine):
 
         Args:
             wavenumber (1/m): Wavenumber of sound in air; its imaginary part is not positive.
-            poses: Where emitters and ears are, and their gains.
+            poses: Places of emitters and ears, and their gains.
 
         Returns:
             pressure ((P, E) complex128): For an emission of pressure 1 at 1 m where the beam's gain

@@ -59,7 +59,7 @@ def simulated(
     Args:
         simulator: Scene and head.
         poses: All of them.
-        indices: Which ones are wanted.
+        indices: Indices of the wanted ones.
         seed_of: Gives the seed of a pose by its index.
         workers: Processes on this machine; one means this process. Where None, as many as there are
             cores, at most 8, if they save time.

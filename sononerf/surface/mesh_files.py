@@ -28,7 +28,7 @@ def mesh_bytes(
     Args:
         mesh: Metres.
         file_type: Binary PLY, binary STL, or binary glTF.
-        confidence (V,): How many poses heard the surface around each vertex.
+        confidence (V,): Number of poses that heard the surface around each vertex.
 
     Returns:
         data: The file.

@@ -129,8 +129,8 @@ def refine(
         options: Options of the simulator that corrects: keys of the section ``simulation`` of the
             settings.
         seed: Order of the poses.
-        accelerator: What to compute on: ``auto``, ``cpu`` or ``gpu``.
-        state: Where an interrupted refinement of the same surface and echoes goes on, see
+        accelerator: Device to compute on: ``auto``, ``cpu`` or ``gpu``.
+        state: State of an interrupted refinement of the same surface and echoes, which resumes, see
             :meth:`sononerf.surface.refine.refinement.Refinement.state`.
         after_step: Called after each step with the refinement and the step's mismatch, dB.
         progress: Display of progress; on stderr where None.

@@ -44,11 +44,11 @@ class Surface(Shown):
         method: Method of the surface, or the start that was refined.
         level: Level of an iso-surface, in the unit of the volume; None for other methods.
         openness: Kind of surface; None for an iso-surface and for one of your own.
-        confidence ((V,) int32 or None): How many poses heard the surface around each vertex.
+        confidence ((V,) int32 or None): Number of poses that heard the surface around each vertex.
         refined: True where the refined mesh explains the validation poses better than its start.
         error_db (dB): Objective of the refinement on validation poses; None without a refinement.
-        faults: What went wrong in the refinement, one line each.
-        echoes: What it was made from; None where that is not known.
+        faults: Faults of the refinement, one line each.
+        echoes: Echoes of its field; None if unknown.
         reading: Evidence that it was made from; None where there is none.
         learned: Weights of its echoes beside what a model renders, by model.
 
@@ -241,14 +241,14 @@ def known_part(
     little out of it as one smooth surface may be.
 
     Args:
-            mesh: m.
-            heard ((V,) int32): How many poses heard the surface around each vertex, see
-                :func:`~sononerf.surface.start.evidence.poses_that_heard`.
-            hull: The onsets.
-            resolution (m): Range resolution of the analysis.
+        mesh: m.
+        heard ((V,) int32): Number of poses that heard the surface around each vertex, see
+            :func:`~sononerf.surface.start.evidence.poses_that_heard`.
+        hull: The onsets.
+        resolution (m): Range resolution of the analysis.
 
-        Returns:
-            known: (T,).
+    Returns:
+        known: (T,).
     """
     middles = np.asarray(mesh.triangles_center, dtype=np.float64)
     bounded = hull.clearance(middles)[0] < resolution

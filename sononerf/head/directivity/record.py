@@ -146,7 +146,7 @@ class Directivity:
     """Linear gains in the head frame (x forward, y left, z up).
 
     Attributes:
-        source: Where it was read from, for messages.
+        source: Name of the source, for messages.
         directions (M, 3): Unit vectors from the head to where sound comes from or goes to, in any
             order.
         frequency ((F,), Hz): Ascending.

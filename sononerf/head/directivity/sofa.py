@@ -202,7 +202,7 @@ def write_sofa(path: Path, directivity: Directivity, *, title: str = "directivit
 
     Args:
         path: The file.
-        directivity: What is written.
+        directivity: The directivity to write.
         title: Title of the file.
     """
     gains, places = directivity.gains, directivity.places

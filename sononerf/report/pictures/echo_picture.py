@@ -67,7 +67,7 @@ def echo_png(
         mesh: The scene, metres.
         points ((N, 3), m): Where sound was reflected towards the ears, world frame; none is
             allowed.
-        level_db ((N,), dB): How loud each is heard; drawn below the loudest.
+        level_db ((N,), dB): Level of each; drawn relative to the loudest.
         position ((3,), m): Place of the head, world frame.
         rotation (3, 3): Head to world.
         echo (E, S): Pressure at the receivers from the emission on, over that of the call at 1 m.
@@ -201,7 +201,7 @@ def hits_image(
         relative_db ((N,), dB): Their levels below the loudest, zero at most.
         position ((3,), m): Place of the head.
         rotation (3, 3): Head to world.
-        receivers: How many hear; of two, the head has ears.
+        receivers: Number of receivers; a head with two has ears.
         size (int, int): Width and height in pixels.
 
     Returns:

@@ -90,7 +90,7 @@ def confidence_png(
 
     Args:
         mesh: Metres.
-        counts (V,): How many poses heard the surface around each vertex.
+        counts (V,): Number of poses that heard the surface around each vertex.
         size (int, int): Width and height in pixels.
         view (3,): Direction from the mesh to the camera, world frame; z is up.
 
@@ -112,7 +112,7 @@ class ColourBar:
     """Legend of the colours of a mesh.
 
     Attributes:
-        title: What is shown, with its unit.
+        title: Title, with the unit.
         colours: Colours (N, 3), 0 to 1, of places (N,) from 0 to 1 along the bar.
         marks: Place along the bar, 0 to 1, and what stands there.
     """

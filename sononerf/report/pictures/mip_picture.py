@@ -200,9 +200,10 @@ def difference_pngs(
     """Draw two volumes and their difference along each axis: ``"x"``, ``"y"``, ``"z"``.
 
     Args:
-        comparison: What to draw; a ring marks the strongest difference, where there is one.
+        comparison: The comparison to draw; a ring marks the strongest difference, where there is
+            one.
         titles (str, str): Names of the two.
-        truth ((3,), m): Where something was truly added; a cross marks it.
+        truth ((3,), m): Place of the object that was truly added; a cross marks it.
 
     Returns:
         pictures: PNG files by the axis looked along.

@@ -50,7 +50,7 @@ def scene_png(
         poses_positions ((P, 3), m): Heads, drawn as dots; paler the further away.
         poses_forward (P, 3): Directions of look, drawn as strokes.
         region_box (((3,), (3,)), m): Opposite corners of the box that is fitted.
-        split (P,): What each pose is for: 0 train, 1 validation, 2 test; each has a colour of its
+        split (P,): Use of each pose: 0 train, 1 validation, 2 test; each has a colour of its
             own.
         size (int, int): Width and height in pixels.
         view (3,): Direction to the camera, world frame.

@@ -29,7 +29,7 @@ class Camera:
 
     Args:
         axes (3, 3): Rows: towards the camera, to the right, upwards; orthonormal.
-        centre ((3,), m): What stands in the middle of the picture.
+        centre ((3,), m): Point in the middle of the picture.
         width, height: Pixels.
         scale: Pixels per metre.
     """

@@ -168,8 +168,8 @@ def drawn_receivers(count: int, most: int = MOST_ROWS) -> tuple[Ints, list[str]]
     """Return which receivers are drawn, evenly chosen, and their names.
 
     Args:
-        count: How many there are.
-        most: How many are drawn at most.
+        count: Number of all.
+        most: Largest number that is drawn.
     """
     chosen = np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
     if count == 2:

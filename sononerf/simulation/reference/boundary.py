@@ -58,9 +58,9 @@ class Boundary(Solved):
     polyhedron, the echo comes later by twice the depth of the facets.
 
     Args:
-        scene: What is ensonified.
+        scene: The ensonified scene.
         hearing: Head and air.
-        frequency_max (Hz): Where the response has fallen to zero.
+        frequency_max (Hz): Frequency at which the response has fallen to zero.
         edges_per_wavelength: Mean edges of the mesh over which the wavelength reaches.
 
     Raises:

@@ -35,7 +35,7 @@ class Comparison:
     wavelength. Physical optics instead of rays ranks surfaces with edges badly.
 
     Args:
-        echoes: What was measured.
+        echoes: The measured echoes.
         optics: The head.
         onsets: Onsets of the training poses.
         seed: Seed of the rays.

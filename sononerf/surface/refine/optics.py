@@ -109,7 +109,7 @@ class Optics(nn.Module):
         plane: The support; None where there is none.
         wavelength (m): The shortest of the analysed band.
         rows, ears: Range slices of a spectrogram, R, and ears, E.
-        kept_nodes (N,): Which of the synthesis' nodes matter for the band.
+        kept_nodes (N,): Indices of the synthesis' nodes that the band needs.
     """
 
     def __init__(self, head: Head, hearing: Hearing | None = None) -> None:
@@ -345,7 +345,7 @@ class Optics(nn.Module):
         """Power (P, E, W, F) of single echoes, on the rows of others.
 
         Args:
-            pose, ear (N,): Who hears them.
+            pose, ear (N,): Indices of pose and ear.
             delay ((N,), s): From the emission.
             weight ((N, N') float32): At the nodes.
             like: Rows are the same.

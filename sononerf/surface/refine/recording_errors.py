@@ -36,7 +36,7 @@ class Calibration:
 
     Attributes:
         gain (E,): Natural logarithm of how much too loud each receiver is.
-        range_offset (m): How much too far everything is heard.
+        range_offset (m): Excess of all measured ranges.
         speed_of_sound: Logarithm of the true speed over the assumed one.
         radius (m): To be added to the distance of the poses from the turntable's axis.
         beam_radius (m): To be added to the radius of the emitter.

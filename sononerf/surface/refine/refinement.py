@@ -67,7 +67,7 @@ class Refined:
             :class:`~sononerf.surface.refine.comparison.Comparison`.
         history: Per stage: its number, its way, the mismatch of its last step, and the objective on
             validation poses after it.
-        faults: What went wrong on the way, one line each: a surface that could not be traced and
+        faults: Faults of the refinement, one line each: a surface that could not be traced and
             counted as the worst, or a stage that went without the simulator's correction.
     """
 

@@ -78,10 +78,10 @@ class Calibrator:
 
     Args:
         mesh: The surface, m.
-        echoes: What was measured; its training and validation poses take part.
+        echoes: The measured echoes; its training and validation poses take part.
         optics: The head.
-        kinds: Which errors are looked for; see :data:`KINDS`.
-        dependent: How many cells of a spectrogram share their noise.
+        kinds: Errors that are sought; see :data:`KINDS`.
+        dependent: Number of cells of a spectrogram that share their noise.
 
     Attributes:
         change: Length of the last step over one standard deviation, of the error that changed most;

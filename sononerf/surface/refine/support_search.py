@@ -56,7 +56,7 @@ def find_support(
 
     Args:
         mesh: A surface that was fitted without a support, m.
-        echoes: What was measured.
+        echoes: The measured echoes.
         shown: Called with the part of the work that is done.
 
     Raises:

@@ -44,7 +44,7 @@ class Evidence:
         normals (G, 3): Unit vectors towards the poses.
         weight (G,): Compressed power of the echo without spreading, at most 1; the loudest point of
             half of the poses reaches 1.
-        pose (G,): Which pose hears it.
+        pose (G,): Index of the pose that hears it.
     """
 
     points: Floats
