@@ -19,21 +19,21 @@ from .sheet import Outline
 Values = NDArray[np.float64]
 
 PETIOLE_LENGTH, PETIOLE = 0.02, 1.2e-3
-"""How far the stalk reaches beyond the blade, and half its width, in m."""
+"""Length of the stalk beyond the blade, and half of its width, m."""
 ROUND, POINTED = 0.6, 0.9
-"""Powers with which the blade widens from its base, and narrows to its tip."""
+"""Exponents of the blade's width at its base and at its tip."""
 MIDRIB, VEIN = 0.8e-3, 0.35e-3
-"""Heights on the lower side in m; on the upper one they are half as high."""
+"""Heights of midrib and veins on the lower side, m; on the upper side they are half as high."""
 RIB = 1e-3
-"""Where a rib has fallen to 1/e, in m from its middle."""
+"""Distance from the middle of a rib at which its height has fallen to 1/e, m."""
 VEINS = 7
-"""Side veins on each side of the midrib."""
+"""Number of side veins on each side of the midrib."""
 WAVES = 4
-"""The undulation is the sum of so many, 5 to 12 cm long."""
+"""Number of waves, 5 to 12 cm long, whose sum is the undulation."""
 STRAIGHT = 1e-4
-"""rad; what is bent less is taken as flat."""
+"""Bend below which a blade counts as flat, rad."""
 STEP = 1e-6
-"""m; of the difference quotients for directions, exact to about 1e-9."""
+"""Step of the difference quotients for directions, m; these err by about 1e-9."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +42,11 @@ class Blade:
 
     Attributes:
         length, width, thickness (m): Without stalk and ribs.
-        curl (rad): By how much it is bent from edge to edge; above 0 towards its upper side.
-        bend (rad): By how much from base to tip; above 0 away from its upper side.
-        amplitude (m): Of each wave.
+        curl (rad): Bend from edge to edge; above 0 towards its upper side.
+        bend (rad): Bend from base to tip; above 0 away from its upper side.
+        amplitude (m): Amplitude of each wave.
         waves ((3, WAVES), rad/m, rad/m and rad): Wave numbers along and across, and phases.
-        veins (2, VEINS): Where the side veins start, as shares of the length; of either side.
+        veins (2, VEINS): Starts of the side veins of either side, as fractions of the length.
     """
 
     length: float

@@ -18,9 +18,9 @@ from .bodies import EDGE, SIDE, Degrees, placed
 from .lathe import lathe
 
 DEGREES = (2, 3, 4, 5)
-"""Of the spherical harmonics that are added: from an ellipsoid's to bumps of 36 degrees."""
+"""Degrees of the spherical harmonics that are added: from an ellipsoid to bumps of 36 degrees."""
 MARGIN = 1.02
-"""By so much finer than it seems to need is a mesh tried next."""
+"""Margin by which the next mesh is finer than the last one shows to be needed."""
 
 BlobRadius = Annotated[float, Field(gt=0, le=0.15)]
 """In m."""

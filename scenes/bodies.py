@@ -47,7 +47,7 @@ def tube(path: ArrayLike, radius: float) -> trimesh.Trimesh:
     Args:
         path ((N, 2), m): Points (y, z) of a line without corners; bends of a smaller radius than
             the tube's would fold it.
-        radius (m): Of the tube.
+        radius (m): Radius of the tube.
 
     Returns:
         body: Closed, facing outward, in the y-z plane.

@@ -13,9 +13,9 @@ from sononerf.scene import MATERIALS, MaterialName, Scene
 from .bodies import Radius, ball, placed
 
 GAP = 0.005
-"""m; what is left between two spheres at least, so that echoes can tell them apart."""
+"""Least gap between two spheres, m, so that echoes resolve them."""
 TRIES = 2000
-"""For each sphere; a place is found long before, unless there is hardly any."""
+"""Largest number of places that are tried for each sphere."""
 
 
 def cluster(

@@ -19,19 +19,21 @@ from .leaf import Seed, leaf
 from .loft import loft
 
 GROUND, GROUND_RADIUS, GROUND_THICKNESS = -0.16, 0.2, 0.01
-"""m: height of the ground's surface, unless the target reaches lower; it is a disc."""
+"""Height of the ground's surface, radius and thickness of its disc, m. It lies lower if the target
+reaches lower."""
 BEHIND = -0.09
-"""m; the twig and its leaves stay behind this x, or behind the target where that reaches so far."""
+"""Largest x of the twig and its leaves, m; they stay behind the target if that reaches farther
+back."""
 APART = 0.01
-"""m; between the target and what is not, at least."""
+"""Least distance between the target and other bodies, m."""
 MOST_STONES, MOST_LEAVES = 50, 10
 STONE = (0.005, 0.013)
-"""m; half axes of stones along the ground."""
+"""Half axes of stones along the ground, m."""
 STONE_HEIGHT = (0.5, 0.8)
-"""Half their height over the smaller of those."""
+"""Half of a stone's height over the smaller of these half axes."""
 TRIES = 2000
 TWIG_RADIUS, TWIG_REACH = 2.5e-3, 0.16
-"""m; the twig crosses the scene from -y to +y, rising."""
+"""Radius of the twig, and its reach from -y to +y, m."""
 
 
 def clutter(

@@ -17,7 +17,7 @@ from sononerf.scene.composition import LARGEST_SCALE, Part, compose
 from .bodies import Degrees
 
 OWN = "scene.options"
-"""How a scene calls its options; within another scene they are somewhere else."""
+"""Key of a scene's own options in messages; within another scene the key is another."""
 MOST_PARTS = 100
 
 Metres = Annotated[float, Field(ge=-100, le=100)]
@@ -85,8 +85,8 @@ def load_within(name: str, options: dict[str, Any], of_name: str, of_options: st
     """Build a scene that another one holds.
 
     Args:
-        name: Of the scene.
-        options: Of the scene.
+        name: Name of the scene.
+        options: Options of the scene.
         of_name, of_options: Dotted keys under which they are set, for messages.
 
     Returns:

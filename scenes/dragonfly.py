@@ -23,36 +23,36 @@ from .sheet import Outline, filled, two_sided
 Values = NDArray[np.float64]
 
 STAND = 4.3e-3
-"""m; between the leaf and the body's underside."""
+"""Distance between the leaf and the body's underside, m."""
 THORAX = (0.425, 0.15, 0.062)
 """Front, end and greatest radius."""
 ABDOMEN = (0.18, -0.5, 0.032)
 SEGMENTS = 10
 WAIST, WAISTED = 0.22, 0.28
-"""Where the abdomen is narrowest, from its front, and by how much."""
+"""Place of the abdomen's waist, from its front, and depth of the waist."""
 FURROW = 0.14
-"""How deep the furrows between segments are, in radii."""
+"""Depth of the furrows between segments, radii."""
 HEAD, HEAD_SIZE = 0.44, (0.036, 0.056, 0.04)
-"""Where its middle is, and half axes ahead, to the left and up."""
+"""Place of the head's middle, and its half axes ahead, to the left and up."""
 EYE, EYE_SIZE = (0.46, 0.034, 0.01), (0.036, 0.036, 0.042)
-"""Where the middle of the left eye is: ahead, left and above the head's; and half axes."""
+"""Place of the left eye's middle: ahead, left and above the head's; and its half axes."""
 LEG_ROOTS = (0.36, 0.30, 0.24)
 FEET = ((0.50, 0.13), (0.32, 0.20), (0.10, 0.17))
-"""Ahead and left."""
+"""Places of the left feet: ahead and left."""
 LEG = 0.0065
 GRIP = 1e-4
-"""m; how far feet reach into the leaf, so that they touch it."""
+"""Depth of the feet in the leaf, m, so that they touch it."""
 WING_SPAN, WING_ROOT = 0.72, 0.035
 WINGS = ((0.335, 0.012, 8.0, 0.155), (0.225, 0.0, -12.0, 0.185))
 """Fore and hind: root ahead and above the thorax's back, sweep forward (degrees), chord."""
 WING_THICKNESS = 3e-4
 WING_CLEARANCE = 2.5e-3
-"""m; between wings and leaf, at least."""
+"""Least distance between wings and leaf, m."""
 LOWEST, HIGHEST = -6, 70
-"""Degrees; how the wings may be raised."""
+"""Smallest and largest elevation of the wings, degrees."""
 WING_SPACING = 0.7 * SIDE
 MARGIN = 2e-3
-"""m; so far from the leaf's edge body and feet stay."""
+"""Least distance of body and feet from the leaf's edge, m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class Seat:
         blade: The leaf.
         along, across (m): Place of the body's middle.
         heading (rad): About the leaf's normal; 0 looks to the tip.
-        length (m): Of the body.
+        length (m): Length of the body.
     """
 
     blade: Blade
@@ -102,7 +102,7 @@ def dragonfly_on(seat: Seat) -> trimesh.Trimesh:
     """Build a dragonfly.
 
     Args:
-        seat: Where it sits; body and feet must be over the leaf.
+        seat: Place on the leaf; body and feet must be over the leaf.
 
     Returns:
         mesh: Closed bodies that overlap, in the leaf's frame before that is turned.

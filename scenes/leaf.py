@@ -15,7 +15,7 @@ from .bodies import EDGE, Degrees, turned
 from .sheet import filled, two_sided
 
 SPACING = 0.55 * EDGE
-"""Of the triangles on the flat blade; ribs and the rim lengthen edges by up to 1.8."""
+"""Spacing of the vertices on the flat blade, m; ribs and the rim lengthen edges by up to 1.8."""
 
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
 LeafLength = Annotated[float, Field(ge=0.04, le=0.25)]

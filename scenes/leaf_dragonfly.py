@@ -26,7 +26,7 @@ from .leaf import (
 )
 
 MOST_ALONG, MOST_ACROSS = 0.06, 0.03
-"""m; how far from the leaf's middle the dragonfly may sit."""
+"""Largest distance of the dragonfly from the leaf's middle, m."""
 TRIES = 1000
 
 Along = Annotated[float, Field(ge=-MOST_ALONG, le=MOST_ALONG)]

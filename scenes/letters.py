@@ -19,10 +19,10 @@ Point = tuple[float, float]
 Stroke = tuple[Point, ...]
 
 THINNER = 0.02
-"""By so much each stroke of a letter is thinner than the one before: where two of them share an
-end, one lies inside the other, and no surfaces coincide."""
+"""Fraction by which each stroke of a letter is thinner than the one before. If two strokes share an
+end, one then lies inside the other, and no surfaces coincide."""
 SPACING = 0.15
-"""Between letters, and a third of the width of a space, in letter heights."""
+"""Gap between letters, and a third of the width of a space, letter heights."""
 
 
 def _line(*points: Point) -> tuple[Stroke, ...]:

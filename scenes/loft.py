@@ -19,8 +19,8 @@ def loft(path: ArrayLike, radius: ArrayLike) -> trimesh.Trimesh:
     Args:
         path ((N, 3), m): Points of the line, at least three, no two that follow one another the
             same. It must not bend more sharply than the body is thick.
-        radius ((N,), m): Of the circles about them. Both ends are points, their radii are not asked
-            for.
+        radius ((N,), m): Radii of the circles about them. Both ends are points, their radii are not
+            asked for.
 
     Returns:
         body: Closed, facing outward.

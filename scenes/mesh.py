@@ -19,7 +19,7 @@ from .mesh_file import IN_METRES, kind_of, read_parts, stacked
 logger = logging.getLogger("sononerf")
 
 WORTH_A_WORD = 1e-3
-"""Shift over size, no unit, from which on the user is told of it: less is rounding of the file."""
+"""Shift over size, no unit, from which it is reported: less is rounding of the file."""
 METRES = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
 
@@ -36,11 +36,11 @@ def mesh(
     Args:
         path: STL, PLY, OBJ, OFF, GLB, or glTF that needs no other file; relative to the working
             directory.
-        unit: Of the file's numbers. GLB and glTF are in metres by their standard; the others say
-            nothing, so it must be given.
-        scale: How many times as large as in the file.
+        unit: Unit of the file's numbers. GLB and glTF are in metres by their standard; the others
+            say nothing, so it must be given.
+        scale: Size relative to that in the file.
         centre: Move the middle of the bounding box to the origin, at which poses look.
-        material: Of all that ``materials`` does not name.
+        material: Material of the parts that ``materials`` does not name.
         materials: Materials by part: the geometries of GLB and glTF, the objects and groups of OBJ
             (``object_group`` where it has both), the solids of a text STL.
 

@@ -13,7 +13,7 @@ import trimesh
 from sononerf.errors import InputError
 
 FORMATS = ("stl", "ply", "obj", "off", "glb", "gltf")
-"""What trimesh reads by itself; its other formats need libraries more, or hold no surface."""
+"""Formats that trimesh reads by itself; others need further libraries, or hold no surface."""
 IN_METRES = ("glb", "gltf")  # by their standard; the others state no unit
 LARGEST_FILE = 1_000_000_000  # bytes
 LARGEST_MESH = 20_000_000  # triangles

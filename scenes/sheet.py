@@ -61,8 +61,8 @@ def filled(outline: Outline, spacing: float) -> tuple[NDArray[np.float64], NDArr
 
     Args:
         outline: The shape.
-        spacing (m): Of a hexagonal lattice, one of whose rows is y = 0; edges near the rim are up
-            to 1.7 times as long.
+        spacing (m): Spacing of a hexagonal lattice, one of whose rows is y = 0; edges near the rim
+            are up to 1.7 times as long.
 
     Returns:
         points ((N, 2), m): On the rim and inside.
@@ -96,9 +96,9 @@ def two_sided(
     """Build a closed sheet of two sides and the rim between them.
 
     Args:
-        top, bottom ((N, 3), m): Where the points of a filled outline come to lie on either side;
-            the top is the side from which its triangles run counter-clockwise.
-        triangles (T, 3): Of the outline.
+        top, bottom ((N, 3), m): Places of the points of a filled outline on either side; the top is
+            the side from which its triangles run counter-clockwise.
+        triangles (T, 3): Triangles of the outline.
 
     Returns:
         sheet: Vertices of the top first, then the bottom's.

@@ -21,9 +21,10 @@ from .lathe import lathe
 OUT = 0.75
 """Distance of the legs from the middle, in radii of the seat."""
 SPACING = 0.8 * SIDE
-"""Of points under the seat; edges next to rims are up to 1.7 times as long."""
+"""Spacing of points under the seat, m; edges next to rims are up to 1.7 times as long."""
 FROM_RIM = 0.72 * SIDE
-"""How far those stay away from the rims. Sides of the rims are at most SIDE long: beyond half the
+"""Least distance of these points from the rims, m. Sides of the rims are at most SIDE long: beyond
+half the
 root of 2 of that, no point lies in the circle over a side, so a triangulation keeps it."""
 
 Legs = Annotated[int, Field(ge=3, le=12)]

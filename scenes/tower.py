@@ -48,8 +48,8 @@ def _blocks(
     Args:
         across ((N,), m): Planes along x, and along y.
         up ((M,), m): Planes along z.
-        solid (N - 1, N - 1, M - 1): Which blocks are part of the body; no two of them may share an
-            edge alone.
+        solid (N - 1, N - 1, M - 1): True for blocks of the body; no two of them may share an edge
+            alone.
     """
     places = []
     for axis, planes in enumerate((across, across, up)):

@@ -28,7 +28,7 @@ PYTEST = ("-m", "pytest", "-n", "auto", "--maxprocesses", "4", "--dist", "loadfi
 """The tests run one file per process, on at most four cores: each process takes 0.7 GiB."""
 DEMO_CONFIG = "configs/three_spheres.yaml"
 TESTS = ".[test]"
-"""What the tests need; the demo does without."""
+"""Requirement of the tests; the demo needs less."""
 UNFINISHED = "unfinished"
 
 

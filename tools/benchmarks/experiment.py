@@ -27,7 +27,7 @@ from sononerf.settings.loading import load_settings
 from sononerf.settings.schema import Settings
 
 CONFIG = Path(__file__).resolve().parents[2] / "configs" / "three_spheres.yaml"
-"""Nothing but defaults; the scene is laid over it."""
+"""Settings file with defaults alone; the scene overrides it."""
 STOPPED = tuple(
     code
     for number in (signal.SIGHUP, signal.SIGINT, signal.SIGTERM)
@@ -156,7 +156,7 @@ def keep(output: Path, what: str, device: str, found: dict[str, Any]) -> Path:
     """Write figures to ``WHAT-VERSION-MACHINE-DEVICE.json``.
 
     Returns:
-        path: Of the file.
+        path: Path of the file.
     """
     chip = torch.cuda.get_device_name() if device == "cuda" else device
     parts = (what, __version__, platform.node() or platform.machine(), chip)

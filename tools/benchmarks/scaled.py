@@ -26,7 +26,7 @@ def scaled_settings(plain: Settings, factor: float) -> list[str]:
 
     Args:
         plain: Of a scene whose ``radius`` scales all of it, without a notch in its ears.
-        factor: Of all lengths and times.
+        factor: Scale of all lengths and times.
 
     Returns:
         assignments: ``KEY=VALUE``.
@@ -59,8 +59,8 @@ def scaled_store(source: Path, target: Path, settings: Settings, factor: float) 
     Args:
         source: The finished ensemble of the unscaled world.
         target: Where the new one comes to lie; one that is complete is left as it is.
-        settings: Of the scaled world.
-        factor: Of all lengths and times.
+        settings: Settings of the scaled world.
+        factor: Scale of all lengths and times.
     """
     old = EnsembleStore.open(source)
     scene = load_scene(settings.scene.name, settings.scene.options)

@@ -35,7 +35,7 @@ from tools.benchmarks.experiment import (
 from tools.benchmarks.scaled import UNSCALED, scaled_settings, scaled_store
 
 FACTOR = 3.0
-"""By how much the world of the case ``scaled`` is larger."""
+"""Scale of the world in the case ``scaled``."""
 SPHERES = "scene.name=three_spheres"
 PROCEDURAL = range(100, 120)
 """Seeds of shapes on which nothing was settled."""

@@ -390,8 +390,8 @@ def attacks(count: int, seed: int, keep: Path) -> Report:
     """Let commands meet what strangers may send.
 
     Args:
-        count: How many of the attacks; all where 0.
-        seed: Which of them.
+        count: Number of attacks; all where 0.
+        seed: Seed of the choice.
         keep: Not used.
     """
     del keep

@@ -175,8 +175,8 @@ def fuzz(count: int, seed: int, keep: Path) -> Report:
     """Give damaged files to every reader.
 
     Args:
-        count: How many files.
-        seed: Of the damage.
+        count: Number of files.
+        seed: Seed of the damage.
         keep: Folder that keeps the files that were a fault.
     """
     return _given(Report("fuzz", seed), damaged, count, keep, all_kinds=True)
@@ -186,8 +186,8 @@ def flips(count: int, seed: int, keep: Path) -> Report:
     """Flip single bits of what sononerf writes; what is read then is right or refused.
 
     Args:
-        count: How many bits.
-        seed: Of their places.
+        count: Number of bits.
+        seed: Seed of their places.
         keep: Folder that keeps the files that were a fault.
     """
     return _given(Report("flips", seed), flipped, count, keep, all_kinds=False)

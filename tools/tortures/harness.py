@@ -50,7 +50,7 @@ AFTER = {
 }
 """Commands after a fit, by their names."""
 TIMES = ("tensorboard", "report.html", "checksums.jsonl", "checkpoints", "provenance.json")
-"""What a run holds that tells how long it took, or in how many parts."""
+"""Files of a run that depend on its time, or on the number of its parts."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,8 @@ class Outcome:
 
     Attributes:
         code: Exit code; below zero the number of the signal that killed it.
-        said: What it wrote to standard error.
-        seconds: How long it took.
+        said: Its standard error.
+        seconds: Its duration.
         hung: Whether it was killed because it did not end.
         peak: Greatest resident memory, bytes.
     """
@@ -92,9 +92,9 @@ class Report:
     """What a series of trials found.
 
     Attributes:
-        name: Of the series.
-        seed: Of its random choices.
-        counts: How many trials there were of each kind.
+        name: Name of the series.
+        seed: Seed of its random choices.
+        counts: Number of trials of each kind.
         faults: One line for each fault.
     """
 
@@ -175,7 +175,7 @@ def give(
         words: ``sononerf WORDS``.
         folder: Working directory.
         kill_after: A signal is sent after so long, s.
-        number: Of the signal.
+        number: Number of the signal.
         before: Called in the new process first.
         limit: The process is killed after so long, s.
     """
@@ -253,7 +253,7 @@ def contents(folder: Path, *, leaving: Iterable[str] = TIMES) -> dict[str, str]:
     """Return the SHA-256 of each file below a folder, without what tells of times.
 
     Args:
-        folder: Of a run or a store.
+        folder: Folder of a run or a store.
         leaving: First parts of names that are left out.
     """
     left = set(leaving)

@@ -50,7 +50,7 @@ def counted(
     """Return what lets the N-th call that writes below a folder act otherwise.
 
     Args:
-        number: Of the call, from 1; of none where 0.
+        number: Number of the call, from 1; 0 for none.
         act: Called before it; the call is done where this returns.
         folder: The process's; calls on paths elsewhere do not count.
         tally: Memory that other processes see, for the number of calls.
@@ -126,10 +126,10 @@ def _kills(name: str, words: tuple[str, ...], count: int, seed: int, keep: Path)
     """Kill a command at random moments and at its writes, and give it again until it ends.
 
     Args:
-        name: Of the folder that the command makes.
+        name: Name of the folder that the command makes.
         words: The command.
-        count: How many kills.
-        seed: Of the moments.
+        count: Number of kills.
+        seed: Seed of the moments.
         keep: Folder that keeps the runs that were a fault.
     """
     report, rng = Report(f"kills of {words[0]}", seed), random.Random(seed)

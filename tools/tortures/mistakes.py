@@ -248,8 +248,8 @@ def mistakes(count: int, seed: int, keep: Path) -> Report:
     """Make mistakes of physics and units; count those that are refused or named.
 
     Args:
-        count: How many of them; all where 0.
-        seed: Which of them.
+        count: Number of mistakes; all where 0.
+        seed: Seed of the choice.
         keep: Not used.
     """
     del keep

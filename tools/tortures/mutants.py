@@ -151,8 +151,8 @@ def mutants(count: int, seed: int, keep: Path) -> Report:
     """Make deliberate faults, one at a time, and run the tests of what has them.
 
     Args:
-        count: How many; as many of each part.
-        seed: Which of them.
+        count: Number of mutants, divided evenly among the parts.
+        seed: Seed of the choice.
         keep: Not used.
     """
     del keep

@@ -46,8 +46,8 @@ class Sample:
     """A kind of file.
 
     Attributes:
-        name: Of the kind.
-        suffix: Of the file.
+        name: Name of the kind.
+        suffix: Suffix of the file.
         data: A sound file.
         read: Reads a file, or raises a fault that the user can read; returns what it found.
         is_checked: Whether the format holds a checksum, so that no change may pass.
