@@ -241,6 +241,16 @@ def undescribed_arguments(tree):
             yield node.lineno
 
 
+def unnamed_entries(tree):
+    """Find docstrings that describe an entry of a list by a question, or by "Of ..."."""
+    question = r"What|Where|Which|Who|When|How|By how|So many|As many|Of|That|None of"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            text = ast.get_docstring(node) or ""
+            if re.search(rf"^    [\w, ]+( \(.*\))?: ({question})\b", text, re.MULTILINE):
+                yield node.lineno
+
+
 def faults(path):
     """Return every broken rule of one source file as `file:line: rule`."""
     tree = parse(path)
@@ -258,6 +268,7 @@ def faults(path):
         "writes past storage": writing(tree, file),
         "draws outside report": drawing(tree, room),
         "global random numbers": global_randomness(tree),
+        "an entry without a noun": unnamed_entries(tree),
         "an argument that Args leaves out": undescribed_arguments(tree),
     }
     return [f"{name_of(path)}:{line}: {rule}" for rule, lines in found.items() for line in lines]
@@ -314,6 +325,12 @@ def test_every_source_keeps_the_rules():
             (),
             'def f(a, b):\n    """F.\n\n    Args:\n        a: One.\n    """',
             'def f(a, b):\n    """F.\n\n    Args:\n        a, b ((3,), m): Two.\n    """',
+        ),
+        (
+            unnamed_entries,
+            (),
+            'def f(a):\n    """F.\n\n    Args:\n        a ((3,), m): Where it is.\n    """',
+            'def f(a):\n    """F.\n\n    Args:\n        a ((3,), m): Its place.\n    """',
         ),
     ],
 )

@@ -24,7 +24,7 @@ class Comparison:
     Attributes:
         first, second: 0 to 1, on one grid.
         difference: First without second.
-        strongest ((3,) or None, m): Where the difference is greatest; None where it is nowhere
+        strongest ((3,) or None, m): Place of the greatest difference; None where it is nowhere
             above zero.
         score: Greatest difference, as a fraction of the common maximum.
         poses: At how many poses both were heard.

@@ -164,8 +164,8 @@ def check_truth(found: trimesh.Trimesh, true: trimesh.Trimesh, kind: Kind, name:
     Args:
         found: Reconstruction, m.
         true: True surface, m.
-        kind: What will lay the reconstruction over it: a similarity has any size, and a motion
-            any place.
+        kind: Motion that will lay the reconstruction over it: a similarity has any size, and a
+            motion any place.
         name: Name of the true surface, for the message.
 
     Raises:

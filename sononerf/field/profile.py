@@ -53,9 +53,8 @@ class ProfileRenderer(Renderer):
             refined; 0 never does.
         prune_below: Places weaker than this part of the strongest in their surroundings are
             dropped.
-        surroundings: How far "surroundings" reaches, range resolutions: some of them, so that a
-            part has its own strongest place, and not a fraction of one, where all of a blur would
-            stay.
+        surroundings: Radius of "surroundings", range resolutions: some of them, so that a part has
+            its own strongest place, and not a fraction of one, where all of a blur would stay.
     """
 
     lattice: Tensor

@@ -75,7 +75,7 @@ class SliceStream(Dataset[RangeSlices]):
         seed: Turns the order.
         memory_bytes: Largest part of the ensemble that is kept in memory, bytes.
         share (int, int): Index of this device, and number of devices that divide each batch.
-        silent_share: Which part of the silent slices is met at all, drawn once by the seed; single
+        silent_share: Fraction of the silent slices that is used, drawn once by the seed; single
             slices alone.
         silent_below: Magnitude that no cell of a silent slice reaches.
 

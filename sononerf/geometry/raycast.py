@@ -42,8 +42,8 @@ class Hits:
         triangle (H,): Index of the triangle.
         distance ((H,), m): Along the ray.
         flat (H, 3): Unit normals of the flat triangles.
-        gradients ((H, 4, 3) float32): How the smooth normal changes along the triangle: gradients
-            of the second and third corner's weight (1/m), and by how much the normals there differ
+        gradients ((H, 4, 3) float32): Changes of the smooth normal along the triangle: gradients of
+            the second and third corner's weight (1/m), and by how much the normals there differ
             from that at the first.
     """
 
@@ -204,8 +204,8 @@ def _sight(
     """Return origins and spans (N, 3), in the engine's coordinates, from lifted points to targets.
 
     Args:
-        points, normals ((N, 3), m): Where sight begins, and which way it is lifted; no normals
-            (0, 3) lift it towards the targets.
+        points, normals ((N, 3), m): Starts of the lines of sight, and directions in which they are
+            lifted; no normals (0, 3) lift it towards the targets.
         targets ((N, 3) or (1, 3), m): Ends of the lines of sight.
         middle ((3,), m), scale (1/m), lift (m): Attributes of the caster.
     """
@@ -298,8 +298,8 @@ class RayCaster:
         Args:
             points ((N, 3), m): On the surface or off it.
             targets ((N, 3) or (3,), m): Places whose visibility is tested.
-            normals (N, 3): Where points lie on the surface: unit normals of their triangles, on the
-                side from which they are seen. The points are lifted along them, or else towards the
+            normals (N, 3): For points on the surface: unit normals of their triangles, on the side
+                from which they are seen. The points are lifted along them, or else towards the
                 targets.
 
         Returns:

@@ -119,7 +119,7 @@ class Head(Shown):
         ears: Places and directivities of emitter and receivers, m and degrees, head frame: keys of
             the section ``ears`` of the settings, such as ``{"receivers": [(0, 0.02, 0)],
             "directivity": "omnidirectional"}``.
-        call: What is emitted, s and Hz: section ``call``, such as ``{"kind": "hyperbolic",
+        call: The emitted call, s and Hz: section ``call``, such as ``{"kind": "hyperbolic",
             "duration": 1e-3, "frequency_start": 90e3, "frequency_end": 30e3}``, or ``{"kind":
             "file", "file": "call.wav"}``.
         air: Speed of sound and absorption: section ``air``, such as ``{"temperature_c": 20}``.

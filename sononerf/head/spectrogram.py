@@ -182,8 +182,8 @@ class Smearing(NamedTuple):
     Attributes:
         frequency ((N,), Hz): The fine ones, ascending.
         rows (F, K): Indices of those that each row hears.
-        weight ((F, K) float64 or complex128): How much: of a sound's pressure for an impulse, of
-            its power for a sweep. The sum is 1, for complex weights its magnitude.
+        weight ((F, K) float64 or complex128): Weights: of a sound's pressure for an impulse, of its
+            power for a sweep. The sum is 1, for complex weights its magnitude.
         later ((F, K) or None, s): The weight times how much later than the row's own frequency each
             one is emitted; None for an impulse.
     """

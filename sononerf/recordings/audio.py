@@ -158,14 +158,14 @@ class Recording:
         path: Path of the source, for messages.
         sampling_rate: Hz.
         labels: Name of each of the P pings in messages.
-        emission ((P,), s): When the call of each ping left, counted from the first sample that
+        emission ((P,), s): Time of emission of each ping's call, counted from the first sample that
             :attr:`read` gives. Negative where the recording began later.
-        until ((P,) or None, s): When the next call in the same file left; infinite where there is
-            none. None if each file holds one call.
+        until ((P,) or None, s): Time of emission of the next call in the same file; infinite where
+            there is none. None if each file holds one call.
         read: Takes the number of a ping and returns its samples (E, S) as they are on disk:
             integers reach from one end of their type to the other, floats have the user's unit.
         columns: Poses as in the table, in its own frame.
-        settings: What the source itself says of ``air``, ``ears`` and ``call``: plain data by
+        settings: Statements of the source about ``air``, ``ears`` and ``call``: plain data by
             section.
         notes: Interpretations that may surprise, one line each.
     """

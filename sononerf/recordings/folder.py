@@ -54,7 +54,7 @@ def read_folder(source: Path, settings: ImportSettings, apart: Collection[Path] 
 
     Args:
         source: The folder, or the table of poses in it.
-        settings: Where the table is, and its units.
+        settings: Path of the table, and its units.
         apart: Further files of the folder that hold no pings, such as the call's.
 
     Raises:

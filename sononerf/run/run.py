@@ -168,7 +168,7 @@ def compare(first: Prediction | Run, second: Echoes | Run) -> Evaluation | Compa
         second: The measured echoes; or a run without the target.
 
     Returns:
-        found: Of a prediction its errors, ``mae_db`` and others; of runs what the first sends back
+        found: For a prediction its errors, ``mae_db`` and others; of runs what the first sends back
             and the second does not.
 
     Raises:

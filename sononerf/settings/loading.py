@@ -327,7 +327,7 @@ def refuse_truths(
     Args:
         given: The settings as they were given.
         taken: The settings after pydantic's validation.
-        source, prefix: Where it was read from, and the dotted key of all of it, for messages.
+        source, prefix: Name of the source, and dotted key of the whole, for messages.
 
     Raises:
         SettingsError: One line for each.

@@ -29,7 +29,7 @@ class Edges:
         normal (K, 3): Outward normals of that face.
         open_angle ((K,), rad): Angle of the air around the edge: pi for a plane, 2 pi where a
             sheet ends.
-        triangle (K,): That face.
+        triangle (K,): Index of that face.
     """
 
     ends: Floats

@@ -25,8 +25,8 @@ class Footprint:
         shift ((2, 3, H) float32, m/rad): Derivative of the hit point by u and by v.
         square ((3, H) float32, m²/rad²): Products of the shifts: of the first with itself, the
             second with itself, of both.
-        bend ((3, H) float32, m/rad²): How the path to the hit bends over u twice, v twice, u and v,
-            on a flat surface.
+        bend ((3, H) float32, m/rad²): Second derivatives of the path to the hit, by u twice, v
+            twice, u and v, on a flat surface.
         curving ((3, H) float32, m/rad²): Second derivatives of the surface's distance from its
             tangent plane, likewise.
         onward ((2, H) float32, m/rad): Shifts along the mirrored ray.
@@ -213,7 +213,7 @@ def land(
     """Let bundles fall on the surface, and mirror them.
 
     Args:
-        bundles ((H, 12) float32): How the rays move square to themselves over u and v (m/rad), and
+        bundles ((H, 12) float32): Motion of the rays square to themselves over u and v (m/rad), and
             how their directions turn; three components each.
         incoming (H, 3): Directions of the rays.
         normals, flat (H, 3): Normals of the smooth surface and of the triangle, unit vectors on

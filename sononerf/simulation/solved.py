@@ -116,7 +116,7 @@ class Solved(Engine):
         scene: The ensonified scene.
         hearing: Head and air.
         frequency_max (Hz): Frequency at which the response has fallen to zero.
-        fall: That over the frequency from which on it falls.
+        fall: ``frequency_max`` over the frequency from which on the response falls.
 
     Attributes:
         frequency ((K,), Hz): Those that are solved for.

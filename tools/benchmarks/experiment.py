@@ -61,8 +61,9 @@ def run_experiment(
     """Run an experiment as a user would, in a process of its own.
 
     Args:
-        folder: Of the run; a finished one is left as it is. What was said goes to ``<folder>.log``.
-        data: Of the ensembles, each by its hash, so that runs of the same echoes share one.
+        folder: Folder of the run; a finished one is left as it is. Standard error goes to
+            ``<folder>.log``.
+        data: Folder of the ensembles, each by its hash, so that runs of the same echoes share one.
         settings: ``KEY=VALUE``, laid over the file.
         config: The settings file; the defaults' where none is given.
         enough: The section of ``metrics.json`` that is asked for: a command that wrote it has not

@@ -25,7 +25,7 @@ def scaled_settings(plain: Settings, factor: float) -> list[str]:
     way. The ears' lobes widen with the root of the wavelength, so they are set narrower.
 
     Args:
-        plain: Of a scene whose ``radius`` scales all of it, without a notch in its ears.
+        plain: Settings of a scene whose ``radius`` scales all of it, without a notch in its ears.
         factor: Scale of all lengths and times.
 
     Returns:
@@ -58,7 +58,7 @@ def scaled_store(source: Path, target: Path, settings: Settings, factor: float) 
 
     Args:
         source: The finished ensemble of the unscaled world.
-        target: Where the new one comes to lie; one that is complete is left as it is.
+        target: Path of the new store; a complete one is left as it is.
         settings: Settings of the scaled world.
         factor: Scale of all lengths and times.
     """

@@ -52,7 +52,7 @@ class Case:
     """One row of the table.
 
     Attributes:
-        name: Of the row, and of its folder up to the seed.
+        name: Name of the row, and of its folder up to the seed.
         settings: ``KEY=VALUE``, laid over the defaults.
         repeated: Whether it is fitted with every seed, and not with the first alone.
         config: File of ``configs/`` that the settings are laid over.

@@ -221,8 +221,8 @@ def disk(count: int, seed: int, keep: Path) -> Report:
     """Let calls that write fail, one each time, and files reach a size limit.
 
     Args:
-        count: How many faults; all calls of all commands in turn where it is 0.
-        seed: Which calls, and with what error.
+        count: Number of faults; 0 means all calls of all commands in turn.
+        seed: Seed of the calls and errors.
         keep: Folder that keeps what was a fault.
     """
     report, rng = Report("disk", seed), random.Random(seed)

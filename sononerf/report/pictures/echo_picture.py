@@ -65,7 +65,7 @@ def echo_png(
 
     Args:
         mesh: The scene, metres.
-        points ((N, 3), m): Where sound was reflected towards the ears, world frame; none is
+        points ((N, 3), m): Points that reflect sound towards the ears, world frame; none is
             allowed.
         level_db ((N,), dB): Level of each; drawn relative to the loudest.
         position ((3,), m): Place of the head, world frame.

@@ -135,7 +135,7 @@ def corrections(panels: Panels) -> tuple[csr_array, ...]:
     r"""Integrate what the middles of edges leave out between near triangles.
 
     Returns:
-        found (five of (V, V)): Of the hypersingular operator the terms in :math:`k^0`, :math:`k^2`
+        found (five of (V, V)): For the hypersingular operator the terms in :math:`k^0`, :math:`k^2`
             and :math:`k^4`, then those of the double layer in :math:`k^0` and :math:`k^2`, times
             :math:`4 \pi`.
     """
