@@ -5,7 +5,7 @@ from __future__ import annotations
 
 
 class SonoNerfError(Exception):
-    """A fault that the user can read in one line: what, where, what is allowed, what to do."""
+    """An error in one line: the fault, its place, the allowed values, and a remedy."""
 
     exit_code = 1
 

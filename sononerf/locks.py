@@ -23,7 +23,7 @@ def _take(path: Path) -> int | None:
         descriptor = storage.open_own(path, os.O_RDWR)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Its last owner removes it on leaving: what we locked may be a name no more.
+            # The last owner removes the file at its end, so that the locked file may have no name.
             with suppress(FileNotFoundError):
                 if path.stat().st_ino == os.fstat(descriptor).st_ino:
                     return descriptor
@@ -39,7 +39,7 @@ def _take(path: Path) -> int | None:
 def _prepare(folder: Path) -> None:
     """Refuse links, so that no file elsewhere is written; remove dead processes' files.
 
-    The folder itself may be one: its name is the user's own.
+    The folder itself may be a link, because the user named it.
 
     Raises:
         StorageError: If there is a link in it or in a folder below it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The root command, and what its faults are called."""
+"""The root command, and its error messages."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def _root(
 
 
 def run() -> int:
-    """Run the command that was given, and return its exit code; raises whatever it raises."""
+    """Run the given command and return its exit code; its exceptions pass through."""
     with memory_limited():
         return app(prog_name="sononerf", standalone_mode=False) or 0
 
 
 def fault_of(error: Exception) -> SonoNerfError:
-    """Return what a command raised as a fault that the user can read."""
+    """Return an exception of a command as an error with a line for the user."""
     if isinstance(error, SonoNerfError):
         return error
     if isinstance(error, typer.TyperException):
@@ -65,14 +65,14 @@ def fault_of(error: Exception) -> SonoNerfError:
 
 
 def _unforeseen(error: Exception) -> SonoNerfError:
-    """Return one line for a fault that nothing expected; a file keeps its traceback."""
+    """Return one line for an unexpected exception; a file keeps its traceback."""
     refused: BaseException | None = error
     while refused is not None:
         # Libraries report a full disk by an exception of their own around the system's.
         if isinstance(refused, OSError) and refused.errno in WAYS_OUT:
             path = Path(str(refused.filename or "a file"))
             return storage_error("cannot be read or written", path, refused)
-        hidden = refused.__suppress_context__  # what was handled is no cause
+        hidden = refused.__suppress_context__  # an exception that was handled is not the cause
         refused = refused.__cause__ or (None if hidden else refused.__context__)
     first = str(error).partition("\n")[0]
     line = f"unforeseen: {type(error).__name__}: {first}"

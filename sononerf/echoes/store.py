@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The ensemble on disk: what the receivers heard at every pose; each pose is whole or missing."""
+"""The ensemble on disk: spectrograms of every pose; each pose is complete or missing."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ from sononerf.errors import IncompatibleError, InputError
 class EnsembleStore(Ensemble):
     """An ensemble in a zarr v3 group, one chunk per pose; open it with :meth:`open`.
 
-    A pose is committed in two durable steps: its chunk, then its line in the manifest. A
-    process that is killed in between leaves a pose that counts as missing. The same input gives
-    the same bytes, in whatever order the poses come.
+    A pose is committed in two durable steps: its chunk, then its line in the manifest. If a process
+    is killed between them, the pose counts as missing. The same input gives the same bytes in any
+    order of the poses.
 
     Args:
         path: The ensemble's folder.
@@ -56,7 +56,7 @@ class EnsembleStore(Ensemble):
         try:
             store = DurableStore(path, read_only=mode == "r")
             group = zarr.open_group(store, mode=mode, zarr_format=3, use_consolidated=False)
-        except Exception as error:  # damaged metadata raises whatever its parser met first
+        except Exception as error:  # the error of damaged metadata depends on the parser
             raise InputError(f"{path}: damaged ({type(error).__name__}: {error})") from error
         self._axes, self._spectrogram = read_axes(path, group)
         self._manifest = Manifest(path)
@@ -83,7 +83,7 @@ class EnsembleStore(Ensemble):
         attributes: dict[str, Any],
         receivers: int = 2,
     ) -> EnsembleStore:
-        """Make a store with its axes and poses whole, or open the same one for more poses.
+        """Create a store with its axes and poses, or open the same one to add spectrograms.
 
         The group's own file comes last, so that an unfinished store is not taken for one.
 
@@ -138,7 +138,7 @@ class EnsembleStore(Ensemble):
         return int(self._spectrogram.shape[1])
 
     def update_attributes(self, **values: Any) -> None:
-        """Set attributes, all at once or, if the process dies, none."""
+        """Set attributes; all of them or, if the process dies, none."""
         self._refuse_reading()
         plain = plain_attributes(self.path, {**self._attributes, **values})
         write_group(self.path, plain)
@@ -193,7 +193,7 @@ class EnsembleStore(Ensemble):
         return values
 
     def missing(self) -> list[int]:
-        """Return the poses that are not there, or whose file has another size than recorded."""
+        """Return the poses without a file, or whose file has another size than recorded."""
         self._records = self._manifest.read()
         return [index for index in np.arange(len(self)).tolist() if not self._is_there(index)]
 
@@ -214,7 +214,7 @@ class EnsembleStore(Ensemble):
         return found
 
     def remove_damaged(self) -> None:
-        """Remove the files of damaged poses, which then are missing.
+        """Remove the files of damaged poses, which then count as missing.
 
         Raises:
             StorageError: If one cannot be removed.
@@ -224,7 +224,7 @@ class EnsembleStore(Ensemble):
             storage.remove_file(self._chunk(index))
 
     def check(self) -> list[str]:
-        """Read everything and return what is wrong, one line each; nothing where all is well."""
+        """Read everything and return the faults, one line each."""
         try:
             fresh = EnsembleStore(self.path)
         except (InputError, IncompatibleError) as error:
@@ -266,7 +266,7 @@ def _sha256(values: Singles) -> str:
 
 
 def _refuse_foreign(path: Path) -> None:
-    """Refuse a folder that holds anything but what a half-made store may hold."""
+    """Refuse a folder with files that an unfinished store does not have."""
     if not path.exists():
         return
     if not path.is_dir():

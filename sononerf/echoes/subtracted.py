@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Echoes of a target amid surroundings, less those of the surroundings alone."""
+"""Echoes of a target in surroundings, minus those of the surroundings alone."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from sononerf.errors import IncompatibleError, InputError, NumericalError
 
 
 class SubtractedStore(EnsembleStore):
-    """Reads an ensemble, and takes the power of another one at the same poses off it.
+    """Ensemble from which the power of another one at the same poses is subtracted.
 
-    Phase is not heard, so what both have in one cell is taken off as power; what sounded there with
-    more power alone than together leaves silence.
+    There is no phase, so power is subtracted cell by cell. A cell in which the surroundings alone
+    have more power becomes silent.
 
     Args:
         path: Store of target and surroundings.
@@ -50,7 +50,7 @@ class SubtractedStore(EnsembleStore):
         return SubtractedStore, (self.path, self._background.path)
 
     def read_pose(self, index: int) -> Singles:
-        """Return one pose's magnitude, (E, R, F), less the surroundings."""
+        """Return one pose's magnitude, (E, R, F), without the surroundings."""
         whole = np.square(super().read_pose(index), dtype=np.float64)
         left = whole - np.square(self._background.read_pose(index), dtype=np.float64)
         return np.sqrt(left.clip(min=0.0)).astype(np.float32)

@@ -41,16 +41,16 @@ def harmonics(directions: Tensor) -> Tensor:
         (35 / 8, x * (x * x - 3 * y * y)),
         (35 / 8, y * (3 * x * x - y * y)),
     )
-    # Side by side in memory, as all that is done to many pairs; see LobeField.
+    # Contiguous in memory over the pairs; see LobeField.
     return torch.stack([math.sqrt(square) * value for square, value in polynomials]).movedim(0, -1)
 
 
 class Correction(nn.Module):
     r"""A network's addition to the log strength: zero at first, and never beyond ``LARGEST``.
 
-    Its inputs are sines and cosines of the position, in wavelengths from twice the region's
-    longest side down by halves to no less than four times the spacing, and the spherical
-    harmonics of the direction; of its output :math:`y` it returns :math:`L \tanh(y / L)`.
+    Its inputs are sines and cosines of the position, whose wavelengths fall by halves from twice
+    the region's longest side to four times the spacing, and the spherical harmonics of the
+    direction; of its output :math:`y` it returns :math:`L \tanh(y / L)`.
 
     Args:
         region ((2, 3), m): Lower and upper corner of the box, world frame.
@@ -82,9 +82,7 @@ class Correction(nn.Module):
         bins: Tensor | None,
         place: Tensor | None = None,
     ) -> Tensor:
-        """Return what to add to the log strength.
-
-        Differentiable in the parameters.
+        """Return the addition to the log strength, differentiable in the parameters.
 
         Args:
             positions ((N, 3), m): Places, world frame.
@@ -96,8 +94,7 @@ class Correction(nn.Module):
         Returns:
             correction: (..., N, B) or (M, B).
         """
-        # What the first layer makes of a place is found out once for all its directions. Weights
-        # are calmed, not what they make of many pairs: it is the same, and they are few.
+        # The first layer's response to a place is computed once for all its directions.
         phase = (self.waves[:, None] * (positions - self.origin).T[:, None]).flatten(0, 1)
         of_place = torch.cat((phase.sin(), phase.cos()))
         (first, bias), second = _calm(self.hidden[0]), _calm(self.hidden[2])
@@ -117,6 +114,6 @@ class Correction(nn.Module):
 
 
 def _calm(layer: nn.Module) -> tuple[Tensor, Tensor]:
-    """Return a layer's weight and bias, a column, as they act."""
+    """Return a layer's effective weight and bias, a column."""
     assert isinstance(layer, CalmLayer)
     return layer.weight * CALM, layer.bias[:, None] * CALM

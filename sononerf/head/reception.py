@@ -62,9 +62,9 @@ def row_duration(call: CallSettings, analysis: SpectrogramSettings, frequency: A
 def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
     """Length of the window that keeps a point echo shortest in the dechirped spectrogram.
 
-    A short window is wide in frequency, so a slow sweep stays in it for long; a long one lasts
-    long itself. What is made smallest is the root mean square of :func:`row_duration` over the
-    analysed frequencies that the call covers.
+    A short window is wide in frequency, so a slow sweep stays in it for long; a long window is long
+    itself. The result minimises the root mean square of :func:`row_duration` over the analysed
+    frequencies that the call covers.
 
     Args:
         call: The emitted call.
@@ -107,9 +107,9 @@ def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> Float
     Returns:
         window (F, W): One value per sample; the point's own range is in the middle, where it is 1.
             For an impulse the rows' envelopes, of a height of almost 1; for a sweep as much longer
-            as the sweep stays in the window's main lobe. Of Hamming windows and a sweep it is made
-            symmetric (the mean power of both sides). Of gammatones it is not, nor where harmonics
-            overlap: what one more harmonic adds at other times is part of it.
+            as the sweep stays in the window's main lobe. For Hamming windows and a sweep it is
+            symmetric (the mean power of both sides). For gammatones it is not, nor if harmonics
+            overlap: it then holds the contribution of another harmonic at other times.
     """
     frequency, filters = frequency_axis(analysis), row_filters(analysis)
     if call.kind == "impulse":
@@ -146,7 +146,7 @@ def _point_echo(call: CallSettings, analysis: SpectrogramSettings, side: float) 
 
 
 def _cropped(row: Floats, call: CallSettings, analysis: SpectrogramSettings) -> Floats:
-    """Return point echoes over their height at their own range, without what is faint all over."""
+    """Return point echoes over their height at their own range, without faint columns."""
     width = row.shape[1]
     middle = row[:, [(width - 1) // 2, width // 2]].mean(axis=1)
     window = row / np.maximum(middle, 1e-12 * row.max())[:, None]

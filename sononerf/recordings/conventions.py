@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Poses of other frames and conventions, as ours: metres, z up, head x forward, y left, z up.
+"""Conversion of poses from other conventions to ours: metres, z up, head x forward, y left, z up.
 
 ======  ===================================  =====================================
 frame   world axes                           head axes
@@ -88,7 +88,7 @@ def to_poses(columns: Columns, settings: ImportSettings) -> Poses:
 
     Raises:
         InputError: If columns are missing or contradict one another.
-        SettingsError: If the frame's matrices are none.
+        SettingsError: If the frame has no valid matrices.
     """
     if settings.turntable is not None:
         return _turntable_of(columns, settings.turntable)
@@ -145,7 +145,7 @@ def _rotations(
 
 
 def _pitch(world: Floats, head: Floats) -> str:
-    """Say where positive pitch looks by the formula."""
+    """Return where positive pitch looks by the formula."""
     own = rotation_from_euler(0.0, 0.1, 0.0)
     return "up" if (world @ own @ head.T)[2, 0] > 0.0 else "down"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The numbers of a run that people ask for first, with their units, as text."""
+"""Key numbers of a run, with their units, as text."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class KeyNumber:
         """Return the number of a run as text.
 
         Raises:
-            TypeError, ValueError: If something else stands in its place.
+            TypeError, ValueError: If the value is not a number.
         """
         value: Any = metrics
         for part in self.key.split("/"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Check the machine: versions, memory, GPU, graphics, disk; and say how each problem is solved."""
+"""Check of the machine: versions, memory, GPU, graphics, disk; with advice for each problem."""
 
 from __future__ import annotations
 
@@ -46,17 +46,18 @@ DRAW = (
     "print([l for l in w.ReportCapabilities().splitlines() if 'renderer string' in l][0]"
     ".partition(':')[2].strip())"
 )
-"""Draws nothing off screen and prints what drew it; a lacking library ends the process."""
+"""Script that opens an off-screen window and prints its class; a missing library ends the
+process."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at.
+    """Result of one check.
 
     Attributes:
         name: Its name.
         found: The finding.
-        good: Whether all works with it as it should.
+        good: True if there is no problem.
         remedy: Advice on how to get a missing item; empty if nothing is missing.
     """
 
@@ -67,7 +68,7 @@ class Finding:
 
 
 def examine(folder: Path | None = None) -> list[Finding]:
-    """Look at what this machine has.
+    """Run all checks.
 
     Args:
         folder: Folder of future runs; the working directory where None.
@@ -93,7 +94,7 @@ def as_plain(findings: list[Finding]) -> dict[str, Any]:
 
 
 def as_lines(findings: list[Finding]) -> list[str]:
-    """Return findings as lines of text, each lack with the line that mends it."""
+    """Return findings as lines of text; each problem has a line with advice."""
     width = max(len(finding.name) for finding in findings)
     lines = [f"     {'sononerf':<{width}}  {__version__}"]
     for finding in findings:

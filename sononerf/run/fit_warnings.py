@@ -29,12 +29,12 @@ SIDE = 8
 
 
 def fit_warnings(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:
-    """Return what speaks against a fit, one line each; nothing where all is well.
+    """Return warnings about a fit, one line each.
 
     Args:
         echoes: Echoes of the fit.
         region ((2, 3), m): Lower and upper corner.
-        is_set: Whether the region was set, not found from the echoes.
+        is_set: True if the region was set, not found from the echoes.
     """
     training = echoes.poses("train")
     found = [_repeated(training)]
@@ -62,7 +62,7 @@ def _repeated(poses: Poses) -> str:
 
 
 def _few(poses: Poses, region: Floats, resolution: float) -> str:
-    """Compare the distance of the places that poses face with the range resolution."""
+    """Return a warning if the poses face places too far apart for the range resolution."""
     places = len(np.unique(np.round(poses.positions / SAME), axis=0))
     radius = float((region[1] - region[0]).mean()) / 2.0
     gap = radius * float(np.sqrt(4.0 * np.pi / max(places, 1)))
@@ -77,7 +77,7 @@ def _few(poses: Poses, region: Floats, resolution: float) -> str:
 
 
 def _out_of_reach(echoes: Echoes, poses: Poses, region: Floats) -> str:
-    """Tell of a region that holds poses, or places that none of them hears."""
+    """Return a warning if the region holds poses, or places that no pose hears."""
     within = ((poses.positions > region[0]) & (poses.positions < region[1])).all(axis=1)
     if within.any():
         return (
@@ -99,7 +99,7 @@ def _out_of_reach(echoes: Echoes, poses: Poses, region: Floats) -> str:
 
 
 def _elsewhere(echoes: Echoes, region: Floats) -> str:
-    """Tell of poses that hear an echo, and none from the region that was set."""
+    """Return a warning if poses hear an echo, and none from the region that was set."""
     free = Echoes(echoes.store, echoes.head)
     heard = np.isfinite(free.onsets.first).any(axis=1)
     hull = echoes.within(region).hull
@@ -107,7 +107,7 @@ def _elsewhere(echoes: Echoes, region: Floats) -> str:
     out = np.linalg.norm(hull.emitters[:, None] - corners, axis=-1)[:, None]  # (P, 1, 8)
     back = np.linalg.norm(hull.receivers[:, :, None] - corners, axis=-1)  # (P, E, 8)
     farthest = ((out + back) / 2.0).max(axis=-1) + echoes.head.resolution
-    # What comes before any echo from the region is no onset here; outliers are of weight zero.
+    # Sound before any echo from the region is no onset here; outliers have weight zero.
     from_region = (np.isfinite(hull.trusted) & (hull.trusted <= farthest)).any(axis=1)
     none = heard & ~from_region
     if none.sum() <= SOME * heard.sum():

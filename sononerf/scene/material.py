@@ -27,18 +27,17 @@ BOUNDS = {
 class Material:
     r"""Reflection of a surface, at nodes over frequency.
 
-    Between the nodes values run straight over the logarithm of frequency; beyond them they stay.
-    A curve of one value holds at all nodes. Where the surface is strongly curved, lobe and strength
-    go over to the curved ones by the share :math:`s = 1 / (1 + e^{-8 b (\kappa - \kappa_0)})`
-    of the total curvature
+    Values are interpolated linearly over the logarithm of frequency, and are constant beyond the
+    nodes. A curve with one value holds at all nodes. Where the surface is strongly curved, lobe and
+    strength go over to the curved ones by the share :math:`s = 1 / (1 + e^{-8 b (\kappa -
+    \kappa_0)})` of the total curvature
     :math:`\kappa = \sqrt{k_1^2 + k_2^2}` (SonoTraceLab's law, with curvature in 1/m).
 
     Attributes:
         frequency ((K,), Hz): Nodes, ascending.
         lobe_width ((K,), rad, or None): Standard deviation of the lobe about the mirror direction;
-            None for a smooth surface, which has none of its own: its shape alone decides what it
-            sends where.
-        strength ((K,), 1): Strengths of what is heard of a hit, relative to a rigid surface.
+            None for a smooth surface, whose shape alone determines its echoes.
+        strength ((K,), 1): Strength of the echo of a hit, relative to a rigid surface.
         reflection ((K,), 1): Pressure after a bounce, over that before it,
             0 to 1.
         curved_lobe_width ((K,), rad, or None): Lobe of strongly curved places; None where it is the
@@ -107,9 +106,9 @@ class Material:
 
 
 def roughened(material: Material, height: float) -> Material:
-    r"""Return a material whose strength is that of a rough surface seen from above.
+    r"""Return a material with the strength of a rough surface at normal incidence.
 
-    A surface whose height scatters by a standard deviation :math:`\sigma` sends back the part
+    A surface whose height has the standard deviation :math:`\sigma` sends back the fraction
     :math:`e^{-2 (k \sigma)^2}` of the pressure in step.
 
     Args:
@@ -117,7 +116,7 @@ def roughened(material: Material, height: float) -> Material:
         height (m): Standard deviation of the height.
 
     Returns:
-        material: At nodes from 20 to 150 kHz; what goes on after a bounce is weakened alike.
+        material: At nodes from 20 to 150 kHz; reflection is weakened alike.
 
     References:
         .. [1] P. Beckmann and A. Spizzichino, "The Scattering of Electromagnetic Waves from Rough
@@ -145,7 +144,7 @@ def roughened(material: Material, height: float) -> Material:
 
 
 RIGID = Material()
-"""Everything that is smooth and much denser than air; the level is absolute."""
+"""Material of all bodies that are smooth and much denser than air; the level is absolute."""
 
 SONOTRACELAB = Material(
     frequency=(20e3, 150e3),

@@ -59,8 +59,8 @@ class Scene(Shown):
         mesh: Metres, world frame; bodies may overlap.
         material: One for all of it, or one for each of its parts.
         part (T,): Index of each triangle's material, if there are several.
-        background (T,): True where a triangle is surroundings and not the target. It sounds all the
-            same.
+        background (T,): True for triangles of the surroundings, which sound too but are not the
+            target.
         to_original (4, 4): From the scene's frame, m, to the frame and unit of the file that it was
             read from; None where it was not read from a file.
 
@@ -109,7 +109,7 @@ class Scene(Shown):
 
     @property
     def materials(self) -> tuple[Material, ...]:
-        """All of them; ``part`` counts through them."""
+        """All materials; ``part`` holds indices of them."""
         return self.material if isinstance(self.material, tuple) else (self.material,)
 
     @classmethod
@@ -118,7 +118,7 @@ class Scene(Shown):
     ) -> Scene:
         """Load a surface from a file: STL, PLY, OBJ, OFF, GLB or glTF.
 
-        The middle of its bounding box is moved to the origin, at which poses look.
+        The middle of its bounding box moves to the origin, which poses look at.
 
         Args:
             path: The file.
@@ -144,7 +144,7 @@ class Scene(Shown):
         return alone
 
     def with_image(self, plane: Plane) -> Scene:
-        """Return what is above a plane together with its image.
+        """Return the part above a plane together with its image.
 
         Raises:
             InputError: If nothing is above it, or the scene has several materials and reaches below
@@ -161,7 +161,7 @@ class Scene(Shown):
         return Scene(mesh, self.material, np.concatenate([self.part[kept], self.part[kept]]))
 
     def surroundings(self) -> Scene | None:
-        """Return what is background as a scene of its own; None where nothing is."""
+        """Return the background as a scene of its own; None if there is none."""
         mesh = self.surface(background=True)
         if mesh is None or self.background is None:
             return None
@@ -170,7 +170,7 @@ class Scene(Shown):
 
 
 def check_surface(mesh: trimesh.Trimesh) -> None:
-    """Refuse a mesh that is no surface of a sensible size in metres.
+    """Refuse a mesh that is not a surface of a sensible size in metres.
 
     Raises:
         InputError, SurfaceSizeError: As :class:`Scene` says.
@@ -250,7 +250,8 @@ def load_scene(
                 raise SettingsError(f"scene.options: {error}") from None
             raise InputError(f"{owner}: {error}") from None
         except InputError as error:
-            # Ours name the file that they read; of what others make only they can say more.
+            # Built-in scenes name the file that they read; other scenes have to add details
+            # themselves.
             if plugin.distribution == "sononerf" or str(error).startswith(owner):
                 raise
             raise InputError(f"{owner}: {error}") from None

@@ -35,7 +35,7 @@ EARS_APART = 0.03
 
 @dataclass(frozen=True)
 class Audibility:
-    """Judges the hits of a bounce.
+    """Test of the hits of a bounce for audibility.
 
     Attributes:
         wavenumber (rad/m): At the frequency that bundles must resolve.
@@ -50,10 +50,10 @@ class Audibility:
     bounces: int
 
     def judge(self, bounce: Bounce, listeners: Floats) -> tuple[Bools, Floats]:
-        """Which hits some listener can hear (H,), and by how much each (H,) may be wrong."""
+        """Return which hits some listener can hear (H,), and the possible error of each (H,)."""
         count = len(bounce.ray)
         audible, doubt = np.zeros(count, dtype=np.bool_), np.zeros(count)
-        # What goes on from here may be heard, however it looks from the head.
+        # Sound that continues from here may be heard, whatever the view from the head.
         explore = EXPLORE / self.radius if 1 < bounce.number < self.bounces else 0.0
         angle = np.atleast_1d(np.asarray(bounce.solid_angle, dtype=np.float64))
         tube = np.ascontiguousarray(bounce.footprint.tube)
@@ -80,7 +80,7 @@ def _judge(
     farthest: float,
     explore: float,
 ) -> None:
-    """Add one listener to what is audible (H,) and in doubt (H,).
+    """Add one listener to the audible hits (H,) and their doubts (H,).
 
     Args:
         audible, doubt (H,): Changed in place.
@@ -159,11 +159,11 @@ class Arrival:
 
 
 def silence_before(echo: Floats, first: Floats, *, sampling_rate: float) -> Floats:
-    """Cut off what comes before sound can arrive.
+    """Set the echo before the first possible arrival to zero.
 
-    Beam and ears are real gains, so their responses are even in time: half of them comes before
-    the echo. Everything that is more than 26 us earlier than the first possible arrival is set to
-    zero. Onsets and free space are then found from sound that has arrived.
+    The gains of beam and ears are real, so their responses are even in time: one half precedes the
+    echo. Everything that is more than 26 us earlier than the first possible arrival is set to zero.
+    Onsets and free space are then found from sound that has arrived.
 
     Args:
         echo (E, S): Pressure from the emission on.

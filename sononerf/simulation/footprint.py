@@ -70,10 +70,10 @@ class Footprint:
 
 @dataclass(frozen=True, eq=False)
 class Ways:
-    r"""From hits to a listener, beside the ways that a mirror nearby would send the sound.
+    r"""Ways from hits to a listener, compared with those by a mirror point nearby.
 
     To second order, the path's length over u and v has the slope :math:`g` and the Hessian
-    :math:`H`; the path by which a mirror would send the sound is shorter (or longer) by
+    :math:`H`; the path by the mirror point is shorter (or longer) by
     :math:`g^T |H|^{-1} g / 2`.
 
     Attributes:
@@ -102,7 +102,7 @@ def ways_to(
     listener: Floats,
     solid_angle: Floats,
 ) -> tuple[Floats, Floats, Singles]:
-    """Return what :class:`Ways` is made of: distance, cosine, and the rest as (4, H).
+    """Return the attributes of :class:`Ways`: distance, cosine, and the rest as (4, H).
 
     Args:
         rows ((H, 19) float32): Rows of a footprint.
@@ -196,7 +196,7 @@ def onto(rows: Singles, turned: Singles, further: Ints, distance: Floats) -> Sin
     for i in range(len(further)):
         before = further[i]
         for k in range(6):
-            # What of it goes along the ray is lost where the bundle lands.
+            # Its component along the ray is lost where the bundle lands.
             bundles[i, k] = rows[before, k] + distance[i] * turned[before, k]
             bundles[i, 6 + k] = turned[before, k]
     return bundles
@@ -210,7 +210,7 @@ def land(
     flat: Floats,
     gradients: Singles,
 ) -> tuple[Singles, Singles, Floats, Floats]:
-    """Let bundles fall on the surface, and mirror them.
+    """Return footprints of bundles on the surface, and the mirrored bundles.
 
     Args:
         bundles ((H, 12) float32): Motion of the rays square to themselves over u and v (m/rad), and

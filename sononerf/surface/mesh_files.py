@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Meshes as files, coloured by how many poses heard each vertex."""
+"""Mesh files, coloured by the number of poses that heard each vertex."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def mesh_bytes(
 
 
 def _carry(mesh: trimesh.Trimesh, file_type: MeshFormat, poses: NDArray[Any]) -> None:
-    """Colour a mesh by its confidence, in place, as far as the format has colours."""
+    """Colour a mesh by its confidence, in place, if the format has colours."""
     if poses.shape != (len(mesh.vertices),) or not (poses >= 0).all():
         raise ValueError(
             f"confidence: shape {poses.shape}, expected ({len(mesh.vertices)},), zero or more"
@@ -81,7 +81,7 @@ def confidence_of(mesh: trimesh.Trimesh) -> NDArray[np.int32] | None:
     return np.asarray(raw["poses"], dtype=np.int32)
 
 
-# So many poses and more have the brightest colour.
+# Number of poses from which on the colour is the brightest.
 MANY_POSES = 100
 # Dark grey and bright yellow in OKLab; on the line between the two, equal steps look equal.
 FEW_COLOUR, MANY_COLOUR = (0.34, 0.0, -0.01), (0.93, -0.02, 0.15)

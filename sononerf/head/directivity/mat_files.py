@@ -82,7 +82,7 @@ def _read_old(path: Path) -> Directivity:
         content = loadmat(path, variable_names=STRUCTS, squeeze_me=True, struct_as_record=False)
     except (MatReadError, NotImplementedError) as error:
         raise InputError(f"{path}: no .mat file of version 5 or 7.3 ({error})") from None
-    except Exception as error:  # a damaged file raises whatever its parser met first
+    except Exception as error:  # the error of a damaged file depends on the parser
         raise InputError(
             f"{path}: damaged or truncated ({type(error).__name__}: {error})"
         ) from None
@@ -175,7 +175,7 @@ NUMBERS = "biufc"
 
 @contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """Open an HDF5 file for reading; what the library says of a damaged one becomes one line.
+    """Open an HDF5 file for reading; an error of the library becomes one line.
 
     Raises:
         InputError: If it is missing, too large, damaged, or no HDF5 file.

@@ -2,8 +2,8 @@
 """Integrals over near triangles, in closed form where the kernel is not smooth.
 
 The kernel is :math:`e^{-jkR} / R`. Its terms :math:`1 / R` and :math:`-k^2 R / 2`, and those of its
-normal derivative, are integrated over a triangle in closed form [1]_ [2]_. What is left is smooth
-and does not depend on how near the triangles are. So one table serves all frequencies.
+normal derivative, are integrated over a triangle in closed form [1]_ [2]_. The remainder is smooth
+and does not depend on the distance of the triangles. So one table serves all frequencies.
 
 References:
     .. [1] D. R. Wilton, S. M. Rao, A. W. Glisson, D. H. Schaubert, O. M. Al-Bundak and C. M.
@@ -44,7 +44,7 @@ MIDDLES = 0.5 * (1.0 - np.eye(3))
 
 
 def potentials(corners: Floats, normals: Floats, slopes: Floats, points: Floats) -> Floats:
-    r"""Integrate linear functions over triangles, times what is not smooth in the kernel.
+    r"""Integrate linear functions over triangles, times the singular terms of the kernel.
 
     With :math:`R` the distance of a point to a place on the triangle and :math:`z` its height
     above the triangle's plane, the functions of the three corners are integrated times
@@ -71,7 +71,7 @@ def potentials(corners: Floats, normals: Floats, slopes: Floats, points: Floats)
     off = _dot(away, out[:, None])
     near, beyond = far, far[:, :, [1, 2, 0]]
     square = off**2 + height[..., None] ** 2
-    # Of ln((R1 + l1) / (R0 + l0)) the form without cancellation.
+    # This form of ln((R1 + l1) / (R0 + l0)) has no cancellation.
     back = end + start < 0.0
     upper = np.where(back, near - start, beyond + end)
     lower = np.where(back, beyond - end, near + start)
@@ -89,7 +89,7 @@ def potentials(corners: Floats, normals: Floats, slopes: Floats, points: Floats)
     angle = np.where(np.abs(height) < 1e-9 * scale, 0.0, angle)
     whole = (off * logs).sum(axis=2) - height * angle
     ways = (height**2 * whole + (off * first).sum(axis=2)) / 3.0
-    # The corners' functions below the point, and what their slopes add.
+    # The corners' functions below the point, and the contribution of their slopes.
     foot = 1.0 / 3.0 + _dot(slopes[:, None], -away.mean(axis=2)[:, :, None])
 
     def slope(over: Floats) -> Floats:
@@ -118,7 +118,7 @@ def near_pairs(panels: Panels) -> tuple[Ints, Ints]:
     middles = corners.mean(axis=1)
     radius = np.linalg.norm(corners - middles[:, None], axis=2).max(axis=1)
     tree = cKDTree(middles)
-    # Larger ones look for smaller ones, so that one long triangle does not find all.
+    # Larger triangles search for smaller ones, so that one long triangle does not find all.
     found = tree.query_ball_point(middles, 2.0 * NEAR * radius, return_sorted=False)
     count = np.array([len(some) for some in found])
     one = np.repeat(np.arange(len(found)), count)
@@ -132,7 +132,7 @@ def near_pairs(panels: Panels) -> tuple[Ints, Ints]:
 
 
 def corrections(panels: Panels) -> tuple[csr_array, ...]:
-    r"""Integrate what the middles of edges leave out between near triangles.
+    r"""Return the correction between near triangles of the quadrature by middles of edges.
 
     Returns:
         found (five of (V, V)): For the hypersingular operator the terms in :math:`k^0`, :math:`k^2`
@@ -172,7 +172,7 @@ def corrections(panels: Panels) -> tuple[csr_array, ...]:
 
 
 def _missing(panels: Panels, one: Ints, other: Ints) -> Floats:
-    """Integrals over pairs of triangles, less those by the middles of edges (4, N, 3, 3)."""
+    """Return integrals over pairs of triangles (4, N, 3, 3), minus those by middles of edges."""
     corners = panels.vertices[panels.faces[one]]
     theirs = panels.vertices[panels.faces[other]]
     normals = panels.normals[other]

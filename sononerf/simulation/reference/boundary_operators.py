@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 """The integral operators of the boundary-element engine, for all frequencies.
 
-Pressure is linear between the vertices. Both operators are Galerkin's. The normal derivative of
-the double layer is written by Maue's formula, with the kernel of the single layer alone [1]_ [2]_.
-Pairs of triangles are integrated by the middles of their edges; near pairs are corrected.
+Pressure is linear between the vertices. Both operators are Galerkin's. Maue's formula gives the
+normal derivative of the double layer from the kernel of the single layer alone [1]_ [2]_. The
+quadrature points of triangles are the middles of their edges; near pairs are corrected.
 
 References:
     .. [1] A.-W. Maue, "Zur Formulierung eines allgemeinen Beugungsproblems durch eine
@@ -85,11 +85,7 @@ def _kernels(
     k: complex,
     beta: complex,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return what the curls and what the values of the pressure are multiplied by (Q, 2 b).
-
-    Real parts come first, then imaginary ones; of edges against themselves what is singular is
-    left out.
-    """
+    """Return the factors of the curls and of the values of the pressure (Q, 2 b)."""
     here = points[some]
     width = len(here)
     away = [here[:, axis] - points[:, axis, None] for axis in range(3)]  # (Q, b)
@@ -140,7 +136,7 @@ def _torch(matrix: csr_array) -> torch.Tensor:
 
 
 def _add(found: torch.Tensor, lefts: list[csr_array], product: torch.Tensor) -> None:
-    """Multiply (K V, 2 b) by the edges' rows from the left as well, and add what comes."""
+    """Multiply (K V, 2 b) by the edges' rows from the left, and add the products."""
     vertices, width = found.shape[0], product.shape[1] // 2
     touched = np.unique(np.concatenate([left.indices for left in lefts]))
     left = _torch(csr_array(_stacked([left[:, touched].T for left in lefts])))
