@@ -99,7 +99,7 @@ def wedge_directivity(
     to_receiver: Floats,
     fade: Floats,
 ) -> Floats:
-    r"""Return what the edge of a rigid wedge sends on from a source to a receiver.
+    r"""Return the diffraction by the edge of a rigid wedge from a source to a receiver.
 
     .. math:: -\frac{\nu}{2} \sum_{\pm \pm}
         \frac{\sin \nu (\pi \pm \theta_1 \pm \theta_2)}
@@ -157,9 +157,9 @@ def wedge_directivity(
 
 
 class Diffraction:
-    r"""Points on edges and strongly curved places, each standing for the same share of them.
+    r"""Points on edges and strongly curved places; each stands for the same fraction of them.
 
-    What counts is by how much the surface turns: for an edge its length times the angle between
+    The measure is the turn of the surface: for an edge its length times the angle between
     its faces' normals, for a curved place :math:`\int s \kappa\, dA`, with the share :math:`s` at
     which its curvature :math:`\kappa` counts as strong. So the level depends neither on the number
     of points nor on that of triangles. A part :math:`dM` (m) of this adds the pressure
@@ -205,7 +205,7 @@ class Diffraction:
         points: int,
         offset: float,
     ) -> Sound:
-        """Collect what the ears of a pose hear of edges and curved places.
+        """Return the sound of edges and curved places at the ears of a pose.
 
         Args:
             hearing: Head and air.
@@ -260,7 +260,7 @@ class Diffraction:
     def _places(
         self, share: float, points: int, offset: float
     ) -> tuple[Floats, Floats, Floats, Ints]:
-        """Points (N, 3), off the surface (N, 3), the stretch each stands for (N, 3), what it is."""
+        """Return points, outward directions, the stretches they stand for (N, 3 each), kinds."""
         at = (np.arange(points) + offset) * share
         index = np.searchsorted(self._end, at, side="right")
         measure = np.diff(self._end, prepend=0.0)[index]

@@ -15,7 +15,7 @@ from sononerf.simulation.reflection import Reflection, reflection
 
 
 class Engine:
-    """From a pose to what the ears hear of a scene.
+    """Base of engines: the sound of a scene at the ears of a pose.
 
     Args:
         scene: The ensonified scene.
@@ -24,7 +24,7 @@ class Engine:
     Attributes:
         reflections: The scene's materials at the nodes of the synthesis.
         note: Note to the user about the simulation of this scene; may be empty.
-        prepares: Whether :meth:`prepare` does all the work, so that nothing is left for other
+        prepares: True if :meth:`prepare` does all the work, so that nothing is left for other
             processes.
     """
 
@@ -32,7 +32,7 @@ class Engine:
 
     @property
     def parts(self) -> int:
-        """Number of parts in which :meth:`prepare` works; none where it does nothing."""
+        """Number of parts of :meth:`prepare`; 0 if it does nothing."""
         return 0
 
     def __init__(self, scene: Scene, hearing: Hearing) -> None:
@@ -71,12 +71,12 @@ class Engine:
         rotations: Floats,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Do at once what can be done for all poses at once.
+        """Compute whatever can be computed for all poses at once.
 
         Args:
             positions ((P, 3), m): Places of the head, world frame.
             rotations (P, 3, 3): Head to world.
-            progress: Takes how many parts are done and how many there are.
+            progress: Takes the numbers of parts that are done and of all parts.
         """
 
     def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
@@ -93,12 +93,12 @@ class Engine:
         raise NotImplementedError
 
     def hits(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
-        """Places that send sound straight back, and how much.
+        """Return places that send sound straight back, and their strength.
 
         Position, rotation and seed are those of :meth:`echo`.
 
         Returns:
             points ((N, 3), m): World frame.
-            strength (N,): Relative, zero or more: what a patch of one size sends to both ears.
+            strength (N,): Relative echo of a patch of one size at both ears, zero or more.
         """
         raise NotImplementedError

@@ -59,12 +59,12 @@ def simulate(
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> Echoes:
-    """Simulate what a head hears of a scene at poses.
+    """Simulate the echoes of a scene that a head hears at poses.
 
-    The same call goes on with an ensemble on disk that was interrupted, and opens one that is
-    complete. Shards are stores beside the ensemble's, each with some of its poses. They can be
-    simulated on different machines at once. The same call without a shard takes the poses from
-    there, simulates what is missing, and seals.
+    The same call resumes an interrupted ensemble on disk, and opens a complete one. Shards are
+    stores beside the ensemble's, each with some of its poses. Different machines can simulate them
+    at once. The same call without a shard takes the poses from there, simulates missing ones, and
+    seals the store.
 
     Args:
         scene: The ensonified scene.
@@ -180,10 +180,9 @@ def echo_hash(
     head: Head,
     options: SimulationSettings,
 ) -> str:
-    """Return a hash of all that the echoes depend on.
+    """Return a hash of all inputs of the echoes.
 
-    Poses count as what they are, not as how they were asked for: a changed table at the same
-    place is another ensemble, the same table at another place is not.
+    Poses count by their values: another table with the same poses gives the same ensemble.
     """
     plain = _heard_settings(head, options)
     digest = hashlib.sha256(f"simulator {VERSION}".encode())
@@ -222,7 +221,7 @@ def _heard_settings(head: Head, options: SimulationSettings) -> dict[str, Any]:
         if section[key] == default:
             del section[key]
     if "file" in ears:
-        # A measured directivity counts as what it is, not as where it lies.
+        # A measured directivity counts by its content, not by its path.
         ears["file"] = directivity_content(head.ears)
     return plain
 
@@ -269,7 +268,7 @@ def _fill(
     scheduler: str | None,
     progress: Progress,
 ) -> None:
-    """Simulate what is missing of a store, and seal it; of some poses ``only``, it is not sealed.
+    """Simulate the missing poses of a store, and seal it unless ``only`` names some poses.
 
     The test poses are simulated twice, with other rays, which gives the noise floor.
     """
@@ -280,7 +279,7 @@ def _fill(
     simulator.prepare(poses.positions[wanted], poses.rotations[wanted], progress)
     known = store.attributes.get("rays")
     if options.rays is None and isinstance(known, int) and 0 < known <= MOST:
-        # An interrupted simulation goes on with the number that it began with.
+        # An interrupted simulation continues with its initial number of rays.
         options = options.model_copy(update={"rays": known})
     here = 1 if scheduler is not None else workers
     rays = settle_rays(simulator, poses, options, progress, workers=here)
@@ -342,7 +341,7 @@ def simulate_ensemble(
     """
     wanted = [int(index) for index in indices]
     results = simulated(simulator, poses, wanted, seed_of, workers=workers, scheduler=scheduler)
-    # Closed at once where a write fails: what runs elsewhere ends before the error is seen.
+    # Closed at once if a write fails: processes elsewhere end before the error is reported.
     with closing(results):
         for index, spectrogram in results:
             write(index, spectrogram)

@@ -42,7 +42,7 @@ class Sound:
 
     Attributes:
         bins: Bins of each ear.
-        heard: Whether any echo was added.
+        heard: True if any echo was added.
     """
 
     def __init__(self, synthesis: Synthesis, ears: int) -> None:
@@ -132,12 +132,11 @@ class Hearing:
         ear.
 
         Args:
-            sound: To this it is added.
+            sound: The sound to add to.
             ear: 0 left, 1 right.
             points ((N, 3), m): World frame.
-            length ((N,), m): From the emitter to the points, along the path.
-            spread ((N,), m): Standard deviation of the whole path's length over what a point stands
-                for.
+            length ((N,), m): Path from the emitter to the points.
+            spread ((N,), m): Standard deviation of the whole path's length over a point's patch.
             level ((N, F) or (N, 1), m): The beam's gain is part of it.
             position ((3,), m): Place of the head.
             rotation (3, 3): Head to world.
@@ -165,8 +164,8 @@ class Hearing:
 
         Args:
             sound: The collected sound.
-            basis ((K, F) complex128): Filters of the synthesis; its ``basis``, for what surfaces
-                send back, where not given.
+            basis ((K, F) complex128): Filters of the synthesis; its ``basis``, for reflections,
+                where not given.
 
         Returns:
             echo (E, S): At the sampling rate.
@@ -179,7 +178,7 @@ class Hearing:
 
 @lru_cache(maxsize=2)  # tables of many receivers are large
 def hearing_of(head: Head) -> Hearing:
-    """Return what a head hears, with the time bins that its analysis needs; made once a head."""
+    """Return the response of a head, with its time bins; computed once per head."""
     return Hearing(head, plan_synthesis(head.analysis, head.samples))
 
 

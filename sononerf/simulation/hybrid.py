@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The default engine: low frequencies by the wave equation, high ones by rays, added in phase."""
+"""Engine `hybrid`: low frequencies by the wave equation, high ones by rays, added in phase."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Hybrid(Engine):
 
 
 def tracer_of(engine: Engine) -> Rays | None:
-    """Return what traces the rays of an engine; None if nothing does."""
+    """Return the part of an engine that traces rays; None if it has none."""
     if isinstance(engine, Hybrid):
         return engine.high
     return engine if isinstance(engine, Rays) else None
@@ -79,14 +79,14 @@ def hybrid(
     frequency_min: float,
     **rays: Any,
 ) -> Engine:
-    """Return the hybrid engine, or the rays alone where the low band cannot be solved for.
+    """Return the hybrid engine, or the rays alone if the low band cannot be solved for.
 
     Args:
         scene: The ensonified scene.
         hearing: Head and air.
-        sources: The most that may be used, which bounds the time.
+        sources: Largest number of sources, which bounds the time.
         frequency_min (Hz): The lowest that is analysed.
-        **rays: What :class:`Rays` takes.
+        **rays: Arguments of :class:`Rays`.
 
     Returns:
         engine: Rays where a surface is open, not rigid, too large or too thin; its ``note`` says
@@ -113,7 +113,7 @@ def _low_band(
     most: int,
     frequency_min: float,
 ) -> Sources | str:
-    """Return the engine of the low band, or why there is none."""
+    """Return the engine of the low band, or the reason for its absence."""
     if not all(material.rigid for material in scene.materials):
         return "a material is not rigid"
     if not scene.mesh.is_watertight:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From single echoes with a strength per frequency to the pressure at an ear.
+"""Synthesis of the pressure at an ear from single echoes with a strength per frequency.
 
 Each echo is laid into fine time bins, one column of bins per frequency node; a column is then
 filtered, once, with the part of the spectrum that its node stands for. Synthesis is linear in the
@@ -38,13 +38,14 @@ NODE_SPACING = NOTCH_WIDTH
 """Distance between frequency nodes, Hz. The responses of ears are then kept for 62 us about an
 echo, three standard deviations of the response of their notch."""
 ROLL_OFF = 0.3
-"""Width of the end of that limit, as a fraction of it. Less rings longer, more cuts more."""
+"""Width of the fall at that limit, as a fraction of it. A smaller one rings longer; a larger one
+cuts more."""
 IMAGES = 2
 """Periods of the nodes on each side that count; the kernel falls as the third power."""
 OVERSAMPLING = 4
 LEVELS = 10  # of bins, each twice as wide as the one before; the last smooths away even 10 kHz
-GUARD = 512  # samples behind the last frame, for what filters put before and after an echo
-RING = 384  # samples; what filters put farther from an echo is some 100 dB down
+GUARD = 512  # samples behind the last frame, for the filters' response before and after an echo
+RING = 384  # samples; farther from an echo the filters' response is some 100 dB down
 SHORTEST = 4  # the part of a record that is filtered is no less than one over this
 # Laying an echo between two bins of width 1 and reading them as triangles spreads it by 1/6 twice.
 LEVEL_VARIANCE = 1.0 / 3.0
@@ -57,7 +58,7 @@ class Synthesis:
     Attributes:
         nodes ((F,), Hz): Frequencies of the strengths.
         hats ((K, F) complex128): Spectrum that each node stands for.
-        basis ((K, F) complex128): The same times ``j f`` in Hz, for what surfaces send back.
+        basis ((K, F) complex128): The same times ``j f`` in Hz, for reflections.
         odd_hats ((K, F) complex128): As ``hats``, for strengths that are odd functions of
             frequency, as imaginary parts are.
         sampling_rate (Hz): Sampling rate of the echo.
@@ -107,13 +108,13 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     """Lay out nodes and filters for an analysis.
 
     Between nodes strengths are interpolated by raised cosines (:func:`between`). They are even
-    about zero frequency, as gains are, and stay what they are above the highest node; there the
-    echo falls smoothly to zero within a third of that frequency. The factor ``j f`` that every
+    about zero frequency, as gains are, and constant above the highest node; there the echo falls
+    smoothly to zero within a third of that frequency. The factor ``j f`` that every
     reflection has is part of the filters: a flat reflection is then a short derivative pulse and
     no long tail.
 
     Args:
-        settings: The analysis the echo is made for.
+        settings: The analysis of the echo.
         samples: Length of the echo, S.
 
     Returns:
@@ -147,8 +148,8 @@ def between(frequency: Floats, nodes: Floats) -> tuple[Floats, Floats]:
 
     .. math:: \operatorname{sinc}(x) \frac{\cos \pi \rho x}{1 - (2 \rho x)^2}
 
-    In time it is a window that keeps what comes within :math:`1 / (2 \Delta f)` of an echo and
-    removes the rest. Straight lines between the nodes would repeat each echo there every
+    In time it is a window that keeps sound within :math:`1 / (2 \Delta f)` of an echo and removes
+    the rest. Straight lines between the nodes would repeat each echo there every
     :math:`1 / \Delta f`, before it too. The nodes lie at odd multiples of half the spacing, so the
     values are continued as an even function about the upper end, and as an even or an odd one about
     zero. An odd one continued as an even one would jump at zero, and ring on as one over time.
@@ -183,13 +184,13 @@ def deposit(
     spread: Floats,
     strength: NDArray[np.floating[Any]],
 ) -> None:
-    """Lay echoes into time bins, each between the two nearest of the two levels it lies between.
+    """Lay echoes into time bins, each into the two nearest bins of its two neighbouring levels.
 
     Args:
         synthesis: The bins.
-        bins: To these the echoes are added, in place.
+        bins: The echoes are added to these, in place.
         delay ((N,), s): From the emission; echoes too late for the last frame are left out.
-        spread ((N,), s): Standard deviation of the arrival times of what an echo stands for.
+        spread ((N,), s): Standard deviation of the arrival times of an echo's patch.
         strength (N, F): Per node.
     """
     kind = bins.values.dtype
@@ -251,7 +252,7 @@ def _lay(
 
 
 def air_loss(synthesis: Synthesis, decay: Floats) -> Floats:
-    """Return what the air leaves of an echo in each bin (B, F), by its decay (F,) in 1/s."""
+    """Return the attenuation by air in each bin (B, F), from its decay (F,) in 1/s."""
     rate = OVERSAMPLING * synthesis.sampling_rate
     times = [np.arange(size) * (2.0**level / rate) for level, size in enumerate(synthesis.sizes)]
     loss: Floats = np.exp(-np.multiply.outer(np.concatenate(times), decay))
@@ -306,7 +307,7 @@ def _filter(
     part: int,
     width: float,
 ) -> None:
-    """Add what the filters make of one level of bins to a spectrum (K / part,), in place.
+    """Add one level of bins, filtered, to a spectrum (K / part,), in place.
 
     Args:
         spectrum (K / part,): Spectrum of the echo.
@@ -330,7 +331,7 @@ def _filter(
             real += one.real * other.real - along * other.imag
             imag += one.real * other.imag + along * other.real
         if width > 1.0 and k > 0:
-            # What the filters make up for happens in the finest bins alone.
+            # The loss that the filters compensate occurs in the finest bins alone.
             wide, fine = math.pi * k / finest * width, math.pi * k / finest
             fade = (math.sin(wide) / wide * math.sin(fine) / fine) ** 2
             real, imag = fade * real, fade * imag
@@ -340,7 +341,7 @@ def _filter(
 def _stretch(synthesis: Synthesis, bins: Bins) -> tuple[int, int]:
     """Return the first sample of the record that is filtered, and one over its length.
 
-    It begins at a bin of the coarsest level, and what the filters add around echoes fits in.
+    It begins at a bin of the coarsest level, and holds the filters' response around echoes.
     """
     unit = 2 ** (LEVELS - 1) // OVERSAMPLING
     earliest = unit * math.floor((bins.first - RING) / unit)

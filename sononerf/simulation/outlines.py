@@ -14,15 +14,15 @@ from sononerf.geometry.normals import CREASE, bodies, corner_normals, weight_gra
 
 
 class Outlines:
-    """The edges of a mesh that may be the outline of an obstacle, seen from somewhere.
+    """Edges of a mesh that may be part of an obstacle's outline, seen from some place.
 
     Args:
         mesh: The scene.
 
     Attributes:
         body (T,): Index of each triangle's connected part.
-        closed (T,): Whether that part has no rim.
-        several: Whether there is more than one part, or any that is not convex.
+        closed (T,): True if that part has no rim.
+        several: True if there are several parts, or one that is not convex.
     """
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
@@ -96,11 +96,11 @@ def _outline(
     """Return the edges between a triangle that faces a place and one that does not, and rims.
 
     Args:
-        place ((3,), m): From where they are seen.
+        place ((3,), m): The viewpoint.
         normals (T, 3): Normals of the triangles.
         height ((T,), m): Height of their planes over the origin.
         pairs (K, 2): Triangles at each edge; at a rim, twice the same.
-        may, rims, sharp (K,): Whether an edge may be an outline, is a rim, has no radius.
+        may, rims, sharp (K,): True if an edge may be an outline, is a rim, has no radius.
         edges ((K, 2, 3), m): Ends.
         middles ((T, 3), m): Middles of the triangles.
         second, third ((T, 3), 1/m): Gradients of the weights of their corners.

@@ -19,7 +19,7 @@ from sononerf.simulation.footprint import Footprint, Ways, emit, land, onto, way
 from sononerf.simulation.reflection import leave
 
 SPLIT = 2  # along each side of a divided cell
-GATHERED = 8192  # hits; so many are taken together, for numpy's calls cost as much as some hundred
+GATHERED = 8192  # hits processed together: a call of numpy costs as much as hundreds
 CHUNK = 49_152  # rays; fewer and calls add up, more and they leave the processor's cache
 
 Beyond = Callable[[Hits, Floats], tuple[Hits, Floats]]
@@ -27,7 +27,7 @@ Beyond = Callable[[Hits, Floats], tuple[Hits, Floats]]
 
 @dataclass(frozen=True, eq=False)
 class Bounce:
-    """The rays that hit the surface for the n-th time.
+    """Rays that hit the surface for the n-th time.
 
     Attributes:
         number: n, the first hit being 1.
@@ -84,7 +84,7 @@ class Bounce:
 def gathered(bounces: Iterable[Bounce]) -> Iterator[Bounce]:
     """Yield the same hits in fewer parts; none of them is empty.
 
-    What was the index of a ray is none any more.
+    Indices of rays are no longer valid afterwards.
     """
     waiting: dict[tuple[int, bool], list[Bounce]] = {}
     for bounce in bounces:
@@ -143,7 +143,7 @@ def trace(
 ) -> Iterator[Bounce]:
     """Follow rays over mirror bounces.
 
-    A surface is the same from both sides: what a ray hits is outside for it.
+    Both sides of a surface are alike: the side that a ray hits is the outside.
 
     Args:
         caster: The surface.
@@ -151,8 +151,8 @@ def trace(
         directions (N, 3): Unit vectors.
         bounces: Largest number of hits of a ray.
         solid_angle (sr): Solid angle of each ray.
-        beyond: Takes what is hit first and all directions (N, 3); returns what is to count as hit
-            instead, and how far it is from the emitter (M,), m.
+        beyond: Takes the first hits and all directions (N, 3); returns the hits to use instead, and
+            their distance from the emitter (M,), m.
 
     Yields:
         bounce: One per bounce, as long as any ray hits.
@@ -200,11 +200,11 @@ def echo_paths(
     beyond: Beyond | None = None,
     index: Ints | None = None,
 ) -> Iterator[Bounce]:
-    """Follow the rays of a cap, with more of them where a few would be noise.
+    """Follow the rays of a cap, with more rays where a few would give noise.
 
     A curved surface spreads neighbouring rays tenfold and more at each bounce, so a pattern that
-    is dense at the first hit is sparse at the second. The cells of doubtful rays are divided, and
-    their parts again, until none is in doubt or the extra rays are used up: stratified sampling,
+    is dense at the first hit is sparse at the second. The cells of doubtful rays are divided
+    repeatedly, until no ray is doubtful or the extra rays are used up. This is stratified sampling,
     refined where the integrand is not resolved.
 
     Args:
@@ -234,11 +234,11 @@ def echo_paths(
                 caster, emitter, chunk, bounces, solid_angle=solid_angle, beyond=beyond
             ):
                 bounce = replace(bounce, ray=rays.take(bounce.ray + start))
-                if extra < SPLIT**2:  # none can be divided any more
+                if extra < SPLIT**2:  # no cell can be divided further
                     found.append((bounce, np.arange(len(bounce.ray))))
                     continue
                 audible, doubt = judge(bounce)
-                # A ray hits once a time, so none stands here twice.
+                # A ray hits once per bounce, so that no ray appears twice.
                 weight[bounce.ray] = np.maximum(weight[bounce.ray], doubt)
                 if cells is None and bounce.number == 2:
                     # Next to a ray that hits again is one that just missed.

@@ -15,15 +15,15 @@ from sononerf.compiled import compiled
 from sononerf.scene.material import Material
 
 COARSEST = 10.0  # rad
-LEAST_RISE = 1e-4  # sine of the angle at which what runs into a surface grazes it
+LEAST_RISE = 1e-4  # sine of the angle below which sound grazes a surface
 # Beyond this many standard deviations a lobe is 3e-4 of its middle (-70 dB) and left out.
 REACH = 4.0
 # A smooth surface sends sound where its shape does: Kirchhoff's integral over it, which lives from
-# the first Fresnel zones about the mirror point. What lies further is faded out by this much per
-# radian of phase; by itself it would cancel, up to false echoes from the border of light and
-# shadow and the noise of rays that are too few for it.
+# the first Fresnel zones about the mirror point. Places farther away fade by this much per radian
+# of phase; by itself it would cancel, up to false echoes from the border of light and shadow and
+# the noise of rays that are too few for it.
 FADE = 1.0
-# Well below this the fade is no slower, so that what is far from the mirror point need not be
+# Well below this the fade is no slower, so that places far from the mirror point need not be
 # followed.
 FADE_FREQUENCY = 25e3  # Hz
 
@@ -66,8 +66,8 @@ class Reflection:
     ) -> NDArray[np.floating[Any]]:
         r"""Lobe times strength.
 
-        A smooth surface fades by :math:`e^{-\epsilon k \delta}` with the detour :math:`\delta`;
-        :func:`unfaded` makes good what that takes.
+        The echo of a smooth surface fades by :math:`e^{-\epsilon k \delta}` with the detour
+        :math:`\delta`; :func:`unfaded` compensates the loss.
 
         Args:
             cosine (N,): Cosines of the angle between the mirror direction and that towards the
@@ -127,7 +127,7 @@ def reflection(material: Material, frequency: ArrayLike, *, speed_of_sound: floa
 
 
 def unfaded(frequency: Floats, *, speed_of_sound: float) -> tuple[Floats, Complexes]:
-    r"""Return the fade of smooth surfaces, and what makes good for it.
+    r"""Return the fade of smooth surfaces, and the gain that compensates it.
 
     Faded, Kirchhoff's integral over the Fresnel zones is
     :math:`\int e^{-(\epsilon + j) k \delta} d\delta = 1 / (\epsilon + j) k` in place of
@@ -147,7 +147,7 @@ def unfaded(frequency: Floats, *, speed_of_sound: float) -> tuple[Floats, Comple
 
 
 def coarse_gain(bend: Singles) -> Singles:
-    r"""Make good what a smooth surface loses, on average, to cells that are too coarse.
+    r"""Return the gain that compensates the mean loss of a smooth surface by coarse cells.
 
     A cell is laid into time bins as wide as its paths are spread, by the slope of the path over it
     and by its bend :math:`b = k \lambda \Omega`, :math:`\lambda` the Hessian's eigenvalue. Over

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The echo simulator: from a scene, a head and poses to what the receivers hear."""
+"""The echo simulator: from a scene, a head and poses to the sound at the receivers."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ class Simulator:
             scene: The ensonified scene.
             head: The head. Of a scene on its support the part above it is ensonified together
                 with its image: a rigid plane is exactly that.
-            options: The engine and what bounds its work.
+            options: The engine and the bounds of its work.
 
         Raises:
             InputError: If all of the scene lies below the support.
@@ -159,8 +159,8 @@ class Simulator:
     def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
         """Pressure at both ears for an impulse; see :meth:`Engine.echo`.
 
-        Engines that solve the wave equation hear with the head as it is; of the others nothing is
-        kept that comes before sound can arrive, see :func:`silence_before`.
+        Engines that solve the wave equation hear with the head as it is; those of other engines are
+        silent before sound can arrive, see :func:`silence_before`.
         """
         engine = self.engine
         echo = engine.echo(position, rotation, seed=seed)
@@ -172,7 +172,7 @@ class Simulator:
         return silence_before(echo, first, sampling_rate=rate)
 
     def spectrogram(self, position: Floats, rotation: Floats, *, seed: int) -> Singles:
-        """Magnitude of what both ears hear, over range and frequency.
+        """Return the magnitude at both ears, over range and frequency.
 
         Position, rotation and seed are those of :meth:`Engine.echo`.
 
@@ -182,7 +182,7 @@ class Simulator:
         return self.receive(position, rotation, seed=seed)[1].astype(np.float32)
 
     def receive(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
-        """Return what both ears hear of the call, noise included, and its spectrogram.
+        """Return the sound at both ears for the call, noise included, and its spectrogram.
 
         Position, rotation and seed are those of :meth:`Engine.echo`.
 
@@ -222,7 +222,7 @@ def quiet_scene(mesh: trimesh.Trimesh) -> Scene:
 
 
 def solved_frequency(wanted: SimulationSettings, analysis: SpectrogramSettings) -> float:
-    """Return the frequency (Hz) at which what is solved for has fallen to zero.
+    """Return the frequency (Hz) at which the solved response has fallen to zero.
 
     Where it is not set, the response is whole up to the highest analysed frequency and the
     bandwidth (-6 dB) of a row there above it.
@@ -245,7 +245,7 @@ POSE_BYTES = 550
 
 
 def ensemble_poses(wanted: PoseSettings) -> tuple[Poses, NDArray[np.int8]]:
-    """Poses of an experiment: those to train on, then those for validation, then for the test.
+    """Return the poses of an experiment: first training, then validation, then test poses.
 
     Each set draws from a generator of its own, so that the number of one does not move another.
     The poses of a path stay in the order of its table.
@@ -286,7 +286,7 @@ def _generator(wanted: PoseSettings, member: int) -> np.random.Generator:
 
 
 def _arrangement(wanted: PoseSettings) -> tuple[Callable[..., Poses], Callable[..., Poses]]:
-    """Return what makes the training poses, and what draws those for validation and test."""
+    """Return the training poses, and functions that draw those for validation and test."""
     radius, axis = wanted.radius, wanted.axis
     if wanted.arrangement == "sphere":
         return partial(Poses.sphere, radius=radius), partial(random_sphere_poses, radius=radius)

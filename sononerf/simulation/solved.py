@@ -28,7 +28,7 @@ from sononerf.simulation.reference.kirchhoff import Kirchhoff
 logger = logging.getLogger("sononerf")
 
 TAPER = 1.15  # the highest frequency over that from which the response falls
-PATH = 12.0  # radii of the bounding sphere; what comes later is more than 80 dB down
+PATH = 12.0  # radii of the bounding sphere; later sound is more than 80 dB down
 LEAD = 5.0  # over the taper's width; it puts less than -80 dB farther before an arrival
 TAIL = 1.0  # over the taper's width, behind the last arrival
 LONGEST = 7.0 * 86_400.0  # s; a longer computation is refused
@@ -43,7 +43,7 @@ class Heads:
         emitters ((P, 3), m): World frame.
         ears ((P, E, 3), m): World frame.
         rotations (P, 3, 3): Head to world.
-        emitting (P, 3, 3): The same for the emitter; that of an image mirrors too.
+        emitting (P, 3, 3): Emitter to world; that of an image also mirrors.
         gains: Tables of one frequency.
     """
 
@@ -218,7 +218,7 @@ class Solved(Engine):
             wavenumber = complex(turn / self.hearing.speed_of_sound, -absorbed[index])
             gains = self.hearing.head.tables(self.frequency[index : index + 1])
             heads = Heads(emitters, ears, turns, turns, gains).with_images(plane)
-            # What the emitter and its image cause adds up.
+            # The responses to the emitter and its image add up.
             found = self.respond(wavenumber, heads).reshape(-1, *start.shape).sum(axis=0)
             return fall[index] * found * np.exp(1j * turn / rate * start)
 
@@ -235,7 +235,7 @@ class Solved(Engine):
     def _in_threads(
         self, respond: Callable[[int], Complexes], count: int
     ) -> Generator[Iterator[Complexes], None, None]:
-        """Give the responses at all frequencies in order; what waits is dropped on an error."""
+        """Yield the responses at all frequencies in order; waiting ones are dropped on an error."""
         if not self.side_by_side:
             yield map(respond, range(count))
             return
@@ -248,7 +248,7 @@ class Solved(Engine):
                 pool.shutdown(cancel_futures=True)
 
     def taper(self, frequency: Floats) -> Floats:
-        """Return what is left of the response (K,) at frequencies (K,) in Hz."""
+        """Return the taper of the response (K,) at frequencies (K,) in Hz."""
         band = self.frequency_max - self.frequency_full
         fall = np.clip((frequency - self.frequency_full) / band, 0.0, 1.0)
         left: Floats = 0.5 * (1.0 + np.cos(np.pi * fall))

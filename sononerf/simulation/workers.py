@@ -41,7 +41,7 @@ SeedOf = Callable[[int], int]
 
 
 def useful_workers(poses: int, rays: int) -> int:
-    """Return how many processes simulate so many poses soonest; one means this process."""
+    """Return the number of processes that simulates the poses soonest; one means this process."""
     return min(available_cores(), MOST_WORKERS) if poses * rays >= WORTH_RAYS else 1
 
 
@@ -175,7 +175,7 @@ def _receive(simulator: Simulator) -> Simulator:
 
 
 def _send(client: Client, simulator: Simulator) -> Any:
-    """Send the simulator once, as a task: what dies with a worker can be made again."""
+    """Send the simulator once, as a task, so that it can be rebuilt if its worker dies."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Sending large graph", category=UserWarning)
         return client.submit(_receive, simulator, pure=False)
