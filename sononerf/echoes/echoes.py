@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Echoes: spectrograms, their head, and what is found in them; echoes less a background's."""
+"""Echoes: spectrograms, their head, and results about them; subtraction of a background."""
 
 from __future__ import annotations
 
@@ -206,14 +206,14 @@ class Echoes(Shown):
     def within(self, box: ArrayLike) -> Echoes:
         """Return the same echoes of a body that lies within a box.
 
-        Echoes that arrive earlier than any from the box are clutter, and no onsets. An onset whose
+        Echoes that arrive earlier than any from the box are clutter, not onsets. An onset whose
         origin cannot lie in the box is an outlier.
 
         Args:
             box ((2, 3), m): Lower and upper corner, world frame.
 
         Raises:
-            InputError: If it is no box.
+            InputError: If the corners are not those of a box.
         """
         corners = np.asarray(box, dtype=np.float64)
         if corners.shape != (2, 3) or not (corners[0] < corners[1]).all():
@@ -255,7 +255,7 @@ class Echoes(Shown):
         return np.asarray(found, dtype=np.int64)
 
     def spectrogram(self, pose: int) -> Singles:
-        """Return what a pose heard, (E, R, F) linear magnitude.
+        """Return the spectrogram of a pose, (E, R, F) linear magnitude.
 
         The axes are ``head.range`` (m) and ``head.frequency`` (Hz).
 
@@ -265,7 +265,7 @@ class Echoes(Shown):
         return self.store.read_pose(pose)
 
     def plot(self, pose: int, prediction: object = None) -> Picture:
-        """Return a picture of what a pose heard, in decibels over range and frequency.
+        """Return a picture of a pose's spectrogram, in decibels over range and frequency.
 
         Args:
             pose: Its number.

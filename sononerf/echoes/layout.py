@@ -145,11 +145,11 @@ def create_arrays(root: Path, axes: dict[str, NDArray[Any]], receivers: int) -> 
 def _open_array(
     root: Path, name: str, group: Any, dtype: str, dims: tuple[str, ...], sizes: tuple[int, ...]
 ) -> Any:
-    """Return one array of the group if it is what we write; nothing is read of it yet."""
+    """Return one array of the group if it has the expected layout; its data are not read yet."""
     path = root / name
     try:
         array = group.get(name)
-    except Exception as error:  # damaged metadata raises whatever its parser met first
+    except Exception as error:  # the error of damaged metadata depends on the parser
         raise InputError(f"{path}: damaged ({type(error).__name__}: {error})") from error
     if not isinstance(array, zarr.Array):
         raise InputError(f"{path}: missing; simulate or fetch the ensemble again")
@@ -181,7 +181,7 @@ def _open_array(
 
 
 def read_axes(root: Path, group: Any) -> tuple[dict[str, NDArray[Any]], Any]:
-    """Check every array against what :func:`create_arrays` writes and read the axes.
+    """Check every array against the layout of :func:`create_arrays`, and read the axes.
 
     Args:
         root: The ensemble's folder.
@@ -199,7 +199,7 @@ def read_axes(root: Path, group: Any) -> tuple[dict[str, NDArray[Any]], Any]:
         array = _open_array(root, name, group, dtype, dims, sizes)
         chunk = chunk_path(root, name, (0,) * array.ndim)
         size = chunk.stat().st_size if chunk.is_file() else 0
-        # Also bounds what is read: a declared size that no file backs costs no memory.
+        # This also bounds the memory: a declared size without a file of that size is refused.
         if size != array.nbytes + CRC_BYTES:
             raise InputError(f"{chunk}: {size} bytes, expected {array.nbytes + CRC_BYTES}; {ANEW}")
         try:
@@ -254,7 +254,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
     """Return a store's attributes, checked, without the format's own names.
 
     Raises:
-        InputError: If it is none of our ensembles, or its attributes are damaged.
+        InputError: If the store is not an ensemble of sononerf, or its attributes are damaged.
         IncompatibleError: If another version of the format wrote it.
     """
     group = storage.read_json(path / "zarr.json")

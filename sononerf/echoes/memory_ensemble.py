@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Ensembles: what receivers heard at many poses. This module keeps them in memory."""
+"""Ensembles: spectrograms of receivers at many poses. This module keeps them in memory."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Ensemble(ABC):
 
     @abstractmethod
     def write_pose(self, index: int, spectrogram: ArrayLike) -> None:
-        """Keep one pose's magnitude, (E, R, F), linear.
+        """Store one pose's linear magnitude, (E, R, F).
 
         Raises:
             InputError: If there is no such pose, or the shape is another.
@@ -125,7 +125,7 @@ LOUDEST = 1e18
 
 
 def fault_of(spectrogram: Singles) -> str:
-    """Return where a spectrogram (E, R, F) holds what is no magnitude; empty if nowhere."""
+    """Return where a spectrogram (E, R, F) holds invalid magnitudes; empty if nowhere."""
     usable = (spectrogram >= 0.0) & (spectrogram <= LOUDEST)  # False for NaN
     if usable.all():
         return ""
@@ -195,7 +195,7 @@ class MemoryEnsemble(Ensemble):
         return [index for index in np.arange(len(self)).tolist() if index not in self._heard]
 
     def seal(self) -> None:
-        """Do nothing: what is complete in memory needs no mark."""
+        """Do nothing: a complete ensemble in memory needs no mark."""
 
 
 def seal(
@@ -209,7 +209,7 @@ def seal(
 
     Args:
         ensemble: No pose is missing.
-        again: By number of a test pose, what the same pose heard another time, (E, R, F).
+        again: Second spectrogram of a test pose, (E, R, F), by the pose's number.
         silent: Message if no training pose heard anything.
         noise ((E, F) or None): Its root mean square, where it is known.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-r"""The noise of recordings, from what was heard before the first echoes.
+r"""The noise of recordings, from the sound before the first echoes.
 
 Noise of many sources has a magnitude of Rayleigh's distribution: the median of its power is
 :math:`\sigma^2 \ln 2`, and its magnitude exceeds :math:`\sigma \sqrt{\ln(1 / p)}` with probability
@@ -54,10 +54,10 @@ def noise_rms(store: Ensemble, head: Head) -> Floats | None:
 
 
 def heard_again(magnitude: NDArray[np.floating], noise: Floats, seed: int) -> Singles:
-    """Return what the same pose would hear another time, (E, R, F).
+    """Return another draw of the same pose's spectrogram, (E, R, F).
 
-    Where an echo stands above the noise, the difference of two draws of noise is added to it. What
-    is below is noise, and is drawn anew.
+    Cells above the noise get the difference of two draws of noise. Cells below are noise, and are
+    drawn again.
 
     Args:
         magnitude (E, R, F): Its spectrogram.
@@ -75,10 +75,10 @@ def heard_again(magnitude: NDArray[np.floating], noise: Floats, seed: int) -> Si
 def seal_recorded(
     store: Ensemble, head: Head, poses: Poses, split: NDArray[np.int8], *, silent: str
 ) -> None:
-    """Seal echoes that were recorded: with their noise, and the noise floor of the test poses.
+    """Seal recorded echoes with their noise, and the noise floor of the test poses.
 
-    The floor is that of poses that were recorded twice, where there are any, or else what the noise
-    before the first echoes gives.
+    The floor comes from poses that were recorded twice, or else from the noise before the first
+    echoes.
 
     Args:
         store: No pose is missing.

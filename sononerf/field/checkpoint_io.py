@@ -41,7 +41,8 @@ def previous_of(path: Path) -> Path:
 def _sign(file: BinaryIO) -> None:
     """Put the SHA-256 of a zip archive into its comment, where its own checksums do not reach.
 
-    They cover its members alone: one bit of the directory of members changes what torch reads.
+    Those cover its members alone: one bit of the directory of members makes torch read other
+        numbers.
     """
     file.flush()
     with Path(file.name).open("rb") as written:
@@ -51,7 +52,7 @@ def _sign(file: BinaryIO) -> None:
 
 
 def _signature(path: Path) -> tuple[bytes, bytes] | None:
-    """Return the SHA-256 that an archive states and the one it has; None where it states none."""
+    """Return the SHA-256 that an archive states and its actual one; None if it states none."""
     found = hashlib.sha256()
     tail = 2 + found.digest_size
     left = path.stat().st_size - tail
@@ -67,7 +68,7 @@ def _signature(path: Path) -> tuple[bytes, bytes] | None:
 
 
 def fault_of(path: Path) -> str | None:
-    """Return what is wrong with a checkpoint's archive, or None where its checksums hold."""
+    """Return the fault of a checkpoint's archive, or None if its checksums hold."""
     try:
         signature = _signature(path)
         if signature is not None:
@@ -118,10 +119,10 @@ class DurableCheckpointIO(CheckpointIO):
         map_location: Any = None,  # noqa: ARG002 - Lightning's signature
         weights_only: bool | None = None,  # noqa: ARG002
     ) -> dict[str, Any]:
-        """Read a checkpoint to the CPU; the one before where the newest is damaged.
+        """Read a checkpoint to the CPU; the previous one if the newest is damaged.
 
-        ``map_location`` and ``weights_only`` are Lightning's; a checkpoint is always loaded to
-        the CPU and never runs code, whatever they say.
+        ``map_location`` and ``weights_only`` are Lightning's; they are ignored: a checkpoint is
+        always loaded to the CPU and never runs code.
 
         Raises:
             InputError: If neither is there whole, or the content is more than plain data.

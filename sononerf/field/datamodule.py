@@ -31,8 +31,8 @@ times."""
 class EpochSampler(DistributedSampler[int]):
     """The numbers of an epoch's batches; it begins at the step that the trainer has reached.
 
-    A batch is a function of its number, so a fit that goes on from a checkpoint in the middle of an
-    epoch meets the batches that are left. Each device gets its share of each batch from the
+    A batch is a function of its number, so a fit that resumes in the middle of an epoch gets the
+    remaining batches. Each device gets its share of each batch from the
     stream: as a ``DistributedSampler`` this one is not replaced by Lightning.
 
     Args:
@@ -69,7 +69,7 @@ class EchoDataModule(lightning.LightningDataModule):
     """Streams the batches of echoes to any Lightning Trainer; the splits are those of the echoes.
 
     A batch is a function of the seed and its number alone: neither the number of workers nor of
-    devices changes it, and a fit that is resumed meets the batches that are left.
+    devices changes it, and a resumed fit gets the remaining batches.
 
     Args:
         echoes: The echoes to fit.
@@ -154,7 +154,7 @@ class EchoDataModule(lightning.LightningDataModule):
         )
 
     def whole(self, split: Literal["train", "val", "test"]) -> WholePoses:
-        """Return the poses of a split, one by one, with what was measured there."""
+        """Return the poses of a split, one by one, with their measured spectra."""
         numbers = torch.as_tensor(self.store.indices(split))
         return WholePoses(
             torch.as_tensor(self.store.positions)[numbers],
@@ -193,7 +193,7 @@ class EchoDataModule(lightning.LightningDataModule):
         )
 
     def val_dataloader(self) -> DataLoader[RangeSlices] | list[DataLoader[RangeSlices]]:
-        """Return the validation poses, or nothing where there are none."""
+        """Return the validation poses; an empty list if there are none."""
         whole = self.whole("val")
         return one_by_one(whole) if len(whole) else []
 

@@ -99,7 +99,7 @@ def _made(
     head: Head | None,
     options: Mapping[str, Any],
 ) -> object:
-    """Return what the factory of a plugin, or a factory, makes."""
+    """Return the object that a plugin's factory, or a factory, makes."""
     what = "field" if group == plugins.FIELDS else "renderer"
     make = plugins.load(group, given) if isinstance(given, str) else given
     if not callable(make):

@@ -33,7 +33,7 @@ class Field(nn.Module):
     occupancy: Tensor
     cell: Tensor
     learning_rate: float = 1e-3
-    """What Adam starts with where the settings name no rate."""
+    """Initial learning rate of Adam where the settings name none."""
     costly: bool = False
     """True if one place needs so many operations that threads always save time."""
     half_precision: bool = False
@@ -48,14 +48,15 @@ class Field(nn.Module):
         self._asked: tuple[Tensor, Tensor, Tensor | None] | None = None  # see outside
 
     def _load_from_state_dict(self, state_dict: dict[str, Any], prefix: str, *rest: Any) -> None:
-        # The fit finds out what is occupied, and how finely; a loaded map replaces ours whole.
+        # The fit determines the map of occupied places and its resolution; a loaded map replaces
+        # ours.
         if prefix + "occupancy" in state_dict:
             self.occupancy = self.occupancy.new_zeros(state_dict[prefix + "occupancy"].shape)
         super()._load_from_state_dict(state_dict, prefix, *rest)
 
     @torch.no_grad()
     def keep(self, places: Tensor, spacing: float) -> None:
-        """Be zero from now on wherever none of the places is near.
+        """Set the field to zero, from now on, at all points that are near none of the places.
 
         Args:
             places ((N, 3), m): Vertices of a lattice that may hold something.
@@ -77,9 +78,9 @@ class Field(nn.Module):
         self.cell = torch.full_like(self.cell, cell)
 
     def advance(self, step: int, total: int) -> None:
-        """Hear how far the fit is, before each training step; a field may change with that.
+        """Note the progress of the fit, before each training step; a field may change with it.
 
-        What changes has to lie in a buffer, so that a loaded field is the fitted one.
+        Such changes have to be kept in a buffer, so that a loaded field is the fitted one.
 
         Args:
             step: Number of the training step, from 0.
@@ -122,9 +123,9 @@ class Field(nn.Module):
         return response if bins is None else response[..., bins]
 
     def code(self, positions: Tensor) -> Tensor | None:
-        """Return what places are, as the field itself puts it, or None where it has no such thing.
+        """Return the field's own parameters of places, or None if it has none.
 
-        :meth:`audible` and :meth:`echo` take it, so that it need be found out once for both.
+        :meth:`audible` and :meth:`echo` take them, so that they are computed once for both.
 
         Args:
             positions ((N, 3), m): Places, world frame.
@@ -139,8 +140,8 @@ class Field(nn.Module):
         """Return what :meth:`code` does, for places that are evaluated repeatedly.
 
         Args:
-            lattice ((L, 3), m): The same tensor as long as the places are the same: how it is read
-                may be kept.
+            lattice ((L, 3), m): The same tensor as long as the places are the same: the way of
+                reading it may be kept.
             which ((N,) int or None): Indices of the places; all where None.
 
         Returns:
@@ -150,7 +151,7 @@ class Field(nn.Module):
 
     @torch.no_grad()
     def audible(self, positions: Tensor, sources: Tensor, code: Tensor | None = None) -> Tensor:
-        """Return which places answer which emitters at all.
+        """Return which places send echoes to which emitters.
 
         Args:
             positions ((N, 3), m): Places, world frame.
@@ -158,7 +159,7 @@ class Field(nn.Module):
             code ((N, C) or None): Code of :meth:`code`; found out where None.
 
         Returns:
-            audible (P, N): False only where the answer may be left out.
+            audible (P, N): False only where the echo may be left out.
         """
         del code
         return positions.new_ones(len(sources), len(positions), dtype=torch.bool)
@@ -171,14 +172,14 @@ class Field(nn.Module):
         place: Tensor | None = None,
         code: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return what places answer, and from how much nearer than they lie.
+        """Return the echoes of places, and how much nearer than the places they arise.
 
         Args:
             positions ((N, 3), m): Places, world frame.
             directions (M, 3): Unit vectors to the emitter.
             bins ((B,) int or None): Indices of the frequencies; all where None.
-            place ((M,) int or None): Index of the place of each direction, so that what a place is
-                need be found out once for all directions; each its own where None.
+            place ((M,) int or None): Index of the place of each direction, so that a place is
+                evaluated once for all its directions; each has its own place where None.
             code ((N, C) or None): Code of :meth:`code`; found out where None.
 
         Returns:

@@ -48,7 +48,7 @@ def has_accelerator() -> bool:
 
 
 def require_accelerator(accelerator: str) -> None:
-    """Refuse a GPU that is not there.
+    """Refuse an accelerator that this machine does not have.
 
     Raises:
         ResourceError: If ``gpu`` was asked for and there is none.
@@ -73,7 +73,7 @@ def fit(
 ) -> EchoModule:
     """Fit a module to echoes and validate after each epoch, as the command ``fit`` does.
 
-    A Trainer of your own does as well: ``trainer.fit(model, EchoDataModule(echoes))``.
+    Your own Trainer works as well: ``trainer.fit(model, EchoDataModule(echoes))``.
 
     Args:
         echoes: The echoes to fit.

@@ -118,7 +118,7 @@ class FourierField(Field):
         return self.spacing or float((self.region[1] - self.region[0]).max()) / 100
 
     def _embedded(self, positions: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what enters the first layers, and the last ones."""
+        """Return the inputs of the first layers, and of the last ones."""
         if self.inputs == "direction":
             place = self._sines(positions * self.scale, self._first)
             both = torch.cat((place, self._sines(directions, self._turns)), dim=-1)

@@ -35,10 +35,10 @@ class _Product(torch.autograd.Function):
 
 
 class _Reading:
-    """Trilinear interpolation at places that stay where they are, as a sparse matrix.
+    """Trilinear interpolation at fixed places, as a sparse matrix.
 
-    Most places of a lattice lie on vertices of the finest grid and between few of the coarser
-    ones, so that ten products do what takes eight of each grid, found anew every time.
+    Most places of a lattice lie on vertices of the finest grid and between few of the coarser ones.
+    So ten products replace eight per grid, which would be recomputed each time.
 
     Args:
         places ((N, 3), m): Kept, to be known again.
@@ -94,7 +94,7 @@ class _Reading:
         return entries.to_sparse_csr()
 
     def __call__(self, grids: list[Tensor]) -> Tensor:
-        """Return what the places read, summed over the grids, (N, C)."""
+        """Return the values at the places, summed over the grids, (N, C)."""
         read = [
             grid.reshape(grid.shape[1], -1).index_select(1, vertices)
             for grid, vertices in zip(grids, self._vertices, strict=True)
@@ -103,7 +103,7 @@ class _Reading:
         return total
 
     def holds(self, places: Tensor, grid: Tensor) -> bool:
-        """Return whether it is these places that are read, in grids such as this."""
+        """Return whether this matrix belongs to these places and to grids like this."""
         return self.places is places and self.device == grid.device and self.dtype == grid.dtype
 
 
@@ -175,7 +175,7 @@ class GridField(LobeField):
         return self.spacing
 
     def code(self, positions: Tensor) -> Tensor:
-        """Read what (N, 3) places are, (N, 5 + rank); see the base class."""
+        """Return the parameters of places (N, 3), (N, 5 + rank); see the base class."""
         total = positions.new_zeros(positions.shape[0], CODE + self.rank)
         for step, grid in zip(self._steps, self.grids, strict=True):
             size = positions.new_tensor([grid.shape[4], grid.shape[3], grid.shape[2]]) - 1
@@ -187,7 +187,7 @@ class GridField(LobeField):
         return total
 
     def code_of_lattice(self, lattice: Tensor, which: Tensor | None) -> Tensor:
-        """Read what places of a lattice are; see the base class."""
+        """Return the parameters of a lattice's places; see the base class."""
         grids = list(self.grids)
         if self._reading is None or not self._reading.holds(lattice, grids[0]):
             with torch.inference_mode(False), torch.no_grad():

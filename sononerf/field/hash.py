@@ -44,8 +44,8 @@ class HashField(LobeField):
     Each level is a cubic lattice with a feature vector per vertex. A level whose vertices fit
     into the table has one entry for each of them; in a finer one vertices share entries, by a
     hash of their numbers [1]_. The levels' features, interpolated trilinearly, go through two
-    hidden layers, and past them, into what the places are. A fit begins with the coarsest level;
-    the finer ones follow one after the other.
+    hidden layers, and past them, to the parameters of the places. A fit begins with the coarsest
+    level; the finer ones follow one after the other.
 
     Args:
         region ((2, 3), m): Lower and upper corner of the box, world frame.
@@ -160,7 +160,7 @@ class HashField(LobeField):
         return (read * self.release()[:, None, None]).transpose(0, 1).flatten(1)
 
     def code(self, positions: Tensor) -> Tensor:
-        """Read what (N, 3) places are, (N, 5 + rank); see the base class."""
+        """Return the parameters of places (N, 3), (N, 5 + rank); see the base class."""
         features = self.encode(positions)
         code: Tensor = self.out(torch.cat((self.hidden(features), features), dim=1))
         return code

@@ -126,7 +126,7 @@ class LobeField(Field):
         self.basis = nn.Parameter(basis) if self.rank else None
 
     def code(self, positions: Tensor) -> Tensor:
-        """Read what (N, 3) places are, (N, 5 + rank).
+        """Return the parameters of places (N, 3), (N, 5 + rank).
 
         Log strength, lobe vector, radius of curvature in ``RADIUS_UNIT``, coefficients.
         """
@@ -182,7 +182,7 @@ class LobeField(Field):
         place: Tensor | None = None,
         code: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
-        """Return the reflectivity, (M, B), and how much nearer it comes from, (M,) m."""
+        """Return the reflectivity, (M, B), and how much nearer than its place it arises, (M,) m."""
         code = (self.code(positions) if code is None else code).T
         outside = self.outside(positions)
         if place is not None:

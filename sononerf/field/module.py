@@ -125,7 +125,7 @@ class EchoModule(lightning.LightningModule):
                 "dynamic_range_db": dynamic_range_db,
             }
         )
-        # A generator of its own: what the caller draws next does not depend on this.
+        # A generator of its own leaves the caller's random numbers alone.
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(options.seed)
             self.field = make_field(field, box, self.head, field_options or {})
@@ -285,7 +285,7 @@ class EchoModule(lightning.LightningModule):
 
     @contextmanager
     def _own_random_numbers(self, step: int) -> Iterator[None]:
-        """Draw a step's random numbers from seed and step, and none from the caller's generators.
+        """Draw a step's random numbers from seed and step alone, not from the caller's generators.
 
         Our fields and renderers draw none; those of others may, for example by dropout.
         """

@@ -132,7 +132,7 @@ class ProfileRenderer(Renderer):
 
     @torch.no_grad()
     def prepare(self, field: Field, possible: Possible | None, step: int) -> bool:
-        """Lay the lattice at the first step; drop what has no energy and refine every so often."""
+        """Lay the lattice at the first step; regularly drop places without energy, and refine."""
         if not len(self.lattice):
             self._lay(field, possible)
             return True
@@ -162,7 +162,7 @@ class ProfileRenderer(Renderer):
         field.keep(self.lattice, spacing)
 
     def _refine(self, possible: Possible | None) -> None:
-        """Halve the spacing around what is alive."""
+        """Halve the spacing around the remaining places."""
         half = float(self.spacing) / 2
         cell = ((self.lattice[self.alive] - self.region[0]) / half).round().long()
         steps = torch.arange(-1, 2, device=cell.device)
@@ -202,7 +202,7 @@ class ProfileRenderer(Renderer):
         """Return the places that are alive, (L, 3): the same tensor until others are."""
         alive, version, places = self._living
         if alive is not self.alive or version != alive._version:
-            # Validation may come first, and what it makes is of no use to a gradient.
+            # Validation may come first, and its tensors have no gradients.
             with torch.inference_mode(False):
                 places = self.lattice[self.alive]
             self._living = (self.alive, self.alive._version, places)
@@ -267,7 +267,7 @@ class ProfileRenderer(Renderer):
         def in_heads(points: Tensor) -> Tensor:
             return (turn.reshape(-1, 3) @ points.T - origin).reshape(3, -1)
 
-        # A place and its image; what the image of a head hears of a place is the same.
+        # A place and its image; the image of a head hears the same of a place.
         turned = [in_heads(points) for points in self._with_image(places)]
         echoes, at, poses = [], [], []
         for emitters, ways in self._ways(position + rotation @ self.emitter):
@@ -326,7 +326,7 @@ class ProfileRenderer(Renderer):
         return [(emitters, (0, 0)), (foot, (0, 1)), (2.0 * foot - emitters, (1, 1))]
 
     def _sounding(self, at: Tensor) -> range:
-        """Return the slices that may see one of the bins, counted from the first; never none."""
+        """Return the slices that may see one of the bins, counted from the first; at least one."""
         last = len(self.range) - 1
         if not at.numel():
             return range(1)
@@ -339,7 +339,7 @@ class ProfileRenderer(Renderer):
         return range(first, min(max(end, first), last) + 1)
 
     def _paths(self, out: Tensor, back: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what the way to places and back does to pressure.
+        """Return the factor of pressure on the way to places and back.
 
         Args:
             out, back ((3, M), m): Places, each in the head of its pose, as the emitter and as the
@@ -357,14 +357,14 @@ class ProfileRenderer(Renderer):
         return self._way(out, back, bins)
 
     def _way(self, emitted: Tensor, heard: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
-        """Return what one of the ways does; see :meth:`_paths`."""
+        """Return the factor of one of the ways; see :meth:`_paths`."""
         ray = heard - self.ear_positions[..., None]  # (E, 3, M)
         back = _length(ray)
         head = (ray / back[:, None]).mT
         ray = emitted - self.emitter[:, None]
         out = _length(ray)
         way = out + back  # (E, M) m, there and back
-        # Each pass over all of it is made once, and in place: memory is what they wait for.
+        # Each pass is made once, and in place: memory traffic limits the speed.
         known = look_up(self.ears.index_select(1, bins), head).mT
         known *= look_up(self.beam.index_select(0, bins), (ray / out).T).T
         absorption = self.absorption[bins]

@@ -53,7 +53,7 @@ def look_up(table: Tensor, directions: Tensor) -> Tensor:
 
 
 class Renderer(nn.Module):
-    """A field, poses and ranges in; the magnitude that both ears hear out.
+    """Renderer: maps a field, poses and ranges to the magnitude at both ears.
 
     Args:
         region ((2, 3), m): Lower and upper corner of the box that holds the field.
@@ -164,15 +164,16 @@ class Renderer(nn.Module):
 
 
 class Deposit(torch.autograd.Function):
-    """Share (..., M) values out between the two bins next to where they lie, of (M,) rows.
+    """Distribute values (..., M) over the two bins next to their positions, in rows (M,).
 
-    Where they lie is (M,), or alike for some of the leading dimensions. What lies outside the bins
-    is lost. By hand, for autograd would take three times as many passes over all pairs.
+    Positions are (M,), or alike for some of the leading dimensions. Values outside the bins are
+    lost. The gradient is written by hand, because autograd takes three times as many passes over
+    all pairs.
     """
 
     @staticmethod
     def forward(ctx: Any, values: Tensor, at: Tensor, row: Tensor, rows: int, bins: int) -> Tensor:
-        """Return what each bin of each row holds, (..., rows, bins)."""
+        """Return the content of each bin of each row, (..., rows, bins)."""
         left = at.floor()
         far = at - left
         within = (left >= 0) & (left < bins - 1)
@@ -208,7 +209,7 @@ class Window(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, profiles: Tensor, kernel: Tensor, step: int) -> Tensor:
-        """Return what the windows see."""
+        """Return the power in the windows."""
         *lead, poses, length = profiles.shape
         taps = kernel.shape[1]
         slices = (length - taps) // step + 1
@@ -245,7 +246,7 @@ class Window(torch.autograd.Function):
 
 @lru_cache(maxsize=8)
 def _band(taps: int, step: int, where: torch.device) -> tuple[int, int, Tensor]:
-    """Return slices of a tile, bins of a block, and which tap, or none, each bin meets."""
+    """Return slices of a tile, bins of a block, and the tap of each bin, if any."""
     tile = max(1, -(-taps // step) - 1)
     block = tile * step
     with torch.inference_mode(False):  # a prediction may come first, a fit afterwards
@@ -314,7 +315,7 @@ class ShellRenderer(Renderer):
         rows: Tensor,
         bins: Tensor | None = None,
     ) -> Tensor:
-        """Render; see the base class. Differentiable in the field and in what is learned."""
+        """Render; see the base class. Differentiable in the field and in the learned parameters."""
         transfer = self.transfer if bins is None else self.transfer[..., bins]
         spectrum = self.log_spectrum if bins is None else self.log_spectrum[bins]
         world = torch.einsum("pij,dj->pdi", rotation, self.directions)  # (P, D, 3)
@@ -333,7 +334,7 @@ class ShellRenderer(Renderer):
             sums.append(total.index_add(0, slice_index, echo))
         total = torch.stack(sums)  # (E, P R, B)
         # The magnitude's gradient at exactly zero is not defined; a field that is zero there
-        # has none. That much less than the root of a little more, and exactly zero of zero.
+        # has none. The offset is subtracted again, so that zero stays exactly zero.
         power = total.real.square() + total.imag.square() if total.is_complex() else total.square()
         magnitude = power / ((power + 1e-20).sqrt() + 1e-10)
         scale = (self.log_gain + spectrum).exp() / len(self.directions)

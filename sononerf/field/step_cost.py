@@ -26,7 +26,7 @@ class StepCost:
     """Cost of one training step.
 
     Attributes:
-        memory: Bytes of parameters and of what the backward pass needs.
+        memory: Bytes of parameters and of the backward pass's values.
         seconds: Duration on this machine's CPU.
     """
 

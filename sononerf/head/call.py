@@ -86,15 +86,15 @@ def _envelope(settings: CallSettings, time: Floats) -> Floats:
 
 
 def covered(settings: CallSettings, frequency: ArrayLike) -> Bools:
-    """Tell which frequencies the call emits.
+    """Return which frequencies the call emits.
 
     Args:
         settings: The call.
         frequency ((F,), Hz): Frequencies of the result.
 
     Returns:
-        covered (F,): Whether a harmonic sweeps over it; an impulse covers all, a file what lies
-            within 20 dB of its loudest frequency.
+        covered (F,): True if a harmonic sweeps over it; an impulse covers all, a file those within
+            20 dB of its loudest frequency.
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "impulse":
@@ -132,7 +132,7 @@ def _carrier(settings: CallSettings, frequency: Floats) -> tuple[Floats, Floats]
     amplitude = np.asarray([settings.harmonics[int(h) - 1] for h in harmonic])
     f = frequency[:, None]
     off = np.maximum(np.maximum(low - f, f - high), 0.0)
-    # Over what all of them have in common: a linear sweep's rate is h, a hyperbolic one's 1 / h.
+    # Relative to the fundamental: a linear sweep's rate is h, a hyperbolic one's 1 / h.
     slowness = amplitude * harmonic ** (-0.5 if settings.kind == "linear" else 0.5)
     time = _time_of(settings, np.clip(f, low, high), harmonic)
     near = off == off.min(axis=1, keepdims=True)
@@ -154,7 +154,7 @@ def _time_of(settings: CallSettings, swept: Floats, harmonic: Floats) -> Floats:
 
 
 def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> Floats:
-    r"""When each frequency is emitted, counted from the start of the emission.
+    r"""Return the time at which each frequency is emitted, from the start of the emission.
 
     The fundamental is at :math:`f` at :math:`T (f - f_0) / (f_1 - f_0)` in a linear sweep and at
     :math:`T (1/f - 1/f_0) / (1/f_1 - 1/f_0)` in a hyperbolic one.
@@ -212,9 +212,9 @@ def sweep_rate(settings: CallSettings, frequency: ArrayLike) -> Floats:
 
 
 def call_content(settings: CallSettings) -> dict[str, Any]:
-    """Return all that echoes depend on of a call, as plain data: for hashes.
+    """Return all properties of a call that echoes depend on, as plain data, for hashes.
 
-    A preset counts as what it fills, a file as what it holds.
+    A preset counts by its values, a file by its content.
     """
     plain = settings.model_dump(mode="json", exclude={"preset", "file"})
     if settings.file is None:
@@ -309,7 +309,7 @@ def inverse_filter(recordings: ArrayLike, call: ArrayLike) -> Floats:
 
     Returns:
         compressed (..., S): An echo that is ``g`` times the call has the spectrum ``g`` within the
-            call's band. The last N - 1 samples lack what came after the recording.
+            call's band. The last N - 1 samples lack the echoes after the end of the recording.
 
     Raises:
         ValueError: If the call is silent or has several dimensions.

@@ -27,7 +27,7 @@ from sononerf.head.spectrogram import frequency_axis, smearing
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 
 SPEED = 343.0  # m/s; the beam's width follows it so weakly that temperature is left out
-WIDTH_FREQUENCY = 50e3  # Hz, where an ear is as wide as its setting says
+WIDTH_FREQUENCY = 50e3  # Hz, at which an ear has the width of its setting
 NOTCH_MIDDLE = 60e3  # Hz, at elevation 0
 NOTCH_RISE = 30e3  # Hz, from elevation 0 to straight up
 NOTCH_WIDTH = 8e3  # Hz, standard deviation
@@ -346,7 +346,7 @@ def ear_gain(ears: Ears, ear: int, directions_head: Floats) -> Singles:
     Args:
         ears: Tables.
         ear: Its number.
-        directions_head (N, 3): Unit vectors from the ear to where the sound comes from, head frame.
+        directions_head (N, 3): Unit vectors from the ear to the origin of the sound, head frame.
 
     Returns:
         gain ((N, F) float32): Linear, zero or more.

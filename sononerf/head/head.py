@@ -83,9 +83,9 @@ class PointEcho:
 
     @property
     def resolution(self) -> float:
-        """Width in range over which its magnitude is above half of its greatest, m.
+        """Width in range over which its magnitude is above half of its maximum, m.
 
-        What lies apart from its own range, as another harmonic's echo does, is not counted.
+        Separate echoes, such as another harmonic's, do not count.
         """
         top = own_top(self.window)
         low = np.flatnonzero(self.window < 0.25 * self.window[top])
@@ -95,9 +95,9 @@ class PointEcho:
 
 
 def own_top(window: Floats) -> int:
-    """Return where a point echo (W,) is greatest about its own range, which is in the middle.
+    """Return the maximum of a point echo (W,) about its own range, which is in the middle.
 
-    What lies apart from that, as another harmonic's echo does, may be greater.
+    Separate echoes, such as another harmonic's, may be greater.
     """
     top = (len(window) - 1) // 2
     while 0 < top < len(window) - 1:
@@ -112,8 +112,8 @@ def own_top(window: Floats) -> int:
 class Head(Shown):
     """Emitter and receivers in air, the call, and the analysis that makes spectrograms.
 
-    Two synthetic ears, an impulse and the analysis of the paper by default. What costs time is
-    computed at its first use, and kept.
+    Two synthetic ears, an impulse and the analysis of the paper by default. Slow results are
+    computed at their first use, and kept.
 
     Args:
         ears: Places and directivities of emitter and receivers, m and degrees, head frame: keys of
@@ -192,7 +192,7 @@ class Head(Shown):
         return cls(**{name: given[name] for name in names if name in given})
 
     def __getstate__(self) -> dict[str, object]:
-        # Other processes compute again what they need of it; the tables are large.
+        # Other processes compute these again if needed; the tables are large.
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     def without_noise(self) -> Head:
@@ -203,7 +203,7 @@ class Head(Shown):
 
     @cached_property
     def plane(self) -> Plane | None:
-        """The support; None where there is none."""
+        """The support; None if there is no support."""
         if self.support.point is None:
             return None
         return Plane.through(np.asarray(self.support.point), np.asarray(self.support.normal))
@@ -341,7 +341,7 @@ class Head(Shown):
         Args:
             impulse_responses (E, S): Pressure for a call that is one sample of height 1. They
                 should have ``samples`` samples; of shorter ones, down to the last frame of an
-                impulse, the last rows lack what the window lets in from behind.
+                impulse, the last rows lack later sound in their window.
             seed: Seed of the pose; the noise is drawn from it.
 
         Returns:

@@ -23,7 +23,7 @@ import scipy.fft
 from sononerf.array_types import Floats
 from sononerf.settings.schema import NoiseSettings, SpectrogramSettings
 
-NOISE_STREAM = 1  # keeps a pose's noise apart from what else is drawn from its seed
+NOISE_STREAM = 1  # keeps a pose's noise independent of other draws from its seed
 
 
 def target_gain(target_strength_db: float, distance: float) -> float:
@@ -88,7 +88,7 @@ def noise_level(settings: NoiseSettings, power: Floats, analysis: SpectrogramSet
 
 
 def draw_noise(level: Floats, samples: int, *, seed: int) -> Floats:
-    """White Gaussian noise, each ear's its own.
+    """White Gaussian noise, independent for each ear.
 
     Args:
         level (E,): Standard deviations.

@@ -127,7 +127,7 @@ def band_mean(values: NDArray[Any], frequency: ArrayLike) -> NDArray[Any]:
 
 
 def band_parts(frequency: ArrayLike) -> Floats | None:
-    """Return what part of the band each row (F,) stands for, together 1; None if all the same."""
+    """Return the fraction of the band that each row (F,) stands for; None if all are the same."""
     f = np.asarray(frequency, dtype=np.float64)
     steps = np.diff(f)
     if len(steps) < 2 or np.ptp(steps) <= 1e-6 * steps.mean():
@@ -186,7 +186,7 @@ def _gammatone(settings: SpectrogramSettings) -> RowFilters:
     b = BANDWIDTH * frequency / settings.q
     before = int(_ring_off() * rate / b[0])
     after = math.ceil(PEAK * rate / b[0])
-    # A frame hears at its time t what came at t - u through the filter's value at u past its peak.
+    # At its time t a frame hears sound of time t - u through the filter's value at u past its peak.
     past = np.arange(before, -after - 1, -1) / rate
     x = np.maximum(2.0 * np.pi * b[:, None] * past + (ORDER - 1), 0.0) / (ORDER - 1)
     envelope = (x * np.exp(1.0 - x)) ** (ORDER - 1)

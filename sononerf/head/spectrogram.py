@@ -156,7 +156,7 @@ def _filtered(
     """Each frequency's row as a filter, an envelope on that frequency; a delay is then a phase."""
     filters = row_filters(settings)
     delays = np.broadcast_to(delay, filters.frequency.shape)
-    # What a filter reads before the emission is the silence behind the signal's end.
+    # Before the emission a filter reads the silence behind the signal's end.
     length = int(scipy.fft.next_fast_len(signal.shape[-1] - filters.origin))
     spectrum = np.fft.fft(signal, length)
     turn = 2j * np.pi * np.fft.fftfreq(length)
@@ -195,13 +195,13 @@ class Smearing(NamedTuple):
 
 
 def smearing(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
-    """Return what the rows of an analysis hear of a call.
+    """Return the response of the rows of an analysis to a call.
 
-    A filter of some bandwidth cannot tell frequencies apart that lie closer than that: a spectrum
-    that varies is smeared over it. Of an impulse the value at the middle of an echo is the
-    spectrum's mean under the filter's transform about its own time. A sweep's frequencies enter the
-    filter one after the other; by Parseval's theorem a row hears the mean power, each frequency
-    weighted with the squares of the filter's transform and of the call's spectrum.
+    A filter does not resolve frequencies closer than its bandwidth: it smears a varying spectrum
+    over them. Of an impulse the value at the middle of an echo is the spectrum's mean under the
+    filter's transform about its own time. A sweep's frequencies enter the filter one after the
+    other; by Parseval's theorem a row hears the mean power, each frequency weighted with the
+    squares of the filter's transform and of the call's spectrum.
 
     Args:
         call: The emitted call.
