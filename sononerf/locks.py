@@ -60,7 +60,7 @@ def _prepare(folder: Path) -> None:
 
 
 def is_held(folder: Path) -> bool:
-    """Tell whether a process holds a folder, or died without letting go of it; see :func:`lock`."""
+    """Return whether a process holds a folder, or died while holding it; see :func:`lock`."""
     return (folder / _LOCK_NAME).is_file()
 
 

@@ -43,7 +43,7 @@ def quiet_lightning() -> None:
 
 
 def has_accelerator() -> bool:
-    """Tell whether there is a GPU that torch can use."""
+    """Return whether there is a GPU that torch can use."""
     return bool(torch.cuda.is_available() or torch.backends.mps.is_available())
 
 

@@ -27,7 +27,7 @@ class RangeSlices(NamedTuple):
 
 
 def _silent(spectrogram: Tensor, below: float) -> Tensor:
-    """Tell which slices of one pose (E, R, F) no ear hears anything in, (R,) bool."""
+    """Return which slices of one pose (E, R, F) no ear hears anything in, (R,) bool."""
     return spectrogram.amax(dim=(0, 2)) < below
 
 

@@ -46,7 +46,7 @@ class Lattice:
         return self.origin + self.spacing * np.argwhere(np.ones(self.shape, dtype=bool))
 
     def at_wall(self, points: Floats) -> Bools:
-        """Tell which points lie at the end of the box, within a voxel, or beyond, (N,)."""
+        """Return which points lie at the end of the box, within a voxel, or beyond, (N,)."""
         place, last = self.coordinates(points), np.asarray(self.shape) - 1
         inner = (place > MARGIN + 1) & (place < last - MARGIN - 1)
         return np.asarray(~inner.all(axis=1))

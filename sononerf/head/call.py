@@ -105,7 +105,7 @@ def covered(settings: CallSettings, frequency: ArrayLike) -> Bools:
 
 
 def has_ghosts(settings: CallSettings, frequency: ArrayLike) -> bool:
-    """Tell whether a point may be heard at several ranges in a row that is dechirped once.
+    """Return whether a point may be heard at several ranges in a row that is dechirped once.
 
     That is so where several harmonics sweep over one of the frequencies, each at a time of its own,
     and has to be expected of a file.

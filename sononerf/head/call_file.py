@@ -80,7 +80,7 @@ class CallFile:
         return np.asarray(scipy.signal.resample_poly(self.waveform, up, down), dtype=np.float64)
 
     def covers(self, frequency: Floats) -> Bools:
-        """Tell which frequencies (F,) the call emits."""
+        """Return which frequencies (F,) the call emits."""
         return np.any([(frequency >= a) & (frequency <= b) for a, b in self.bands], axis=0)
 
     def delay_at(self, frequency: Floats) -> Floats:
@@ -159,7 +159,7 @@ def _read(path: Path) -> tuple[int, NDArray[np.generic]]:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
         except InputError:
             raise
-        except Exception:  # a damaged file raises whatever its parser met first
+        except Exception:  # the error of a damaged file depends on the parser
             raise InputError(f"{path}: is no WAV of samples; write the call as WAV") from None
     if any("EOF" in str(each.message) for each in told):
         raise InputError(f"{path}: is cut off; copy it again")
@@ -202,7 +202,7 @@ def _first_top(power: Floats) -> int:
 
 
 def _loud(waveform: Floats, rate: float, frequency: Floats, bandwidth: float) -> Bools:
-    """Tell which frequencies (F,) lie within 20 dB of the loudest."""
+    """Return which frequencies (F,) lie within 20 dB of the loudest."""
     power = np.abs(np.fft.rfft(waveform, 4 * len(waveform))) ** 2
     step = rate / (4 * len(waveform))
     wide = max(1, round(SMOOTHING * bandwidth / step))

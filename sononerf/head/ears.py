@@ -195,7 +195,7 @@ def receiver_places(settings: EarSettings) -> Floats:
 
 
 def directivity_content(settings: EarSettings) -> str | None:
-    """Return a hash of the directivity's file, None where there is none."""
+    """Return a hash of the directivity's file, None if there is none."""
     return None if settings.file is None else content_hash(settings.file)
 
 

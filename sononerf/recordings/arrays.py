@@ -67,7 +67,7 @@ def _read(path: Path, *stamp: int) -> dict[str, NDArray[Any]]:
             arrays = {name: np.asarray(found[name]) for name in found.files}
     except InputError:
         raise
-    except Exception as error:  # a damaged file raises whatever its parser met first
+    except Exception as error:  # the error of a damaged file depends on the parser
         said = " ".join(str(error).split())
         raise InputError(f"{path}: damaged, truncated, or no .npz of numbers ({said})") from None
     odd = [name for name, values in arrays.items() if values.dtype.kind not in "biuf"]
@@ -79,7 +79,7 @@ def _read(path: Path, *stamp: int) -> dict[str, NDArray[Any]]:
 def waveform_of(
     path: Path, arrays: dict[str, NDArray[Any]], settings: ImportSettings
 ) -> tuple[float, NDArray[Any]]:
-    """Return the sampling rate (Hz) and the array ``waveform`` as it is.
+    """Return the sampling rate (Hz) and the unchanged array ``waveform``.
 
     Raises:
         InputError: If either is missing.

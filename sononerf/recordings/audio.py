@@ -75,7 +75,7 @@ def _wav(path: Path) -> tuple[float, NDArray[Any]]:
                 if "mmap" not in str(error):
                     raise
                 rate, samples = wavfile.read(path)  # 24 bits cannot be mapped
-    except Exception as error:  # a damaged file raises whatever its parser met first
+    except Exception as error:  # the error of a damaged file depends on the parser
         said = " ".join(str(error).split())
         raise InputError(f"{path}: damaged or truncated WAV file ({said})") from None
     return rate, samples
@@ -116,7 +116,7 @@ HEADER = "file,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg,split"
 
 
 def wav_bytes(waveform: ArrayLike, sampling_rate: float) -> bytes:
-    """Return a WAV file of 32-bit floats, so that levels stay as they are.
+    """Return a WAV file of 32-bit floats, which keeps levels.
 
     Args:
         waveform (E, S): One channel per receiver.
@@ -152,7 +152,7 @@ def pose_table(poses: Poses, files: Sequence[str], split: NDArray[np.int8]) -> s
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Pings as they were recorded, and the table that says where each of them was.
+    """Recorded pings, and the table of their poses.
 
     Attributes:
         path: Path of the source, for messages.

@@ -27,7 +27,7 @@ LOOKED_AT = 16
 
 @dataclass(frozen=True)
 class Channel:
-    """One channel, over the pings that were looked at.
+    """State of one channel, over the pings that were checked.
 
     Attributes:
         level_db (dB): Its loudest echo over that of the loudest channel; the median of the pings.
@@ -44,7 +44,7 @@ class Channel:
 
 
 def channels_of(power: Floats, looks: float) -> list[Channel]:
-    """Return what each channel holds.
+    """Return the state of each channel.
 
     Args:
         power (P, E, R): Averaged over frequency.
@@ -63,7 +63,7 @@ def channels_of(power: Floats, looks: float) -> list[Channel]:
 
 
 def faults_of_channels(channels: list[Channel]) -> list[str]:
-    """Return what is wrong with channels that the others contradict, one line each."""
+    """Return the faults of channels that the others contradict, one line each."""
     most = max(channel.heard for channel in channels)
     faults = []
     for number, channel in enumerate(channels):

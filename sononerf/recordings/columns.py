@@ -70,7 +70,7 @@ class Columns:
         return 0 if self.rotation is None else len(self.rotation)
 
     def has(self, *names: str) -> bool:
-        """Tell whether there are all of these columns."""
+        """Return whether there are all of these columns."""
         return all(name in self.values for name in names)
 
     def take(self, rows: ArrayLike) -> Columns:
@@ -85,7 +85,7 @@ class Columns:
         )
 
     def split(self) -> NDArray[np.int8] | None:
-        """Return what each pose is for, (P,): 0 train, 1 validation, 2 test; None if not said.
+        """Return the use of each pose, (P,): 0 training, 1 validation, 2 test; None if not stated.
 
         Raises:
             InputError: If a word is none of these three.

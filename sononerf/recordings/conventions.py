@@ -84,7 +84,7 @@ def to_poses(columns: Columns, settings: ImportSettings) -> Poses:
 
     Args:
         columns: Places and orientations, or a turntable's angles and heights.
-        settings: Frame, turntable, and what is looked at where there are no orientations.
+        settings: Frame, turntable, and the point that poses look at if there are no orientations.
 
     Raises:
         InputError: If columns are missing or contradict one another.

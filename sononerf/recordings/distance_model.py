@@ -55,7 +55,7 @@ def predict(middle: Floats, separation: Floats, first: Floats) -> Prediction:
     Args:
         middle ((P, E, 3), m): Points half way between emitter and receivers.
         separation ((P, E, 3), m): From the emitter to each receiver.
-        first ((P, E), m): Ranges of first echoes; not finite where there is none.
+        first ((P, E), m): Ranges of first echoes; not finite without an echo.
     """
     known = np.isfinite(first).any(axis=1)
     pings = np.flatnonzero(known)

@@ -112,7 +112,7 @@ def read_folder(source: Path, settings: ImportSettings, apart: Collection[Path] 
 
 
 def _next_call(table: Path, files: list[Path], times: Floats, rows: list[int]) -> Floats:
-    """Return when the next call of the same file left, (P,) s; infinite where there is none."""
+    """Return the emission of the next call in the same file, (P,) s; infinite if none."""
     until = np.full(len(files), np.inf)
     for path in dict.fromkeys(files):
         inside = np.array([row for row, other in enumerate(files) if other == path])

@@ -51,7 +51,7 @@ def calibrate(
     reference: ReferenceSettings,
     head: Head,
 ) -> Calibration:
-    r"""Compare the echo of a reference target with what it should be.
+    r"""Compare the echo of a reference target with theory.
 
     A rigid sphere of radius a, large against the wavelength, sends back a/2 of the pressure that
     falls on it, at 1 m [1]_. Heard at distance r of its surface that is, of the call's pressure at
@@ -200,7 +200,7 @@ def found_ranges(
     audible = INAUDIBLE_DB / loss if loss > 0.0 else math.inf
     whole = min(_widest(analysis.window, count, longest * rate, metre), audible)
     apart = np.linalg.norm(head.receivers - head.emitter, axis=1)
-    # The call itself comes first, as long as a window smears it.
+    # The call itself comes first, smeared by a window.
     dead = float(apart.max()) / 2.0 + 2.0 * analysis.window * metre
     first = max(dead, (begins + analysis.window / 2.0) * metre)
     low = analysis.range_min if "range_min" in given else first
@@ -257,7 +257,7 @@ def calibrated(
     head: Head,
     folder: Path,
 ) -> tuple[Cutter, dict[str, Any]]:
-    """Return what cuts pings, with background, reference and offsets, and what was applied.
+    """Return the cutter of pings, with all corrections, and the applied calibration.
 
     Args:
         recording: All pings.

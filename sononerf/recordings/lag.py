@@ -35,7 +35,7 @@ count as a path. Poses in random order reach 1."""
 
 
 def is_path(poses: Poses) -> bool:
-    """Tell whether successive poses are neighbours, so that places between them can be known."""
+    """Return whether successive poses are neighbours, so that places between them can be known."""
     steps = np.linalg.norm(np.diff(poses.positions, axis=0), axis=1)
     order = np.random.default_rng(0).permutation(len(poses))
     apart = np.linalg.norm(np.diff(poses.positions[order], axis=0), axis=1)
@@ -60,11 +60,11 @@ def find_lag(
     consistency: Consistency,
     shown: Callable[[], None] = lambda: None,
 ) -> tuple[float, float]:
-    """Return by how many rows poses are too early for their pings, and the standard deviation.
+    """Return the lag of pings behind their poses, rows, and its standard deviation.
 
     Args:
         poses: Poses of all pings, in the order of recording.
-        first ((N, E), m): Ranges of the first echoes of some pings; not finite where there is none.
+        first ((N, E), m): Ranges of the first echoes of some pings; not finite without an echo.
         heard (N,): Rows of these pings.
         consistency: Consistency of the head.
         shown: Called once per lag that is tried.

@@ -58,7 +58,7 @@ def read_mat(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
         found = scipy.io.loadmat(path, variable_names=list(wanted), struct_as_record=True)
     except (NotImplementedError, MemoryError) as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
-    except Exception as error:  # a damaged file raises whatever its parser met first
+    except Exception as error:  # the error of a damaged file depends on the parser
         said = " ".join(str(error).split())
         raise InputError(f"{path}: damaged or truncated MATLAB file ({said})") from None
     return {name: _old(path, found[name], name, 0) for name in wanted if name in found}
@@ -168,8 +168,8 @@ def opened(path: Path) -> Iterator[h5py.File]:
     """Open an HDF5 file for reading.
 
     Raises:
-        InputError: If it is missing, truncated, or no HDF5 file; also for what is found on reading
-            it.
+        InputError: If it is missing, truncated, or no HDF5 file; also for faults that reading
+            finds.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -182,7 +182,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 
 def child(group: Any, name: str) -> Any:
-    """Return a group's member; None where there is none.
+    """Return a group's member; None if there is none.
 
     Raises:
         InputError: If it is a link.
@@ -196,7 +196,7 @@ def child(group: Any, name: str) -> Any:
 
 
 def dataset(group: Any, name: str) -> Any:
-    """Return a dataset of numbers of its own file, not read; None where there is none.
+    """Return a dataset of numbers of its own file, not read; None if there is none.
 
     Raises:
         InputError: If it is no dataset of numbers, lies in another file, or is larger than it can

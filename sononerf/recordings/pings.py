@@ -38,7 +38,7 @@ def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -
         samples (E, S): As they are on disk.
         emission: Time of the call's emission, in samples from the first one on; need not be whole.
         count: Number of samples, N.
-        first: The first of them, counted from the emission.
+        first: Index of the first sample, from the emission on.
 
     Returns:
         echo: (E, N).
@@ -101,7 +101,7 @@ class Cutter:
     call: Floats | None = None
 
     def samples(self, index: int) -> int:
-        """Return how many samples a ping has from the emission on; less than one if none.
+        """Return the number of samples of a ping from the emission on, which may be below one.
 
         It ends with the file, or when the next call leaves.
         """
@@ -123,7 +123,7 @@ class Cutter:
         return round(seconds * self.recording.sampling_rate, 6)
 
     def echo(self, index: int, count: int, *, first: int = 0) -> Floats:
-        """Return what the receivers of a ping heard, (E, N), calibrated.
+        """Return the calibrated samples of a ping, (E, N).
 
         Args:
             index: Number of the ping.
@@ -195,7 +195,7 @@ class Clipping:
 
 
 def clipped_pings(found: list[Clipping]) -> Bools:
-    """Tell which pings are clipped, (P,).
+    """Return which pings are clipped, (P,).
 
     A ping is clipped if one of its channels has three samples or more that equal a neighbour, at a
     value that no ping of this channel exceeds, or at full scale; upward or downward.

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: MIT
 r"""Test of pose conventions: which one explains the first echoes best.
 
-First echoes are compared under the convention that was stated and under others that people mix up.
-Three things tell them apart, each as a scale of errors s whose logarithm is summed over the pings,
-the log-likelihood of errors of an unknown scale:
+First echoes are compared under the stated convention and under others that people mix up. Three
+criteria distinguish them, each as a scale of errors s whose logarithm is summed over the pings, the
+log-likelihood of errors of an unknown scale:
 
 * how well each ping's range is predicted by the others' (``distance_model``),
 * how well the *differences* between its receivers are: they tell left from right,
@@ -194,7 +194,7 @@ def check_poses(
     """Name the convention that explains the first echoes, if it is not the stated one.
 
     Args:
-        first ((P, E), m): Ranges of the first echoes; not finite where there is none.
+        first ((P, E), m): Ranges of the first echoes; not finite without an echo.
         stated: The poses as they were read.
         others: The same poses under other conventions, by name.
         emitter ((3,), m): Head frame.
@@ -246,7 +246,7 @@ def check_poses(
 
 
 def _scaled_ranges(head: Consistency, poses: Poses, ranges: Floats, own: Misfit) -> Verdict:
-    """Tell whether all ranges times a factor fit the poses clearly better.
+    """Return whether all ranges times a factor fit the poses clearly better.
 
     Poses at one distance from the body fit ranges of any scale.
     """
@@ -343,7 +343,7 @@ class Consistency:
         return Misfit(float(total), count, found)
 
     def _hears_direction(self) -> bool:
-        """Tell whether it matters which way the head looks."""
+        """Return whether it matters which way the head looks."""
         return bool(np.abs(self.receivers - self.emitter).max() > 0.0)
 
 
@@ -374,7 +374,7 @@ def _length(metres: float) -> str:
 
 
 def _late(poses: Poses, found: Prediction, resolution: float) -> Verdict:
-    """Tell whether the ranges are too long for any body amid the poses."""
+    """Return whether the ranges are too long for any body amid the poses."""
     away = poses.positions - found.centre
     distance = np.linalg.norm(away, axis=1)
     direction = away / np.maximum(distance, 1e-12)[:, None]
@@ -394,7 +394,7 @@ def _late(poses: Poses, found: Prediction, resolution: float) -> Verdict:
 
 
 def _turns(poses: Poses) -> bool:
-    """Tell whether poses are those of a turntable: on a cylinder, level, looking at its axis."""
+    """Return whether poses are those of a turntable: on a cylinder, level, looking at its axis."""
     forward = poses.rotations[:, :, 0]
     if np.abs(forward[:, 2]).max() > 0.05:
         return False

@@ -32,12 +32,10 @@ OWN_KEYS = ("spectrogram.dynamic_range_db",)
 
 
 def with_store(settings: Settings) -> Settings:
-    """Complete the settings by what the store knows, if the echoes come from a store.
-
-    Settings with a scene are left as they are.
+    """Complete the settings from the store, if the echoes come from one.
 
     Args:
-        settings: As the user gave them. A key that was not given takes the store's value.
+        settings: The user's settings. A missing key takes the store's value.
 
     Returns:
         settings: With air, ears, call and analysis of the store.
@@ -206,7 +204,7 @@ def read_truth(path: Path, unit: Unit = "m") -> trimesh.Trimesh:
             mesh = mesh.to_mesh()
         good = isinstance(mesh, trimesh.Trimesh) and len(mesh.faces) > 0
         good = good and mesh.vertices.shape[1:] == (3,) and bool(np.isfinite(mesh.vertices).all())
-    except Exception as error:  # trimesh's readers raise whatever they met first
+    except Exception as error:  # the error of a damaged file depends on trimesh's reader
         raise InputError(f"{path}: evaluation.truth: damaged ({error})") from error
     if not good:
         raise InputError(f"{path}: evaluation.truth: holds no surface of finite triangles")

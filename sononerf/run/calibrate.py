@@ -98,7 +98,7 @@ def kinds_of(names: Sequence[str]) -> tuple[Kind, ...]:
 def calibrate(
     source: Path, output: Path, kinds: Sequence[str], *, progress: Progress | None = None
 ) -> Calibrated:
-    """Find errors of the recording that a run was fitted to, and write a corrected store.
+    """Estimate errors of the recording behind a run, and write a corrected store.
 
     Args:
         source: Folder of a run with a surface; for the lag, a store too.
@@ -188,7 +188,7 @@ def _without_lag(
 
 
 def _is_turntable(positions: Floats) -> bool:
-    """Tell whether poses (P, 3), m, are at one distance from the z axis."""
+    """Return whether poses (P, 3), m, are at one distance from the z axis."""
     distance = np.linalg.norm(positions[:, :2], axis=1)
     return bool(np.ptp(distance) < ON_CYLINDER * distance.mean())
 
@@ -228,7 +228,7 @@ def _by_trials(opened: RunFolder, kind: str, output: Path, progress: Progress) -
 def _with_support(
     echoes: Echoes, mesh: trimesh.Trimesh, progress: Progress
 ) -> tuple[Echoes, trimesh.Trimesh, float]:
-    """Return the echoes above the support that the surface stands on, and what is above it.
+    """Return echoes with the support under the surface, and the part of the surface above it.
 
     The third value is the standard deviation of its height, m.
     """
@@ -276,7 +276,7 @@ def dependent_cells(analysis: SpectrogramSettings) -> float:
 def describe(
     head: Head, store: Ensemble, mesh: trimesh.Trimesh, estimate: Estimate, kinds: Sequence[str]
 ) -> tuple[list[str], list[str]]:
-    """Return what was found and what is not determined, one line each.
+    """Return results and undetermined errors, one line each.
 
     Args:
         head, store, mesh: Head, store and mesh of the run.
@@ -360,7 +360,7 @@ def describe(
 
 
 def _lengths(head: Head, store: Ensemble, found: Calibration) -> dict[str, float]:
-    """Return the lengths of a recording as they were found, m."""
+    """Return the estimated lengths of a recording, m."""
     lengths = {"beam_radius": head.ears.beam_radius + found.beam_radius}
     at = store.positions[store.indices("train")]
     lengths["radius"] = float(np.linalg.norm(at[:, :2], axis=1).mean()) + found.radius

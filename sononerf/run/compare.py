@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Two runs side by side: what is heard in one and not in the other."""
+"""Comparison of two runs: the echoes of one that the other lacks."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def compare_runs(
     accelerator: str = "auto",
     progress: Progress | None = None,
 ) -> Path:
-    """Compare what two fitted fields are heard to send back, place by place.
+    """Compare the echoes of two fitted fields, place by place.
 
     Both are rendered for the same poses, those that either was trained on, and their levels (dB,
     0 is silence) are projected back to where they can have come from. In decibels a few loud
@@ -116,7 +116,7 @@ def compare_runs(
 def compare_runs_of(
     first: Fitted, second: Fitted, *, accelerator: str = "auto", progress: Progress | None = None
 ) -> Comparison:
-    """Compare what two fitted fields send back, see :func:`compare_runs`, whose errors it raises.
+    """Compare the echoes of two fitted fields; see :func:`compare_runs`, whose errors it raises.
 
     Args:
         first, second: The difference is the first without the second.
@@ -185,7 +185,7 @@ def _heard(
 
 
 def _added(first: trimesh.Trimesh | None, second: trimesh.Trimesh | None) -> Floats | None:
-    """Return the middle of what the first true surface has and the second has not, (3,) m."""
+    """Return the middle of the parts that only the first true surface has, (3,) m."""
     if first is None or second is None:
         return None
     added = added_part(first, second)

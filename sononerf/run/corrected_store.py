@@ -31,7 +31,7 @@ DECIBELS = 20.0 / math.log(10.0)
 def write_corrected(
     echoes: Echoes, output: Path, found: Calibration, progress: Progress
 ) -> EnsembleStore:
-    """Write echoes without the errors of their recording; an interrupted call goes on.
+    """Write echoes without the errors of their recording; an interrupted call resumes.
 
     Args:
         echoes: With the errors. The support of their head is the right one already.

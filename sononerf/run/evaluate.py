@@ -68,9 +68,9 @@ class EvaluationWork:
         self._pool.shutdown(cancel_futures=True)
 
     def begin(self) -> None:
-        """Begin what needs the reconstructed surface; the run has it."""
+        """Begin the parts that need the reconstructed surface, which the run has."""
         laid = self._pool.submit(self._laid)
-        # A thread takes tasks in their order, so that none waits for one that is not yet taken.
+        # Threads take tasks in order, so that no task waits for a later one.
         self._parts["geometry"] = self._pool.submit(self._geometry, laid)
         for name in BASELINES:
             self._parts[name] = self._pool.submit(self._baseline, laid, name)
@@ -135,7 +135,7 @@ def evaluate(
     Args:
         run: A run that was reconstructed.
         truth, registration, unit, frame: As in :class:`EvaluationWork`.
-        begun: An evaluation of this run that goes on already.
+        begun: An evaluation of this run that has begun.
         progress: Display of progress.
 
     Returns:

@@ -37,7 +37,7 @@ HEAD = "MATLAB 5.0 MAT-file, written by sononerf"
 
 @dataclass(frozen=True, eq=False)
 class Named:
-    """An array that says what it is.
+    """An array with its description.
 
     Attributes:
         values: Any shape.

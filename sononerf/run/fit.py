@@ -57,8 +57,6 @@ def finish(
 ) -> dict[str, Any]:
     """Reconstruct, find the weight of the surface's echoes, predict held-out poses, evaluate.
 
-    Stages that are done are left out, so that an interrupted call goes on with its own stage.
-
     Args:
         run: A fitted run.
         accelerator: Device to render on.
@@ -172,8 +170,8 @@ def fit(
 ) -> RunFolder:
     """Simulate where needed, or open the store of ``data.store``; fit, and keep the fitted field.
 
-    The same call goes on where an interrupted one stopped; a finished run is left as it is. More
-    ``fit.epochs`` than a run has go on from its last one.
+    The same call resumes an interrupted one; a finished run is left as it is. If ``fit.epochs`` is
+    larger than in the run, the fit continues from its last epoch.
 
     Args:
         settings: The experiment.
@@ -253,10 +251,7 @@ class _Work:
 def _prepared(
     settings: Settings, echoes: Echoes, hardware: dict[str, Any], progress: Progress
 ) -> _Work:
-    """Make field and batches, say what speaks against the fit, and refuse what is too large.
-
-    Nothing is written.
-    """
+    """Make field and batches, log warnings, and refuse a fit that is too large."""
     lower, upper = settings.region.lower, settings.region.upper
     if lower is not None and upper is not None:
         echoes = echoes.within((lower, upper))
@@ -341,7 +336,7 @@ def _fit(
 def _announce(
     cost: StepCost, echoes: Echoes, settings: Settings, steps: int, progress: Progress
 ) -> None:
-    """Say what the fit needs, and refuse it if it needs more memory than there is.
+    """Show the cost of the fit, and refuse it if it needs more memory than there is.
 
     Raises:
         ResourceError: With the memory needed and the memory free.
@@ -379,7 +374,7 @@ def _can_resume(run: RunFolder) -> bool:
 def _keep(
     settings: Settings, run: RunFolder, echoes: Echoes, module: EchoModule, seconds: float
 ) -> None:
-    """Write the fitted field and what it cost."""
+    """Write the fitted field and its cost."""
     hull = echoes.hull
     state = {f"field.{k}": v for k, v in module.field.state_dict().items()}
     state |= {f"renderer.{k}": v for k, v in module.renderer.state_dict().items()}

@@ -137,7 +137,7 @@ def echoes_of(fitted: Fitted) -> Echoes:
 
 
 def all_poses(fitted: Fitted) -> tuple[Poses, NDArray[np.int8]]:
-    """Return the poses of a run's ensemble and what each is for (P,): 0 train, 1 val, 2 test."""
+    """Return the poses of a run's ensemble and the use of each (P,): 0 train, 1 val, 2 test."""
     if fitted.settings.scene is not None:
         return ensemble_poses(fitted.settings.poses)
     store = echoes_of(fitted).store
@@ -148,7 +148,7 @@ NAME = "traced.safetensors"
 
 
 def save_traced(path: Path, traced: Traced) -> None:
-    """Write what was learned of the surface of a run."""
+    """Write the traced surface of a run, with its gain and weight."""
     tensors = {
         "vertices": torch.as_tensor(np.array(traced.mesh.vertices, dtype=np.float64)),
         "faces": torch.as_tensor(np.array(traced.mesh.faces, dtype=np.int64)),
@@ -162,7 +162,7 @@ def save_traced(path: Path, traced: Traced) -> None:
 
 
 def load_traced(path: Path) -> Traced | None:
-    """Read ``RUN/traced.safetensors``; None where there is none, or it belongs to another fit.
+    """Read ``RUN/traced.safetensors``; None if there is none, or it belongs to another fit.
 
     Raises:
         InputError: If it is damaged.

@@ -69,7 +69,7 @@ def echo_hash(understood: Understood) -> str:
 
 
 def spectrogram_of(understood: Understood, ping: int) -> Singles:
-    """Return what the receivers heard of one ping of the recording, (E, R, F)."""
+    """Return the spectrogram of one ping of the recording, (E, R, F)."""
     head = understood.head
     return head.analyse(understood.cutter.echo(ping, head.samples)).astype(np.float32)
 
@@ -83,7 +83,7 @@ def read_recordings(
     settings_file: Path | None = None,
     progress: Progress | None = None,
 ) -> Echoes:
-    """Make echoes of recordings, or open them if they are there already.
+    """Turn recordings into echoes, or open the echoes if they exist.
 
     Args:
         source: Folder of WAV files with ``poses.csv``, or a file.
@@ -124,7 +124,7 @@ def read_recordings(
 def import_understood(
     known: Understood, output: Path, *, progress: Progress | None = None
 ) -> tuple[EnsembleStore, Verdict]:
-    """Write what was understood, and say what the first echoes say of the poses.
+    """Write the store, and report the check of the poses by first echoes.
 
     Args:
         known: The interpretation of recordings and settings.
@@ -197,7 +197,7 @@ def _attributes(known: Understood, wanted: str) -> dict[str, Any]:
 
 
 def verdict(known: Understood, store: EnsembleStore) -> Verdict:
-    """Return what the first echoes of the training poses say of the conventions of poses."""
+    """Return the check of pose conventions by the first echoes of the training poses."""
     heard = Echoes(store, known.head).onsets
     table, pings = known.recording.columns, known.pings[heard.poses]
     others = alternatives(table.take(pings), known.wanted)
@@ -226,7 +226,7 @@ def check_before(known: Understood, *, progress: Progress | None = None) -> Verd
 
 
 def describe(known: Understood) -> list[str]:
-    """Return what was understood, one line each."""
+    """Return the interpretation of the recordings, one line each."""
     settings, analysis = known.settings, known.settings.spectrogram
     poses = known.poses[known.pings]
     lower, upper = poses.positions.min(axis=0), poses.positions.max(axis=0)
@@ -273,7 +273,7 @@ def describe(known: Understood) -> list[str]:
 
 
 def _cost_line(known: Understood) -> str:
-    """Say how large the store becomes and how long the import takes, measured on one ping."""
+    """Show the size of the store and the duration of the import, measured on one ping."""
     begun = time.monotonic()
     heard = spectrogram_of(known, int(known.pings[0]))
     seconds = len(known.pings) * (time.monotonic() - begun + WRITTEN_SECONDS)

@@ -46,7 +46,7 @@ def read_poses(run: RunFolder, path: Path, frame: FrameName = "auto") -> Poses:
     """Read a table of poses.
 
     Args:
-        run: Whose frame is meant.
+        run: Run with the frame of the table.
         path: In the world's frame with the header ``x,y,z,yaw,pitch,roll`` (m, degrees); in the
             original one of recordings with the columns, units and conventions of their import.
         frame: ``auto``: the original one of recordings that have one.
@@ -153,7 +153,7 @@ def predict(
 
 @contextmanager
 def _named(file: Path | None) -> Iterator[None]:
-    """Name the file of poses in what is wrong with them."""
+    """Name the file of poses in errors about them."""
     try:
         yield
     except InputError as error:

@@ -42,7 +42,7 @@ STATE = Path("checkpoints") / "surface.safetensors"
 def refine_surface(
     run: RunFolder, surface: Surface, *, accelerator: str = "auto", progress: Progress
 ) -> Surface:
-    """Refine the surface of a run, or go on where an interrupted refinement stopped.
+    """Refine the surface of a run, or resume an interrupted refinement.
 
     Args:
         run: Keeps the state until the refinement is done.
@@ -175,7 +175,7 @@ def reconstruct(
     options = run.fitted.settings.reconstruction
     folder = output or run.reconstruction
     own = folder.resolve() == run.reconstruction.resolve()
-    # What the caller gives replaces both settings.
+    # Arguments of the caller replace both settings.
     if method is None:
         method = options.method if level in (None, "auto") else "isosurface"
     if level is None:
@@ -207,7 +207,7 @@ def reconstruct(
 
 
 def _has_echoes(run: RunFolder, progress: Progress) -> bool:
-    """Tell whether the run's echoes are there to refine against; say so where they are not."""
+    """Return whether the run's echoes are there to refine against; say so where they are not."""
     try:
         return run.echoes is not None
     except InputError as error:

@@ -33,7 +33,7 @@ def report(
 ) -> Path:
     """Write one page of HTML with all its pictures inside, of a run or of several.
 
-    A fit that was interrupted has a page too, of what it has come to.
+    An interrupted fit has a page too, with its results so far.
 
     Args:
         paths: Runs. Of several the page compares numbers, settings and pictures.

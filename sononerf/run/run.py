@@ -164,7 +164,7 @@ def compare(first: Prediction | Run, second: Echoes | Run) -> Evaluation | Compa
     """Compare a prediction with echoes, or two runs with each other.
 
     Args:
-        first: A prediction of poses of the echoes; or a run with what is looked for.
+        first: A prediction of poses of the echoes; or a run with the target.
         second: The measured echoes; or a run without the target.
 
     Returns:

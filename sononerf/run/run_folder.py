@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A run on disk: its lock, its stages, and what is loaded from it, each thing once."""
+"""A run on disk: its lock, its stages, and its parts, each of which is loaded once."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def differing_keys(old: Settings, new: Settings) -> list[str]:
 
 
 def stated_frame(attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what the attributes of a store state of the frame that its poses were given in."""
+    """Return the frame of the original poses, from the attributes of a store."""
     facts = {key: attributes.get(key) for key in (*KEYS, "origin")}
     given = attributes.get("import") or {}
     return {**facts, "poses_as": {key: given[key] for key in POSE_KEYS if key in given}}
@@ -170,7 +170,7 @@ class RunFolder:
         self.require_recorded(file, f"reconstruct again with `sononerf reconstruct {self.path}`")
         try:
             mesh = trimesh.load_mesh(file, file_type="ply")
-        except Exception as error:  # trimesh's readers raise whatever they met first
+        except Exception as error:  # the error of a damaged file depends on trimesh's reader
             raise InputError(f"{file}: damaged ({error}); reconstruct again") from error
         if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
             raise InputError(f"{file}: holds no surface; reconstruct again")
@@ -199,12 +199,12 @@ class RunFolder:
         return replace(found, simulator=kept.simulator)
 
     def keep_traced(self, traced: Traced) -> None:
-        """Write what was learned of the reconstructed surface."""
+        """Write the traced surface, with its gain and weight."""
         save_traced(self.path, traced)
         self._kept = traced
 
     def _traces_its_mesh(self) -> bool:
-        """Tell whether the traced surface is that of the reconstruction."""
+        """Return whether the traced surface is that of the reconstruction."""
         try:
             traced, mesh = self.traced(), self.mesh()
         except InputError:
@@ -212,7 +212,7 @@ class RunFolder:
         return traced is not None and _same(traced.mesh, mesh)
 
     def is_done(self, stage: Stage) -> bool:
-        """Tell whether a stage came to its end, with the results of the stages before it."""
+        """Return whether a stage came to its end, with the results of the stages before it."""
         if stage == "fit":
             return (self.path / DESCRIPTION_NAME).is_file()
         if stage == "surface":
@@ -269,8 +269,6 @@ class RunFolder:
 
     def prolong(self, settings: Settings) -> None:
         """Take over a larger number of epochs, if nothing else differs.
-
-        The fit then goes on from its last checkpoint, and the stages after it are done again.
 
         Args:
             settings: Settings of the fit that is asked for.
@@ -329,7 +327,7 @@ class RunFolder:
         return aside
 
     def read_metrics(self) -> dict[str, Any]:
-        """Return what ``metrics.json`` holds so far."""
+        """Return the present content of ``metrics.json``."""
         if not self.metrics.is_file():
             return {"schema": METRICS_SCHEMA}
         self.require_recorded(self.metrics, "remove it, and the same fit command goes on")
@@ -358,7 +356,7 @@ class RunFolder:
                 storage.commit_json(self.metrics, metrics)
 
     def write_provenance(self, **facts: Any) -> None:
-        """Record what the run was made with; no names of people, machines or folders."""
+        """Record versions and sources of the run, without names of people, machines or folders."""
         storage.commit_json(
             self.path / "provenance.json",
             {
@@ -389,7 +387,7 @@ def locked(runs: Iterable[RunFolder], output: Path) -> Iterator[None]:
 
 
 def _same(one: trimesh.Trimesh, two: trimesh.Trimesh) -> bool:
-    """Tell whether two meshes have the same vertices and triangles."""
+    """Return whether two meshes have the same vertices and triangles."""
     return np.array_equal(one.vertices, two.vertices) and np.array_equal(one.faces, two.faces)
 
 

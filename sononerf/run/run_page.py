@@ -267,7 +267,7 @@ class _Predicted:
 
 
 def read_predictions(path: Path) -> _Predicted | None:
-    """Return what a run predicted for its held-out poses; None where it has not yet.
+    """Return the prediction of a run for its held-out poses; None before it exists.
 
     Raises:
         InputError: If the file is damaged.

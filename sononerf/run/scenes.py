@@ -28,12 +28,12 @@ from sononerf.simulation.simulator import pose_seed
 
 
 def describe_scenes() -> list[dict[str, Any]]:
-    """Return what there is to know of every scene, built as it is without options.
+    """Return the properties of every scene, built without options.
 
     Returns:
         rows: Plain data. ``needs`` are the options without a default; where there are any,
-            ``size_m`` and ``triangles`` are None. A broken scene says in its ``summary`` why, and
-            hurts no other.
+            ``size_m`` and ``triangles`` are None. A broken scene has its fault as ``summary``, and
+            affects no other.
     """
     rows = []
     for plugin in list_scenes():
@@ -81,7 +81,7 @@ def scene_table(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def describe_scene(name: str) -> dict[str, Any]:
-    """Return what one scene is, and what may be set of it.
+    """Return the description of one scene, with its options.
 
     Returns:
         scene: ``name``, ``description``, all of it but what is returned and raised, and
@@ -127,7 +127,7 @@ def _options(factory: Callable[..., Any]) -> tuple[list[str], list[str]]:
 
 @contextmanager
 def _quietly() -> Iterator[None]:
-    """Keep what factories print off our output, and warnings of meshes nobody asked for."""
+    """Keep the output of factories, and warnings about their meshes, off ours."""
 
     def drop(record: logging.LogRecord) -> bool:
         del record

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From settings to a sealed ensemble of echoes, or to what microphones would have recorded."""
+"""Simulation from settings: a sealed ensemble of echoes, or the recordings of microphones."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def scene_of(settings: Settings) -> Scene:
 
 
 def store_path(settings: Settings, scene: Scene | None, output: Path | None) -> Path:
-    """Return where the ensemble lies: as asked for, as set, or by its hash under ``data/``."""
+    """Return the path of the ensemble: as given, as set, or by its hash under ``data/``."""
     chosen = output or settings.data.store
     if chosen is not None:
         return chosen
@@ -51,13 +51,13 @@ def store_path(settings: Settings, scene: Scene | None, output: Path | None) -> 
 
 
 def default_store(settings: Settings, echoes: str) -> Path:
-    """Return where the ensemble of a hash lies when nobody says where."""
+    """Return the default path of the ensemble with a hash."""
     name = "recorded" if settings.scene is None else settings.scene.name
     return Path("data") / f"{name}-{echoes[:12]}"
 
 
 def background_path(settings: Settings) -> Path | None:
-    """Return where the ensemble of the surroundings alone lies; None where none is taken off.
+    """Return the path of the ensemble of the surroundings alone; None if none is subtracted.
 
     Raises:
         SettingsError: If the scene's own are asked for, and it marks none.
@@ -115,11 +115,11 @@ def simulate(
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> EnsembleStore:
-    """Simulate what is missing of an ensemble, and seal it.
+    """Simulate the missing poses of an ensemble, and seal it.
 
     Shards are stores beside the ensemble's, each with some of its poses. They can be simulated on
     different machines at once. The same call without a shard takes the poses from there, simulates
-    what is missing, and seals.
+    missing ones, and seals the store.
 
     Args:
         settings: The experiment.
@@ -167,7 +167,7 @@ def write_waveforms(
     scene: Scene | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
-    """Simulate what the receivers hear at every pose, and write it as WAV files with a table.
+    """Simulate the sound at the receivers at every pose, and write WAV files with a table.
 
     The folder is what ``sononerf import recordings`` reads: a WAV file per pose (32-bit floats),
     ``poses.csv``, and ``import.yaml`` with air, ears, call and analysis. Poses, echoes and noise

@@ -57,9 +57,7 @@ def least_error(error_at: Callable[[int], float]) -> tuple[float, float]:
 
 
 def fitted_error(settings: Settings, store: Path, run: Path, progress: Progress) -> float:
-    """Return how badly the refined surface of a store explains its validation poses, dB.
-
-    A fit that is finished is not done again, and an interrupted one goes on.
+    """Return the error of a store's refined surface on its validation poses, dB.
 
     Args:
         settings: Settings of a run, whose field, fit and reconstruction are taken.

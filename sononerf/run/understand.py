@@ -225,7 +225,7 @@ def _complete(
     output: Path,
     where: str,
 ) -> Settings:
-    """Fill what the settings leave out from the recording, and check them as those of a fit."""
+    """Complete the settings from the recording, and check them like those of a fit."""
     for section, known in recording.settings.items():
         own = data.setdefault(section, {})
         if isinstance(own, dict):
@@ -255,7 +255,7 @@ def _complete(
 
 
 def _mixed(known: dict[str, Any], wanted: ImportSettings) -> dict[str, Any]:
-    """Return what the source says of receivers, for the channels that are chosen."""
+    """Return the source's statements about receivers, for the chosen channels."""
     if "receivers" not in known or wanted.channels is None:
         return known
     places = mix(np.asarray(known["receivers"], dtype=np.float64), wanted.channels)

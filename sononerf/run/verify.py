@@ -89,7 +89,7 @@ def verify(
 
 
 def _prediction(run: RunFolder, accelerator: str, progress: Progress) -> dict[str, Any]:
-    """Predict the test poses again, and compare with what the store holds of them."""
+    """Predict the test poses again, and compare with the store."""
     fitted, echoes = run.fitted, run.echoes
     found = predict(
         fitted.module,
@@ -105,7 +105,7 @@ def _prediction(run: RunFolder, accelerator: str, progress: Progress) -> dict[st
 
 
 def _equal(stated: Any, found: Any) -> bool:
-    """Tell whether two values agree; numbers within the tolerance."""
+    """Return whether two values agree; numbers within the tolerance."""
     if isinstance(found, (list, tuple, np.ndarray)):
         return (
             isinstance(stated, list)

@@ -25,7 +25,7 @@ WAIT = 2.0
 
 
 class View:
-    """A viewer of one folder; :meth:`refresh` shows what has come since.
+    """A viewer of one folder; :meth:`refresh` shows new files.
 
     Args:
         path: A run, finished or not, or a store.
@@ -59,7 +59,7 @@ class View:
         self._has_echoes = True
 
     def refresh(self) -> None:
-        """Show what is new in the run: echoes, the mesh of the last epoch, model, and surface."""
+        """Show new parts of the run: echoes, the mesh of the last epoch, model, and surface."""
         if not self.run.config.is_file():
             return
         if not self._has_echoes:
@@ -107,7 +107,7 @@ class View:
         self.viewer.say(f"**{self.run.path.resolve().name}**: {text}.")
 
     def _is_new(self, name: str, file: Path) -> bool:
-        """Tell whether a file has come or changed since the last look."""
+        """Return whether a file has come or changed since the last look."""
         if not file.is_file():
             return False
         state = (str(file), file.stat().st_mtime_ns)

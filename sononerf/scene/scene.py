@@ -133,7 +133,7 @@ class Scene(Shown):
         return load_scene("mesh", {"path": str(path), "unit": unit, **options})
 
     def surface(self, *, background: bool) -> trimesh.Trimesh | None:
-        """Return the surroundings alone, or the target alone; None where there is none of it."""
+        """Return the surroundings alone, or the target alone; None if there is none of it."""
         faces = np.asarray(self.mesh.faces)
         marked = np.zeros(len(faces), bool) if self.background is None else self.background
         faces = faces[marked == background]

@@ -141,7 +141,7 @@ def describe_options(factory: Callable[..., Any], *, given: int = 0) -> list[dic
         given: Number of leading arguments that the caller passes.
 
     Returns:
-        rows: ``name``; ``default``, plain data, or None where there is none; ``needed``, where it
+        rows: ``name``; ``default``, plain data, or None if there is none; ``needed``, where it
             has to be set; ``allowed``, in words.
     """
     rows = []

@@ -29,7 +29,7 @@ def check_poses(
         poses: To be checked.
         offsets ((K, 3), m): Further points of the head that must be outside, such as emitter and
             ears; head frame.
-        plane: The support; None where there is none.
+        plane: The support; None if there is none.
 
     Raises:
         InputError: If a pose lies there.

@@ -49,7 +49,7 @@ class Surface(Shown):
         error_db (dB): Objective of the refinement on validation poses; None without a refinement.
         faults: Faults of the refinement, one line each.
         echoes: Echoes of its field; None if unknown.
-        reading: Evidence that it was made from; None where there is none.
+        reading: Evidence that it was made from; None if there is none.
         learned: Weights of its echoes beside what a model renders, by model.
 
     Raises:
@@ -189,7 +189,7 @@ def judge_openness(
         mesh: A closed reconstruction, normals outward, m.
         sources ((P, 3), m): Places of the poses.
         resolution (m): Range resolution of the analysis.
-        plane: The support; None where there is none.
+        plane: The support; None if there is none.
     """
     middles = np.asarray(mesh.triangles_center, dtype=np.float64)
     normals = np.asarray(mesh.face_normals, dtype=np.float64)

@@ -193,7 +193,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 
 def find(group: h5py.Group, name: str) -> Any:
-    """Return the group or dataset of a name in a group; None where there is none.
+    """Return the group or dataset of a name in a group; None if there is none.
 
     Raises:
         InputError: If it is a link to somewhere else.

@@ -106,7 +106,7 @@ class Optics(nn.Module):
 
     Attributes:
         head: Without noise.
-        plane: The support; None where there is none.
+        plane: The support; None if there is none.
         wavelength (m): The shortest of the analysed band.
         rows, ears: Range slices of a spectrogram, R, and ears, E.
         kept_nodes (N,): Indices of the synthesis' nodes that the band needs.
