@@ -82,7 +82,7 @@ def count(folder: Path) -> int:
 
 
 def differing(folder: Path) -> list[str]:
-    """Return the names of the files of a run that are missing, or not as they were recorded."""
+    """Return the names of the files of a run that are missing or differ from their checksum."""
     found = []
     for name, valid in sorted(_valid(folder).items()):
         file = folder / name

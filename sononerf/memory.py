@@ -16,7 +16,7 @@ DRIVERS = (Path("/dev/nvidiactl"), Path("/dev/kfd"))
 
 
 def available_cores() -> int:
-    """Return on how many cores this process may run, as far as the system tells."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

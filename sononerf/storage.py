@@ -42,7 +42,7 @@ WAYS_OUT = {
 
 
 def storage_error(what: str, path: Path, error: OSError) -> StorageError:
-    """Return one line for an operating system's refusal: what, which path, why, what to do."""
+    """Return one line for an operating system's refusal: action, path, reason, remedy."""
     reason = error.strerror or str(error)
     way_out = WAYS_OUT.get(error.errno or 0, f"{reason}; check the path and the disk")
     return StorageError(f"{path}: {what}: {way_out}")
@@ -66,7 +66,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def _missing_folders(folder: Path) -> list[Path]:
-    """Return what has to be created for a folder to be there, innermost first."""
+    """Return the folders that have to be created for a folder, innermost first."""
     missing = []
     while not folder.is_dir():
         missing.append(folder)
@@ -121,7 +121,7 @@ def _keep(path: Path, previous: Path) -> None:
 def commit(
     path: Path, writer: Callable[[BinaryIO], object], *, previous: Path | None = None
 ) -> None:
-    """Write a file so that, whatever happens, its old or its new content is there, whole.
+    """Write a file so that its old or its new content is complete, even after a crash.
 
     The content goes to a temporary file beside the target, is flushed and fsynced, takes the
     target's name, and the folder is fsynced. Missing folders are created.
@@ -159,11 +159,11 @@ def commit(
 
 @contextmanager
 def watched(watcher: Callable[[Path, Path | None], None]) -> Iterator[None]:
-    """Let a function know of every file, in whatever thread it is written, before it is there.
+    """Call a function for every file, in any thread, before the file has its name.
 
     Args:
         watcher: Called with the target and, where it is written, the temporary file that holds its
-            content; where it is removed, None. What it raises stops the change.
+            content; where it is removed, None. Its exceptions stop the change.
     """
     _watchers.append(watcher)
     try:
@@ -178,7 +178,7 @@ def commit_bytes(path: Path, data: bytes | memoryview) -> None:
 
 
 def commit_folder(folder: Path, files: Mapping[str, str]) -> None:
-    """Write a new folder of text files so that all of them are there, whole, or none.
+    """Write a new folder of text files, all of them or none.
 
     They are written into a temporary folder beside the target, which then takes its name.
 
@@ -217,7 +217,7 @@ def commit_folder(folder: Path, files: Mapping[str, str]) -> None:
 
 
 def commit_text(path: Path, text: str) -> None:
-    """Commit text as UTF-8, line ends as they are; see :func:`commit`."""
+    """Commit text as UTF-8 with unchanged line ends; see :func:`commit`."""
     commit_bytes(path, text.encode())
 
 
@@ -276,8 +276,8 @@ def read_json(path: Path) -> Any:
 def append_line(path: Path, text: str) -> None:
     """Append one line of text to a file, durably; the file is created if it does not exist.
 
-    A line that a crash tore is closed first, so that it swallows none that follows. Readers
-    tell torn lines by a checksum of their own.
+    A line that a crash tore is ended first, so that it does not absorb the next one. Readers
+    recognise torn lines by checksums.
 
     Raises:
         StorageError: If it cannot be written.
@@ -308,7 +308,7 @@ def append_record(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def read_records(path: Path) -> list[dict[str, Any]]:
-    """Read the whole records of a journal; torn and damaged lines are none.
+    """Read the records of a journal; torn and damaged lines are ignored.
 
     Raises:
         InputError: If it cannot be read.
@@ -363,7 +363,7 @@ def _is_alive(pid: int) -> bool:
 
 
 def clean_leftovers(folder: Path) -> None:
-    """Remove what dead processes left half-written in a folder: ``.<name>.<pid>.tmp``."""
+    """Remove unfinished files of dead processes from a folder: ``.<name>.<pid>.tmp``."""
     if not folder.is_dir():
         return
     with os.scandir(folder) as entries:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: MIT
 """Contract tests of scenes, fields and renderers, for the authors of plugins.
 
-Each function raises ``AssertionError`` with what was found and what is expected.
+Each function raises ``AssertionError`` with the found and the expected value.
 """
 
 from __future__ import annotations

@@ -57,7 +57,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class CheckpointCallback(lightning.Callback):
-    """Keeps ``checkpoints/last.ckpt``; the step it holds is where the fit goes on.
+    """Keeps ``checkpoints/last.ckpt``; the fit resumes at its step.
 
     Args:
         folder: The run.
@@ -79,7 +79,7 @@ class CheckpointCallback(lightning.Callback):
         return self._earlier + time.monotonic() - self._began
 
     def state_dict(self) -> dict[str, float]:
-        """Return what a checkpoint keeps of this callback."""
+        """Return the state of this callback, for a checkpoint."""
         return {"elapsed": self.elapsed}
 
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
@@ -89,11 +89,11 @@ class CheckpointCallback(lightning.Callback):
 
     @contextmanager
     def watching(self) -> Iterator[None]:
-        """Turn signals into an orderly stop; a second one does what it did without us."""
+        """Turn signals into an orderly stop; a second signal has its usual effect."""
         if threading.current_thread() is threading.main_thread():
             for number in SIGNALS:
                 handler = signal.getsignal(number)
-                # What was ignored when we were started (nohup, a shell's &) stays ignored.
+                # Signals that were ignored at the start (nohup, a shell's &) stay ignored.
                 if handler is not None and handler is not signal.SIG_IGN:
                     self._before[number] = handler
         self._watch()
@@ -144,7 +144,7 @@ class CheckpointCallback(lightning.Callback):
     def on_train_epoch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
-        """Save what the epoch reached, after its validation."""
+        """Save the state after the epoch's validation."""
         del pl_module
         self._save(trainer)
         if self._is_asked_to_stop(trainer):

@@ -55,7 +55,7 @@ class PreviewCallback(lightning.Callback):
     def on_train_epoch_end(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
-        """Read the field out coarsely and write what is seen."""
+        """Read the field out coarsely and write its pictures."""
         field, epoch = getattr(pl_module, "field", None), trainer.current_epoch + 1
         if epoch % self.every_epochs or not trainer.is_global_zero or not isinstance(field, Field):
             return

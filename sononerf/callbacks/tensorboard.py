@@ -49,7 +49,7 @@ picture after the start, s. With these a fit of 40 s takes 1.4 s longer."""
 
 
 def event_folder(run: Path) -> Path:
-    """Return the folder of a run's events; its name is what TensorBoard calls the run."""
+    """Return the folder of a run's events; TensorBoard shows its name."""
     parent = run / FOLDER
     known = sorted(path for path in parent.glob("*") if path.is_dir())
     return known[0] if known else parent / (run.resolve().name or "run")

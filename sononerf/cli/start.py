@@ -38,7 +38,7 @@ def _signals_unwind(came: list[int]) -> Iterator[None]:
 
     before = {}
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        # What was ignored when we were started (nohup, a shell's &) stays ignored.
+        # Signals that were ignored at the start (nohup, a shell's &) stay ignored.
         if signal.getsignal(number) is not signal.SIG_IGN:
             before[number] = signal.signal(number, unwind)
     try:
@@ -75,7 +75,7 @@ def _run(came: list[int]) -> int:
 
 
 def main() -> None:
-    """Run the command line and end with the exit code of what went wrong."""
+    """Run the command line and end with its exit code."""
     try:
         sys.exit(_run([]))
     except BrokenPipeError:

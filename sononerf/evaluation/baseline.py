@@ -21,7 +21,7 @@ from sononerf.head.call import matched_filter
 from sononerf.head.head import Head
 from sononerf.surface.start.volume import Volume, grid_over, isosurface
 
-# Levels tried by `best_level_surface`, as shares of the voxels that lie above, and what it scores.
+# Levels tried by `best_level_surface`, as fractions of the voxels above them, and the score.
 LEVEL_SHARES = np.geomspace(0.002, 0.5, 12)
 LEVEL_SAMPLES = 4000
 LEVEL_DISTANCE = 0.005
@@ -230,9 +230,9 @@ def best_level_surface(
 ) -> tuple[trimesh.Trimesh, float]:
     """Extract the surface at the level that suits a baseline best, *knowing the truth*.
 
-    A baseline has no rule for its level. Rather than put it at a disadvantage it is given the best
-    of twelve levels, judged by the F-score at 5 mm against the true surface. Never use this on what
-    is being evaluated.
+    A baseline has no rule for its level. To its advantage it gets the best of twelve levels, by the
+    F-score at 5 mm against the true surface. Never use this function on the result under
+    evaluation.
 
     Args:
         volume: Greater values are inside.
@@ -358,7 +358,7 @@ def voxel_fit(
 
 
 def _kernel(values: Floats, window_step: float, step: float, depth: float) -> Floats:
-    """Return what a voxel leaves in the slices around it: the window, over the voxel's depth."""
+    """Return the response of the slices around a voxel: the window, over the voxel's depth."""
     half = (len(values) - 1) / 2
     # So far that even the nearest part of a voxel's depth lies beyond the window: zero at the ends.
     reach = int(np.ceil((half * window_step + depth / 2) / step))
@@ -423,7 +423,7 @@ def _gather(
     heard: Singles,
     audible: Singles,
 ) -> None:
-    """Add to each voxel (X, Y, Z) what is heard and what is audible in its bin, in place."""
+    """Add the heard power and the audibility of its bin to each voxel (X, Y, Z), in place."""
     for i in range(index.shape[0]):
         for j in range(index.shape[1]):
             for k in range(index.shape[2]):

@@ -19,7 +19,7 @@ SAME = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Two volumes over their common maximum, and what remains of one without the other.
+    """Two volumes over their common maximum, and the difference between them.
 
     Attributes:
         first, second: 0 to 1, on one grid.
@@ -64,7 +64,7 @@ def compare(first: Volume, second: Volume) -> Comparison:
 
 
 def added_part(mesh: trimesh.Trimesh, without: trimesh.Trimesh) -> trimesh.Trimesh | None:
-    """Return what a true surface has and another one has not; None where that is nothing.
+    """Return the parts of a true surface that another one lacks; None if there are none.
 
     Args:
         mesh, without: Metres, one world frame; equal parts are equal triangle for triangle.

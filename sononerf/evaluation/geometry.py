@@ -108,7 +108,7 @@ def register(
 
 
 def _starts(points: Floats, target: Floats, scaled: bool) -> list[Floats]:
-    """Return the first guesses (4, 4): as they lie, moved to one centre, and axes aligned."""
+    """Return the initial guesses (4, 4): identity, equal centres, and aligned axes."""
     middles = points.mean(axis=0), target.mean(axis=0)
     spread = [
         np.sqrt(((p - m) ** 2).sum(axis=1).mean())
@@ -255,9 +255,7 @@ class Truth:
 def baseline_volume(
     name: str, echoes: Echoes, lower: Floats, upper: Floats, stop: threading.Event
 ) -> Volume:
-    """Compute what needs no learning: backprojection or a voxel fit of the training poses.
-
-    Where there are many poses it is done in another process, and this thread waits.
+    """Compute a baseline: backprojection or a voxel fit of the training poses.
 
     Args:
         name: Name in ``BASELINES``.

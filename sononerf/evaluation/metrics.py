@@ -108,8 +108,8 @@ def target_metrics(
 ) -> dict[str, Any]:
     """Compare a reconstruction of a target amid surroundings with the target alone.
 
-    Of the reconstruction counts what lies nearer to the true target than to the true surroundings;
-    else as :func:`geometry_metrics`.
+    Parts of the reconstruction count if they are nearer to the true target than to the true
+    surroundings; else as :func:`geometry_metrics`.
 
     Args:
         reconstructed, target, background: Metres, world frame.
@@ -139,7 +139,7 @@ def target_metrics(
     if not counts.any():
         return {**found, "chamfer_m": None, "fscore": {f"{limit:g}": 0.0 for limit in thresholds}}
     to_truth = to_truth[counts]
-    # The border between what counts and what does not is as coarse as the triangles.
+    # The border of the counted part is as coarse as the triangles.
     middles = np.asarray(reconstructed.triangles_center)
     kept = true.nearest.distance(middles) <= around.distance(middles)
     kept[face[counts]] = True
@@ -187,7 +187,7 @@ def _normal_consistency(
 
 def _nearest_of(points: Floats, places: Floats) -> NDArray[np.intp]:
     """Return which of the points is nearest to each place, (N,)."""
-    # Neighbours one after another: what one needs of the tree is still at hand for the next.
+    # Neighbours follow one another, so that their part of the tree is still in the cache.
     cells = ((places - places.min(axis=0)) / max(float(np.ptp(places)), 1e-12) * 64).astype(np.intp)
     order = np.lexsort(cells.T)
     found = np.zeros(len(places), np.intp)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Numbers of a surface beside the true one, and of a prediction beside what was measured."""
+"""Metrics of a surface against the true one, and of a prediction against the measurement."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def evaluate(
     registration: Kind = "none",
     progress: Progress | None = None,
 ) -> Evaluation:
-    """Compare a surface with the true one, and with what needs no learning.
+    """Compare a surface with the true one, and with the baselines.
 
     Args:
         surface: Reconstructed, m.
@@ -104,7 +104,7 @@ def evaluate(
 
 
 def compare_prediction(prediction: Prediction, echoes: Echoes) -> Evaluation:
-    """Compare a prediction with what its poses measured.
+    """Compare a prediction with the measurement of its poses.
 
     Args:
         prediction: Prediction of poses of the echoes.

@@ -140,7 +140,7 @@ def check_hearing(model: EchoModule, poses: Poses) -> None:
     lower, upper = _corners(model)
     ranges = model.renderer.range.cpu().double().numpy()
     below, above = lower - poses.positions, poses.positions - upper
-    with np.errstate(over="ignore"):  # what is too far for a number is too far
+    with np.errstate(over="ignore"):  # a distance that overflows is too far
         nearest = np.linalg.norm(np.maximum(np.maximum(below, above), 0), axis=1)
         farthest = np.linalg.norm(np.maximum(-below, -above), axis=1)
     deaf = np.flatnonzero((nearest > ranges[-1]) | (farthest < ranges[0]))
@@ -181,7 +181,7 @@ def traced_of(
 def prediction_numbers(
     prediction: Prediction, echoes: Echoes, measured: NDArray[np.floating]
 ) -> dict[str, Any]:
-    """Compare a prediction with what its poses measured, (P, E, R, F) linear magnitude.
+    """Compare a prediction with the measurement of its poses, (P, E, R, F) linear magnitude.
 
     The mean spectrogram of the training poses and the noise floor of the echoes stand beside.
     """
@@ -237,8 +237,8 @@ def prediction_metrics(
     Args:
         measured_db, predicted_db ((P, E, R, F), dB): 0 dB is silence; arrays mapped from a file are
             read a few poses at a time.
-        mean_db ((E, R, F), dB): Mean spectrogram of the training poses: what knowing nothing of the
-            pose predicts.
+        mean_db ((E, R, F), dB): Mean spectrogram of the training poses: the prediction without
+            knowledge of the pose.
         active_db (dB): A cell is active where the measured or the judged spectrogram reaches this;
             one number, or one that is broadcast to a spectrogram.
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Echoes traced off a surface, and their weight beside what the field renders."""
+"""Echoes traced off a surface, and their weight beside the rendered ones."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Traced:
         mesh: The surface, m.
         gain_db ((E, F), dB): Level that is added to the traced echoes.
         weight (F,): Weight of the traced echoes in the mean with the rendered ones, 0 to 1.
-        fault: Why no echoes can be traced off the surface; empty where they can.
+        fault: The reason why no echoes can be traced off the surface; empty where they can.
         simulator: Simulator of the surface, with what it has solved for; made anew where None.
     """
 
@@ -171,7 +171,7 @@ lobes and interference."""
 
 
 def gain_db(measured_db: ArrayLike, traced_db: ArrayLike) -> Floats:
-    """Return how much louder each ear measured each frequency than it was traced.
+    """Return the level of the measurement over that of the traced echoes, by ear and frequency.
 
     Args:
         measured_db, traced_db ((P, E, R, F), dB): Reported decibels; 0 dB is silence.

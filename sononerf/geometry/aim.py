@@ -30,7 +30,7 @@ def off_axis(poses: Poses, centre: Floats) -> Floats:
 
 
 def aim_fault(poses: Poses, centre: Floats) -> str:
-    """Say that poses look away from a body, and what mistake may explain it; empty if they do not.
+    """Return a line if poses look away from a body, and its likely cause; empty otherwise.
 
     Args:
         poses: P of them.

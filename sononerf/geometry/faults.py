@@ -26,7 +26,7 @@ THIN = 1e-9
 
 
 def surface_faults(vertices: ArrayLike, faces: ArrayLike) -> list[str]:
-    """Describe what is odd about a surface.
+    """Return the faults of a surface.
 
     Args:
         vertices ((V, 3), m): Finite.
@@ -64,7 +64,7 @@ def surface_faults(vertices: ArrayLike, faces: ArrayLike) -> list[str]:
 
 @dataclass(frozen=True)
 class _Edges:
-    """The edges of a surface, each once: its ends, and what is odd about it."""
+    """Edges of a surface, each once: its ends and its faults."""
 
     ends: Ints  # (K, 2)
     open: Bools

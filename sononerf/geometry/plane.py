@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A rigid plane that mirrors sound, and what stands on it with its image."""
+"""A rigid plane that mirrors sound, and the bodies on it with their images."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Plane:
         return image
 
     def with_image(self, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Bools | None]:
-        """Return what is above the plane of a mesh, and its image, as one mesh.
+        """Return the part of a mesh above the plane, and its image, as one mesh.
 
         Faces that lie on the plane are left out: sound reaches none of them. A closed body that
         stands on the plane and its image are then one closed body.

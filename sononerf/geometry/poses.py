@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Poses: where the head is, and where it looks.
+"""Poses: place and orientation of the head.
 
 World frame: metres, right-handed, z up. Head frame: x forward, y left, z up. A rotation takes
 head to world, ``R = Rz(yaw) Ry(pitch) Rx(roll)``, so positive pitch looks *down*.

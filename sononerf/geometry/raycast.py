@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Rays against a triangle mesh: what they hit first, what sees what, and what lies inside."""
+"""Ray casting against a triangle mesh: first hits, visibility, and points inside."""
 
 from __future__ import annotations
 
@@ -228,7 +228,7 @@ def _sight(
 
 
 class RayCaster:
-    """Rays against one mesh. Cannot be pickled; send the mesh and build it anew.
+    """Rays against one mesh. It cannot be pickled; send the mesh instead.
 
     Args:
         mesh: At least one triangle.
@@ -271,7 +271,7 @@ class RayCaster:
         )
 
     def first_hit(self, origins: Floats, directions: Floats) -> Hits:
-        """Return what each ray hits first; rays that hit nothing are left out.
+        """Return the first hit of each ray; rays without a hit are left out.
 
         Args:
             origins ((N, 3), m): Origins of the rays.
@@ -383,7 +383,7 @@ def winding_numbers(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) ->
 
 
 def _both_ways(corners: Floats, triangles: Ints, places: Floats) -> Floats:
-    """Sum what is crossed up and down the third axis."""
+    """Return the signed number of crossings up and down the third axis."""
     order = np.argsort(places[:, 0], kind="stable")
     sorted_places = places[order]
     total = np.zeros(len(places))

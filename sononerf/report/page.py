@@ -65,11 +65,11 @@ class Page:
         self.parts.append(f"<h{level}>{html.escape(text)}</h{level}>")
 
     def say(self, text: str) -> None:
-        """Add a paragraph; what stands between backticks is shown as code."""
+        """Add a paragraph; text between backticks is shown as code."""
         self.parts.append(f"<p>{_inline(text)}</p>")
 
     def code(self, text: str) -> None:
-        """Add lines as they are."""
+        """Add lines unchanged."""
         self.parts.append(f"<pre>{html.escape(text)}</pre>")
 
     def table(self, rows: Sequence[Sequence[str]]) -> None:

@@ -161,7 +161,7 @@ class Viewer:
         if not len(known):
             return
         trusted = np.asarray(np.isfinite(hull.trusted[known]).any(axis=1))
-        # Drawn straight ahead, for an onset tells its range alone.
+        # Drawn straight ahead, because an onset has a range and no direction.
         at = hull.sources[known] + hull.axes[known] * hull.first[known].max(axis=1)[:, None]
         colours = np.where(trusted[:, None], (30, 120, 30), (220, 0, 160)).astype(np.uint8)
         points = self.server.scene.add_point_cloud(
@@ -187,7 +187,7 @@ class Viewer:
         self._toggle("free space's bound", handle, on=False, hint=hint)
 
     def choose(self, pose: int) -> None:
-        """Show what a pose measured, and what is predicted for it."""
+        """Show the measured and the predicted spectrogram of a pose."""
         echoes = self._echoes
         assert echoes is not None
         with self._lock:
@@ -269,7 +269,7 @@ class Viewer:
         self._follow()
 
     def _follow(self) -> None:
-        """Predict what the free head hears, by the field alone."""
+        """Predict the spectrogram of the free head, by the field alone."""
         began = time.monotonic()
         place = np.asarray(self.head.position, dtype=np.float64)
         turn = trimesh.transformations.quaternion_matrix(self.head.wxyz)[:3, :3]
@@ -282,7 +282,7 @@ class Viewer:
         )
 
     def _rendered(self, poses: Poses, *, all_ranges: bool = False) -> tuple[Floats, Floats, Floats]:
-        """Return decibels (E, R, F) of one pose, and range and frequency of what was rendered."""
+        """Return decibels (E, R, F) of one pose, and the rendered ranges and frequencies."""
         model = self._model
         assert model is not None
         renderer = model.renderer

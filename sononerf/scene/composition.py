@@ -110,7 +110,7 @@ def _placed(part: Part, where: str) -> trimesh.Trimesh:
     if position.shape != (3,) or not np.isfinite(position).all():
         raise SettingsError(f"{where}.position: found no three finite numbers; give x, y, z in m")
     vertices = np.asarray(part.scene.mesh.vertices) * part.scale
-    # What is not turned keeps its coordinates to the last bit.
+    # Parts that are not turned keep their coordinates to the last bit.
     if not np.array_equal(rotation, np.eye(3)):
         vertices = vertices @ rotation.T
     faces = np.asarray(part.scene.mesh.faces)

@@ -278,7 +278,7 @@ def _model_at(model: type[BaseModel], path: Iterable[str | int]) -> type[BaseMod
 def describe_faults(
     error: ValidationError, model: type[BaseModel], source: str | None, prefix: str = ""
 ) -> str:
-    """Turn pydantic's faults into one line each: source, dotted key, what is wrong, a way out."""
+    """Turn pydantic's faults into one line each: source, dotted key, fault, remedy."""
     head = "" if source is None else f"{source}: "
     lines: dict[str, None] = {}
     for fault in error.errors():
@@ -301,7 +301,7 @@ def describe_faults(
             hint = f"did you mean {near[0]}?" if near else listed
             lines[f"{head}{key}: unknown key; {hint}"] = None
         elif fault["type"] == "missing" and isinstance(location[-1], int):
-            # One fault for each value that a list is short of; the last one tells the length.
+            # There is one fault for each missing value of a list; the last one has the length.
             short = ".".join([*([prefix] if prefix else []), *map(str, location[:-1])])
             end = f"found {fault['input']!r}; give {location[-1] + 1} values"
             lines = {line: None for line in lines if not line.startswith(f"{head}{short}: found")}

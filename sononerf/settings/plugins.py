@@ -29,7 +29,7 @@ RENDERERS = "sononerf.renderers"
 
 @dataclass(frozen=True)
 class Plugin:
-    """One registered name: where it comes from, not yet imported."""
+    """One registered name with its origin, not yet imported."""
 
     name: str
     distribution: str
@@ -38,7 +38,7 @@ class Plugin:
 
 
 def registered(group: str) -> list[Plugin]:
-    """Return what is registered under a group, sorted by name; imports nothing."""
+    """Return the registered plugins of a group, sorted by name; imports nothing."""
     found: dict[tuple[str, str, str], Plugin] = {}
     for entry in entry_points(group=group):
         distribution = entry.dist.name if entry.dist else "unknown"
@@ -100,7 +100,7 @@ def call(owner: str, factory: Callable[..., Any], *given: Any, **options: Any) -
         with memory_faults():
             return factory(*given, **options)
     except SonoNerfError:
-        raise  # says itself what is wrong, in one line
+        raise  # has its own message of one line
     except (Exception, SystemExit) as error:
         text = " ".join(str(error).split())
         raise InputError(f"{owner} failed: {type(error).__name__}: {text}") from error
@@ -134,7 +134,7 @@ def check_options(
 
 
 def describe_options(factory: Callable[..., Any], *, given: int = 0) -> list[dict[str, Any]]:
-    """Return what may be set of a factory's keyword arguments.
+    """Return the options of a factory: its keyword arguments.
 
     Args:
         factory: Its annotated keyword arguments are what may be set.

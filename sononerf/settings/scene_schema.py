@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Settings of what is ensonified, what it stands on, and from where."""
+"""Settings of scene, support and poses."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class SceneSettings(Section):
 
 
 class SupportSettings(Section):
-    """A large rigid plane that things stand on, such as a table or a turntable; none by default.
+    """A large rigid plane under the body, such as a table or a turntable; none by default.
 
     It mirrors sound. ``point`` (m, world frame) lies on it, ``normal`` points to the side of body
-    and head. Its own echo is not part of what is heard: recordings with the support have a
-    recording of the support alone subtracted.
+    and head. Its own echo is not included: recordings with the support have a recording of the
+    support alone subtracted.
     """
 
     point: Vector | None = None

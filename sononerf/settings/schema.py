@@ -110,8 +110,9 @@ class EarSettings(Section):
 class CallSettings(Section):
     """The emitted call: an impulse, a sweep of frequency with its harmonics, or a ``file``.
 
-    A ``preset`` fills the other keys with those of a published call; what is set beside it wins.
-    The file is a WAV of one channel that holds one call from the start of the emission on.
+    A ``preset`` fills the other keys with those of a published call; keys that are also set
+    override it. The file is a WAV of one channel that holds one call from the start of the emission
+    on.
     """
 
     preset: str | None = None
@@ -226,7 +227,7 @@ def check_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
 
 
 class NoiseSettings(Section):
-    """White noise of the ears; what the ratio is measured by stands in ``acoustics.noise``."""
+    """White noise of the ears; ``sononerf.head.noise`` defines the ratio."""
 
     snr_db: Decibels | tuple[Decibels, Decibels] | None = None  # none, both ears, (left, right)
     relative_to: Literal["target", "pose"] = "target"
@@ -260,21 +261,21 @@ class RegionSettings(Section):
 
 
 class FieldSettings(Section):
-    """The reflectivity field by the name of its entry point, and what its factory takes."""
+    """The reflectivity field by the name of its entry point, and the options of its factory."""
 
     kind: Name = "grid"
     options: dict[str, Any] = Field(default_factory=dict)
 
 
 class RendererSettings(Section):
-    """The renderer by the name of its entry point, and what its factory takes."""
+    """The renderer by the name of its entry point, and the options of its factory."""
 
     kind: Name = "profile"
     options: dict[str, Any] = Field(default_factory=dict)
 
 
 class FitSettings(Section):
-    """The fit: how long, on what, how fast."""
+    """The fit: its length, its batches, its learning rate."""
 
     epochs: Count = 20
     steps_per_epoch: Annotated[int, Field(ge=1)] | Literal["auto"] = "auto"

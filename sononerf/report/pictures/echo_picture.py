@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""One pose: where its echo comes from, and what the receivers hear."""
+"""Picture of one pose: the origin of its echo, and the sound at the receivers."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from sononerf.report.pictures.spectrogram_picture import (
 
 PALE = (0.84, 0.86, 0.88)
 HIT_MAP = "plasma"
-# What is fainter than the loudest hit by more than this is not drawn.
+# Hits that are fainter than the loudest one by more than this are not drawn.
 HIT_RANGE_DB = 40.0
 EARS = ((46, 125, 50), (21, 101, 192))  # left, right
 MOST_ROWS = 3  # number of receivers, at most, that are drawn, evenly chosen
@@ -59,7 +59,7 @@ def echo_png(
     speed_of_sound: float,
     title: str = "",
 ) -> bytes:
-    """Draw one pose: its hits on the scene, what receivers hear, and their spectrograms.
+    """Draw one pose: its hits on the scene, the waveforms at the receivers, and their spectrograms.
 
     Of more than three receivers three are drawn.
 

@@ -86,7 +86,7 @@ def confidence_png(
     size: tuple[int, int] = (960, 720),
     view: ArrayLike = DEFAULT_VIEW,
 ) -> bytes:
-    """Draw a mesh in the colours of its confidence, with a bar that tells what they mean.
+    """Draw a mesh in the colours of its confidence, with a legend.
 
     Args:
         mesh: Metres.
@@ -114,7 +114,7 @@ class ColourBar:
     Attributes:
         title: Title, with the unit.
         colours: Colours (N, 3), 0 to 1, of places (N,) from 0 to 1 along the bar.
-        marks: Place along the bar, 0 to 1, and what stands there.
+        marks: Place along the bar, 0 to 1, and its label.
     """
 
     title: str
@@ -161,8 +161,7 @@ def sides_png(
     """Draw meshes from four sides through the same cameras, one mesh per row.
 
     Args:
-        rows: For each row a title, the mesh, its colours as in :func:`mesh_png`, and what they
-            mean.
+        rows: For each row a title, the mesh, its colours as in :func:`mesh_png`, and their legend.
         size (int, int): Width and height of each view in pixels.
     """
     for title, mesh, *_ in rows:
@@ -187,7 +186,7 @@ def sides_png(
 
 
 def _draw_colour_bar(picture: Image.Image, bar: ColourBar) -> None:
-    """Draw what colours mean near the lower left corner, in place."""
+    """Draw the legend near the lower left corner, in place."""
     width, height = picture.size
     margin, length, thick = height // 24, max(width // 4, 150), max(6, height // 55)
     left, bottom = max(margin, 22), height - margin  # half of the first mark stands to the left

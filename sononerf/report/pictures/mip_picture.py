@@ -24,7 +24,7 @@ from sononerf.report.pictures.mesh_picture import mesh_png, round_length
 from sononerf.report.pictures.shading import DEFAULT_VIEW
 from sononerf.surface.start.volume import Volume, require_finite
 
-# Reflectivity spans decades; what lies further below the greatest value is drawn black.
+# Reflectivity spans decades; values farther below the maximum are drawn black.
 RANGE_DB = 40.0
 COLOUR_MAP = "magma"
 LONGEST_SIDE = 4.6  # inches

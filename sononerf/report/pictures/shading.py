@@ -115,7 +115,7 @@ def draw_mesh(
         colour ((3,) or (V, 3)): Colour in 0 to 1, one for all or one per vertex.
 
     Returns:
-        nearness ((H, W), m): Nearness of what was drawn; minus infinity where nothing was.
+        nearness ((H, W), m): Nearness of the drawn surface; minus infinity where nothing was.
     """
     height, width = pixels.shape[:2]
     local = (np.asarray(mesh.vertices) - camera.centre) @ camera.axes.T
@@ -153,7 +153,7 @@ def _crevices(nearness: Floats) -> Floats:
         return np.ones(nearness.shape)
     low, high = nearness[there].min(), nearness[there].max()
     filled = np.where(there, nearness - low, 0).astype(np.float32)
-    # What is blurred this far need not be computed at every pixel.
+    # A blur this wide need not be computed at every pixel.
     coarse = 4
     radius = 0.02 * max(nearness.shape) / coarse
     mask = gaussian_filter(there[::coarse, ::coarse].astype(np.float32), radius)

@@ -25,7 +25,7 @@ MARGIN = 0.02
 """Range that is shown before the first and after the last active cell, m."""
 LEVEL_MAP, DIFFERENCE_MAP = "magma", "RdBu_r"
 MOST_ROWS = 8  # number of receivers, at most, that are drawn, evenly chosen
-# Inches: what labels need on each side of the panels, between them, and for a colour bar.
+# Inches: space for labels on each side of the panels, between them, and for a colour bar.
 LEFT, TOP, BOTTOM, GAP = 0.76, 0.48, 0.46, 0.13
 BAR, BAR_GAP, BAR_WIDTH = 0.82, 0.08, 0.19
 # Where a logarithmic axis is marked.
