@@ -35,8 +35,7 @@ def require_regular(path: Path) -> None:
 
 
 def require_sound_matlab(path: Path) -> None:
-    """Refuse a MATLAB file of version 5 that crashes its reader or takes too long; a process tries
-    it.
+    """Refuse a MATLAB 5 file that crashes its reader or takes too long; a process tries it.
 
     SciPy 1.17 reads beyond its tables where the type of an element is damaged, and reads millions
     of elements that are not there where a size is. What it refuses with an error passes: whoever
