@@ -71,8 +71,8 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
         analysis: Sampling rate and frequencies.
 
     Returns:
-        window: Samples. For an impulse shorter is always better, so it is the window that is set; a
-            gammatone's is not needed.
+        window: Samples. For an impulse, for which shorter is always better, it is the set window;
+            gammatones need none.
 
     Examples:
         >>> call = CallSettings(kind="linear", duration=3e-3)

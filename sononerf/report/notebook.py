@@ -50,8 +50,8 @@ def png_of(thing: object, **options: Any) -> bytes | None:
     """Return the picture of an object as a PNG file; None where it has none.
 
     Args:
-        thing: The mesh of a scene or a surface is drawn, of echoes and a prediction the
-            spectrogram of one pose.
+        thing: A scene or a surface, whose mesh is drawn; or echoes or a prediction, of which one
+            spectrogram is drawn.
         options: ``pose``, its number; of echoes also ``prediction``, which is drawn beside.
     """
     del thing, options

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Predict spectrograms of poses, heard or not, and compare where they were measured."""
+"""Prediction of spectrograms at any poses, with a comparison where they were measured."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def read_poses(run: RunFolder, path: Path, frame: FrameName = "auto") -> Poses:
         frame: ``auto``: the original one of recordings that have one.
 
     Raises:
-        InputError: If the table is none.
+        InputError: If the table cannot be read or is invalid.
     """
     stated = run.provenance.get("poses_as")
     recorded = run.provenance.get("origin") == "recorded"
@@ -94,7 +94,7 @@ def predict(
         folder: With ``spectrograms.npz`` and pictures.
 
     Raises:
-        InputError: If the run or the poses are none, a pose can hear nothing of what was fitted, or
+        InputError: If the run or the poses cannot be read, a pose cannot hear the fitted region, or
             the folder is a run's.
     """
     progress = progress or Progress(quiet=True)

@@ -84,7 +84,7 @@ def describe_scene(name: str) -> dict[str, Any]:
     """Return the description of one scene, with its options.
 
     Returns:
-        scene: ``name``, ``description``, all of it but what is returned and raised, and
+        scene: ``name``, ``description`` (the docstring without its Returns and Raises), and
             ``options``, as :func:`sononerf.settings.plugins.describe_options` has them.
 
     Raises:
@@ -177,7 +177,7 @@ def draw_scenes(folder: Path) -> tuple[list[Path], list[str]]:
 def draw_ensemble(settings: Settings, store: Ensemble, folder: Path) -> list[Path]:
     """Draw a scene with the poses of its ensemble, and the echo of the first test pose.
 
-    The first pose of all where none is for the test.
+    Without test poses, the first pose is drawn.
 
     Args:
         settings: Settings of the ensemble.

@@ -18,7 +18,7 @@ from sononerf.simulation.simulator import Simulator
 from sononerf.simulation.workers import simulated
 
 FIRST = 30_000
-"""Rays per pose of the first trial. With fewer a pose takes hardly less time."""
+"""Rays per pose of the first trial. Fewer rays hardly save time."""
 MOST = 300_000
 """Largest number of rays per pose that the search for an accuracy takes. Sound that bounces between
 many bodies converges slowly: with this number ``ua`` has 0.8 dB, and 0.2 dB would take ten times as
@@ -26,7 +26,8 @@ many."""
 POSES = 8
 """Poses that are simulated twice in a trial, spread evenly over all of them."""
 CONVERGENCE = 0.6
-"""The difference falls with the number of rays to the power of minus this, measured from 30,000 to
+"""The difference is proportional to the number of rays to the power -CONVERGENCE, measured from
+30,000 to
 300,000 rays on ``three_spheres``; on ``ua`` the power is 0.4."""
 LEAST_DB = 1e-6
 """Difference below which two simulations are the same, dB."""
@@ -45,8 +46,8 @@ def settle_rays(
     """Set the number of rays per pose that reaches the accuracy of the settings.
 
     The difference between two seeds is measured at a few poses, as the noise floor is: the mean
-    over active cells of reported decibels. What :meth:`Simulator.prepare` finds for the poses is
-    used, so it should come first.
+    over active cells of reported decibels. Call :meth:`Simulator.prepare` first; its results are
+    used.
 
     Args:
         simulator: Its engine gets the number.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The edges of bodies that are their outlines, seen from somewhere."""
+"""Outlines: the edges of bodies that are seen against the background from some place."""
 
 from __future__ import annotations
 
@@ -66,8 +66,7 @@ class Outlines:
                 second.
             away (K, 3): Unit vectors off the surface.
             body (K,): Body of each edge.
-            radius ((K,), m): Radius of the surface's curvature along the way from the place; zero
-                where it is sharp.
+            radius ((K,), m): Radius of curvature along the way from the place; zero at sharp edges.
         """
         return _outline(
             place, self._normals, self._height, self._pairs, self._may, self._rim, self._sharp,

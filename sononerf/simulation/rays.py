@@ -102,10 +102,10 @@ class Rays(Engine):
         self._hats = synthesis.hats if band is None else synthesis.hats * band[:, None]
         factor = gain if any_smooth else 1j * synthesis.frequency
         self._basis = self._hats * factor[:, None]
-        # What a shadow turns is an imaginary part, and so an odd function of frequency.
+        # The part that a shadow turns in phase is imaginary, so it is an odd function of frequency.
         odd_hats = synthesis.odd_hats if band is None else synthesis.odd_hats * band[:, None]
         self._turned_basis = odd_hats * (1j * factor)[:, None]
-        # Beside smooth surfaces lobed ones go through the same filters: their level is theirs.
+        # Rough surfaces use the filters of smooth ones, without their compensation of the fade.
         _, gain = unfaded(synthesis.nodes, speed_of_sound=hearing.speed_of_sound)
         self._lobed_level = synthesis.nodes / np.abs(gain) if any_smooth else 1.0
         wavenumber = 2.0 * math.pi / hearing.speed_of_sound * synthesis.nodes

@@ -48,7 +48,7 @@ def figure(
 ) -> Iterator[Any]:
     """Open a figure of this size (inches) in our style; draw in the block, then take its pixels.
 
-    To find a layout takes twice as long as to draw.
+    Computing a layout takes twice as long as drawing.
     """
     import matplotlib
     from matplotlib.backends.backend_agg import FigureCanvasAgg
