@@ -51,7 +51,9 @@ def commands() -> str:
     command = typer.main.get_command(cli)
     context = typer.Context(command)
     page = get_docs_for_click(obj=command, ctx=context, name="sononerf")
-    return page.partition("## `")[1] + page.partition("## `")[2]
+    page = page.partition("## `")[1] + page.partition("## `")[2]
+    # Markdown would take <hash> in a help text for a tag; options in backticks keep theirs.
+    return re.sub(r"(?m)(?<=: )[^`\n]*$", lambda text: text[0].replace("<", "&lt;"), page)
 
 
 def settings() -> str:

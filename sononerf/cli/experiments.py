@@ -121,12 +121,12 @@ def fit(
         typer.Option(help="The run's folder; runs/<name of config or scene> by default."),
     ] = None,
     accelerator: OnWhat = "auto",
-    devices: Annotated[int | None, typer.Option(min=1, help="How many devices.")] = None,
-    num_nodes: Annotated[int, typer.Option(min=1, help="How many machines.")] = 1,
+    devices: Annotated[int | None, typer.Option(min=1, help="Number of devices.")] = None,
+    num_nodes: Annotated[int, typer.Option(min=1, help="Number of machines.")] = 1,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the fit (fit.seed).")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes that simulate.")] = None,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Move a run that is there aside.")
+        bool, typer.Option("--overwrite", help="Move an existing run aside first.")
     ] = False,
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Serve TensorBoard on this machine meanwhile.")
@@ -134,7 +134,7 @@ def fit(
 ) -> None:
     """Simulate where needed, fit, reconstruct, predict the test poses and evaluate.
 
-    The same command goes on where an interrupted one stopped.
+    The same command resumes an interrupted one.
     """
     from sononerf.settings.loading import load_settings
 
@@ -225,7 +225,7 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
 def predict(
     run: Run,
     split: Annotated[
-        Split | None, typer.Option(help="Which poses of the ensemble; test by default.")
+        Split | None, typer.Option(help="Split of the ensemble; test by default.")
     ] = None,
     poses: Annotated[
         Path | None,
@@ -236,7 +236,7 @@ def predict(
     frame: InFrame = "auto",
     output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
     pictures: Annotated[
-        str, typer.Option(help="How many poses are drawn, best to worst: a number, or all.")
+        str, typer.Option(help="Number of poses that are drawn, from best to worst; or all.")
     ] = "3",
     accelerator: OnWhat = "auto",
 ) -> None:
@@ -268,7 +268,7 @@ def reconstruct(
     method: Annotated[
         SurfaceMethod | None,
         typer.Option(
-            help="How the surface is read out. open, filled, hull, sheet: from field and first "
+            help="Method of the read-out. open, filled, hull, sheet: from field and first "
             "echoes; open opens hollows and gaps, filled leaves them closed, hull takes the first "
             "echoes alone, sheet is for a thin sheet. isosurface: where the field has one value. "
             "auto: the best of the first four, refined. A method other than auto is not refined."

@@ -48,7 +48,7 @@ InFrame = Annotated[
         "original for recordings."
     ),
 ]
-OnWhat = Annotated[Accelerator, typer.Option(help="What to compute on.")]
+OnWhat = Annotated[Accelerator, typer.Option(help="Device to compute on.")]
 
 
 def say(text: str) -> None:
