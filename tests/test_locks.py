@@ -153,3 +153,8 @@ def test_a_refused_lock_leaves_no_file_open(tmp_path, monkeypatch):
     with pytest.raises(StorageError, match="cannot be locked"), locks.lock(tmp_path):
         pass
     assert len(names(OPEN)) == before
+
+
+def test_a_folder_that_is_missing_is_made_to_be_locked(tmp_path):
+    with locks.lock(tmp_path / "new" / "run"):
+        assert locks.is_held(tmp_path / "new" / "run")

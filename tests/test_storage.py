@@ -13,6 +13,7 @@ import subprocess
 import sys
 import threading
 from contextlib import contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -349,3 +350,38 @@ def test_torn_and_changed_records_are_none(tmp_path):
     lines[2] = lines[2][:-4]
     path.write_bytes(b"\n".join([*lines[:4], b"[1]", b'{"number": 9}', b"\xff"]))
     assert [record["number"] for record in storage.read_records(path)] == [0, 3]
+
+
+OPEN = Path("/proc/self/fd")
+"""Lists the files that this process has open, on Linux."""
+
+
+def descriptors():
+    return len(list(OPEN.iterdir()))
+
+
+@pytest.mark.skipif(not OPEN.is_dir(), reason="Linux alone lists open files")
+def test_no_descriptor_stays_open(tmp_path):
+    journal, twice = tmp_path / "journal", tmp_path / "twice"
+    storage.append_line(journal, "one")
+    os.link(journal, twice)
+    before = descriptors()
+    for _ in range(5):
+        with pytest.raises(StorageError, match="is no file of its own"):
+            storage.append_line(journal, "two")
+    twice.unlink()
+    for _ in range(5):
+        storage.append_line(journal, "two")
+    assert descriptors() == before
+
+
+def test_a_file_in_place_of_a_folder_is_refused(tmp_path):
+    (tmp_path / "taken").write_text("x")
+    with pytest.raises(StorageError, match="taken"):
+        storage.make_folder(tmp_path / "taken")
+
+
+def test_records_have_the_same_bytes_whatever_the_order_of_their_keys(tmp_path):
+    storage.append_record(tmp_path / "a", {"b": 1, "a": 2})
+    storage.append_record(tmp_path / "b", {"a": 2, "b": 1})
+    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
