@@ -18,11 +18,11 @@ from tools.tortures.mutants import mutated, places
 
 ROOT = Path(__file__).resolve().parent.parent
 SHARES = [
-    ("fuzz", 150),
-    ("flips", 100),
+    ("fuzz", 60),
     *(
         pytest.param(*share, marks=pytest.mark.slow)
         for share in (
+            ("flips", 100),
             ("kill-simulate", 8),
             ("attacks", 12),
             ("mistakes", 12),
