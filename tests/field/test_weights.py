@@ -83,3 +83,10 @@ def test_the_description_vouches_last(folder, monkeypatch):
     monkeypatch.setattr("sononerf.storage.commit", lambda path, *_, **__: order.append(path.name))
     save_weights(folder, STATE, {})
     assert order == [WEIGHTS_NAME, DESCRIPTION_NAME]
+
+
+def test_weights_that_cannot_be_read_are_refused(folder):
+    (folder / WEIGHTS_NAME).unlink()
+    (folder / WEIGHTS_NAME).mkdir()
+    with pytest.raises(InputError, match=r"model\.safetensors: cannot be read"):
+        load_weights(folder)
