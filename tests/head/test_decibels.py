@@ -1,0 +1,22 @@
+# SPDX-License-Identifier: MIT
+"""Noise makes a cell active as rarely as is said."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sononerf.head.decibels import ACTIVE_DB, EXCEEDED, active_level, compress
+
+
+def test_noise_makes_one_cell_in_a_thousand_active():
+    rng = np.random.default_rng(0)
+    rms = np.array([[30.0], [50.0]])  # far above the reference, two ears, one frequency
+    parts = rng.standard_normal((2, 2, 400_000)) * np.sqrt(0.5)
+    magnitude = rms * np.hypot(*parts)  # Rayleigh's distribution
+    active = compress(magnitude, 1.0) >= active_level(rms, 1.0)[:, 0]
+    assert 0.8 * EXCEEDED < active.mean() < 1.2 * EXCEEDED
+
+
+def test_without_noise_or_with_little_of_it_three_decibels_are_active():
+    assert active_level(None, 1.0) == ACTIVE_DB
+    assert (active_level(np.full((2, 3), 1e-6), 1.0) == ACTIVE_DB).all()
