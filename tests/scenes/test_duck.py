@@ -23,3 +23,9 @@ def test_a_duck_looks_forward_with_its_beak_in_the_middle():
     assert foremost[2] > 0.0
     assert abs(foremost[1]) < 0.004
     assert vertices[:, 1].min() == pytest.approx(-vertices[:, 1].max(), abs=1e-4)
+
+
+@pytest.mark.parametrize("length", [0.05, 0.114, 0.12])
+def test_triangles_are_fine_at_any_length(length):
+    edges = load_scene("duck", {"length": length}).mesh.edges_unique_length
+    assert edges.max() < 2.0 / 3.0 * 3.4e-3
