@@ -47,12 +47,13 @@ def _digest(file: Path) -> str:
         return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
-def _valid(folder: Path) -> dict[str, list[str | None]]:
-    """Return the one or two valid checksums of each file; None stands for no file."""
-    valid: dict[str, list[str | None]] = {}
+def _valid(folder: Path) -> dict[str, tuple[str | None, str | None]]:
+    """Return the older and the newest checksum of each file; None stands for no file."""
+    valid: dict[str, tuple[str | None, str | None]] = {}
     for record in storage.read_records(folder / NAME):
         name = str(record.get("file"))
-        valid[name] = [*valid.get(name, [None])[-1:], record.get("sha256")]
+        _, older = valid.get(name, (None, None))
+        valid[name] = (older, record.get("sha256"))
     return valid
 
 
@@ -78,18 +79,18 @@ def require_recorded(folder: Path, file: Path, remedy: str) -> None:
 
 def count(folder: Path) -> int:
     """Return of how many files of a run a checksum is known."""
-    return sum(valid[-1] is not None for valid in _valid(folder).values())
+    return sum(newest is not None for _, newest in _valid(folder).values())
 
 
 def differing(folder: Path) -> list[str]:
     """Return the names of the files of a run that are missing or differ from their checksum."""
     found = []
-    for name, valid in sorted(_valid(folder).items()):
+    for name, (older, newest) in sorted(_valid(folder).items()):
         file = folder / name
         if not file.is_file():
-            is_wrong = valid[-1] is not None
+            is_wrong = newest is not None
         else:
-            is_wrong = _digest(file) not in valid
+            is_wrong = _digest(file) not in (older, newest)
         if is_wrong:
             found.append(name)
     return found

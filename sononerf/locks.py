@@ -102,5 +102,5 @@ def lock(folder: Path) -> Iterator[None]:
         yield
     finally:
         with suppress(OSError):
-            path.unlink(missing_ok=True)
+            path.unlink()
         os.close(descriptor)

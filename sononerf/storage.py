@@ -324,7 +324,7 @@ def read_records(path: Path) -> list[dict[str, Any]]:
         with suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
             record = json.loads(line.decode())
             del record["crc32"]
-            body = to_json(record, sort_keys=True)
+            body = to_json(record)
             if line.decode() == f"{body[:-1]},{_checksum_field(body)}}}":
                 records.append(record)
     return records

@@ -44,6 +44,18 @@ def test_what_is_written_again_is_right_again(run):
     assert differing(run) == []
 
 
+def test_content_older_than_the_newest_two_is_refused(run):
+    for content in (b"second", b"third"):
+        with recorded(run):
+            storage.commit_bytes(run / "part" / "mesh.ply", content)
+    (run / "part" / "mesh.ply").write_bytes(b"second")  # a crash before the rename leaves this
+    require_recorded(run, run / "part" / "mesh.ply", "")
+    (run / "part" / "mesh.ply").write_bytes(b"first")
+    with pytest.raises(InputError, match="damaged, or changed"):
+        require_recorded(run, run / "part" / "mesh.ply", "")
+    assert differing(run) == ["part/mesh.ply"]
+
+
 def test_a_missing_file_is_named_unless_it_was_removed(run):
     (run / "part" / "mesh.ply").unlink()
     with recorded(run):

@@ -80,6 +80,14 @@ def test_lock_dies_with_its_process(tmp_path):
         pass
 
 
+def test_nothing_of_a_dead_owner_stays_in_the_lock(tmp_path):
+    (tmp_path / ".lock").write_text("process 1 " + 500 * "x")
+    with locks.lock(tmp_path):
+        text = (tmp_path / ".lock").read_text()
+    assert text.startswith(f"process {os.getpid()} on ")
+    assert "x" * 500 not in text
+
+
 def test_only_the_lock_of_a_dead_process_is_removed(tmp_path):
     (tmp_path / ".lock").write_text("process 1 on a machine that lost its power\n")
     (tmp_path / ".metrics.json.999999.tmp").write_text("half")

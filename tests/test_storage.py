@@ -273,6 +273,21 @@ def test_probe_that_fails_leaves_nothing_behind(tmp_path, monkeypatch, number):
     assert names(tmp_path) == []
 
 
+def test_a_probe_that_cannot_be_removed_at_once_is_removed_later(tmp_path, monkeypatch):
+    unlink, refused = os.unlink, []
+
+    def refuse_once(path, **options):
+        if not refused:
+            refused.append(path)
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        unlink(path, **options)
+
+    monkeypatch.setattr(os, "unlink", refuse_once)
+    with pytest.raises(StorageError, match="input/output error"):
+        storage.probe_writable(tmp_path / "a")
+    assert names(tmp_path) == []
+
+
 def test_probe_below_a_file_is_a_storage_error(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     for folder in (tmp_path / "file" / "folder", tmp_path / "file"):
@@ -288,6 +303,7 @@ def test_messages_say_what_to_do(tmp_path):
     for code, hint in [(errno.ENOSPC, "free space"), (errno.EACCES, "permission"), (9999, "check")]:
         error = storage.storage_error("cannot be written", tmp_path, OSError(code, "reason"))
         assert hint in str(error)
+    assert "odd" in str(storage.storage_error("cannot be written", tmp_path, OSError("odd")))
     assert json.loads(storage.to_json({"b": 1, "a": 2}, sort_keys=True)) == {"a": 2, "b": 1}
 
 

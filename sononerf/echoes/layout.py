@@ -259,11 +259,11 @@ def read_attributes(path: Path) -> dict[str, Any]:
     """
     group = storage.read_json(path / "zarr.json")
     try:
-        is_group = (group["node_type"], group["zarr_format"]) == ("group", 3)
+        kind = (group["node_type"], group["zarr_format"])
         stored = dict(group["attributes"])
     except (KeyError, TypeError, ValueError):
-        is_group, stored = False, {}
-    if not is_group or stored.get("format") != FORMAT:
+        kind, stored = None, {}
+    if kind != ("group", 3) or stored.get("format") != FORMAT:
         raise InputError(f"{path}: no ensemble of sononerf, or its zarr.json is damaged")
     version = stored.get("schema_version")
     if version != SCHEMA_VERSION:
