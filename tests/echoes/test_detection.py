@@ -1,8 +1,16 @@
 # SPDX-License-Identifier: MIT
 import numpy as np
 import pytest
+from scipy.stats import poisson
 
-from sononerf.echoes.detection import RANK, onsets, threshold_factor, threshold_levels
+from sononerf.echoes.detection import (
+    FALSE_ALARMS,
+    RANK,
+    Onsets,
+    onsets,
+    threshold_factor,
+    threshold_levels,
+)
 
 SLICES = 400
 WINDOW = np.hamming(33) ** 2
@@ -106,3 +114,16 @@ def test_an_onset_is_at_a_point_echos_own_range_not_at_its_greatest():
         row[130:171] += rise  # of an echo at 150
     levels = threshold_levels(power, 4.0)
     np.testing.assert_allclose(onsets(power, levels, rise, 1.0), 150.0, atol=0.2)
+
+
+@pytest.mark.parametrize("heard", [1, 2, 5])
+def test_the_chance_of_onsets_is_that_of_false_alarms(heard):
+    first = np.full((400, 2), -np.inf)
+    first[:heard, 0] = 0.3
+    shape = (400, 2, SLICES)
+    found = Onsets(
+        np.arange(400), 0.1 + 5e-4 * np.arange(SLICES), np.ones(shape), np.ones(shape, bool), first
+    )
+    # 200 mm of range hold 34 independent values of each of the 800 rows.
+    usual = FALSE_ALARMS * 800 * SLICES * 5e-4 / 5.8e-3
+    assert found.chance(5.8e-3) == pytest.approx(poisson.sf(heard - 1, usual), rel=1e-6)

@@ -572,6 +572,18 @@ def test_a_box_of_unequal_sides_is_refined_where_there_is_energy_too(listener, f
     assert torch.cdist(found, expected).amin(1).max() < 1e-6
 
 
+def test_a_refined_lattice_reaches_the_far_corner_of_its_region(listener, formula):
+    # In floating point 0.3 / 0.1 lies just below three.
+    region = torch.tensor([[0.0] * 3, [0.3] * 3], dtype=torch.float64)
+    field = formula(region, listener.frequency, smooth, spacing=0.1)
+    renderer = quiet(ProfileRenderer(region, listener, start=30, prune_every=10))
+    for step, spacing, farthest in ((0, 0.2, 0.2), (10, 0.1, 0.3)):
+        assert renderer.prepare(field, None, step)
+        assert float(renderer.spacing) == pytest.approx(spacing)
+        assert float(renderer.lattice.max()) == pytest.approx(farthest)
+    assert len(renderer.lattice) == 64
+
+
 def test_a_lattice_that_is_refined_stays_within_what_is_possible(listener, formula):
     """The neighbours of what is alive are asked about, each as finely as it is laid."""
     region = torch.tensor([[-0.024] * 3, [0.024] * 3], dtype=torch.float64)
