@@ -62,6 +62,10 @@ def test_after_every_epoch(training, tmp_path):
     ]
 
 
+def test_the_time_of_a_fit_begins_at_zero(tmp_path):
+    assert 0 <= CheckpointCallback(tmp_path, 60.0).elapsed < 0.5
+
+
 def test_every_so_many_seconds_and_at_a_boundary_once(training, tmp_path):
     steps = Steps()
     training(CheckpointCallback(tmp_path, 1e-9), steps).train()

@@ -116,9 +116,16 @@ def test_a_full_disk_is_a_storage_error_and_keeps_both(path):
     assert sorted(p.name for p in path.parent.iterdir()) == ["c", "c.previous"]
 
 
+class _Refusing:
+    def __reduce__(self):
+        raise RuntimeError("of its own")
+
+
 def test_other_errors_in_saving_stay_themselves(path):
     with pytest.raises(Exception, match="pickle"):
         DurableCheckpointIO().save_checkpoint({"f": lambda: 0}, path)
+    with pytest.raises(RuntimeError, match="of its own"):
+        DurableCheckpointIO().save_checkpoint({"f": _Refusing()}, path)
     assert DurableCheckpointIO().load_checkpoint(path)["step"] == 2
 
 

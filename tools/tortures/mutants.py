@@ -26,7 +26,12 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "resume": (
         ("field/checkpoint_io.py", "callbacks/epoch.py"),
-        ("field/test_checkpoint_io.py", "callbacks/test_epoch.py", "run/test_fit.py"),
+        (
+            "field/test_checkpoint_io.py",
+            "field/test_weights.py",
+            "callbacks/test_epoch.py",
+            "run/test_fit.py",
+        ),
     ),
     "onsets": (("echoes/detection.py",), ("echoes/test_detection.py", "echoes/test_onsets.py")),
     "renderer": (
@@ -35,7 +40,7 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "metrics": (
         ("evaluation/metrics.py", "head/decibels.py"),
-        ("evaluation/test_metrics.py", "evaluation/test_prediction.py"),
+        ("evaluation/test_metrics.py", "evaluation/test_prediction.py", "head/test_decibels.py"),
     ),
     "head": (
         ("head/head.py", "head/spectrogram.py", "head/reception.py"),
