@@ -67,12 +67,16 @@ def test_a_second_echo_does_not_move_the_first():
         np.testing.assert_allclose(found_in(rows)[:10], first, atol=0.6)  # of 32 slices
 
 
-def test_a_precursor_that_all_echoes_have_is_no_echo():
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_a_precursor_that_all_echoes_have_is_no_echo(scale):
     """As sidelobes of pulse compression are: 25 dB below each echo, 60 slices before it."""
     middles = np.linspace(150, 250, 50)
     level = 10 ** (-2.5) * noise((50,), 4.0)
     rows = [echo(m) + echo(m - 60, p) for m, p in zip(middles, level, strict=True)]
-    np.testing.assert_allclose(found_in(rows), middles, atol=0.1)
+    np.testing.assert_allclose(found_in(scale * np.stack(rows)), middles, atol=0.1)
+    # Nor is it one if the last slice cuts the echo.
+    cut = echo(SLICES - 1) + echo(SLICES - 61, 10 ** (-2.5))
+    assert found_in(scale * np.stack([*rows, cut]))[-1] == -np.inf
     # An echo that some have there, and others elsewhere, is one.
     real = [echo(m) + echo(m - 40 - i, 1e-3) for i, m in enumerate(middles)]
     np.testing.assert_allclose(found_in(real), middles - 40 - np.arange(50), atol=0.1)

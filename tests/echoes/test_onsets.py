@@ -70,6 +70,8 @@ def test_what_is_heard_before_the_nearest_place_is_clutter():
     heard = find_onsets(store_of([both, both]), ECHO, nearest=nearest)
     np.testing.assert_allclose(heard.first, [[0.32, 0.32], [0.26, -np.inf]], atol=1e-4)
     assert not heard.heard[0][:, RANGE < 0.30].any()
+    amid = find_onsets(store_of([both]), ECHO, nearest=np.full((1, 2), RANGE[86]))
+    np.testing.assert_array_equal(np.flatnonzero(amid.heard[0, 0])[:3], [86, 87, 88])
     np.testing.assert_array_equal(heard.power, whole.power)
 
 

@@ -118,3 +118,21 @@ def test_any_field_works_with_any_renderer(listener, kind, heard_by, device):
             assert bool(parameter.grad.isfinite().all()), name
             assert parameter.grad.abs().max() > 0 or math.prod(parameter.shape) < 2, name
     assert int(renderer.points_evaluated) > 0
+
+
+@pytest.mark.parametrize("heard_by", [ShellRenderer, ProfileRenderer])
+def test_some_frequencies_are_rendered_as_among_all(listener, heard_by):
+    torch.manual_seed(0)
+    field = FIELDS["grid"](REGION.double(), listener.frequency).double()
+    renderer = heard_by(REGION, listener).double()
+    with torch.no_grad():
+        renderer.log_spectrum.normal_()
+    position = 0.28 * sphere_directions(3, REGION)
+    rotation = torch.as_tensor(look_at(position.numpy(), np.zeros(3)))
+    renderer.eval()
+    renderer.prepare(field, None, 0)
+    rows = torch.arange(120).expand(3, -1)
+    with torch.no_grad():
+        whole = renderer(field, position, rotation, rows)
+        some = renderer(field, position, rotation, rows, torch.tensor([2, 0]))
+    torch.testing.assert_close(some, whole[..., [2, 0]])

@@ -3,13 +3,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 
 import pytest
 import torch
 
 from sononerf.errors import IncompatibleError, InputError
-from sononerf.field.checkpoint_io import DESCRIPTION_NAME, WEIGHTS_NAME, load_weights, save_weights
+from sononerf.field.checkpoint_io import (
+    DESCRIPTION_NAME,
+    WEIGHTS_NAME,
+    load_weights,
+    model_checksum,
+    save_weights,
+)
 
 STATE = {"grid": torch.arange(6.0).reshape(2, 3).T, "bias": torch.ones(2, dtype=torch.complex64)}
 
@@ -21,6 +28,9 @@ def folder(tmp_path):
 
 
 def test_round_trip(folder):
+    assert (
+        model_checksum(folder) == hashlib.sha256((folder / WEIGHTS_NAME).read_bytes()).hexdigest()
+    )
     state, description = load_weights(folder)
     assert state.keys() == STATE.keys()
     for name, tensor in STATE.items():

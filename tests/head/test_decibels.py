@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sononerf.head.decibels import ACTIVE_DB, EXCEEDED, active_level, compress
+from sononerf.head.decibels import ACTIVE_DB, EXCEEDED, active_level, compress, expand
 
 
 def test_noise_makes_one_cell_in_a_thousand_active():
@@ -20,3 +20,8 @@ def test_noise_makes_one_cell_in_a_thousand_active():
 def test_without_noise_or_with_little_of_it_three_decibels_are_active():
     assert active_level(None, 1.0) == ACTIVE_DB
     assert (active_level(np.full((2, 3), 1e-6), 1.0) == ACTIVE_DB).all()
+
+
+def test_levels_are_expanded_to_what_was_compressed():
+    magnitude = np.array([[0.0, 1e-3], [0.5, 40.0]])
+    np.testing.assert_allclose(expand(compress(magnitude, 0.2), 0.2), magnitude, rtol=1e-9)
