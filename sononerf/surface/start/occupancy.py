@@ -285,9 +285,9 @@ def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> trimesh.Tr
         inner = distance[(slice(MARGIN, -MARGIN),) * 3]
         most = np.partition(inner.ravel(), min(_LEAST, inner.size - 1))[: _LEAST + 1].max()
         distance = distance - most - np.float32(0.5)
-    distance = _without_hollows(_walled(distance))
-    distance = _without_parts(distance, None if belief == "hull" else known)
-    mesh = _surface(distance, lattice)
+    distance = without_hollows(_walled(distance))
+    distance = without_parts(distance, lattice, None if belief == "hull" else known)
+    mesh = surface_of(distance, lattice)
     if belief != "hull":
         back = _THICKER * spacing * lattice.read(known.thin, np.asarray(mesh.vertices)).clip(0, 1)
         mesh.vertices = mesh.vertices - back[:, None] * mesh.vertex_normals
@@ -317,22 +317,27 @@ def _walled(distance: Singles) -> Singles:
     return walled
 
 
-def _without_hollows(distance: Singles) -> Singles:
-    """Fill hollows: no sound comes out of them."""
+def without_hollows(distance: Singles) -> Singles:
+    """Fill hollows of a signed distance (X, Y, Z): no sound comes out of them."""
     labels, _ = ndimage.label(distance > 0)
     hollow = (labels != labels[0, 0, 0]) & (distance > 0)
     return np.where(hollow, -distance, distance).astype(np.float32)
 
 
-def _without_parts(distance: Singles, known: Gathered | None) -> Singles:
-    """Leave out parts that the lattice does not resolve and, by the evidence, unheard ones."""
+def without_parts(distance: Singles, lattice: Lattice, known: Gathered | None) -> Singles:
+    """Leave out parts that the lattice does not resolve and, by the evidence, unheard ones.
+
+    Args:
+        distance ((X, Y, Z), voxels): Signed distance.
+        lattice: The voxels.
+        known: The evidence; None to judge no part by it.
+    """
     labels, count = ndimage.label(distance < 0)
     if not count:
         return distance
     size = np.bincount(labels.ravel(), minlength=count + 1)[1:]
     kept, best = size >= _RESOLVED, size
     if known is not None:
-        lattice = known.lattice
         inside = known.points - 1.5 * lattice.spacing * known.evidence.normals
         at = np.rint(lattice.coordinates(inside)).astype(np.intp)
         at = at.clip(0, np.asarray(lattice.shape) - 1)
@@ -346,7 +351,8 @@ def _without_parts(distance: Singles, known: Gathered | None) -> Singles:
     return np.where(dropped, np.float32(1.0), distance).astype(np.float32)
 
 
-def _surface(distance: Singles, lattice: Lattice) -> trimesh.Trimesh:
+def surface_of(distance: Singles, lattice: Lattice) -> trimesh.Trimesh:
+    """Return the surface of a signed distance (X, Y, Z), voxels, in m."""
     # A voxel on the surface itself would be wrapped in triangles without area.
     near = np.abs(distance) < 1e-3
     off = np.where(near, np.where(distance < 0, -1e-3, 1e-3), distance)
