@@ -24,4 +24,5 @@ def test_without_noise_or_with_little_of_it_three_decibels_are_active():
 
 def test_levels_are_expanded_to_what_was_compressed():
     magnitude = np.array([[0.0, 1e-3], [0.5, 40.0]])
-    np.testing.assert_allclose(expand(compress(magnitude, 0.2), 0.2), magnitude, rtol=1e-9)    assert compress(9 * 0.2, 0.2) == 20.0
+    np.testing.assert_allclose(expand(compress(magnitude, 0.2), 0.2), magnitude, rtol=1e-9)
+    assert compress(9 * 0.2, 0.2) == 20.0
