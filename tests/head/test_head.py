@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sononerf.geometry.poses import rotation_from_euler
-from sononerf.head.head import Head
+from sononerf.head.head import Head, PointEcho, own_top
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 
 
@@ -31,3 +31,29 @@ def test_the_mean_lag_is_that_of_the_directions_that_are_heard():
     loud = gains > 0.5 * gains.max()
     assert head.lag[loud].min() < head.mean_lag < head.lag[loud].max()
     assert np.ptp(head.lag[loud]) < 0.2 * np.ptp(head.lag)
+
+
+def test_the_echo_of_a_point_has_the_spacing_of_samples_and_half_its_power_in_a_resolution():
+    head = Head(air={"speed_of_sound": 340.0})
+    assert head.point_echo.spacing == pytest.approx(170.0 / head.analysis.sampling_rate)
+    triangle = np.concatenate((np.arange(0.0, 8.0), np.arange(8.0, -1.0, -1.0))) / 8.0
+    echo = PointEcho(window=triangle**2, rows=None, spacing=0.002, looks=1.0)
+    assert echo.resolution == pytest.approx(0.018)  # nine of its magnitudes are one half or more
+
+
+def test_the_top_of_a_window_may_be_its_end():
+    rising = np.arange(7.0)
+    assert (own_top(rising), own_top(rising[::-1])) == (6, 0)
+    assert own_top(np.array([9.0, 0.0, 1.0, 2.0, 3.0, 1.0, 0.0])) == 4
+
+
+def test_the_shortest_wavelength_is_that_of_the_highest_row():
+    head = Head(air={"speed_of_sound": 340.0}, analysis={"frequency_max": 80e3})
+    assert head.wavelength == pytest.approx(340.0 / head.frequency.max())
+
+
+def test_a_head_has_a_plane_where_things_stand_on_a_support():
+    assert Head().plane is None
+    plane = Head(support={"point": [0.0, 0.0, -0.1]}).plane
+    assert plane is not None
+    assert plane.height(np.array([[0.0, 0.0, 0.3]])) == pytest.approx(0.4)

@@ -44,7 +44,12 @@ PARTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "head": (
         ("head/head.py", "head/spectrogram.py", "head/reception.py"),
-        ("head/test_head.py", "head/test_spectrogram.py", "head/test_reception.py"),
+        (
+            "head/test_head.py",
+            "head/test_spectrogram.py",
+            "head/test_reception.py",
+            "head/test_row_filters.py",
+        ),
     ),
 }
 """Parts that must not fail: their sources below `sononerf/`, and their tests below `tests/`."""
