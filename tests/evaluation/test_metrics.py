@@ -120,6 +120,10 @@ def test_wrong_input_is_refused():
         geometry_metrics(trimesh.Trimesh(), sphere(RADIUS, subdivisions=1))
     with pytest.raises(ValueError, match="samples"):
         geometry_metrics(sphere(1, subdivisions=1), sphere(1, subdivisions=1), samples=0)
+    small = sphere(RADIUS, subdivisions=1)
+    with pytest.raises(ValueError, match="samples: 0, expected 1 or more"):
+        target_metrics(small, small, ground(), samples=0)
+    assert target_metrics(small, small, ground(), samples=1)["chamfer_m"] < 1e-6
 
 
 def ground(size=0.2):
