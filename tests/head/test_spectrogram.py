@@ -179,3 +179,16 @@ def test_a_gammatones_channel_hears_the_power_of_a_sweep():
     assert abs(late).max() > 30e-6
     # The filter's own delay, which is less off its middle, is left out.
     np.testing.assert_allclose(shift, late, atol=15e-6)
+
+
+def test_above_half_the_sampling_rate_there_is_nothing_to_hear():
+    rate = 220e3
+    analysis = SpectrogramSettings(
+        kind="gammatone", sampling_rate=rate, frequency_max=100e3, hop=1, window=64, fft=64
+    )
+    found = smearing(CallSettings(), analysis)
+    beyond = found.frequency >= rate / 2
+    assert beyond.any()
+    np.testing.assert_allclose(found.frequency[beyond], rate / 2)
+    assert (np.abs(found.weight[beyond[found.rows]]) == 0).all()
+    assert (np.abs(found.weight).max(axis=1) > 0).all()
