@@ -20,7 +20,7 @@ from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sononerf.array_types import Bools, Floats, Singles
+from sononerf.array_types import Bools, Floats, Ints, Singles
 from sononerf.echoes.free_space import EchoHull
 from sononerf.field.field import Field
 
@@ -52,8 +52,8 @@ class Evidence:
     weight: Floats
     pose: NDArray[np.intp]
 
-    def where(self, kept: Bools) -> Evidence:
-        """Return those for which (G,) is true."""
+    def where(self, kept: Bools | Ints) -> Evidence:
+        """Return those for which (G,) is true, or those of some indices."""
         return Evidence(self.points[kept], self.normals[kept], self.weight[kept], self.pose[kept])
 
 

@@ -17,6 +17,7 @@ from sononerf.array_types import Floats
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
+from sononerf.surface.start.learned import learned_surface
 from sononerf.surface.start.occupancy import Gathered, estimate_occupancy, gather_evidence
 from sononerf.surface.start.sheet import fit_sheet
 from sononerf.surface.start.volume import (
@@ -32,11 +33,12 @@ _FAINTEST = (
 )
 _CHUNK = 16_384  # places at a time, a bound of memory
 
-StartMethod = Literal["open", "filled", "hull", "sheet"]
+StartMethod = Literal["open", "filled", "hull", "sheet", "learned"]
 """Method of a start surface. The first three are the surface of the occupancy
 (:mod:`sononerf.surface.start.occupancy`); ``sheet`` is one thin body
-(:mod:`sononerf.surface.start.sheet`)."""
-Method = Literal["open", "filled", "hull", "sheet", "isosurface"]
+(:mod:`sononerf.surface.start.sheet`); ``learned`` is that of a network
+(:mod:`sononerf.surface.start.learned`)."""
+Method = Literal["open", "filled", "hull", "sheet", "learned", "isosurface"]
 """A start method, or ``isosurface``: a level of the field's volume."""
 
 
@@ -101,9 +103,7 @@ def start_surfaces(
     for method in methods:
         try:
             if method not in reading.found:
-                known = reading.gathered
-                mesh = fit_sheet(known) if method == "sheet" else estimate_occupancy(known, method)
-                reading.found[method] = mesh
+                reading.found[method] = _start(reading.gathered, method)
         except NumericalError as error:
             first = first or error
             continue
@@ -111,6 +111,12 @@ def start_surfaces(
         yield method, reading.found[method]
     if first is not None and not found:
         raise first
+
+
+def _start(known: Gathered, method: StartMethod) -> trimesh.Trimesh:
+    if method == "sheet":
+        return fit_sheet(known)
+    return learned_surface(known) if method == "learned" else estimate_occupancy(known, method)
 
 
 def read_isosurface(

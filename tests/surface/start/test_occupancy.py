@@ -192,7 +192,7 @@ def test_a_crumb_that_is_full_of_evidence_does_not_remove_the_body():
         evidence=SimpleNamespace(normals=normals),
         weight=np.ones(50),
     )
-    left = occupancy._without_parts(distance, known)
+    left = occupancy.without_parts(distance, known.lattice, known)
     assert (left[5:45, 5:45, 5:45] < 0).all()
 
 

@@ -1,0 +1,257 @@
+# SPDX-License-Identifier: MIT
+"""A start surface by a network that has learned how bodies look in evidence.
+
+Flat faces are silent except in the direction of a mirror, and a hollow is heard at its rim and its
+bottom alone. What lies between is a matter of experience: a small network takes all evidence on a
+lattice and gives the signed distance. It has seen procedural bodies alone, each through the whole
+pipeline, see ``tools/learn_start.py``. Lengths are in range resolutions and counts are per pose, so
+that scale, band and number of poses may differ.
+
+References:
+    .. [1] O. Ronneberger, P. Fischer, T. Brox, "U-Net: convolutional networks for biomedical image
+       segmentation", 2015.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+from numpy.typing import NDArray
+from safetensors.torch import load_file
+from torch import Tensor, nn
+
+from sononerf.array_types import Floats, Singles
+from sononerf.errors import NumericalError
+from sononerf.geometry.lattice import MARGIN, Lattice
+from sononerf.surface.start.occupancy import (
+    Gathered,
+    planes,
+    surface_of,
+    winding_of,
+    without_hollows,
+    without_parts,
+)
+
+WEIGHTS = Path(__file__).with_name("learned.safetensors")
+"""The trained network."""
+VOXEL = 0.25
+"""Spacing of the lattice, range resolutions: walls of half a range resolution have two voxels."""
+LARGEST = 3_000_000
+"""Number of voxels, at most; a larger body gets a coarser lattice. The network takes about 1 µs of
+one core per voxel."""
+MOST = 20_000
+"""Number of points of evidence, at most; it bounds the time."""
+USUAL = 400
+"""Number of poses for which counts are stated."""
+OUTSIDE = 4.0
+"""Distance beyond the lattice, voxels; also the largest one that the network has learned."""
+BLOCK = 16
+"""Voxels along each axis that become one at the network's coarsest level."""
+_REACH = 0.3  # range resolutions in front of the onsets' bound at which the lattice may begin
+_NEGLIGIBLE = 1e-3  # weight of a point that is left out, to save time
+_CHUNK = 2000  # points at a time; it bounds the memory
+FEATURES = 16
+"""Number of features of a voxel; the last three are the mean normal, a vector."""
+CHANNELS = (24, 48, 64, 64)
+"""Channels of the network, from fine to coarse."""
+
+
+def lattice_of(known: Gathered) -> Lattice | None:
+    """Return the lattice over all places that the onsets leave; None if they leave none."""
+    coarse = known.lattice
+    left = np.argwhere(known.bound < _REACH * known.resolution / coarse.spacing)
+    if not len(left):
+        return None
+    lower = coarse.origin + coarse.spacing * (left.min(axis=0) - 1.5)
+    upper = coarse.origin + coarse.spacing * (left.max(axis=0) + 1.5)
+    spacing = max(VOXEL * known.resolution, float(np.prod(upper - lower) / LARGEST) ** (1 / 3))
+    blocks = np.ceil((upper - lower) / (BLOCK * spacing)).astype(int)
+    x, y, z = (int(n) * BLOCK for n in blocks)
+    origin = (lower + upper) / 2 - spacing * (np.array([x, y, z]) - 1) / 2
+    return Lattice(origin, spacing, (x, y, z))
+
+
+def features(known: Gathered, lattice: Lattice) -> Singles:
+    """Return the evidence that the network sees, (FEATURES, X, Y, Z), no unit.
+
+    Args:
+        known: All evidence.
+        lattice: From :func:`lattice_of`.
+    """
+    evidence, coarse, shape = known.evidence, known.lattice, lattice.shape
+    unit = lattice.spacing / VOXEL  # one range resolution, unless the lattice is coarser
+    poses = max(1, len(known.hull.emitters))
+    per = USUAL / poses
+    places = lattice.points()
+    # Points come pose by pose: an even choice takes as much of each.
+    count = len(evidence.points)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, MOST)).astype(np.int64))
+    per *= count / max(1, len(chosen))
+    reliable = known.weight[chosen]
+    evidence = evidence.where(chosen)
+    some = reliable > _NEGLIGIBLE
+    points, normals, weight = evidence.points[some], evidence.normals[some], reliable[some]
+
+    def read(grid: Singles) -> Floats:
+        return coarse.read(grid, places).reshape(shape)
+
+    half = Lattice(
+        lattice.origin + lattice.spacing / 2,
+        2 * lattice.spacing,
+        (shape[0] // 2, shape[1] // 2, shape[2] // 2),
+    )
+    near, near_off = planes(lattice, points, normals, weight)
+    wide, wide_off = (_twice(grid) for grid in planes(half, points, normals, weight))
+    winding = np.zeros(coarse.shape, np.float32)
+    if len(points):
+        winding = winding_of(coarse, evidence.points, evidence.normals, evidence.weight)
+    far = lattice.spacing * float(np.linalg.norm(shape))
+
+    def sight(points: Floats, ways: Floats, weight: Floats, start: float, stop: float) -> Singles:
+        return np.log1p(0.2 * per * _along(lattice, points, ways, weight, start, stop))
+
+    dense = lattice.spread(points, weight, 2.0)
+    size = np.log1p(40 * per * dense) / np.maximum(dense, 1e-9) / 2
+    found = [
+        np.clip(read(known.bound) * coarse.spacing / unit, -3, 3) / 1.5,
+        near,
+        near * np.clip(near_off, -3, 3) / 2,
+        wide,
+        wide * np.clip(wide_off, -3, 3) / 2,
+        np.clip(read(winding), -1, 1.5),
+        sight(points, normals, weight, 0.6 * unit, far) / 2,
+        sight(evidence.points, evidence.normals, evidence.weight, 0.6 * unit, far) / 2,
+        sight(points, -normals, weight, 0.2 * unit, 1.2 * unit),
+        np.log1p(10 * per * lattice.spread(points, weight, 1.0)) / 2,
+        np.log1p(62.5 * per * lattice.spread(points, weight, 2.5)) / 2,
+        np.log1p(20 * per * lattice.spread(evidence.points, evidence.weight, 1.5)) / 2,
+        np.full(shape, np.log(poses / 100) / 2),
+        *(size * lattice.spread(points, weight * along, 2.0) for along in normals.T),
+    ]
+    return np.stack(found).astype(np.float32)
+
+
+def _twice(grid: Singles) -> Singles:
+    """Repeat each voxel along each axis."""
+    for axis in range(3):
+        grid = grid.repeat(2, axis)
+    return grid
+
+
+def _along(
+    lattice: Lattice, points: Floats, ways: Floats, weight: Floats, start: float, stop: float
+) -> Singles:
+    """Sum the weights of the points from which a voxel lies along their way, (X, Y, Z)."""
+    steps = np.arange(start, stop, 0.8 * lattice.spacing)
+    total, shape = np.zeros(int(np.prod(lattice.shape))), np.asarray(lattice.shape)
+    for first in range(0, len(points), _CHUNK):
+        lot = slice(first, first + _CHUNK)
+        on_way = points[lot, None] + steps[None, :, None] * ways[lot, None]
+        voxel: NDArray[np.intp] = np.rint(lattice.coordinates(on_way)).astype(np.intp)
+        within = ((voxel >= 0) & (voxel < shape)).all(axis=2)
+        flat = np.ravel_multi_index(tuple(voxel[within].T), lattice.shape)
+        counted = np.broadcast_to(weight[lot, None], within.shape)[within]
+        total += np.bincount(flat, counted, total.size)
+    return total.reshape(lattice.shape).astype(np.float32)
+
+
+class _Norm(nn.Module):
+    """Divides each voxel's channels by their root mean square, alike in crops and in wholes."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.gain = nn.Parameter(torch.ones(channels))
+
+    def forward(self, values: Tensor) -> Tensor:
+        scale = torch.rsqrt(values.float().square().mean(1, keepdim=True) + 1e-3)
+        return values * scale.to(values.dtype) * self.gain[:, None, None, None].to(values.dtype)
+
+
+class _Residual(nn.Module):
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = _Norm(channels)
+        self.first = nn.Conv3d(channels, channels, 3, padding=1)
+        self.second = nn.Conv3d(channels, channels, 3, padding=1)
+        for part in self.second.parameters():
+            nn.init.zeros_(part)
+
+    def forward(self, values: Tensor) -> Tensor:
+        return values + self.second(nn.functional.silu(self.first(self.norm(values))))
+
+
+class StartNetwork(nn.Module):
+    """A U-Net on blocks of eight voxels, from evidence to signed distance.
+
+    Args:
+        channels: Number of channels, from fine to coarse.
+    """
+
+    def __init__(self, channels: tuple[int, ...] = CHANNELS) -> None:
+        super().__init__()
+        steps = list(pairwise(channels))
+        self.enter = nn.Conv3d(8 * FEATURES, channels[0], 1)
+        self.down = nn.ModuleList(_Residual(width) for width in channels)
+        self.pool = nn.ModuleList(nn.Conv3d(a, b, 2, stride=2) for a, b in steps)
+        self.narrow = nn.ModuleList(nn.Conv3d(b, a, 1) for a, b in reversed(steps))
+        self.mix = nn.ModuleList(nn.Conv3d(2 * a, a, 1) for a, _ in reversed(steps))
+        self.up = nn.ModuleList(_Residual(a) for a, _ in reversed(steps))
+        self.norm = _Norm(channels[0])
+        self.leave = nn.Conv3d(channels[0], 8, 1)
+
+    def forward(self, evidence: Tensor) -> Tensor:
+        """Return the signed distance, voxels, positive outside, (B, X, Y, Z).
+
+        Args:
+            evidence (B, FEATURES, X, Y, Z): From :func:`features`; all sides are multiples of 16.
+        """
+        batch, count, x, y, z = evidence.shape
+        blocks = evidence.reshape(batch, count, x // 2, 2, y // 2, 2, z // 2, 2)
+        blocks = blocks.permute(0, 1, 3, 5, 7, 2, 4, 6).flatten(1, 4)
+        values = self.enter(blocks.contiguous(memory_format=torch.channels_last_3d))
+        levels = [self.down[0](values)]
+        for pool, down in zip(self.pool, self.down[1:], strict=True):
+            levels.append(down(pool(levels[-1])))
+        values = levels.pop()
+        for narrow, mix, up in zip(self.narrow, self.mix, self.up, strict=True):
+            values = nn.functional.interpolate(narrow(values), scale_factor=2.0, mode="nearest")
+            values = up(mix(torch.cat([values, levels.pop()], dim=1)))
+        found = self.leave(self.norm(values)).float().unflatten(1, (2, 2, 2))
+        found = found.permute(0, 4, 1, 5, 2, 6, 3).reshape(batch, x, y, z)
+        return 2.0 * found + 3.0 * evidence[:, 0].float().clamp(-1.0, 1.0)
+
+
+@cache
+def _network() -> StartNetwork:
+    network = StartNetwork()
+    network.load_state_dict({name: part.float() for name, part in load_file(WEIGHTS).items()})
+    return network.eval()
+
+
+def learned_surface(known: Gathered) -> trimesh.Trimesh:
+    """Return the closed surface of the body by the network, m, normals outward.
+
+    Args:
+        known: The evidence.
+
+    Raises:
+        NumericalError: If the network sees no body.
+    """
+    lattice = lattice_of(known)
+    if lattice is None:
+        raise NumericalError("no surface: the first echoes leave no room for a body")
+    with torch.no_grad():
+        seen = torch.from_numpy(features(known, lattice))[None]
+        distance = _network()(seen)[0].numpy()
+    if not (distance < 0).any():
+        raise NumericalError("no surface: the network sees no body in the evidence")
+    x, y, z = (n + 2 * MARGIN for n in lattice.shape)
+    wider = Lattice(lattice.origin - MARGIN * lattice.spacing, lattice.spacing, (x, y, z))
+    distance = np.pad(distance, MARGIN, constant_values=OUTSIDE)
+    distance = without_parts(without_hollows(distance), wider, known)
+    return surface_of(distance, wider)
