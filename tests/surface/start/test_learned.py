@@ -79,6 +79,17 @@ def test_a_large_body_gets_a_coarser_lattice(monkeypatch):
     assert learned.learned_surface(known).is_watertight
 
 
+def test_each_channel_of_a_block_is_a_voxel_of_it():
+    network = StartNetwork()
+    with torch.no_grad():
+        network.leave.weight.zero_()
+        network.leave.bias.copy_(torch.arange(8.0))
+        found = network(torch.zeros(1, FEATURES, BLOCK, 2 * BLOCK, BLOCK))[0]
+    assert found.shape == (BLOCK, 2 * BLOCK, BLOCK)
+    x, y, z = np.indices(found.shape) % 2
+    np.testing.assert_array_equal(found.numpy(), 2.0 * (4 * x + 2 * y + z))
+
+
 def test_many_points_are_seen_as_few_of_the_same_density(monkeypatch):
     known = sphere_heard()
     lattice = lattice_of(known)
