@@ -1,13 +1,14 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: MIT
-"""Make the network that gives a start surface.
+"""Train the network of the start surface ``learned``.
 
     python tools/learn_start.py examples FOLDER [--seeds FIRST LAST] [--every N]
     python tools/learn_start.py train FOLDER [--steps N] [--seed S] [--without KIND ...]
 
 ``examples`` makes one example per seed: a procedural body, its echoes, a fit, the evidence, and the
-true signed distance; about 20 s of one core each. What is there is kept, so that it goes on where
-it stopped; two processes take every second seed with ``--every 2``. ``train`` makes the weights.
+true signed distance; about 20 s of one core each. Examples that exist are kept, so that the same
+command resumes. Two processes share the seeds with ``--every 2`` and ``--seeds 0 400`` and
+``--seeds 1 400``. ``train`` writes the weights, by default into the package.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ import torch
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # the parts of this command, and the package of this checkout
 
+from sononerf.errors import InputError  # noqa: E402
 from sononerf.surface.start.learned import WEIGHTS  # noqa: E402
 from tools.learning.examples import make_example  # noqa: E402
 from tools.learning.training import load_examples, train, weights_file  # noqa: E402
@@ -51,14 +53,16 @@ def main() -> None:
         for seed in range(first, last, given.every):
             _tell(make_example(seed, given.folder))
         return
-    examples = load_examples(given.folder)
-    network = train(
-        examples,
-        steps=given.steps,
-        seed=given.seed,
-        without=tuple(given.without),
-        tell=_tell,
-    )
+    try:
+        network = train(
+            load_examples(given.folder),
+            steps=given.steps,
+            seed=given.seed,
+            without=tuple(given.without),
+            tell=_tell,
+        )
+    except InputError as error:
+        parser.error(f"{given.folder}: {error}")
     weights_file(network, given.output)
     _tell(f"wrote {given.output}")
 

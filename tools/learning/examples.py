@@ -26,15 +26,15 @@ from tools.learning.bodies import body
 FAR = 6.0
 """Distance at which the true signed distance is clipped, voxels."""
 EPOCHS = 6
-"""Epochs of a fit, a third of the usual number: evidence varies as much as it does in use."""
+"""Epochs of a fit; a third of the default saves most of the time."""
 FEWEST, USUAL = 25, 300
-"""Number of poses, drawn evenly in its logarithm."""
+"""Number of poses: its logarithm is drawn evenly between these."""
 QUIETEST_DB, LOUDEST_DB = 20.0, 40.0
 """Signal-to-noise ratio of the bodies that are heard in noise, dB."""
 NOISY = 0.3
 """Fraction of the bodies that are heard in noise."""
 MANY = 1_400_000
-"""Number of voxels above which a body is left out: its region was not found."""
+"""Number of voxels above which a body is left out, because its region was found too large."""
 
 
 def make_example(seed: int, folder: Path) -> str:
@@ -77,7 +77,7 @@ def make_example(seed: int, folder: Path) -> str:
     known = reading.gathered
     lattice = lattice_of(known)
     if lattice is None or np.prod(lattice.shape) > MANY:
-        return f"{seed}: {kind}, {count} poses: its region was not found"
+        return f"{seed}: {kind}, {count} poses: its region was found too large, or not at all"
     seen = features(known, lattice).astype(np.float16)
     true = true_distance(mesh, lattice).astype(np.float16)
 

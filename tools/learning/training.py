@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from sononerf import storage
+from sononerf.errors import InputError
 from sononerf.surface.start.learned import BLOCK, FEATURES, OUTSIDE, StartNetwork
 
 CROP = 64
@@ -23,19 +24,20 @@ CROP = 64
 BATCH = 2
 """Number of crops per step."""
 RATE = 2e-3
-"""Greatest step length of AdamW."""
+"""Largest learning rate of AdamW, no unit; cosine decay to a hundredth of it."""
 CLASS = 0.7
-"""Weight of the sign beside the distance; also the scale of its logit, voxels."""
+"""Weight of the error of the sign beside that of the distance, no unit; also the distance at which
+the logit of the sign is 1, voxels."""
 NEAR, NEAR_WEIGHT = 2.0, 4.0
 """Distance from the true surface, voxels, within which a voxel counts this many times."""
 BEYOND = 0.02
-"""Slope of the loss of a distance that is beyond OUTSIDE on the right side."""
+"""Weight of the error of a distance beyond OUTSIDE whose sign is right, no unit."""
 AVERAGE = 0.998
-"""Decay per step of the mean of the weights that is kept."""
+"""Decay per step of the running mean of the weights, no unit."""
 TOLD = 500
-"""Number of steps between two lines."""
+"""Number of steps between two lines of progress."""
 WITHHELD = 9
-"""One of so many seeds is withheld from the training."""
+"""Every ninth seed is withheld from the training."""
 _NORMAL = slice(FEATURES - 3, FEATURES)  # features that turn with the axes
 _BOUND, _POSES = 0, FEATURES - 4  # features with a value outside of the lattice
 
@@ -127,19 +129,24 @@ def train(
     without: tuple[str, ...] = (),
     tell: Callable[[str], None],
 ) -> StartNetwork:
-    """Train for so many steps, and return the mean of the weights.
+    """Train, and return the network with the running mean of its weights.
 
     Args:
-        examples: Those of one of ``WITHHELD`` seeds are withheld.
+        examples: Every ``WITHHELD``-th seed is withheld.
         steps: Number of steps; about 0.4 s of one core each.
         seed: Seed of weights and crops.
         without: Kinds that are withheld too.
-        tell: Takes a line from time to time.
+        tell: Called with a line of progress every ``TOLD`` steps.
+
+    Raises:
+        InputError: If no example is left to train on.
     """
     torch.manual_seed(seed)
     random = np.random.default_rng(seed)
     held = [one for one in examples if one.seed % WITHHELD == 4 or one.kind in without]
     used = [one for one in examples if one.seed % WITHHELD != 4 and one.kind not in without]
+    if not used:
+        raise InputError("no examples to train on; make some, or withhold fewer kinds")
     network, mean = StartNetwork(), StartNetwork()
     mean.load_state_dict(network.state_dict())
     optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=1e-2)

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""A start surface by a network that has learned how bodies look in evidence.
+"""Start surface by a network that was trained on the evidence of procedural bodies.
 
 Flat faces are silent except in the direction of a mirror, and a hollow is heard at its rim and its
-bottom alone. What lies between is a matter of experience: a small network takes all evidence on a
-lattice and gives the signed distance. It has seen procedural bodies alone, each through the whole
-pipeline, see ``tools/learn_start.py``. Lengths are in range resolutions and counts are per pose, so
-that scale, band and number of poses may differ.
+bottom alone. The evidence does not determine the surface in between. A small U-Net [1]_ takes all
+evidence on a lattice and returns the signed distance. It was trained on procedural bodies, each of
+which went through the whole pipeline, see ``tools/learn_start.py``. Lengths are in range
+resolutions and counts are relative to the number of poses, so that size, band and number of poses
+may differ.
 
 References:
     .. [1] O. Ronneberger, P. Fischer, T. Brox, "U-Net: convolutional networks for biomedical image
@@ -38,7 +39,7 @@ from sononerf.surface.start.occupancy import (
 )
 
 WEIGHTS = Path(__file__).with_name("learned.safetensors")
-"""The trained network."""
+"""File of the trained weights, float16."""
 VOXEL = 0.25
 """Spacing of the lattice, range resolutions: walls of half a range resolution have two voxels."""
 LARGEST = 3_000_000
@@ -47,12 +48,12 @@ one core per voxel."""
 MOST = 20_000
 """Number of points of evidence, at most; it bounds the time."""
 USUAL = 400
-"""Number of poses for which counts are stated."""
+"""Number of poses to which counts are scaled: counts over poses times this."""
 OUTSIDE = 4.0
-"""Distance beyond the lattice, voxels; also the largest one that the network has learned."""
+"""Distance outside of the lattice, voxels; the training clips larger ones to it."""
 BLOCK = 16
-"""Voxels along each axis that become one at the network's coarsest level."""
-_REACH = 0.3  # range resolutions in front of the onsets' bound at which the lattice may begin
+"""Number of voxels along an axis that are one voxel at the coarsest level of the network."""
+_REACH = 0.3  # distance outside of the onsets' bound that the lattice covers, range resolutions
 _NEGLIGIBLE = 1e-3  # weight of a point that is left out, to save time
 _CHUNK = 2000  # points at a time; it bounds the memory
 FEATURES = 16
@@ -77,7 +78,7 @@ def lattice_of(known: Gathered) -> Lattice | None:
 
 
 def features(known: Gathered, lattice: Lattice) -> Singles:
-    """Return the evidence that the network sees, (FEATURES, X, Y, Z), no unit.
+    """Return the input of the network, (FEATURES, X, Y, Z), no unit.
 
     Args:
         known: All evidence.
@@ -146,7 +147,10 @@ def _twice(grid: Singles) -> Singles:
 def _along(
     lattice: Lattice, points: Floats, ways: Floats, weight: Floats, start: float, stop: float
 ) -> Singles:
-    """Sum the weights of the points from which a voxel lies along their way, (X, Y, Z)."""
+    """Return the sum of the weights of the points whose ray passes a voxel, (X, Y, Z).
+
+    The ray of a point runs along its way, a unit vector, from the distance start to stop, m.
+    """
     steps = np.arange(start, stop, 0.8 * lattice.spacing)
     total, shape = np.zeros(int(np.prod(lattice.shape))), np.asarray(lattice.shape)
     for first in range(0, len(points), _CHUNK):
@@ -161,7 +165,10 @@ def _along(
 
 
 class _Norm(nn.Module):
-    """Divides each voxel's channels by their root mean square, alike in crops and in wholes."""
+    """Division of the channels of a voxel by their root mean square.
+
+    Other voxels do not enter, so that crops and whole lattices give the same values.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -186,7 +193,7 @@ class _Residual(nn.Module):
 
 
 class StartNetwork(nn.Module):
-    """A U-Net on blocks of eight voxels, from evidence to signed distance.
+    """U-Net from evidence to signed distance; its finest level has blocks of 2 x 2 x 2 voxels.
 
     Args:
         channels: Number of channels, from fine to coarse.
@@ -240,7 +247,7 @@ def learned_surface(known: Gathered) -> trimesh.Trimesh:
         known: The evidence.
 
     Raises:
-        NumericalError: If the network sees no body.
+        NumericalError: If the onsets leave no place for a body, or the network finds none.
     """
     lattice = lattice_of(known)
     if lattice is None:
@@ -249,7 +256,7 @@ def learned_surface(known: Gathered) -> trimesh.Trimesh:
         seen = torch.from_numpy(features(known, lattice))[None]
         distance = _network()(seen)[0].numpy()
     if not (distance < 0).any():
-        raise NumericalError("no surface: the network sees no body in the evidence")
+        raise NumericalError("no surface: the network finds no body in the evidence")
     x, y, z = (n + 2 * MARGIN for n in lattice.shape)
     wider = Lattice(lattice.origin - MARGIN * lattice.spacing, lattice.spacing, (x, y, z))
     distance = np.pad(distance, MARGIN, constant_values=OUTSIDE)

@@ -12,7 +12,7 @@ import trimesh
 from safetensors.torch import load_file
 
 from sononerf.echoes.free_space import EchoHull
-from sononerf.errors import NumericalError
+from sononerf.errors import InputError, NumericalError
 from sononerf.geometry.lattice import Lattice
 from sononerf.surface.start import learned
 from sononerf.surface.start.evidence import Evidence
@@ -126,6 +126,11 @@ def test_the_true_distance_is_negative_inside():
     found = true_distance(trimesh.creation.icosphere(4, RADIUS), lattice)
     expected = (np.linalg.norm(lattice.points(), axis=1) - RADIUS) / 0.002
     np.testing.assert_allclose(found.ravel(), np.minimum(expected, 6.0).clip(-6.0), atol=0.05)
+
+
+def test_without_examples_nothing_is_trained():
+    with pytest.raises(InputError, match="no examples to train on"):
+        train([], steps=1, seed=0, tell=lambda line: None)
 
 
 @pytest.mark.slow
