@@ -19,6 +19,7 @@ from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.detection import Onsets, asked_poses, find_onsets
 from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
+from sononerf.echoes.range_levels import RangeLevels
 from sononerf.echoes.recorded_noise import seal_recorded
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
 from sononerf.echoes.splits import repeats, split_of
@@ -325,6 +326,20 @@ class Echoes(Shown):
         """Places that the echoes leave possible."""
         turned = self.rotations[self.onsets.poses]
         return EchoRegion(self.onsets, self.hull, self.head.gains, turned, self.head.resolution)
+
+    @cached_property
+    def levels(self) -> RangeLevels:
+        """Levels of the training poses over range."""
+        poses, head = self.onsets.poses, self.head
+        emitters, receivers = head.places(self.positions[poses], self.rotations[poses])
+        return RangeLevels.of(
+            (self.store.read_pose(int(pose)) for pose in poses),
+            emitters,
+            receivers,
+            first=float(head.range[0]) - head.mean_lag,
+            spacing=float(head.range[1] - head.range[0]),
+            resolution=head.resolution,
+        )
 
     def magnitude(self, number: int) -> Tensor:
         """Return the spectrogram of a pose as a tensor that is kept, (E, R, F) float32."""

@@ -37,7 +37,7 @@ from sononerf.surface.surface import Surface, finished_surface
 
 UNREFINED: tuple[StartMethod, ...] = ("filled", "hull", "open", "sheet")
 """Start methods in order: without refinement the first that gives a surface is taken."""
-REFINED: tuple[StartMethod, ...] = ("open", "filled", "hull", "sheet")
+REFINED: tuple[StartMethod, ...] = ("open", "filled", "hull", "learned", "sheet")
 """Start surfaces: the one that explains the validation poses best is refined, see
 :class:`~sononerf.surface.refine.refinement.Refinement`."""
 RAYS = 20_000
@@ -91,6 +91,7 @@ def reconstruct(
             resolution=_resolution(model, heard),
             spacing=chosen.spacing,
             directions=chosen.directions,
+            levels=None if heard is None else heard.levels,
             progress=shown,
         )
     methods = UNREFINED if chosen.method == "auto" else (chosen.method,)

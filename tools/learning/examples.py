@@ -71,7 +71,12 @@ def make_example(seed: int, folder: Path) -> str:
         model = sononerf.EchoModule.for_echoes(echoes, options={"epochs": EPOCHS, "seed": seed})
         model = sononerf.fit(echoes, model, accelerator="cpu")
         with torch.inference_mode():
-            reading = read_field(model.field, echoes.hull, resolution=echoes.head.resolution)
+            reading = read_field(
+                model.field,
+                echoes.hull,
+                resolution=echoes.head.resolution,
+                levels=echoes.levels,
+            )
     except SonoNerfError as error:
         return f"{seed}: {kind}, {count} poses: {error}"
     known = reading.gathered

@@ -17,17 +17,26 @@ from torch.nn import functional
 
 from sononerf import storage
 from sononerf.errors import InputError
-from sononerf.surface.start.learned import BLOCK, FEATURES, OUTSIDE, StartNetwork
+from sononerf.surface.start.learned import (
+    BLOCK,
+    FEATURES,
+    LOGIT,
+    OPEN,
+    OUTSIDE,
+    VECTORS,
+    StartNetwork,
+)
 
 CROP = 64
 """Side of a crop, voxels."""
 BATCH = 2
 """Number of crops per step."""
-RATE = 2e-3
+RATE = 6e-4
 """Largest learning rate of AdamW, no unit; cosine decay to a hundredth of it."""
+WARM = 0.03
+"""Fraction of the steps in which the rate rises linearly to its largest value, no unit."""
 CLASS = 0.7
-"""Weight of the error of the sign beside that of the distance, no unit; also the distance at which
-the logit of the sign is 1, voxels."""
+"""Weight of the error of the sign beside that of the distance, no unit."""
 NEAR, NEAR_WEIGHT = 2.0, 4.0
 """Distance from the true surface, voxels, within which a voxel counts this many times."""
 BEYOND = 0.02
@@ -38,8 +47,8 @@ TOLD = 500
 """Number of steps between two lines of progress."""
 WITHHELD = 9
 """Every ninth seed is withheld from the training."""
-_NORMAL = slice(FEATURES - 3, FEATURES)  # features that turn with the axes
-_BOUND, _POSES = 0, FEATURES - 4  # features with a value outside of the lattice
+_VECTORS = tuple(FEATURES - 3 * (VECTORS - n) for n in range(VECTORS))  # first component of each
+_DISTANCES, _POSES = (0, OPEN, OPEN + 1), OPEN - 1  # features with a value outside of the lattice
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,27 +78,31 @@ def load_examples(folder: Path) -> list[Example]:
     return found
 
 
-def _crop(example: Example, random: np.random.Generator) -> tuple[Any, Any]:
+def crop(example: Example, random: np.random.Generator) -> tuple[Any, Any]:
     """Return a crop, turned and mirrored at random; air surrounds a small lattice."""
-    seen = np.zeros((FEATURES, CROP, CROP, CROP), np.float32)
-    seen[_BOUND], seen[_POSES] = 2.0, example.seen[_POSES].flat[0]
-    true = np.full((CROP,) * 3, 1.5 * OUTSIDE, np.float32)
+    seen = np.zeros((FEATURES, CROP, CROP, CROP), np.float16)
+    for one in _DISTANCES:
+        seen[one] = 2.0
+    seen[_POSES] = example.seen[_POSES].flat[0]
+    true = np.full((CROP,) * 3, 1.5 * OUTSIDE, np.float16)
+    order, mirrored = random.permutation(3), random.random(3) < 0.5
+    features = np.arange(FEATURES)
+    for first in _VECTORS:
+        features[first : first + 3] = first + order
     source, target = [], []
-    for size in example.true.shape:
+    for size in np.asarray(example.true.shape)[order]:
         shift = int(random.integers(0, abs(size - CROP) + 1))
         start, length = max(0, size - CROP) and shift, min(size, CROP)
         source.append(slice(start, start + length))
         start = 0 if size >= CROP else shift
         target.append(slice(start, start + length))
-    seen[(slice(None), *target)] = example.seen[(slice(None), *source)]
-    true[tuple(target)] = example.true[tuple(source)]
-    order = random.permutation(3)
-    seen[_NORMAL] = seen[_NORMAL][order]
-    seen, true = seen.transpose(0, *(1 + order)).copy(), true.transpose(order)
-    for axis in np.flatnonzero(random.random(3) < 0.5):
-        seen, true = np.flip(seen, 1 + axis).copy(), np.flip(true, axis)
-        seen[_NORMAL][axis] *= -1
-    return seen, true.copy()
+    way = tuple(slice(None, None, -1 if back else 1) for back in mirrored)
+    true[way][tuple(target)] = example.true.transpose(order)[tuple(source)]
+    for made, given in zip(seen, features, strict=True):
+        made[way][tuple(target)] = example.seen[given].transpose(order)[tuple(source)]
+    for first in _VECTORS:
+        seen[first + np.flatnonzero(mirrored)] *= -1
+    return seen, true
 
 
 def loss(found: Tensor, true: Tensor) -> Tensor:
@@ -99,7 +112,7 @@ def loss(found: Tensor, true: Tensor) -> Tensor:
     off = torch.where(right, BEYOND * (found - aim), found - aim)
     distance = functional.smooth_l1_loss(off, torch.zeros_like(off), reduction="none")
     sign = functional.binary_cross_entropy_with_logits(
-        -found / CLASS, (true < 0).float(), reduction="none"
+        -found / LOGIT, (true < 0).float(), reduction="none"
     )
     weight = torch.where(true.abs() < NEAR, NEAR_WEIGHT, 1.0)
     return (weight * (distance + CLASS * sign)).mean()
@@ -107,7 +120,7 @@ def loss(found: Tensor, true: Tensor) -> Tensor:
 
 @torch.no_grad()
 def overlaps(network: StartNetwork, examples: list[Example]) -> dict[str, tuple[float, float]]:
-    """Return the mean intersection over union of network and of onsets' bound, by kind."""
+    """Return the mean intersection over union of network and of the belief ``open``, by kind."""
     found: dict[str, list[tuple[float, float]]] = {}
     for one in examples:
         wider = [(0, -size % BLOCK) for size in one.true.shape]
@@ -115,8 +128,8 @@ def overlaps(network: StartNetwork, examples: list[Example]) -> dict[str, tuple[
         made = network(torch.from_numpy(seen)[None])[0].numpy()
         inside = one.true < 0
         made = made[tuple(slice(size) for size in inside.shape)] < 0
-        bound = one.seen[_BOUND] < 0
-        both = [(part & inside).sum() / max(1, (part | inside).sum()) for part in (made, bound)]
+        start = one.seen[OPEN] < 0
+        both = [(part & inside).sum() / max(1, (part | inside).sum()) for part in (made, start)]
         found.setdefault(one.kind, []).append((float(both[0]), float(both[1])))
     return {kind: tuple(np.mean(all_, axis=0)) for kind, all_ in found.items()}
 
@@ -147,22 +160,23 @@ def train(
     used = [one for one in examples if one.seed % WITHHELD != 4 and one.kind not in without]
     if not used:
         raise InputError("no examples to train on; make some, or withhold fewer kinds")
-    network, mean = StartNetwork(), StartNetwork()
+    network = StartNetwork().to(memory_format=torch.channels_last_3d)
+    mean = StartNetwork()
     mean.load_state_dict(network.state_dict())
-    optimizer = torch.optim.AdamW(network.parameters(), RATE, weight_decay=1e-2)
+    optimizer = torch.optim.AdamW(network.parameters(), RATE, betas=(0.9, 0.95), weight_decay=1e-2)
     running = math.nan
     for step in range(steps):
         rate = RATE * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps)))
         for group in optimizer.param_groups:
-            group["lr"] = rate * min(1.0, (step + 1) / 50)
-        crops = [_crop(used[random.integers(len(used))], random) for _ in range(BATCH)]
+            group["lr"] = rate * min(1.0, (step + 1) / (WARM * steps))
+        crops = [crop(used[random.integers(len(used))], random) for _ in range(BATCH)]
         seen, true = (torch.from_numpy(np.stack(both)) for both in zip(*crops, strict=True))
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            found = network(seen)
-        value = loss(found, true)
+            found = network(seen.bfloat16())
+        value = loss(found, true.float())
         optimizer.zero_grad()
         value.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 0.5)
         optimizer.step()
         share = 1 - min(AVERAGE, (step + 1) / (step + 11))
         with torch.no_grad():

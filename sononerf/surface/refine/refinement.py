@@ -42,14 +42,15 @@ SIMULATED = 96
 Simulate = Callable[[trimesh.Trimesh], Simulator]
 TOLERATED = 1.15
 """Ratio of two objectives of validation poses below which they differ by chance. Within it, a later
-stage is preferred; after the first stage a sheet is preferred, or else the blurred surface, which
-is the smoother one."""
-STATE_VERSION = 2
+stage is preferred; after the first stage a sheet is preferred, or else the blurred surface to the
+sharp one, because it is smoother. The learned start must have the lowest objective of all."""
+STATE_VERSION = 3
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
-Way = Literal["blurred", "sharp", "sheet"]
-"""Way of a surface through the stages: with the blur and the edges of each stage; without blur on
-fine triangles; or as a sheet, whose triangles are kept because a signed distance on voxels would
-tear it."""
+Way = Literal["blurred", "sharp", "learned", "sheet"]
+"""Way of a surface through the stages: with the blur and the edges of each stage, unless the blur
+would take away thin parts; without blur on fine triangles; so from the start ``learned``; or as a
+sheet, whose triangles are kept because a signed distance on voxels would tear it."""
+_OWN: tuple[Literal["learned", "sheet"], ...] = ("learned", "sheet")  # starts with their own way
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,17 +116,17 @@ def number_of_steps(starts: Iterable[str], stages: tuple[Stage, ...] = STAGES) -
 
 
 def _ways(starts: Iterable[str]) -> list[Way]:
-    ways: list[Way] = ["blurred", "sharp"] if set(starts) - {"sheet"} else []
-    return [*ways, "sheet"] if "sheet" in starts else ways
+    ways: list[Way] = ["blurred", "sharp"] if set(starts) - set(_OWN) else []
+    return [*ways, *(name for name in _OWN if name in starts)]
 
 
 class Refinement:
     """Refinement, step by step; between any two steps it can be stopped, saved and resumed.
 
     Args:
-        meshes: Start surfaces, m; the one that explains the validation poses best is refined. A
-            start with the name ``sheet`` takes part in the first stage beside the best of the
-            others.
+        meshes: Start surfaces, m; the one that explains the validation poses best is refined.
+            Starts with the names ``learned`` and ``sheet`` take part in the first stage beside the
+            best of the others.
         echoes: Measured spectrograms and onsets; the surface must begin at the onsets. If their
             level is absolute, gains are learned in the last stage alone: a rough surface is too
             faint, and a gain would hide that. Otherwise gains are learned from the first stage on.
@@ -196,11 +197,16 @@ class Refinement:
     def _prepared(self) -> trimesh.Trimesh:
         """Return the surface that a stage begins with."""
         stage, unit = self.stages[self.stage], self.optics.wavelength
-        if self.way == "sheet":
-            return self.starts["sheet"] if self.stage == 0 else self.candidates[-1]
-        edge, blur = (SHARP, 0.0) if self.way == "sharp" else (stage.edge, stage.blur)
         before, plane = self.candidates[-1], self.optics.plane
-        made = remesh(before, min(edge, stage.edge) * unit, blur * unit, plane)
+        if self.way in _OWN and self.stage == 0:
+            before = self.starts[self.way]
+        if self.way == "sheet":
+            return before
+        made = None
+        if self.way == "blurred":
+            made = remesh(before, stage.edge * unit, stage.blur * unit, plane)
+        if made is None:
+            made = remesh(before, min(SHARP, stage.edge) * unit, 0.0, plane)
         return before if made is None else made
 
     def _finish(self, mismatch: float) -> None:
@@ -230,20 +236,18 @@ class Refinement:
 
     def _best_way(self) -> tuple[trimesh.Trimesh, float]:
         """Continue in the best way; return its result of the first stage, and its objective."""
-        found = [one["objective_db"] for one in self.history]
-        best = int(np.argmin(found))
-        if self.ways[0] == "blurred" and found[0] <= TOLERATED * found[best]:
-            best = 0
-        if self.ways[-1] == "sheet" and found[-1] <= TOLERATED * found[best]:
-            best = len(found) - 1
-            if self.start != "sheet":
-                self._begin(["sheet"])
-        self.way = self.ways[best]
-        return self._rivals[best], found[best]
+        found = dict(zip(self.ways, (one["objective_db"] for one in self.history), strict=True))
+        good = TOLERATED * min(found.values())
+        self.way = min(found, key=lambda way: found[way])
+        smooth: tuple[Way, ...] = ("sheet",) if self.way == "learned" else ("sheet", "blurred")
+        self.way = next((way for way in smooth if found.get(way, math.inf) <= good), self.way)
+        if self.way in _OWN and self.start != self.way:
+            self._begin([self.way])
+        return self._rivals[self.ways.index(self.way)], found[self.way]
 
     def _choose(self) -> None:
         """Begin with the start that explains the validation poses best."""
-        self._begin([name for name in self.starts if name != "sheet"] or list(self.starts))
+        self._begin([name for name in self.starts if name not in _OWN] or list(self.starts))
 
     def _begin(self, names: list[StartMethod]) -> None:
         meshes = [self.starts[name] for name in names]

@@ -18,6 +18,7 @@ from __future__ import annotations
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -27,12 +28,15 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from sononerf.array_types import Floats, Singles
+from sononerf.echoes.range_levels import STATISTICS
 from sononerf.errors import NumericalError
 from sononerf.geometry.lattice import MARGIN, Lattice
 from sononerf.surface.start.occupancy import (
+    THICKER,
     Gathered,
     planes,
     surface_of,
+    thickened,
     winding_of,
     without_hollows,
     without_parts,
@@ -51,14 +55,28 @@ USUAL = 400
 """Number of poses to which counts are scaled: counts over poses times this."""
 OUTSIDE = 4.0
 """Distance outside of the lattice, voxels; the training clips larger ones to it."""
+LOGIT = 0.7
+"""Distance at which the logit of the probability that a voxel is outside is 1, voxels; the same in
+the training."""
+SURE = 3.0
+"""Distance from which a voxel is surely outside, voxels: beyond it the small probabilities of many
+voxels would add up."""
 BLOCK = 16
 """Number of voxels along an axis that are one voxel at the coarsest level of the network."""
 _REACH = 0.3  # distance outside of the onsets' bound that the lattice covers, range resolutions
 _NEGLIGIBLE = 1e-3  # weight of a point that is left out, to save time
 _CHUNK = 2000  # points at a time; it bounds the memory
-FEATURES = 16
-"""Number of features of a voxel; the last three are the mean normal, a vector."""
-CHANNELS = (24, 48, 64, 64)
+_NEAR = 0.5  # distance outside of the onsets' bound up to which levels are read, range resolutions
+VECTORS = 2
+"""Number of features that are vectors: mean direction of the sound, and mean normal. They are the
+last ones, three components each."""
+FEATURES = 16 + STATISTICS + 3
+"""Number of features of a voxel."""
+OPEN = 13
+"""First of the features that are signed distances of ``BELIEFS``, 1.5 range resolutions."""
+BELIEFS: tuple[Literal["open", "filled"], ...] = ("open", "filled")
+"""Beliefs whose signed distances the network sees."""
+CHANNELS = (32, 64, 96, 96)
 """Channels of the network, from fine to coarse."""
 
 
@@ -116,10 +134,12 @@ def features(known: Gathered, lattice: Lattice) -> Singles:
     def sight(points: Floats, ways: Floats, weight: Floats, start: float, stop: float) -> Singles:
         return np.log1p(0.2 * per * _along(lattice, points, ways, weight, start, stop))
 
+    thin = read(known.thin)
+    voxel = coarse.spacing / unit
     dense = lattice.spread(points, weight, 2.0)
     size = np.log1p(40 * per * dense) / np.maximum(dense, 1e-9) / 2
     found = [
-        np.clip(read(known.bound) * coarse.spacing / unit, -3, 3) / 1.5,
+        np.clip(read(known.bound) * voxel, -3, 3) / 1.5,
         near,
         near * np.clip(near_off, -3, 3) / 2,
         wide,
@@ -132,9 +152,33 @@ def features(known: Gathered, lattice: Lattice) -> Singles:
         np.log1p(62.5 * per * lattice.spread(points, weight, 2.5)) / 2,
         np.log1p(20 * per * lattice.spread(evidence.points, evidence.weight, 1.5)) / 2,
         np.full(shape, np.log(poses / 100) / 2),
+        *(
+            np.clip((read(thickened(known, belief)) + THICKER * thin) * voxel, -3, 3) / 1.5
+            for belief in BELIEFS
+        ),
+        thin,
+        *_level_features(known, half),
         *(size * lattice.spread(points, weight * along, 2.0) for along in normals.T),
     ]
     return np.stack(found).astype(np.float32)
+
+
+def _level_features(known: Gathered, half: Lattice) -> list[Singles]:
+    """Return the statistics of the levels over range, (X, Y, Z) each; zero in free space.
+
+    Args:
+        known: All evidence.
+        half: Lattice of half as many voxels along each axis.
+    """
+    levels, places = known.levels, half.points()
+    found = np.zeros((STATISTICS, len(places)), np.float32)
+    outside = known.lattice.read(known.bound, places) * known.lattice.spacing
+    near = outside < _NEAR * known.resolution
+    if levels is not None and near.any():
+        points = known.evidence.points
+        middle = points.mean(axis=0) if len(points) else places[near].mean(axis=0)
+        found[:, near] = levels.statistics(places[near], middle).T
+    return [_twice(grid.reshape(half.shape)) for grid in found]
 
 
 def _twice(grid: Singles) -> Singles:
@@ -164,36 +208,22 @@ def _along(
     return total.reshape(lattice.shape).astype(np.float32)
 
 
-class _Norm(nn.Module):
-    """Division of the channels of a voxel by their root mean square.
-
-    Other voxels do not enter, so that crops and whole lattices give the same values.
-    """
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.gain = nn.Parameter(torch.ones(channels))
-
-    def forward(self, values: Tensor) -> Tensor:
-        scale = torch.rsqrt(values.float().square().mean(1, keepdim=True) + 1e-3)
-        return values * scale.to(values.dtype) * self.gain[:, None, None, None].to(values.dtype)
-
-
 class _Residual(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.norm = _Norm(channels)
         self.first = nn.Conv3d(channels, channels, 3, padding=1)
         self.second = nn.Conv3d(channels, channels, 3, padding=1)
         for part in self.second.parameters():
             nn.init.zeros_(part)
 
     def forward(self, values: Tensor) -> Tensor:
-        return values + self.second(nn.functional.silu(self.first(self.norm(values))))
+        return values + self.second(nn.functional.relu(self.first(values), inplace=True))
 
 
 class StartNetwork(nn.Module):
     """U-Net from evidence to signed distance; its finest level has blocks of 2 x 2 x 2 voxels.
+
+    It adds to the mean of the signed distances of the beliefs ``open`` and ``filled``.
 
     Args:
         channels: Number of channels, from fine to coarse.
@@ -205,11 +235,13 @@ class StartNetwork(nn.Module):
         self.enter = nn.Conv3d(8 * FEATURES, channels[0], 1)
         self.down = nn.ModuleList(_Residual(width) for width in channels)
         self.pool = nn.ModuleList(nn.Conv3d(a, b, 2, stride=2) for a, b in steps)
-        self.narrow = nn.ModuleList(nn.Conv3d(b, a, 1) for a, b in reversed(steps))
-        self.mix = nn.ModuleList(nn.Conv3d(2 * a, a, 1) for a, _ in reversed(steps))
+        self.widen = nn.ModuleList(
+            nn.ConvTranspose3d(b, a, 2, stride=2) for a, b in reversed(steps)
+        )
         self.up = nn.ModuleList(_Residual(a) for a, _ in reversed(steps))
-        self.norm = _Norm(channels[0])
         self.leave = nn.Conv3d(channels[0], 8, 1)
+        for part in self.leave.parameters():
+            nn.init.zeros_(part)
 
     def forward(self, evidence: Tensor) -> Tensor:
         """Return the signed distance, voxels, positive outside, (B, X, Y, Z).
@@ -225,12 +257,26 @@ class StartNetwork(nn.Module):
         for pool, down in zip(self.pool, self.down[1:], strict=True):
             levels.append(down(pool(levels[-1])))
         values = levels.pop()
-        for narrow, mix, up in zip(self.narrow, self.mix, self.up, strict=True):
-            values = nn.functional.interpolate(narrow(values), scale_factor=2.0, mode="nearest")
-            values = up(mix(torch.cat([values, levels.pop()], dim=1)))
-        found = self.leave(self.norm(values)).float().unflatten(1, (2, 2, 2))
+        for widen, up in zip(self.widen, self.up, strict=True):
+            values = up(widen(values) + levels.pop())
+        found = self.leave(values).float().unflatten(1, (2, 2, 2))
         found = found.permute(0, 4, 1, 5, 2, 6, 3).reshape(batch, x, y, z)
-        return 2.0 * found + 3.0 * evidence[:, 0].float().clamp(-1.0, 1.0)
+        mean = (evidence[:, OPEN] + evidence[:, OPEN + 1]).float() / 2
+        return 2.0 * found + 1.5 / VOXEL * mean.clamp(-1.5, 1.5)
+
+
+def expected_level(distance: Singles) -> float:
+    """Return the level at which the volume is the expected one, voxels.
+
+    A wire whose place is known less exactly than it is thick is nowhere likelier than air, so that
+    the level 0 would lose it.
+
+    Args:
+        distance ((X, Y, Z), voxels): Signed distance; some of it is below ``SURE``.
+    """
+    near = distance[distance < SURE].astype(np.float64)
+    expected = int((1 / (1 + np.exp(near / LOGIT))).sum())
+    return float(np.partition(near, expected)[expected]) if expected < len(near) else SURE
 
 
 @cache
@@ -247,16 +293,20 @@ def learned_surface(known: Gathered) -> trimesh.Trimesh:
         known: The evidence.
 
     Raises:
-        NumericalError: If the onsets leave no place for a body, or the network finds none.
+        NumericalError: If the onsets leave no place for a body, or the network finds none, or the
+            levels of the echoes are not known.
     """
+    if known.levels is None:
+        raise NumericalError("the start learned needs the echoes; their free space is not enough")
     lattice = lattice_of(known)
     if lattice is None:
         raise NumericalError("no surface: the first echoes leave no room for a body")
     with torch.no_grad():
         seen = torch.from_numpy(features(known, lattice))[None]
         distance = _network()(seen)[0].numpy()
-    if not (distance < 0).any():
+    if not (distance < SURE).any():
         raise NumericalError("no surface: the network finds no body in the evidence")
+    distance = np.minimum(distance - expected_level(distance), OUTSIDE)
     x, y, z = (n + 2 * MARGIN for n in lattice.shape)
     wider = Lattice(lattice.origin - MARGIN * lattice.spacing, lattice.spacing, (x, y, z))
     distance = np.pad(distance, MARGIN, constant_values=OUTSIDE)

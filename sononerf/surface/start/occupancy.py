@@ -18,7 +18,7 @@ what explains the echoes.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -28,6 +28,7 @@ from scipy import fft, ndimage
 
 from sononerf.array_types import Floats, Singles
 from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.range_levels import RangeLevels
 from sononerf.errors import NumericalError
 from sononerf.field.field import Field
 from sononerf.geometry.lattice import MARGIN, Lattice, level_surface
@@ -182,11 +183,12 @@ BACKS = (0.02, 0.06)
 weight rises to the maximum."""
 OPENING = 0.03
 """Weight of a place that is outside by its winding number; evidence has weight 1 at its point."""
+THICKER = 1.5
+"""Length that each side of a thin part is moved outward, and the surface moved back, voxels: two
+sides closer than the blur of their planes would cancel."""
 UNHEARD = 0.03
 """Evidence of a part per area, over that of the part with most evidence, below which the part is
 left out."""
-_THICKER = 1.5  # voxels that each side of a thin part is moved outward, and the surface moved back:
-# two sides closer than the blur of their planes would cancel
 _BENDING = 1.0  # of a voxel; evidence at its point has 1: it sets the unit of all weights
 _NEGLIGIBLE = 1e-3  # weight of a point that is left out of the planes, to save time
 _LEAST = 30  # voxels of the smallest surface
@@ -209,6 +211,7 @@ class Gathered:
             it.
         hull: The free space.
         resolution (m): Range resolution.
+        levels: Levels of the echoes over range; None if only the free space is known.
     """
 
     evidence: Evidence
@@ -219,6 +222,8 @@ class Gathered:
     bound: Singles
     hull: EchoHull
     resolution: float
+    levels: RangeLevels | None = None
+    _found: dict[str, Singles] = field(default_factory=dict, init=False, repr=False)
 
 
 def gather_evidence(
@@ -229,6 +234,7 @@ def gather_evidence(
     upper: Floats,
     spacing: float,
     resolution: float,
+    levels: RangeLevels | None = None,
 ) -> Gathered:
     """Return the evidence of field and onsets about a region.
 
@@ -239,6 +245,7 @@ def gather_evidence(
         lower, upper ((3,), m): The region.
         spacing (m): Spacing of the voxels.
         resolution (m): Range resolution of the analysis.
+        levels: Levels of the echoes over range, where they are known.
 
     Raises:
         NumericalError: If nothing was heard.
@@ -250,12 +257,12 @@ def gather_evidence(
     lattice = Lattice.over(lower, upper, spacing)
     weight = evidence.weight * reliability(evidence, hull, resolution)
     thin = thinness(lattice, evidence.points, evidence.normals, weight)
-    move = _THICKER * lattice.read(thin, evidence.points).clip(0, 1)
+    move = THICKER * lattice.read(thin, evidence.points).clip(0, 1)
     points = evidence.points + spacing * move[:, None] * evidence.normals
     farthest = max(lattice.shape)
     bound = (-clearance_grid(hull, lattice) / spacing).clip(-farthest, farthest)
     bound = _walled(bound.astype(np.float32))
-    return Gathered(evidence, weight, points, lattice, thin, bound, hull, resolution)
+    return Gathered(evidence, weight, points, lattice, thin, bound, hull, resolution, levels)
 
 
 def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> trimesh.Trimesh:
@@ -279,7 +286,7 @@ def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> trimesh.Tr
             raise NumericalError("no surface: no pose has a first echo")
         distance = known.bound
     else:
-        distance = _by_all_evidence(known, belief)
+        distance = thickened(known, belief)
     if not (distance < 0).any():
         # The body is thinner than a voxel: the most likely places are taken, however few.
         inner = distance[(slice(MARGIN, -MARGIN),) * 3]
@@ -289,15 +296,28 @@ def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> trimesh.Tr
     distance = without_parts(distance, lattice, None if belief == "hull" else known)
     mesh = surface_of(distance, lattice)
     if belief != "hull":
-        back = _THICKER * spacing * lattice.read(known.thin, np.asarray(mesh.vertices)).clip(0, 1)
+        back = THICKER * spacing * lattice.read(known.thin, np.asarray(mesh.vertices)).clip(0, 1)
         mesh.vertices = mesh.vertices - back[:, None] * mesh.vertex_normals
     return mesh
 
 
+def thickened(known: Gathered, belief: Literal["open", "filled"]) -> Singles:
+    """Return the signed distance by all evidence, (X, Y, Z) voxels; thin parts are too thick.
+
+    It is too small by ``THICKER`` times the thinness. A second call returns it without computing.
+
+    Args:
+        known: The evidence.
+        belief: As in :func:`estimate_occupancy`.
+    """
+    if belief not in known._found:
+        known._found[belief] = _by_all_evidence(known, belief)
+    return known._found[belief]
+
+
 def _by_all_evidence(known: Gathered, belief: Literal["open", "filled"]) -> Singles:
-    """Return the signed distance, voxels, with thin parts too thick."""
     lattice, normals = known.lattice, known.evidence.normals
-    bound = _walled(known.bound - np.float32(_THICKER) * known.thin)
+    bound = _walled(known.bound - np.float32(THICKER) * known.thin)
     used = known.weight > _NEGLIGIBLE
     weight, target = planes(lattice, known.points[used], normals[used], known.weight[used])
     empty = np.zeros_like(bound)

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from sononerf.array_types import Floats
 from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.range_levels import RangeLevels
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
 from sononerf.surface.start.learned import learned_surface
@@ -64,6 +65,7 @@ def read_field(
     resolution: float,
     spacing: float | None = None,
     directions: int = 100,
+    levels: RangeLevels | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FieldReading:
     """Read volume and evidence out of a field.
@@ -74,15 +76,15 @@ def read_field(
         resolution (m): Range resolution of the analysis.
         spacing (m): Voxel size; half of the field's own resolution where None.
         directions: Size of the spherical lattice that is summed over where the field has no lobes.
+        levels: Levels of the echoes over range, for the method ``learned``.
         progress: Called with the voxels done and the voxels in all.
     """
     lower, upper, step = _grid_of(field, spacing)
     energy = _energy(field, directions)
     volume = volume_from_function(energy, lower, upper, step, chunk=_CHUNK, progress=progress)
     places = _places(field, lower, upper, directions)
-    return FieldReading(
-        volume, gather_evidence(field, places, hull, lower, upper, step, resolution)
-    )
+    known = gather_evidence(field, places, hull, lower, upper, step, resolution, levels)
+    return FieldReading(volume, known)
 
 
 def start_surfaces(

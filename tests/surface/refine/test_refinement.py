@@ -273,6 +273,29 @@ def test_the_better_of_the_blurred_and_the_sharp_surface_goes_on(
         assert len(work.candidates) == 2
 
 
+@pytest.mark.thorough
+def test_the_learned_start_goes_on_where_it_explains_most(bumpy, echoes, optics, monkeypatch):
+    starts = {"body": bumpy, "learned": bumpy.copy().apply_scale(1.02)}
+    for blurred, learned, way in (
+        (1.1, 0.9, "learned"),
+        (1.1, 1.01, "blurred"),
+        (2.0, 1.01, "sharp"),
+    ):
+        work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        found = {"blurred": blurred, "sharp": 1.0, "learned": learned}
+        monkeypatch.setattr(
+            work.comparison, "objective", lambda *a, work=work, found=found, **k: found[work.way]
+        )
+        while not work.done:
+            work.advance()
+        assert work.drawn == number_of_steps(starts, SHORT)
+        assert work.way == way
+        assert work.start == ("learned" if way == "learned" else "body")
+        again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        again.load(work.state())
+        assert (again.start, again.way) == (work.start, way)
+
+
 def slab(height):
     """A thin plate, thinner than any voxel of the stages."""
     plate = trimesh.creation.box((0.02, 0.02, height))

@@ -45,6 +45,13 @@ def test_a_blur_cuts_a_thin_neck():
     assert remesh(whole, 1e-3, blur=0.002).body_count == 2
 
 
+def test_a_blur_that_would_take_a_wire_away_is_refused():
+    wire = trimesh.creation.torus(0.03, 0.0015, major_sections=96, minor_sections=16)
+    both = trimesh.util.concatenate([wire, ball(0.008)])
+    assert remesh(both, 1e-3).body_count == 2
+    assert remesh(both, 1e-3, blur=0.002) is None
+
+
 def test_open_surfaces_and_sheets_that_would_be_lost_are_left_alone():
     whole = ball()
     half = trimesh.Trimesh(whole.vertices, whole.faces[whole.triangles_center[:, 2] > 0])

@@ -12,15 +12,26 @@ import trimesh
 from safetensors.torch import load_file
 
 from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.range_levels import RangeLevels
 from sononerf.errors import InputError, NumericalError
 from sononerf.geometry.lattice import Lattice
 from sononerf.surface.start import learned
 from sononerf.surface.start.evidence import Evidence
-from sononerf.surface.start.learned import BLOCK, FEATURES, StartNetwork, features, lattice_of
+from sononerf.surface.start.learned import (
+    BLOCK,
+    FEATURES,
+    LOGIT,
+    OPEN,
+    VECTORS,
+    StartNetwork,
+    expected_level,
+    features,
+    lattice_of,
+)
 from sononerf.surface.start.occupancy import Gathered, clearance_grid
 from tools.learning.bodies import KINDS, body
 from tools.learning.examples import true_distance
-from tools.learning.training import Example, loss, train, weights_file
+from tools.learning.training import Example, crop, loss, train, weights_file
 
 RADIUS, RESOLUTION = 0.02, 0.006
 
@@ -45,8 +56,20 @@ def sphere_heard(count=200, scale=1.0):
     lattice = Lattice.over(np.full(3, -0.04 * scale), np.full(3, 0.04 * scale), 0.002 * scale)
     bound = (-clearance_grid(hull, lattice) / lattice.spacing).astype(np.float32)
     thin = np.zeros(lattice.shape, np.float32)
+    resolution = RESOLUTION * scale
+    ranges = scale * (0.3 + 0.001 * np.arange(200))
+    pulse = np.exp(-(((ranges - first) / (0.4 * resolution)) ** 2))
+    levels = RangeLevels.of(
+        pulse[:, None, :, None],
+        sources,
+        sources[:, None],
+        first=ranges[0],
+        spacing=ranges[1] - ranges[0],
+        resolution=resolution,
+    )
+    weight = np.ones(count)
     return Gathered(
-        evidence, np.ones(count), evidence.points, lattice, thin, bound, hull, RESOLUTION * scale
+        evidence, weight, evidence.points, lattice, thin, bound, hull, resolution, levels
     )
 
 
@@ -90,6 +113,24 @@ def test_each_channel_of_a_block_is_a_voxel_of_it():
     np.testing.assert_array_equal(found.numpy(), 2.0 * (4 * x + 2 * y + z))
 
 
+def test_an_untrained_network_gives_the_mean_of_open_and_filled():
+    seen = torch.zeros(1, FEATURES, BLOCK, BLOCK, BLOCK)
+    seen[:, OPEN], seen[:, OPEN + 1] = 0.5, -0.1
+    with torch.no_grad():
+        found = StartNetwork()(seen)
+    np.testing.assert_allclose(found.numpy(), 0.2 * 1.5 / learned.VOXEL, rtol=1e-5)
+
+
+def test_the_level_gives_the_expected_volume():
+    steps = np.linalg.norm(np.indices((40, 40, 40)) - 19.5, axis=0) - 12.0
+    assert abs(expected_level(steps.clip(-4, 4))) < 0.15  # a sharp surface stays in its place
+    wire = np.full((40, 40, 40), 4.0)
+    wire[:, 15:21, 15:21] = np.linspace(0.3, 1.5, 36).reshape(6, 6)  # nowhere likelier than air
+    chance = 1 / (1 + np.exp(wire[:, 15:21, 15:21] / LOGIT))
+    inside = (wire < expected_level(wire)).sum()
+    assert inside == pytest.approx(chance.sum(), rel=0.1)
+
+
 def test_many_points_are_seen_as_few_of_the_same_density(monkeypatch):
     known = sphere_heard()
     lattice = lattice_of(known)
@@ -103,6 +144,29 @@ def test_without_room_for_a_body_there_is_no_surface():
     known = sphere_heard()
     with pytest.raises(NumericalError, match="no room"):
         learned.learned_surface(dataclasses.replace(known, bound=known.bound + 100))
+
+
+def test_without_the_echoes_there_is_no_surface():
+    with pytest.raises(NumericalError, match="needs the echoes"):
+        learned.learned_surface(dataclasses.replace(sphere_heard(), levels=None))
+
+
+def test_a_crop_turns_its_vectors_with_it():
+    lattice = Lattice.over(np.full(3, -0.03), np.full(3, 0.03), 0.0008)
+    true = true_distance(trimesh.creation.icosphere(3, RADIUS), lattice)
+    true += np.tensordot([0.1, -0.3, 0.2], np.indices(true.shape), 1)
+    seen = np.zeros((FEATURES, *true.shape))
+    for vector in range(VECTORS):
+        first = FEATURES - 3 * (VECTORS - vector)
+        seen[first : first + 3] = np.gradient(true)
+    example, random = Example(seen, true, "blob", 0), np.random.default_rng(1)
+    inner = (slice(25, 40),) * 3
+    for _ in range(8):
+        made, aim = crop(example, random)
+        for vector in range(VECTORS):
+            first = FEATURES - 3 * (VECTORS - vector)
+            for axis, slope in enumerate(np.gradient(aim.astype(np.float64))):
+                np.testing.assert_allclose(made[first + axis][inner], slope[inner], atol=0.1)
 
 
 def test_the_weights_are_small_and_fit_the_network():
@@ -139,8 +203,9 @@ def test_training_lowers_the_loss_and_its_weights_are_read_again(tmp_path):
     lattice = lattice_of(known)
     seen = features(known, lattice).astype(np.float16)
     true = true_distance(trimesh.creation.icosphere(4, RADIUS), lattice).astype(np.float16)
+    seen[OPEN : OPEN + 2] += 0.3  # as if both beliefs made the body too small
     examples = [Example(seen, true, "blob", seed) for seed in (0, 4)]
-    network = train(examples, steps=30, seed=0, tell=lambda line: None)
+    network = train(examples, steps=60, seed=0, tell=lambda line: None)
     given, aim = torch.from_numpy(seen.astype(np.float32))[None], torch.from_numpy(true)[None]
     with torch.no_grad():
         made = (StartNetwork()(given), network(given))
