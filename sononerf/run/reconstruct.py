@@ -191,8 +191,10 @@ def reconstruct(
     with run.locked(None if refines else folder), results_folder(folder):
         if refines:
             check_state(run)
+        # The learned start needs the echoes; all others do with the free space.
+        heard = run.echoes if refines or method == "learned" else run.fitted.hull
         surface = reconstruction.reconstruct(
-            run.fitted.module, run.fitted.hull, options=chosen, progress=progress
+            run.fitted.module, heard, options=chosen, progress=progress
         )
         if refines:
             surface = refine_surface(run, surface, accelerator=accelerator, progress=progress)
