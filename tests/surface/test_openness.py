@@ -359,7 +359,7 @@ def read(monkeypatch):
         evidence = Evidence(nothing, nothing, np.zeros(0), np.zeros(0, np.intp))
         return SimpleNamespace(
             hull=given[2],
-            resolution=given[-1],
+            resolution=given[6],
             evidence=evidence,
             weight=np.zeros(0),
             lattice=Lattice.over(np.full(3, -WALL), np.full(3, WALL), 0.002),
