@@ -47,9 +47,10 @@ sharp one, because it is smoother. The learned start must have the lowest object
 STATE_VERSION = 3
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
 Way = Literal["blurred", "sharp", "learned", "sheet"]
-"""Way of a surface through the stages: with the blur and the edges of each stage, unless the blur
-would take away thin parts; without blur on fine triangles; so from the start ``learned``; or as a
-sheet, whose triangles are kept because a signed distance on voxels would tear it."""
+"""Way of a surface through the stages. ``blurred``: with the blur and the edges of each stage,
+unless the blur would take away thin parts. ``sharp``: without blur, on fine triangles. ``learned``:
+the same, from the start of this name. ``sheet``: its triangles are kept, because a signed distance
+on voxels would tear it."""
 _OWN: tuple[Literal["learned", "sheet"], ...] = ("learned", "sheet")  # starts with their own way
 
 

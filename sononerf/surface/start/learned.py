@@ -59,8 +59,8 @@ LOGIT = 0.7
 """Distance at which the logit of the probability that a voxel is outside is 1, voxels; the same in
 the training."""
 SURE = 3.0
-"""Distance from which a voxel is surely outside, voxels: beyond it the small probabilities of many
-voxels would add up."""
+"""Distance from which a voxel is taken to be outside, voxels. Farther voxels are many, and their
+small probabilities would add up."""
 BLOCK = 16
 """Number of voxels along an axis that are one voxel at the coarsest level of the network."""
 _REACH = 0.3  # distance outside of the onsets' bound that the lattice covers, range resolutions
@@ -73,7 +73,8 @@ last ones, three components each."""
 FEATURES = 16 + STATISTICS + 3
 """Number of features of a voxel."""
 OPEN = 13
-"""First of the features that are signed distances of ``BELIEFS``, 1.5 range resolutions."""
+"""Index of the first of the features that are signed distances of ``BELIEFS``. Their unit is 1.5
+range resolutions."""
 BELIEFS: tuple[Literal["open", "filled"], ...] = ("open", "filled")
 """Beliefs whose signed distances the network sees."""
 CHANNELS = (32, 64, 96, 96)
