@@ -24,8 +24,9 @@ from sononerf.progress import Progress
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import ReconstructionSettings, SimulationSettings
 from sononerf.simulation.simulator import Simulator
+from sononerf.surface.refine.course import number_of_steps
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.refinement import Refinement, number_of_steps
+from sononerf.surface.refine.refinement import Refinement
 from sononerf.surface.refine.refinement import refine as refine_starts
 from sononerf.surface.start.read_out import (
     StartMethod,
@@ -153,6 +154,7 @@ def refine(
     with progress.task("refining", number_of_steps(starts)) as task, _one_thread():
 
         def stepped(work: Refinement, mismatch: float) -> None:
+            task.total = work.steps
             task.advance(work.drawn - task.done, f"mismatch {mismatch:.2f} dB")
             if after_step is not None:
                 after_step(work, mismatch)

@@ -235,7 +235,7 @@ def _tube(path: NDArray[np.float64], radius: ArrayLike, sides: int = 24) -> trim
 
 def tubes(random: Random) -> trimesh.Trimesh:
     """Return a helix, rings, a bent tube, or a twig of capsules."""
-    which, radius = random.integers(4), random.uniform(0.07, 0.2)
+    which, radius = random.integers(4), float(np.exp(random.uniform(*np.log([0.035, 0.2]))))
     if which == 0:
         turns, wide = random.uniform(1.0, 4.0), random.uniform(0.4, 0.9)
         part = np.linspace(0.0, 1.0, 300)
@@ -318,6 +318,6 @@ def _may_touch(one: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:
 
 
 KINDS: tuple[Kind, ...] = (
-    solids, lathe, extrusion, tubes, table, blob, cluster, slabs, lathe, extrusion,
+    solids, lathe, extrusion, tubes, table, blob, cluster, slabs, lathe, tubes,
 )  # fmt: skip
 """Kinds in the order of the seeds."""

@@ -6,9 +6,9 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,6 +21,7 @@ from sononerf.errors import SonoNerfError
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.comparison import Comparison
 from sononerf.surface.refine.correction import Correction
+from sononerf.surface.refine.course import OWN, Course, below, going_on, number_of_steps, ways_of
 from sononerf.surface.refine.descent import (
     POSES,
     SHARP,
@@ -40,18 +41,8 @@ logger = logging.getLogger("sononerf")
 SIMULATED = 96
 """Number of training poses for which a surface is simulated; each is drawn about three times."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
-TOLERATED = 1.15
-"""Ratio of two objectives of validation poses below which they differ by chance. Within it, a later
-stage is preferred; after the first stage a sheet is preferred, or else the blurred surface to the
-sharp one, because it is smoother. The learned start must have the lowest objective of all."""
-STATE_VERSION = 3
+STATE_VERSION = 4
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
-Way = Literal["blurred", "sharp", "learned", "sheet"]
-"""Way of a surface through the stages. ``blurred``: with the blur and the edges of each stage,
-unless the blur would take away thin parts. ``sharp``: without blur, on fine triangles. ``learned``:
-the same, from the start of this name. ``sheet``: its triangles are kept, because a signed distance
-on voxels would tear it."""
-_OWN: tuple[Literal["learned", "sheet"], ...] = ("learned", "sheet")  # starts with their own way
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,23 +102,14 @@ def refine(
     return work.result()
 
 
-def number_of_steps(starts: Iterable[str], stages: tuple[Stage, ...] = STAGES) -> int:
-    """Return the steps of a refinement of these start methods; each way has a first stage."""
-    return (len(_ways(starts)) - 1) * stages[0].steps + sum(stage.steps for stage in stages)
-
-
-def _ways(starts: Iterable[str]) -> list[Way]:
-    ways: list[Way] = ["blurred", "sharp"] if set(starts) - set(_OWN) else []
-    return [*ways, *(name for name in _OWN if name in starts)]
-
-
 class Refinement:
     """Refinement, step by step; between any two steps it can be stopped, saved and resumed.
 
     Args:
         meshes: Start surfaces, m; the one that explains the validation poses best is refined.
             Starts with the names ``learned`` and ``sheet`` take part in the first stage beside the
-            best of the others.
+            best of the others. Of surfaces that the first stage leaves about as good, the learned
+            one and another one go through all stages.
         echoes: Measured spectrograms and onsets; the surface must begin at the onsets. If their
             level is absolute, gains are learned in the last stage alone: a rough surface is too
             faint, and a gain would hide that. Otherwise gains are learned from the first stage on.
@@ -137,6 +119,7 @@ class Refinement:
         stages: From coarse to fine; ``STAGES`` where None.
 
     Attributes:
+        courses: Those of the present stage; after the first stage, those that go on.
         history: As in :class:`Refined`, so far.
         newest: The surface that the last entry of the history tells of; None before the first, and
             after a state was taken over.
@@ -155,23 +138,17 @@ class Refinement:
         self.simulate = simulate
         self.echoes, self.optics, self.seed = echoes, optics, seed
         self.stages = stages or STAGES
-        like = optics.get_buffer("wavenumber")
-        self.level = Level(optics.ears, len(optics.frequencies), like)
         self.onsets = OnsetRanges(echoes.hull, optics.head.resolution, seed)
         self.starts = {name: _plain(mesh) for name, mesh in meshes.items()}
-        self.candidates: list[trimesh.Trimesh] = []
-        self.objectives: list[float] = []
-        self.start: StartMethod | None = None
+        self.courses: list[Course] = []
         self.stage, self.step, self.drawn = 0, 0, 0
-        self.ways = _ways(meshes)
-        self.way = self.ways[0]
         self.history: list[dict[str, Any]] = []
         self.faults: list[str] = []
         self.newest: trimesh.Trimesh | None = None
-        self._rivals: list[trimesh.Trimesh] = []  # results of the first stage, by way
+        self._at = 0  # number of the present course
         self._descent: Descent | None = None
         self._later: LaterBounces | None = None
-        self._source = 0  # the candidate whose later bounces are added
+        self._source = 0  # number of the surface whose later bounces are added
         self.comparison = Comparison(echoes, optics, self.onsets, seed)
 
     @property
@@ -179,14 +156,24 @@ class Refinement:
         """True if nothing is left to do."""
         return self.stage >= len(self.stages)
 
+    @property
+    def steps(self) -> int:
+        """Number of all steps; before the first stage has ended, of one course that goes on."""
+        return number_of_steps(self.starts, self.stages, len(self.courses) if self.stage else 1)
+
+    @property
+    def course(self) -> Course:
+        """The present course."""
+        if not self.courses:
+            self._choose()
+        return self.courses[self._at]
+
     def advance(self) -> float:
         """Do one step; return its mismatch, dB."""
-        stage = self.stages[self.stage]
-        if self.start is None:
-            self._choose()
+        stage, course = self.stages[self.stage], self.course
         if self._descent is None:
             if stage.beyond == "trace":
-                self._source = len(self.candidates) - 1
+                self._source = len(course.meshes) - 1
             self._descent = self._descend(self._prepared())
         mismatch = self._descent.step(self.drawn, self.step / stage.steps)
         self.step += 1
@@ -198,71 +185,72 @@ class Refinement:
     def _prepared(self) -> trimesh.Trimesh:
         """Return the surface that a stage begins with."""
         stage, unit = self.stages[self.stage], self.optics.wavelength
-        before, plane = self.candidates[-1], self.optics.plane
-        if self.way in _OWN and self.stage == 0:
-            before = self.starts[self.way]
-        if self.way == "sheet":
+        before, plane = self.course.meshes[-1], self.optics.plane
+        if self.course.way == "sheet":
             return before
         made = None
-        if self.way == "blurred":
+        if self.course.way == "blurred":
             made = remesh(before, stage.edge * unit, stage.blur * unit, plane)
         if made is None:
             made = remesh(before, min(SHARP, stage.edge) * unit, 0.0, plane)
         return before if made is None else made
 
     def _finish(self, mismatch: float) -> None:
-        """End a stage; the first one is done in each way."""
+        """End a stage of the present course."""
         assert self._descent is not None
-        mesh, self._descent, self.step = self._descent.mesh(), None, 0
-        objective = self._objective(mesh, f"the surface of stage {self.stage}", smooth=True)
+        course, mesh = self.course, self._descent.mesh()
+        self._descent, self.step = None, 0
+        name = f"the surface of stage {self.stage}"
+        objective = self._objective(mesh, name, course.level, smooth=True)
         self.history.append(
             {
                 "stage": self.stage,
-                "way": self.way,
+                "way": course.way,
                 "mismatch_db": mismatch,
                 "objective_db": objective,
             }
         )
         self.newest = mesh
-        if self.stage == 0:
-            self._rivals.append(mesh)
-            if len(self._rivals) < len(self.ways):
-                self.way = self.ways[len(self._rivals)]
-                self.level.reset()
-                return
-            mesh, objective = self._best_way()
-        self.candidates.append(mesh)
-        self.objectives.append(objective)
-        self.stage += 1
+        course.meshes.append(mesh)
+        course.objectives.append(objective)
+        first, last = self.stage == 0, self.stage == len(self.stages) - 1
+        if (first or last) and self._at + 1 < len(self.courses):
+            self._at, self._later = self._at + 1, None
+            self.stage = 0 if first else 1
+        else:
+            self.stage += 1
+            if first:
+                self._select()
 
-    def _best_way(self) -> tuple[trimesh.Trimesh, float]:
-        """Continue in the best way; return its result of the first stage, and its objective."""
-        found = dict(zip(self.ways, (one["objective_db"] for one in self.history), strict=True))
-        good = TOLERATED * min(found.values())
-        self.way = min(found, key=lambda way: found[way])
-        smooth: tuple[Way, ...] = ("sheet",) if self.way == "learned" else ("sheet", "blurred")
-        self.way = next((way for way in smooth if found.get(way, math.inf) <= good), self.way)
-        if self.way in _OWN and self.start != self.way:
-            self._begin([self.way])
-        return self._rivals[self.ways.index(self.way)], found[self.way]
+    def _select(self) -> None:
+        """After the first stage, keep the courses that go on."""
+        self.courses, self._at, self._later = going_on(self.courses), 0, None
+        for one in self.courses:
+            if math.isnan(one.objectives[0]):
+                one.objectives[0] = self._compared(one.start)
 
     def _choose(self) -> None:
-        """Begin with the start that explains the validation poses best."""
-        self._begin([name for name in self.starts if name not in _OWN] or list(self.starts))
+        """Begin with the start that explains the validation poses best, and those with own ways."""
+        names = [name for name in self.starts if name not in OWN]
+        found = {name: self._compared(name) for name in names}
+        for way in ways_of(self.starts):
+            start: Any = way if way in OWN else min(names, key=lambda name: found[name])
+            mesh, objective = self.starts[start], found.get(start, math.nan)
+            self.courses.append(Course(way, start, self._new_level(), [mesh], [objective]))
 
-    def _begin(self, names: list[StartMethod]) -> None:
-        meshes = [self.starts[name] for name in names]
-        found = [
-            self._objective(mesh, f"the start {name}", smooth=False)
-            for name, mesh in zip(names, meshes, strict=True)
-        ]
-        best = int(np.argmin(found))
-        self.start, self.candidates, self.objectives = names[best], [meshes[best]], [found[best]]
+    def _new_level(self) -> Level:
+        like = self.optics.get_buffer("wavenumber")
+        return Level(self.optics.ears, len(self.optics.frequencies), like)
 
-    def _objective(self, mesh: trimesh.Trimesh, name: str, *, smooth: bool) -> float:
+    def _compared(self, name: StartMethod) -> float:
+        """Return the objective of a start."""
+        mesh, level = self.starts[name], self._new_level()
+        return self._objective(mesh, f"the start {name}", level, smooth=False)
+
+    def _objective(self, mesh: trimesh.Trimesh, name: str, level: Level, *, smooth: bool) -> float:
         """Return the objective of a surface; infinite if it cannot be traced."""
         try:
-            return self.comparison.objective(mesh, self.level, smooth=smooth)
+            return self.comparison.objective(mesh, level, smooth=smooth)
         except SonoNerfError as error:
             self._note(f"{name} cannot be compared and counts as the worst: {error}")
             return math.inf
@@ -274,30 +262,30 @@ class Refinement:
             logger.warning("%s", fault)
 
     def _descend(self, mesh: trimesh.Trimesh) -> Descent:
-        stage = self.stages[self.stage]
+        stage, course = self.stages[self.stage], self.course
         last = self.stage == len(self.stages) - 1
-        self.level.learns = "none" if self.echoes.calibrated and not last else "each"
+        course.level.learns = "none" if self.echoes.calibrated and not last else "each"
         correction = None
         if stage.beyond == "simulate":
             self._later, correction = None, self._correction(mesh)
         elif stage.beyond == "none":
             self._later = None
         elif stage.beyond == "trace" or self._later is None:
-            source = self.candidates[self._source]
+            source = course.meshes[self._source]
             self._later = LaterBounces(self.optics, source, self.echoes, seed=self.seed)
             self._later.trace(self._coming())
         return Descent(
             mesh,
             self.echoes,
             self.optics,
-            self.level,
+            course.level,
             smoothing=stage.smoothing * self.optics.wavelength,
             rate=stage.rate,
             later=self._later,
             correction=correction,
             # The simulator's correction is more exact than the onsets.
             onsets=None if correction is not None else self.onsets,
-            sheet=self.way == "sheet",
+            sheet=course.way == "sheet",
             band=stage.band,
             seed=self.seed,
         )
@@ -329,26 +317,21 @@ class Refinement:
 
     def state(self) -> dict[str, Tensor]:
         """Return all that is needed to go on, as plain tensors."""
-        start = -1 if self.start is None else list(self.starts).index(self.start)
-        way = self.ways.index(self.way)
+        ways = ways_of(self.starts)
         found = {
-            "progress": torch.tensor([self.stage, self.step, self.drawn, start, way, self._source]),
-            "objectives": torch.tensor(self.objectives, dtype=torch.float64),
+            "progress": torch.tensor([self.stage, self.step, self.drawn, self._at, self._source]),
             "history": torch.tensor(
                 [
-                    (one["stage"], self.ways.index(one["way"]), *list(one.values())[2:])
+                    (one["stage"], ways.index(one["way"]), *list(one.values())[2:])
                     for one in self.history
                 ],
                 dtype=torch.float64,
             ).reshape(-1, 4),
             "faults": torch.tensor(list("\n".join(self.faults).encode()), dtype=torch.uint8),
-            **{f"level.{name}": part for name, part in self.level.state().items()},
         }
-        meshes = {f"candidate.{number}": mesh for number, mesh in enumerate(self.candidates)}
-        meshes.update({f"rival.{number}": mesh for number, mesh in enumerate(self._rivals)})
-        for name, mesh in meshes.items():
-            found[f"{name}.vertices"] = torch.as_tensor(np.array(mesh.vertices))
-            found[f"{name}.faces"] = torch.as_tensor(np.array(mesh.faces))
+        for number, course in enumerate(self.courses):
+            parts = course.state()
+            found.update({f"course.{number}.{name}": part for name, part in parts.items()})
         if self._descent is not None:
             parts = self._descent.state()
             found.update({f"descent.{name}": part for name, part in parts.items()})
@@ -356,56 +339,49 @@ class Refinement:
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Go on from a state; meshes, echoes, optics, seed and stages must be the same."""
-        self.stage, self.step, self.drawn, start, way, self._source = (
+        self.stage, self.step, self.drawn, self._at, self._source = (
             int(part) for part in state["progress"]
         )
-        self.start = None if start < 0 else list(self.starts)[start]
-        self.way = self.ways[way]
-        self.objectives = state["objectives"].tolist()
+        ways = ways_of(self.starts)
+        self.courses = []
+        while parts := below(state, f"course.{len(self.courses)}."):
+            self.courses.append(Course.of(parts, self._new_level()))
         self.history = [
             {
                 "stage": int(stage),
-                "way": self.ways[int(way)],
+                "way": ways[int(way)],
                 "mismatch_db": mismatch,
                 "objective_db": objective,
             }
             for stage, way, mismatch, objective in state["history"].tolist()
         ]
         self.faults = bytes(state["faults"].tolist()).decode().splitlines()
-        self.level.load({name: state[f"level.{name}"] for name in self.level.state()})
-        self.candidates, self._rivals = _meshes(state, "candidate"), _meshes(state, "rival")
         self._later, self._descent = None, None
-        parts = {k.removeprefix("descent."): v for k, v in state.items() if k[:8] == "descent."}
-        if parts:
+        if parts := below(state, "descent."):
             begun = trimesh.Trimesh(parts["start"].numpy(), parts["faces"].numpy(), process=False)
             self._descent = self._descend(begun)
             self._descent.load(parts)
 
     def result(self) -> Refined:
         """Return the best surface so far; the start where none explains more."""
-        if self.start is None:
+        if not self.courses:
             self._choose()
-        good = TOLERATED * min(self.objectives)
-        better = [n for n, found in enumerate(self.objectives) if found < self.objectives[0]]
-        best = max([n for n in better if self.objectives[n] <= good], default=0)
-        mesh = self.candidates[best]
+        course = min(self.courses, key=lambda one: one.objectives[one.best])
+        best = course.best
+        mesh = course.meshes[best]
         confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
         if best:
             mesh, confidence = finer(mesh, confidence, self.optics.wavelength)
-        gain = self.level.gain.exp().cpu().double().numpy()
-        assert self.start is not None
-        error = self.objectives[best]
-        kept = best > 0
-        return Refined(mesh, gain, confidence, self.start, kept, error, self.history, self.faults)
-
-
-def _meshes(state: dict[str, Tensor], name: str) -> list[trimesh.Trimesh]:
-    """Return the meshes ``name.0``, ``name.1`` and so on of a state."""
-    found: list[trimesh.Trimesh] = []
-    while f"{name}.{len(found)}.vertices" in state:
-        parts = (state[f"{name}.{len(found)}.{part}"].numpy() for part in ("vertices", "faces"))
-        found.append(trimesh.Trimesh(*parts, process=False))
-    return found
+        return Refined(
+            mesh=mesh,
+            gain=course.level.gain.exp().cpu().double().numpy(),
+            confidence=confidence,
+            start=course.start,
+            kept=best > 0,
+            error_db=course.objectives[best],
+            history=self.history,
+            faults=self.faults,
+        )
 
 
 def _plain(mesh: trimesh.Trimesh) -> trimesh.Trimesh:

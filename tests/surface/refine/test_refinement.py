@@ -18,7 +18,7 @@ from sononerf.surface.refine import refinement as module
 from sononerf.surface.refine.descent import Descent, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.refinement import Refinement, number_of_steps
+from sononerf.surface.refine.refinement import Refinement
 from tests.memory import changed, deaf_hull
 from tests.surface.conftest import RADIUS
 
@@ -61,7 +61,7 @@ def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, e
     )
     while work.stage == 0:
         work.advance()
-    gain = work.level.gain[0].exp().numpy()
+    gain = work.course.level.gain[0].exp().numpy()
     assert gain[-1] / gain[0] > 5.0
 
 
@@ -113,12 +113,15 @@ def test_of_two_starts_the_one_that_explains_more_is_refined(bumpy, echoes, opti
     for starts in ({"whole": bumpy, "half": half}, {"half": half, "whole": bumpy}):
         work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
         work.advance()
-        assert work.start == "whole"
-        assert len(work.candidates) == 1
-        np.testing.assert_array_equal(work.candidates[0].vertices, bumpy.vertices)
+        assert [(one.start, one.way) for one in work.courses] == [
+            ("whole", "blurred"),
+            ("whole", "sharp"),
+        ]
+        (begun,) = work.course.meshes
+        np.testing.assert_array_equal(begun.vertices, bumpy.vertices)
         again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
         again.load(work.state())
-        assert again.start == "whole"
+        assert again.course.start == "whole"
 
 
 @pytest.fixture
@@ -184,8 +187,9 @@ def test_going_on_from_any_step_ends_the_same(bumpy, echoes, optics, simulated_s
         again.load(states[step])
         while not again.done:
             again.advance()
-        assert np.array_equal(again.candidates[-1].vertices, whole.candidates[-1].vertices)
-        assert torch.equal(again.level.gain, whole.level.gain)
+        one, other = again.course, whole.course
+        assert np.array_equal(one.meshes[-1].vertices, other.meshes[-1].vertices)
+        assert torch.equal(one.level.gain, other.level.gain)
 
 
 def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
@@ -261,39 +265,62 @@ def test_the_better_of_the_blurred_and_the_sharp_surface_goes_on(
         monkeypatch.setattr(
             work.comparison,
             "objective",
-            lambda *a, work=work, worse=worse, v=value, **k: v if work.way == worse else 1.0,
+            lambda *a, work=work, worse=worse, v=value, **k: v if way_of(work) == worse else 1.0,
         )
         ends = []
         while work.stage == 0:
             work.advance()
             if work.step == 0:
-                ends.append(work._rivals[-1] if work.stage == 0 else work.candidates[-1])
-        assert work.way == better
-        assert (ends[1] is ends[0]) == (better == "blurred")
-        assert len(work.candidates) == 2
+                ends.append(work.newest)
+        (course,) = work.courses
+        assert course.way == better
+        assert course.meshes[1:] == [ends[0] if better == "blurred" else ends[1]]
+
+
+def way_of(work):
+    return work.courses[work._at].way if work.courses else "start"
 
 
 @pytest.mark.thorough
-def test_the_learned_start_goes_on_where_it_explains_most(bumpy, echoes, optics, monkeypatch):
+@pytest.mark.parametrize(
+    ("first", "ways"),
+    [
+        ({"blurred": 1.0, "sharp": 1.0, "learned": 1.2}, ["blurred"]),
+        ({"blurred": 1.1, "sharp": 1.0, "learned": 1.1}, ["blurred", "learned"]),
+        ({"blurred": 2.0, "sharp": 1.1, "learned": 1.0}, ["sharp", "learned"]),
+        ({"blurred": 2.0, "sharp": 2.0, "learned": 1.0}, ["learned"]),
+    ],
+)
+def test_of_the_learned_start_and_another_that_are_as_good_the_better_end_counts(
+    bumpy, echoes, optics, monkeypatch, first, ways
+):
     starts = {"body": bumpy, "learned": bumpy.copy().apply_scale(1.02)}
-    for blurred, learned, way in (
-        (1.0, 0.95, "learned"),
-        (1.1, 1.01, "blurred"),
-        (2.0, 1.01, "sharp"),
-    ):
+    for best in ways:
         work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-        found = {"blurred": blurred, "sharp": 1.0, "learned": learned}
-        monkeypatch.setattr(
-            work.comparison, "objective", lambda *a, work=work, found=found, **k: found[work.way]
-        )
+
+        def objective(*given, work=work, best=best, **named):
+            way = way_of(work)
+            return first.get(way, 3.0) if work.stage == 0 else 0.5 + 0.01 * (way != best)
+
+        monkeypatch.setattr(work.comparison, "objective", objective)
+        middle = None
         while not work.done:
             work.advance()
-        assert work.drawn == number_of_steps(starts, SHORT)
-        assert work.way == way
-        assert work.start == ("learned" if way == "learned" else "body")
+            if work.stage == 1 and middle is None:
+                middle = {name: part.clone() for name, part in work.state().items()}
+        assert work.drawn == work.steps
+        later = [one["way"] for one in work.history if one["stage"] == 1]
+        assert later == ways
+        found = work.result()
+        assert found.start == ("learned" if best == "learned" else "body")
         again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-        again.load(work.state())
-        assert (again.start, again.way) == (work.start, way)
+        again.load(middle)
+        monkeypatch.setattr(
+            again.comparison, "objective", lambda *a, again=again, **k: objective(work=again)
+        )
+        while not again.done:
+            again.advance()
+        np.testing.assert_array_equal(again.result().mesh.vertices, found.mesh.vertices)
 
 
 def slab(height):
@@ -313,18 +340,19 @@ def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
         monkeypatch.setattr(
             work.comparison,
             "objective",
-            lambda *a, work=work, value=value, **k: value if work.way == "sheet" else 1.0,
+            lambda *a, work=work, value=value, **k: value if way_of(work) == "sheet" else 1.0,
         )
         while not work.done:
             work.advance()
-        assert work.drawn == number_of_steps(starts, SHORT)
-        assert work.start == start
+        assert work.drawn == work.steps
+        (course,) = work.courses
+        assert course.start == start
         again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
         again.load(work.state())
-        assert (again.start, again.way) == (start, work.way)
+        assert (again.course.start, again.course.way) == (start, course.way)
         assert again.history == work.history
         if start == "sheet":
-            assert all(len(mesh.faces) == len(thin.faces) for mesh in work.candidates)
+            assert all(len(mesh.faces) == len(thin.faces) for mesh in course.meshes)
 
 
 def test_a_sheet_alone_is_refined(echoes, optics):
