@@ -39,7 +39,7 @@ FACTOR = 3.0
 SPHERES = "scene.name=three_spheres"
 PROCEDURAL = range(100, 120)
 """Seeds of shapes on which nothing was settled."""
-NEW = ("beaker", "cone", "rings", "tower", "blob", "stool", "helix")
+NEW = ("beaker", "cone", "rings", "tower", "blob", "stool", "helix", "box", "star")
 
 ABOVE = ("poses.arrangement=cap", "poses.axis=[0,0,1]", "poses.half_angle_deg=70")
 """Poses as a hand or a robot reaches above a table."""
