@@ -49,7 +49,7 @@ class Task:
         if note is not None:
             self.note = note
         if self._bars is not None and self._id is not None:
-            self._bars.update(self._id, completed=self.done, total=self.total, note=self.note)
+            self._bars.update(self._id, completed=self.done, note=self.note)
         elif self.done < self.total and time.monotonic() - self._last >= LINE_SECONDS:
             self._line()
 

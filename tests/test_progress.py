@@ -91,11 +91,3 @@ def test_a_terminal_gets_a_bar(monkeypatch, capsys):
     assert "fitting" in err
     assert "3/4" in err
     assert "loss 7" in err
-
-
-def test_work_that_grows_tells_its_new_total(clock, capsys):
-    with Progress().task("refining", 10) as task:
-        clock.now += 20.0
-        task.total = 40
-        task.advance(10)
-    assert "refining: 10 of 40, " in capsys.readouterr().err

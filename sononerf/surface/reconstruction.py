@@ -154,7 +154,6 @@ def refine(
     with progress.task("refining", number_of_steps(starts)) as task, _one_thread():
 
         def stepped(work: Refinement, mismatch: float) -> None:
-            task.total = work.steps
             task.advance(work.drawn - task.done, f"mismatch {mismatch:.2f} dB")
             if after_step is not None:
                 after_step(work, mismatch)

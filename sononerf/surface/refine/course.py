@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
 
@@ -18,15 +18,13 @@ from sononerf.surface.start.read_out import StartMethod
 
 TOLERATED = 1.15
 """Ratio of two objectives of validation poses below which they differ by chance. Within it, a later
-stage is preferred; after the first stage a sheet is preferred, or else the blurred surface to the
-sharp one, because it is smoother. The learned start and another one within it both go on."""
-Way = Literal["blurred", "sharp", "learned", "sheet"]
+stage is preferred. After the first stage a sheet is preferred within it; or else the learned start
+to the other one, because it knows more bodies; and then its blurred surface to its sharp one,
+because that is smoother."""
+Way = Literal["blurred", "sharp", "sheet"]
 """Way of a surface through the stages. ``blurred``: with the blur and the edges of each stage,
-unless the blur would take away thin parts. ``sharp``: without blur, on fine triangles. ``learned``:
-the same, from the start of this name. ``sheet``: its triangles are kept, because a signed distance
-on voxels would tear it."""
-OWN: tuple[Literal["learned", "sheet"], ...] = ("learned", "sheet")
-"""Starts that have a way of their own."""
+unless the blur would take away thin parts. ``sharp``: without blur, on fine triangles. ``sheet``:
+its triangles are kept, because a signed distance on voxels would tear it."""
 
 
 @dataclass(eq=False)
@@ -87,31 +85,40 @@ def below(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
     return {key.removeprefix(name): part for key, part in state.items() if key.startswith(name)}
 
 
-def ways_of(starts: Iterable[str]) -> list[Way]:
-    """Return the ways of start methods."""
-    ways: list[Way] = ["blurred", "sharp"] if set(starts) - set(OWN) else []
-    return [*ways, *(name for name in OWN if name in starts)]
-
-
-def number_of_steps(
-    starts: Iterable[str], stages: tuple[Stage, ...] = STAGES, courses: int = 1
-) -> int:
-    """Return the steps of a refinement; each way has a first stage, and some courses go on.
+def plans(starts: Mapping[StartMethod, float]) -> list[tuple[StartMethod, Way]]:
+    """Return the start and the way of each course.
 
     Args:
-        starts: Start methods.
-        stages: From coarse to fine.
-        courses: Number of courses that go on after the first stage.
+        starts: Start methods, and their objectives before the first stage.
+
+    Returns:
+        plans: The learned start and the best of the others go both ways; a sheet has its own.
     """
-    later = sum(stage.steps for stage in stages[1:])
-    return len(ways_of(starts)) * stages[0].steps + courses * later
+    others = [name for name in starts if name not in ("learned", "sheet")]
+    chosen = sorted(others, key=lambda name: starts[name])[:1]
+    chosen = [name for name in starts if name == "learned"] + chosen
+    ways: tuple[Way, ...] = ("blurred", "sharp")
+    found = [(name, way) for name in chosen for way in ways]
+    return [*found, *((name, "sheet") for name in starts if name == "sheet")]
 
 
-def going_on(courses: list[Course]) -> list[Course]:
-    """Return the courses that go on after the first stage: one, or two of which one is learned."""
-    good = TOLERATED * min(course.objectives[-1] for course in courses)
-    found = {course.way: course for course in courses if course.objectives[-1] <= good}
-    if "sheet" in found:
-        return [found["sheet"]]
-    plain = found.get("blurred") or found.get("sharp")
-    return [course for course in (plain, found.get("learned")) if course]
+def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = STAGES) -> int:
+    """Return the steps of a refinement of start methods: each course has a first stage."""
+    courses = len(plans(dict.fromkeys(starts, 0.0)))
+    return (courses - 1) * stages[0].steps + sum(stage.steps for stage in stages)
+
+
+def best_of(courses: list[Course]) -> Course:
+    """Return the course that goes on after the first stage, see ``TOLERATED``."""
+    for told in (
+        lambda course: course.way == "sheet",
+        lambda course: course.start == "learned",
+        lambda course: course.way == "blurred",
+    ):
+        good = TOLERATED * min(course.objectives[-1] for course in courses)
+        some = [one for one in courses if told(one) and one.objectives[-1] <= good]
+        if some:
+            courses = [one for one in courses if told(one)]
+        else:
+            courses = [one for one in courses if not told(one)] or courses
+    return min(courses, key=lambda course: course.objectives[-1])

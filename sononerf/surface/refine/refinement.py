@@ -8,7 +8,7 @@ import logging
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from sononerf.errors import SonoNerfError
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.comparison import Comparison
 from sononerf.surface.refine.correction import Correction
-from sononerf.surface.refine.course import OWN, Course, below, going_on, number_of_steps, ways_of
+from sononerf.surface.refine.course import Course, Way, below, best_of, plans
 from sononerf.surface.refine.descent import (
     POSES,
     SHARP,
@@ -58,8 +58,8 @@ class Refined:
         kept: True where the refined surface explains the validation poses better than the start.
         error_db: Objective on validation poses, see
             :class:`~sononerf.surface.refine.comparison.Comparison`.
-        history: Per stage: its number, its way, the mismatch of its last step, and the objective on
-            validation poses after it.
+        history: Per stage: its number, the start, its way, the mismatch of its last step, and the
+            objective on validation poses after it.
         faults: Faults of the refinement, one line each: a surface that could not be traced and
             counted as the worst, or a stage that went without the simulator's correction.
     """
@@ -107,9 +107,8 @@ class Refinement:
 
     Args:
         meshes: Start surfaces, m; the one that explains the validation poses best is refined.
-            Starts with the names ``learned`` and ``sheet`` take part in the first stage beside the
-            best of the others. Of surfaces that the first stage leaves about as good, the learned
-            one and another one go through all stages.
+            ``learned`` and ``sheet`` take part in the first stage beside the best of the others,
+            see :func:`~sononerf.surface.refine.course.plans`.
         echoes: Measured spectrograms and onsets; the surface must begin at the onsets. If their
             level is absolute, gains are learned in the last stage alone: a rough surface is too
             faint, and a gain would hide that. Otherwise gains are learned from the first stage on.
@@ -119,7 +118,7 @@ class Refinement:
         stages: From coarse to fine; ``STAGES`` where None.
 
     Attributes:
-        courses: Those of the present stage; after the first stage, those that go on.
+        courses: Those of the first stage; after it, the one that goes on.
         history: As in :class:`Refined`, so far.
         newest: The surface that the last entry of the history tells of; None before the first, and
             after a state was taken over.
@@ -155,11 +154,6 @@ class Refinement:
     def done(self) -> bool:
         """True if nothing is left to do."""
         return self.stage >= len(self.stages)
-
-    @property
-    def steps(self) -> int:
-        """Number of all steps; before the first stage has ended, of one course that goes on."""
-        return number_of_steps(self.starts, self.stages, len(self.courses) if self.stage else 1)
 
     @property
     def course(self) -> Course:
@@ -205,6 +199,7 @@ class Refinement:
         self.history.append(
             {
                 "stage": self.stage,
+                "start": course.start,
                 "way": course.way,
                 "mismatch_db": mismatch,
                 "objective_db": objective,
@@ -213,29 +208,24 @@ class Refinement:
         self.newest = mesh
         course.meshes.append(mesh)
         course.objectives.append(objective)
-        first, last = self.stage == 0, self.stage == len(self.stages) - 1
-        if (first or last) and self._at + 1 < len(self.courses):
-            self._at, self._later = self._at + 1, None
-            self.stage = 0 if first else 1
-        else:
-            self.stage += 1
-            if first:
-                self._select()
-
-    def _select(self) -> None:
-        """After the first stage, keep the courses that go on."""
-        self.courses, self._at, self._later = going_on(self.courses), 0, None
-        for one in self.courses:
-            if math.isnan(one.objectives[0]):
-                one.objectives[0] = self._compared(one.start)
+        if self.stage == 0 and self._at + 1 < len(self.courses):
+            self._at += 1
+            return
+        if self.stage == 0:
+            course = best_of(self.courses)
+            if math.isnan(course.objectives[0]):
+                course.objectives[0] = self._compared(course.start)
+            self.courses, self._at, self._later = [course], 0, None
+        self.stage += 1
 
     def _choose(self) -> None:
-        """Begin with the start that explains the validation poses best, and those with own ways."""
-        names = [name for name in self.starts if name not in OWN]
-        found = {name: self._compared(name) for name in names}
-        for way in ways_of(self.starts):
-            start: Any = way if way in OWN else min(names, key=lambda name: found[name])
-            mesh, objective = self.starts[start], found.get(start, math.nan)
+        """Begin the courses; of the starts without a place of their own, the best takes part."""
+        names = [name for name in self.starts if name not in ("learned", "sheet")]
+        found = dict.fromkeys(self.starts, math.nan)
+        if len(names) > 1:
+            found.update({name: self._compared(name) for name in names})
+        for start, way in plans(found):
+            mesh, objective = self.starts[start], found[start]
             self.courses.append(Course(way, start, self._new_level(), [mesh], [objective]))
 
     def _new_level(self) -> Level:
@@ -317,16 +307,22 @@ class Refinement:
 
     def state(self) -> dict[str, Tensor]:
         """Return all that is needed to go on, as plain tensors."""
-        ways = ways_of(self.starts)
+        starts, ways = list(self.starts), get_args(Way)
         found = {
             "progress": torch.tensor([self.stage, self.step, self.drawn, self._at, self._source]),
             "history": torch.tensor(
                 [
-                    (one["stage"], ways.index(one["way"]), *list(one.values())[2:])
+                    (
+                        one["stage"],
+                        starts.index(one["start"]),
+                        ways.index(one["way"]),
+                        one["mismatch_db"],
+                        one["objective_db"],
+                    )
                     for one in self.history
                 ],
                 dtype=torch.float64,
-            ).reshape(-1, 4),
+            ).reshape(-1, 5),
             "faults": torch.tensor(list("\n".join(self.faults).encode()), dtype=torch.uint8),
         }
         for number, course in enumerate(self.courses):
@@ -342,18 +338,19 @@ class Refinement:
         self.stage, self.step, self.drawn, self._at, self._source = (
             int(part) for part in state["progress"]
         )
-        ways = ways_of(self.starts)
+        starts, ways = list(self.starts), get_args(Way)
         self.courses = []
         while parts := below(state, f"course.{len(self.courses)}."):
             self.courses.append(Course.of(parts, self._new_level()))
         self.history = [
             {
                 "stage": int(stage),
+                "start": starts[int(start)],
                 "way": ways[int(way)],
                 "mismatch_db": mismatch,
                 "objective_db": objective,
             }
-            for stage, way, mismatch, objective in state["history"].tolist()
+            for stage, start, way, mismatch, objective in state["history"].tolist()
         ]
         self.faults = bytes(state["faults"].tolist()).decode().splitlines()
         self._later, self._descent = None, None
@@ -366,7 +363,7 @@ class Refinement:
         """Return the best surface so far; the start where none explains more."""
         if not self.courses:
             self._choose()
-        course = min(self.courses, key=lambda one: one.objectives[one.best])
+        course = self.courses[self._at]
         best = course.best
         mesh = course.meshes[best]
         confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
