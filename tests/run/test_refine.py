@@ -82,8 +82,8 @@ def test_a_run_has_its_refined_surface(run, no_projections):
     events = EventAccumulator(str(run / "tensorboard" / run.name))
     events.Reload()
     stages_shown = [one.step for one in events.Scalars("refinement/validation_error_dB")]
-    # Three ways of the first stage, the learned start among them, and the second.
-    assert stages_shown == [1, 2, 3, 4]
+    # Both ways of the learned start and of another one, and the second stage.
+    assert stages_shown == [1, 2, 3, 4, 5]
     assert "mesh/refinement_stages_VERTEX" in events.Tags()["tensors"]
     again = reconstruct(run, method="filled", spacing=0.008, accelerator="cpu")
     assert read_json(again / "read_out.json")["validation_error_db"] is None
