@@ -116,9 +116,6 @@ def best_of(courses: list[Course]) -> Course:
         lambda course: course.way == "blurred",
     ):
         good = TOLERATED * min(course.objectives[-1] for course in courses)
-        some = [one for one in courses if told(one) and one.objectives[-1] <= good]
-        if some:
-            courses = [one for one in courses if told(one)]
-        else:
-            courses = [one for one in courses if not told(one)] or courses
+        near = any(told(one) and one.objectives[-1] <= good for one in courses)
+        courses = [one for one in courses if told(one) == near]
     return min(courses, key=lambda course: course.objectives[-1])
