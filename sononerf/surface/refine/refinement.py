@@ -106,9 +106,9 @@ class Refinement:
     """Refinement, step by step; between any two steps it can be stopped, saved and resumed.
 
     Args:
-        meshes: Start surfaces, m; the one that explains the validation poses best is refined.
-            ``learned`` and ``sheet`` take part in the first stage beside the best of the others,
-            see :func:`~sononerf.surface.refine.course.plans`.
+        meshes: Start surfaces, m. ``learned``, ``sheet`` and the best of the others go through the
+            first stage; one of the results goes through the later stages, see
+            :func:`~sononerf.surface.refine.course.best_of`.
         echoes: Measured spectrograms and onsets; the surface must begin at the onsets. If their
             level is absolute, gains are learned in the last stage alone: a rough surface is too
             faint, and a gain would hide that. Otherwise gains are learned from the first stage on.
@@ -219,7 +219,7 @@ class Refinement:
         self.stage += 1
 
     def _choose(self) -> None:
-        """Begin the courses; of the starts without a place of their own, the best takes part."""
+        """Begin the courses; of the starts other than learned and sheet, the best takes part."""
         names = [name for name in self.starts if name not in ("learned", "sheet")]
         found = dict.fromkeys(self.starts, math.nan)
         if len(names) > 1:
