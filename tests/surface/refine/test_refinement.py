@@ -15,7 +15,7 @@ from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.simulation.simulator import Simulator, quiet_scene
 from sononerf.surface.refine import comparison
 from sononerf.surface.refine import refinement as module
-from sononerf.surface.refine.course import number_of_steps
+from sononerf.surface.refine.course import Course, number_of_steps
 from sononerf.surface.refine.descent import Descent, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
@@ -317,6 +317,19 @@ def test_the_learned_start_and_the_best_other_one_go_both_ways(
     again.load(work.state())
     assert (again.course.start, again.course.way) == chosen
     assert again.history == work.history
+
+
+@pytest.mark.parametrize(
+    ("objectives", "best"),
+    [
+        ((9.0, 5.0, 5.1, 5.4), 2),  # of equals the later one; a rise is none
+        ((9.0, 5.0, 5.4, 4.0), 3),
+        ((4.0, 5.0, 6.0, 4.0), 0),  # no stage explains more than the start
+    ],
+)
+def test_the_later_of_equal_surfaces_is_kept(bumpy, objectives, best):
+    course = Course("sharp", "body", None, [bumpy] * len(objectives), list(objectives))
+    assert course.best == best
 
 
 def slab(height):
