@@ -190,7 +190,7 @@ def test_the_numbers_are_those_of_schema_one(smoke):
     assert metrics["prediction"].keys() == {
         *("split", "poses", "log_spectral_distance_db", "psnr_db", "ssim", "pearson"),
         *("rendered_mae_db", "rendered_mae_db_active", "traced_weight", "traced_fault"),
-        "noise_floor_of",
+        *("noise_floor_of", "interval_coverage"),
         *both,
         *(f"{name}_active" for name in both),
     }

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError, expect
+from sononerf.evaluation.interval import covered, interval_db
 from sononerf.evaluation.traced import Traced, learn_traced, mix, trace_poses
 from sononerf.field.fitting import render_poses
 from sononerf.field.module import EchoModule
@@ -53,6 +54,9 @@ class Prediction(Shown):
         traced_weight: Mean weight of the traced echoes.
         traced_fault: Why no echoes are traced off the surface.
         reference: Magnitude m0 of the reported decibels.
+        error_db ((P, E, R, F) float32, dB): Distance from the predicted level within which 90 % of
+            the measured ones lie, over active cells; None where the surface's echoes have no weight
+            that was learned on validation poses.
     """
 
     poses: Poses
@@ -63,6 +67,7 @@ class Prediction(Shown):
     traced_weight: float
     traced_fault: str | None
     reference: float
+    error_db: Singles | None = None
 
     @property
     def level_db(self) -> Floats:
@@ -128,7 +133,13 @@ def predict(
             )
             level = mix(compress(rendered, reference), compress(found, reference), traced.weight)
             magnitude = (reference * (10 ** (level / 20) - 1)).astype(np.float32)
-    return Prediction(poses, magnitude, rendered, ranges, frequency, weight, fault, reference)
+    error = None
+    if isinstance(traced, Traced) and traced.half_db is not None:
+        level = compress(magnitude, reference)
+        error = interval_db(level, traced.half_db).astype(np.float32)
+    return Prediction(
+        poses, magnitude, rendered, ranges, frequency, weight, fault, reference, error
+    )
 
 
 def check_hearing(model: EchoModule, poses: Poses) -> None:
@@ -201,6 +212,9 @@ def prediction_numbers(
         **{key: store.attributes.get(key) for key in floor},
         "rendered_mae_db": mae_db(level, alone),
         "rendered_mae_db_active": mae_db(level, alone, active=True, active_db=active_db),
+        "interval_coverage": None
+        if prediction.error_db is None
+        else covered(level, predicted, prediction.error_db, active_db),
         "traced_weight": prediction.traced_weight,
         "traced_fault": prediction.traced_fault,
     }

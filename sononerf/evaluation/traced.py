@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import ResourceError, SonoNerfError
+from sononerf.evaluation.interval import learn_interval
 from sononerf.field.fitting import render_poses
 from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses
@@ -41,6 +42,8 @@ class Traced:
         gain_db ((E, F), dB): Level that is added to the traced echoes.
         weight (F,): Weight of the traced echoes in the mean with the rendered ones, 0 to 1.
         fault: The reason why no echoes can be traced off the surface; empty where they can.
+        half_db ((L, F), dB): Half the width of the prediction's interval, see
+            :mod:`sononerf.evaluation.interval`; None where it is unknown.
         simulator: Simulator of the surface, with what it has solved for; made anew where None.
     """
 
@@ -48,6 +51,7 @@ class Traced:
     gain_db: Floats
     weight: Floats
     fault: str = ""
+    half_db: Floats | None = None
     simulator: Simulator | None = None
 
     @classmethod
@@ -114,8 +118,10 @@ def learn_traced(
     poses = echoes.poses("val")
     rendered = render_poses(model, poses, accelerator=accelerator, progress=progress)
     measured = compress(_measured(echoes, validation), reference)
-    weight = regress_weight(measured, compress(rendered, reference), traced)
-    return Traced(mesh, gain, weight, simulator=simulator)
+    alone = compress(rendered, reference)
+    weight = regress_weight(measured, alone, traced)
+    half = learn_interval(measured, mix(alone, traced, weight), echoes.active_db)
+    return Traced(mesh, gain, weight, half_db=half, simulator=simulator)
 
 
 def for_single_poses(traced: Traced, head: Head, simulation: SimulationSettings) -> Traced:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A surface beside the truth, coloured by its error and by its confidence: pictures and meshes."""
+"""A surface beside the truth, coloured by its distance from it and by its error."""
 
 from __future__ import annotations
 
@@ -17,7 +17,10 @@ from sononerf.report.pictures.mesh_picture import (
     CLAY,
     CONFIDENCE_BAR,
     STEEL,
+    UNHEARD,
     ColourBar,
+    distance_bar,
+    distance_colours,
     error_bar,
     error_colours,
     sides_png,
@@ -36,12 +39,14 @@ class SurfaceViews:
     Args:
         mesh: The reconstruction, m.
         confidence ((V,) int32 or None): Number of poses that heard each vertex.
+        error ((V,) float32 or None, m): Error of each vertex, known without the truth.
         truth: The true surface in the frame of the reconstruction, m; None where it is not known.
-        limit (m): Error of the strongest colour.
+        limit (m): Error and distance of the strongest colour.
     """
 
     mesh: trimesh.Trimesh
     confidence: NDArray[np.int32] | None
+    error: NDArray[np.float32] | None
     truth: trimesh.Trimesh | None
     limit: float
 
@@ -49,22 +54,28 @@ class SurfaceViews:
     def _rows(self) -> list[tuple[str, trimesh.Trimesh, Floats, ColourBar | None]]:
         rows: list[tuple[str, trimesh.Trimesh, Floats, ColourBar | None]] = []
         if self.truth is not None:
-            error = error_colours(signed_error(self.mesh, self.truth), self.limit)
+            off = distance_colours(signed_error(self.mesh, self.truth), self.limit)
             rows.append(("truth", self.truth, np.array(STEEL), None))
-            rows.append(("error", self.mesh, error, error_bar(self.limit)))
-        if self.confidence is not None:
+            rows.append(("distance", self.mesh, off, distance_bar(self.limit)))
+        if self.error is not None:
+            colours = error_colours(self.error, self.limit)
+            if self.confidence is not None:
+                colours[self.confidence == 0] = UNHEARD
+            rows.append(("error", self.mesh, colours, error_bar(self.limit)))
+        elif self.confidence is not None:
             colours = confidence_colours(self.confidence)
             rows.append(("confidence", self.mesh, colours, CONFIDENCE_BAR))
         return rows or [("reconstruction", self.mesh, np.array(CLAY), None)]
 
     def png(self, size: tuple[int, int] = (380, 340)) -> bytes:
-        """Draw truth, error and confidence from four sides, one row each; ``size`` is of a view."""
+        """Draw truth, distance and error from four sides, one row each; ``size`` is of a view."""
         return sides_png(self._rows, size=size)
 
     def meshes(self) -> dict[str, trimesh.Trimesh]:
         """Return coloured meshes by name, the reconstruction first; of glTF's linear colours."""
         names = {
-            "error": "reconstruction, coloured by its error",
+            "distance": "reconstruction, coloured by its distance from the truth",
+            "error": "reconstruction, coloured by its error, known without the truth",
             "confidence": "reconstruction, coloured by how many poses heard it",
         }
         rows = self._rows

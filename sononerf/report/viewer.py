@@ -313,7 +313,7 @@ class Viewer:
     # Surfaces.
 
     def show_surface(self, views: SurfaceViews) -> None:
-        """Show a surface, coloured by its error or its confidence, and the truth."""
+        """Show a surface, coloured by its distance from the truth or its error, and the truth."""
         parts = views.meshes()
         options = {name: mesh for name, mesh in parts.items() if name != "truth"}
         chooser = self._chooser

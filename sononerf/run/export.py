@@ -24,7 +24,7 @@ from sononerf.errors import InputError, ResourceError, SettingsError
 from sononerf.geometry.frame import Frame, FrameName
 from sononerf.geometry.poses import Poses
 from sononerf.run.run_folder import RunFolder, locked
-from sononerf.surface.mesh_files import MeshFormat, confidence_of, mesh_bytes
+from sononerf.surface.mesh_files import MeshFormat, confidence_of, error_of, mesh_bytes
 from sononerf.surface.start.volume import Volume
 
 FileType = Literal["mat", "h5", "nc"]
@@ -197,7 +197,8 @@ def _content(source: Path, suffix: str, what: What, frame: Frame) -> bytes:
     """Return the bytes of the file that :func:`export` writes."""
     if suffix in MESHES:
         mesh = RunFolder(source).mesh()
-        return mesh_bytes(frame.mesh(mesh), MESHES[suffix], confidence=confidence_of(mesh))
+        known = {"confidence": confidence_of(mesh), "error": error_of(mesh)}
+        return mesh_bytes(frame.mesh(mesh), MESHES[suffix], **known)
     if suffix == ".csv":
         return _csv(source, what, frame).encode()
     parts = {"echoes": _echoes, "prediction": _prediction, "volume": _volume, "points": _points}
@@ -329,10 +330,15 @@ def _points(source: Path, frame: Frame) -> Part:
     if heard is None:
         heard = np.zeros(len(mesh.vertices), np.int32)
     places, normals = frame.places(mesh.vertices), frame.directions(mesh.vertex_normals)
+    error = error_of(mesh)
+    if error is None:
+        error = np.full(len(mesh.vertices), np.nan, np.float32)
+    meaning = "the true surface is within it with a probability of 90 %, if poses heard it"
     return {
         "position": Named(places, ("point", "world"), frame.unit_name, "vertex of the mesh"),
         "normal": Named(normals, ("point", "world"), "", "outward unit normal"),
         "poses": Named(heard, ("point",), "", "number of poses that heard the surface around it"),
+        "error": Named(error, ("point",), "m", meaning),
     }, {}
 
 

@@ -157,6 +157,8 @@ def save_traced(path: Path, traced: Traced) -> None:
         # Not in the metadata: several entries are written in any order, and the file differs.
         "fault": torch.tensor(list(traced.fault.encode()), dtype=torch.uint8),
     }
+    if traced.half_db is not None:
+        tensors["half_db"] = torch.as_tensor(traced.half_db)
     data = safetensors.torch.save(tensors, metadata={"model": model_checksum(path)})
     storage.commit_bytes(path / NAME, data)
 
@@ -186,8 +188,11 @@ def load_traced(path: Path) -> Traced | None:
         if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
             raise ValueError("a triangle names a vertex that is not there")
         fault = found["fault"].tobytes().decode() if "fault" in found else ""  # older files
+        half = found.get("half_db")
+        if half is not None and not (np.isfinite(half) & (half >= 0)).all():
+            raise ValueError("intervals that are negative or not finite")
         mesh = trimesh.Trimesh(vertices, faces, process=False)
-        return Traced(mesh, gain, weight, fault)
+        return Traced(mesh, gain, weight, fault, half)
     except (SafetensorError, KeyError, ValueError, OSError) as error:
         raise InputError(
             f"{file}: damaged ({error}); remove it, and `sononerf fit` makes it again"

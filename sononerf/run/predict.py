@@ -133,6 +133,8 @@ def predict(
                 "pose": numbers,
                 **axes,
             }
+            if found.error_db is not None:
+                arrays["error_db"] = found.error_db
             measured: Singles | None = None
             if own is None:
                 measured = np.stack([run.echoes.spectrogram(int(i)) for i in numbers])

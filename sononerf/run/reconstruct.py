@@ -223,7 +223,7 @@ def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None, frame:
     for kind in FORMATS:
         storage.commit_bytes(folder / f"mesh.{kind}", surface.file(kind))
         if not frame.is_world:
-            data = mesh_bytes(frame.mesh(mesh), kind, confidence=seen)
+            data = mesh_bytes(frame.mesh(mesh), kind, confidence=seen, error=surface.error)
             storage.commit_bytes(folder / f"mesh_original.{kind}", data)
     if seen is not None:
         storage.commit_bytes(folder / "confidence.png", confidence_png(mesh, seen))

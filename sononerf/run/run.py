@@ -23,7 +23,7 @@ from sononerf.run.compare import compare_runs_of
 from sononerf.run.run_folder import RunFolder
 from sononerf.settings.schema import Settings
 from sononerf.shown import Shown
-from sononerf.surface.mesh_files import confidence_of
+from sononerf.surface.mesh_files import confidence_of, error_of
 from sononerf.surface.surface import Surface
 
 
@@ -90,6 +90,7 @@ class Run(Shown):
             method=known["method"],
             level=known["level"],
             confidence=confidence_of(mesh),
+            error=error_of(mesh),
             refined=known["refined"],
             error_db=known["validation_error_db"],
             faults=tuple(known["faults"]),

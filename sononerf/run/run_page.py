@@ -32,7 +32,7 @@ from sononerf.run.fitted import Fitted, all_poses
 from sononerf.run.run_folder import RunFolder, flat
 from sononerf.settings.loading import dump_yaml
 from sononerf.settings.schema import Settings
-from sononerf.surface.mesh_files import confidence_of
+from sononerf.surface.mesh_files import confidence_of, error_of
 from sononerf.surface.start.read_out import read_isosurface
 
 SIDES = (380, 340)
@@ -218,6 +218,7 @@ def _surface(page: Page, run: RunFolder, settings: Settings) -> None:
     views = SurfaceViews(
         mesh,
         confidence_of(mesh),
+        error_of(mesh),
         _truth_beside(page, run, settings),
         run.fitted.head.resolution / 2,
     )

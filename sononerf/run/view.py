@@ -18,7 +18,7 @@ from sononerf.run.export import read_volume
 from sononerf.run.run import open_run
 from sononerf.run.run_folder import RunFolder
 from sononerf.run.simulate import store_path
-from sononerf.surface.mesh_files import confidence_of
+from sononerf.surface.mesh_files import confidence_of, error_of
 
 WAIT = 2.0
 """Interval at which a run's folder is checked for new files, s."""
@@ -97,7 +97,8 @@ class View:
             self._say(str(error))
             truth = None
         limit = self.run.fitted.head.resolution / 2
-        self.viewer.show_surface(SurfaceViews(mesh, confidence_of(mesh), truth, limit))
+        views = SurfaceViews(mesh, confidence_of(mesh), error_of(mesh), truth, limit)
+        self.viewer.show_surface(views)
         if (self.run.reconstruction / "volume.vti").is_file():
             self.viewer.show_volume(read_volume(self.run.path))
         told = self.run.read_out

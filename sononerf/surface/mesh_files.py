@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Mesh files, coloured by the number of poses that heard each vertex."""
+"""Mesh files, with the number of poses that heard each vertex, and its error."""
 
 from __future__ import annotations
 
@@ -16,19 +16,25 @@ MeshFormat = Literal["ply", "stl", "glb"]
 
 
 def mesh_bytes(
-    mesh: trimesh.Trimesh, file_type: MeshFormat, *, confidence: ArrayLike | None = None
+    mesh: trimesh.Trimesh,
+    file_type: MeshFormat,
+    *,
+    confidence: ArrayLike | None = None,
+    error: ArrayLike | None = None,
 ) -> bytes:
     """Return a mesh as the bytes of a file; the same mesh gives the same bytes.
 
     With a confidence PLY and GLB carry a colour per vertex: from dark grey, heard by no pose, to
     bright yellow, heard by a hundred or more, in steps even to the eye over the logarithm (see
     :func:`~sononerf.surface.mesh_files.confidence_colours`). PLY also holds the numbers
-    themselves, as the vertices' property ``poses``, and always their normals. STL knows neither.
+    themselves, as the vertices' property ``poses``, their error (m) as the property ``error``, and
+    always their normals. STL knows none of them.
 
     Args:
         mesh: Metres.
         file_type: Binary PLY, binary STL, or binary glTF.
         confidence (V,): Number of poses that heard the surface around each vertex.
+        error ((V,), m): Error of each vertex.
 
     Returns:
         data: The file.
@@ -48,6 +54,8 @@ def mesh_bytes(
     bare = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False, validate=False)
     if confidence is not None:
         _carry(bare, file_type, np.asarray(confidence))
+    if error is not None and file_type == "ply":
+        bare.vertex_attributes["error"] = np.asarray(error, dtype=np.float32)
     options = {"vertex_normal": True} if file_type == "ply" else {}
     return bytes(bare.export(file_type=file_type, **options))
 
@@ -75,10 +83,24 @@ def confidence_of(mesh: trimesh.Trimesh) -> NDArray[np.int32] | None:
 
     None where the file does not say.
     """
+    found = _property(mesh, "poses")
+    return None if found is None else found.astype(np.int32)
+
+
+def error_of(mesh: trimesh.Trimesh) -> NDArray[np.float32] | None:
+    """Return the error ((V,), m) of each vertex of a mesh that was read from a PLY file.
+
+    None where the file does not say.
+    """
+    found = _property(mesh, "error")
+    return None if found is None else found.astype(np.float32)
+
+
+def _property(mesh: trimesh.Trimesh, name: str) -> NDArray[Any] | None:
     raw = mesh.metadata.get("_ply_raw", {}).get("vertex", {}).get("data")
-    if raw is None or "poses" not in (raw.dtype.names or ()) or len(raw) != len(mesh.vertices):
+    if raw is None or name not in (raw.dtype.names or ()) or len(raw) != len(mesh.vertices):
         return None
-    return np.asarray(raw["poses"], dtype=np.int32)
+    return np.asarray(raw[name])
 
 
 # Number of poses from which on the colour is the brightest.

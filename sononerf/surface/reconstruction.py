@@ -173,6 +173,7 @@ def refine(
         reading,
         echoes=echoes,
         confidence=refined.confidence.round().astype(np.int32),
+        error=refined.error.astype(np.float32),
         refined=refined.kept,
         error_db=refined.error_db if math.isfinite(refined.error_db) else None,
         faults=refined.faults,

@@ -45,6 +45,8 @@ class Surface(Shown):
         level: Level of an iso-surface, in the unit of the volume; None for other methods.
         openness: Kind of surface; None for an iso-surface and for one of your own.
         confidence ((V,) int32 or None): Number of poses that heard the surface around each vertex.
+        error ((V,) float32 or None, m): Distance within which the true surface is with a
+            probability of 90 %, where the confidence is above zero; None without a refinement.
         refined: True where the refined mesh explains the validation poses better than its start.
         error_db (dB): Objective of the refinement on validation poses; None without a refinement.
         faults: Faults of the refinement, one line each.
@@ -62,6 +64,7 @@ class Surface(Shown):
     level: float | None = None
     openness: Openness | None = None
     confidence: NDArray[np.int32] | None = None
+    error: NDArray[np.float32] | None = None
     refined: bool = False
     error_db: float | None = None
     faults: Sequence[str] = ()
@@ -75,7 +78,7 @@ class Surface(Shown):
             raise InputError("the mesh has no triangles, or a vertex is not finite")
 
     def save(self, path: Path | str) -> None:
-        """Write the mesh, m: PLY (with normals and confidence), STL or GLB, by the name's ending.
+        """Write the mesh, m: PLY (with normals, confidence, error), STL or GLB, by the ending.
 
         Args:
             path: The file; one that is there is replaced whole.
@@ -92,7 +95,7 @@ class Surface(Shown):
 
     def file(self, kind: MeshFormat) -> bytes:
         """Return the mesh as the bytes of a file, see :meth:`save`."""
-        return mesh_bytes(self.mesh, kind, confidence=self.confidence)
+        return mesh_bytes(self.mesh, kind, confidence=self.confidence, error=self.error)
 
 
 def finished_surface(
@@ -102,6 +105,7 @@ def finished_surface(
     *,
     echoes: Echoes | None = None,
     confidence: NDArray[np.int32] | None = None,
+    error: NDArray[np.float32] | None = None,
     refined: bool = False,
     error_db: float | None = None,
     faults: Sequence[str] = (),
@@ -116,12 +120,13 @@ def finished_surface(
         reading: Evidence of the start; without it the mesh stays whole.
         confidence ((V,) int32): Number of poses that heard each vertex; counted in the evidence
             where None.
+        error ((V,) float32, m): As in :class:`Surface`.
         echoes, refined, error_db, faults: As in :class:`Surface`.
     """
     known: dict[str, Any] = {"echoes": echoes, "reading": reading}
     known |= {"refined": refined, "error_db": error_db, "faults": faults}
     if reading is None:
-        return Surface(mesh, None, method, confidence=confidence, **known)
+        return Surface(mesh, None, method, confidence=confidence, error=error, **known)
     found = reading.gathered
     if confidence is None:
         confidence = poses_that_heard(mesh, found.evidence, found.resolution)
@@ -136,7 +141,9 @@ def finished_surface(
             openness = leaving_out(openness, ~part, mesh.area_faces)
         used = np.unique(mesh.faces[~openness.unseen])
         mesh, confidence = without_unseen(mesh, openness), confidence[used]
-    return Surface(mesh, reading.volume, method, openness=openness, confidence=confidence, **known)
+        error = None if error is None else error[used]
+    known |= {"openness": openness, "confidence": confidence, "error": error}
+    return Surface(mesh, reading.volume, method, **known)
 
 
 FACING = 0.1

@@ -160,7 +160,7 @@ def test_the_page_holds_all_that_it_shows(finished, tmp_path):
 def test_the_mesh_stands_beside_the_truth_and_can_be_turned(finished):
     text = report(finished).read_text()
     assert re.findall(r'<option value="([^"]*)"', text) == [
-        "reconstruction, coloured by its error",
+        "reconstruction, coloured by its distance from the truth",
         "reconstruction, coloured by how many poses heard it",
         "truth",
     ]
@@ -177,8 +177,8 @@ def test_colours_tell_outside_from_inside(finished):
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
     truth = mesh.copy()
     mesh.apply_translation([0.002, 0.0, 0.0])
-    shown = SurfaceViews(mesh, None, truth, limit=0.002).meshes()
-    coloured = shown["reconstruction, coloured by its error"]
+    shown = SurfaceViews(mesh, None, None, truth, limit=0.002).meshes()
+    coloured = shown["reconstruction, coloured by its distance from the truth"]
     red, _, blue, _ = coloured.visual.vertex_colors.T.astype(int)
     out = coloured.vertices[:, 0] - 0.002
     assert (red > blue + 50)[out > 0.015].all()

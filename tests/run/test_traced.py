@@ -104,6 +104,7 @@ def believe(learned):
             **safetensors.torch.load(learned),
             "weight": torch.full((ROWS,), share, dtype=torch.float64),
         }
+        tensors.pop("half_db")  # it belongs to the learned weight
         (path / NAME).write_bytes(safetensors.torch.save(tensors, {"model": digest}))
 
     return put

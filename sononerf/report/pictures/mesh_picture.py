@@ -132,15 +132,37 @@ CONFIDENCE_BAR = ColourBar(
 )
 
 
-def error_bar(limit: float) -> ColourBar:
-    """Return the colour bar of signed errors up to a limit, m: red outside, blue inside."""
+def distance_bar(limit: float) -> ColourBar:
+    """Return the colour bar of signed distances up to a limit, m: red outside, blue inside."""
     marks = tuple((0.5 + 0.5 * part, f"{1e3 * part * limit:+.2g}") for part in (-1, -0.5, 0.5, 1))
     return ColourBar("mm outside (+) or inside (-) of the truth", _diverging, (*marks, (0.5, "0")))
 
 
+def distance_colours(distance: ArrayLike, limit: float) -> Floats:
+    """Colour signed distances (V,), m, as :func:`distance_bar` shows; larger ones as the limit."""
+    return _diverging(0.5 + 0.5 * np.clip(np.asarray(distance) / limit, -1, 1))
+
+
+UNHEARD = (0.35, 0.35, 0.35)
+"""Colour (sRGB, 0 to 1) of vertices that no echo bounds."""
+
+
+def error_bar(limit: float) -> ColourBar:
+    """Return the colour bar of errors up to a limit, m: yellow for small, violet for large ones."""
+    marks = tuple((part, f"{1e3 * part * limit:.2g}") for part in (0, 0.5, 1))
+    return ColourBar("error in mm (90 %); grey: unheard", _sequential, marks)
+
+
 def error_colours(error: ArrayLike, limit: float) -> Floats:
-    """Colour signed errors (V,), m, as :func:`error_bar` shows; larger ones like the limit."""
-    return _diverging(0.5 + 0.5 * np.clip(np.asarray(error) / limit, -1, 1))
+    """Colour errors (V,), m, as :func:`error_bar` shows; larger ones as the limit."""
+    return _sequential(np.clip(np.asarray(error) / limit, 0, 1))
+
+
+def _sequential(places: Floats) -> Floats:
+    from matplotlib import colormaps
+
+    colours: Floats = colormaps["plasma_r"](np.asarray(places))[:, :3]
+    return colours
 
 
 def _diverging(places: Floats) -> Floats:

@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csr_array
 from torch import Tensor
 
 from sononerf.array_types import Ints
@@ -42,19 +42,12 @@ class MeshOperators:
         pairs = np.unique(np.sort(pairs, axis=1), axis=0)
         both = np.concatenate([pairs, pairs[:, ::-1]])
         links = coo_array((np.ones(len(both)), (both[:, 0], both[:, 1])), shape=(count, count))
-        rows = links.tocsr()
         self.edges = torch.as_tensor(pairs).to(faces.device)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch calls them beta; products are all we use
-            self._adjacency = torch.sparse_csr_tensor(
-                torch.as_tensor(rows.indptr.astype(np.int64)),
-                torch.as_tensor(rows.indices.astype(np.int64)),
-                torch.ones(rows.nnz, dtype=torch.float64),
-                (count, count),
-                check_invariants=False,
-            ).to(faces.device)
+        self._adjacency = sparse_tensor(links).to(faces.device)
         self._single = self._adjacency.float()
-        self.degree = torch.as_tensor(np.diff(rows.indptr).astype(np.float64)).to(faces.device)
+        self.degree = torch.as_tensor(np.diff(links.tocsr().indptr).astype(np.float64)).to(
+            faces.device
+        )
         self._corners = faces.reshape(-1)
 
     def areas(self, vertices: Tensor) -> Tensor:
@@ -161,6 +154,16 @@ class MeshOperators:
         for _ in range(passes):
             found = self.averaged(found)
         return found
+
+
+def sparse_tensor(matrix: coo_array | csr_array) -> Tensor:
+    """Return a sparse matrix as a tensor in double precision."""
+    rows = matrix.tocsr()
+    ends, columns = (torch.as_tensor(p.astype(np.int64)) for p in (rows.indptr, rows.indices))
+    data = torch.as_tensor(rows.data.astype(np.float64))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # torch calls them beta; products are all we use
+        return torch.sparse_csr_tensor(ends, columns, data, rows.shape, check_invariants=False)
 
 
 def unit(vectors: Tensor) -> Tensor:

@@ -113,11 +113,37 @@ def mismatch(
         later ((P, E, W, F) float32): Power of the later bounces.
         found: From :func:`measured`.
         level: Gains and weights.
+        corrected, learn, band: As in :func:`differences`.
+    """
+    difference, weight = differences(
+        heard, later, found, level, corrected=corrected, learn=learn, band=band
+    )
+    return (difference.abs() * weight).sum((1, 2, 3))
+
+
+def differences(
+    heard: Heard,
+    later: Tensor | None,
+    found: tuple[Tensor, Tensor, Tensor],
+    level: Level,
+    *,
+    corrected: tuple[Tensor, Tensor] | None = None,
+    learn: bool,
+    band: float = 0.0,
+) -> tuple[Tensor, Tensor]:
+    """Return the measured levels less the rendered ones, by cells.
+
+    Args:
+        heard, later, found, level: As in :func:`mismatch`.
         corrected (simulated, rendered, both (P, E, W, F) float32): Echoes of a surface nearby:
             their difference in decibels is added to what is rendered. Cells count less, the larger
             it is; the frequencies' weights are not needed then.
         learn: True to update gains and errors.
         band: Fraction of the frequencies over which power is averaged first, 0 to 1.
+
+    Returns:
+        difference ((P, E, W, F) float32, reported dB): Gradients flow through it.
+        weight (P, E, W, F): Weights of the active cells; those of a pose add up to 1.
     """
     magnitude, inside, loudest = found
     power = heard.power if later is None else heard.power + later
@@ -144,7 +170,7 @@ def mismatch(
             _learn(level, magnitude, rendered, a, b, active, loudest)
         weight = active * weight
         weight = weight / weight.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
-    return ((a - b).abs() * weight).sum((1, 2, 3))
+    return a - b, weight
 
 
 def over_band(power: Tensor, part: float) -> Tensor:

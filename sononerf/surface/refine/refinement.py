@@ -34,6 +34,7 @@ from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.objective import Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.remesh import finer, remesh
+from sononerf.surface.refine.surface_error import surface_error
 from sononerf.surface.start.read_out import StartMethod
 
 logger = logging.getLogger("sononerf")
@@ -53,7 +54,8 @@ class Refined:
         mesh: m.
         gain (E, F): Factor of rendered magnitudes, learned on training poses.
         confidence (V,): Number of training poses that see each vertex near the direction of a
-            mirror.
+            mirror; 0 where echoes do not bound its place.
+        error ((V,), m): See :mod:`sononerf.surface.refine.surface_error`.
         start: Name of the start that was refined.
         kept: True where the refined surface explains the validation poses better than the start.
         error_db: Objective on validation poses, see
@@ -67,6 +69,7 @@ class Refined:
     mesh: trimesh.Trimesh
     gain: Floats
     confidence: Floats
+    error: Floats
     start: StartMethod
     kept: bool
     error_db: float
@@ -367,15 +370,21 @@ class Refinement:
         best = course.best
         mesh = course.meshes[best]
         confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
+        objective = course.objectives[best]
+        known = surface_error(
+            mesh, self.echoes, self.optics, validation_db=objective, seed=self.seed
+        )
+        values = np.stack([confidence * known.heard, known.error], axis=1)
         if best:
-            mesh, confidence = finer(mesh, confidence, self.optics.wavelength)
+            mesh, values = finer(mesh, values, self.optics.wavelength)
         return Refined(
             mesh=mesh,
             gain=course.level.gain.exp().cpu().double().numpy(),
-            confidence=confidence,
+            confidence=values[:, 0],
+            error=values[:, 1],
             start=course.start,
             kept=best > 0,
-            error_db=course.objectives[best],
+            error_db=objective,
             history=self.history,
             faults=self.faults,
         )

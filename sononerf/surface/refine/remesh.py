@@ -107,13 +107,13 @@ def finer(
 
     Args:
         mesh: Its vertices lie on the smooth surface.
-        values (V,): Per vertex; new ones get the mean of both ends.
+        values (V, ...): Per vertex; new ones get the mean of both ends.
         wavelength (m): The shortest.
 
     Returns:
         finer: The mesh itself where its edges' middles lie deep by less than :data:`CHORD` on
             average.
-        values (V',): Values of its vertices.
+        values (V', ...): Values of its vertices.
 
     References:
         .. [1] A. Vlachos et al., "Curved PN triangles", I3D 2001.

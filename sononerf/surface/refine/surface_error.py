@@ -1,0 +1,235 @@
+# SPDX-License-Identifier: MIT
+r"""Error of a surface per vertex, from how far the echoes of single poses contradict it.
+
+The displacement along the normals is a sum of bumps, one per ``SPACING`` of surface. Of each bump a
+pose gives the gradient g of the squared misfit, and the curvature h of that misfit (Gauss and
+Newton), by probes with random signs [1]_; the unit of displacement is ``PRIOR``. If the misfits
+were noise, the squares of g would have the mean h. Errors of the surface and of physical optics
+make them larger by the factor
+
+.. math:: u = \frac{1 + \sum g^2}{1 + \sum h}
+
+(the quotient of Huber's robust covariance [2]_ and the usual one). The variance of the displacement
+over that before anything is heard is :math:`v = 1 / (1 + \sum h)`. The error of a vertex is
+
+.. math:: \epsilon = \text{SCALE}\, \lambda\, d\, u^a\, v^b\, (\text{FLAT} + \lambda\kappa)^c
+
+with the shortest wavelength :math:`\lambda`, the error d of the validation poses in decibels, and
+the concave curvature :math:`\kappa`: physical optics has no echo between the walls of a hollow.
+The exponents were fitted to bodies whose surface is known, see ``docs/method.md``.
+
+References:
+    .. [1] C. Bekas, E. Kokiopoulou, Y. Saad, "An estimator for the diagonal of a matrix", Applied
+       Numerical Mathematics 57, 2007.
+    .. [2] P. J. Huber, "The behavior of maximum likelihood estimates under nonstandard conditions",
+       Berkeley Symposium 5(1), 1967.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from sononerf.array_types import Bools, Floats, Ints
+from sononerf.echoes.echoes import Echoes
+from sononerf.surface.refine.mesh_operators import (
+    MeshOperators,
+    smoothing_passes,
+    sparse_tensor,
+    unit,
+)
+from sononerf.surface.refine.objective import Level, differences, measured
+from sononerf.surface.refine.optics import Heard, Optics
+from sononerf.surface.refine.visibility import listen, sight_of
+
+ASKED = 48
+"""Number of training poses, at most, that are rendered."""
+PROBES = 2
+"""Number of random probes per pose."""
+SPACING = 1.5
+"""Distance between bumps, shortest wavelengths: about what sound resolves along the surface."""
+PRIOR = 0.5
+"""Standard deviation of a bump before anything is heard, shortest wavelengths."""
+AROUND = 2.0
+"""Standard deviation of the weights around a vertex over which u is averaged, wavelengths."""
+EXPONENTS = (0.2, 0.06, 0.67)
+"""Exponents a, b and c."""
+FLAT = 0.05
+"""Curvature times wavelength that a flat surface counts with, no unit."""
+SCALE = 0.335
+"""Error of a vertex where all factors are 1, wavelengths per decibel."""
+UNHEARD = 0.8
+"""v above which a vertex is unheard."""
+POSES = 8  # number that is rendered at a time; it bounds the memory
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceError:
+    """Error of the vertices of a surface.
+
+    Attributes:
+        error ((V,), m): The true surface is within this distance with a probability of 90 %, if
+            the vertex was heard.
+        heard (V,): True where echoes bound the place of the surface.
+    """
+
+    error: Floats
+    heard: Bools
+
+
+def surface_error(
+    mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics, *, validation_db: float, seed: int
+) -> SurfaceError:
+    """Return the error of a surface.
+
+    Args:
+        mesh: A refined surface, m.
+        echoes: Measured echoes.
+        optics: The head, on the device of the computation.
+        validation_db: Objective of the surface on validation poses, see
+            :class:`~sononerf.surface.refine.comparison.Comparison`.
+        seed: Seed of poses and probes.
+    """
+    bumps, wavelength = Bumps(mesh, optics), optics.wavelength
+    gradient, curvature = _misfit(bumps, echoes, seed)
+    points = bumps.vertices.cpu().numpy()
+    around = _weights(points, points[bumps.centres], AROUND * wavelength)
+    excess = around @ ((1.0 + gradient) / (1.0 + curvature))
+    variance = bumps.matrix.multiply(bumps.matrix) @ (1.0 / (1.0 + curvature))
+    a, b, c = EXPONENTS
+    factors = excess**a * variance**b * (FLAT + wavelength * bumps.hollow) ** c
+    return SurfaceError(SCALE * wavelength * validation_db * factors, variance < UNHEARD)
+
+
+class Bumps:
+    """Smooth displacements along the normals of a surface.
+
+    Args:
+        mesh: The surface, m.
+        optics: The head.
+
+    Attributes:
+        vertices, normals ((V, 3) float64): Places (m) and outward unit normals.
+        centres (B,): Vertices in the middle of the bumps.
+        matrix ((V, B) float64): Displacement by each bump; the squares of a row add up to 1.
+        hollow ((V,), 1/m): Concave curvature; 0 where the surface is convex.
+    """
+
+    def __init__(self, mesh: trimesh.Trimesh, optics: Optics) -> None:
+        self.optics = optics
+        like = optics.get_buffer("wavenumber")
+        faces = np.array(mesh.faces, dtype=np.int64)
+        self.vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
+        self.operators = MeshOperators(torch.as_tensor(faces).to(like.device), len(self.vertices))
+        self._area = self.operators.areas(self.vertices)
+        self.normals = unit(self._area)
+        passes = smoothing_passes(optics.wavelength, self.operators.edge_length(self.vertices))
+        self._bending = self.operators.bending(self.vertices, self.normals, passes)
+        self._sight = sight_of(optics, self.vertices.cpu().numpy(), faces)
+        xx, yy, zz, xy, xz, yz = self._bending.cpu().numpy().T
+        tensors = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
+        self.hollow = np.maximum(-np.linalg.eigvalsh(tensors)[:, 0], 0.0)
+        # The sides of a thin body have bumps of their own.
+        spacing = SPACING * optics.wavelength
+        places = np.concatenate([mesh.vertices / spacing, self.normals.cpu().numpy()], axis=1)
+        self.centres = _cover(places)
+        near = _weights(places, places[self.centres], math.sqrt(0.5))
+        norm = np.sqrt(near.multiply(near).sum(axis=1))
+        self.matrix = csr_array(near.multiply(1.0 / norm[:, None]))
+        self._moves = sparse_tensor(self.matrix).to(like.device)
+
+    def render(self, positions: Floats, rotations: Floats) -> tuple[Heard | None, Tensor]:
+        """Render poses.
+
+        Args:
+            positions, rotations ((P, 3), (P, 3, 3)): Poses.
+
+        Returns:
+            heard: None if no pose hears any of the surface.
+            moves ((P, B) float64): Heights of the bumps, 0 m, one row for each pose; gradients
+                flow to them.
+        """
+        moves = torch.zeros(len(positions), len(self.centres), dtype=torch.float64)
+        moves = moves.to(self.vertices).requires_grad_(True)
+        places, turns = (torch.as_tensor(part).to(self.vertices) for part in (positions, rotations))
+        pieces, heads, middle = listen(
+            self.optics, self.operators, self.vertices, self._area, self._bending, self._sight,
+            places, turns,
+        )  # fmt: skip
+        if not len(pieces.pose):
+            return None, moves
+        # Each pose has a surface of its own, so that its gradients stay apart.
+        moved = (self._moves @ moves.T).T[:, :, None] * self.normals + self.vertices
+        areas = torch.cat([self.operators.areas(one) for one in moved])
+        own = pieces.pose % len(places) * len(self.vertices) + pieces.vertex
+        points = (moved - middle).flatten(0, 1).float()
+        pieces = dataclasses.replace(pieces, vertex=own)
+        return self.optics.render(points, areas.float(), pieces, heads), moves
+
+
+def _misfit(bumps: Bumps, echoes: Echoes, seed: int) -> tuple[Floats, Floats]:
+    """Return, per bump, the sums over the training poses of squared gradient and of curvature."""
+    optics, training = bumps.optics, echoes.training
+    level = Level(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
+    rng = np.random.default_rng(seed)
+    chosen = rng.choice(training, min(ASKED, len(training)), replace=False)
+    lots = np.array_split(chosen, -(-len(chosen) // POSES))
+    random = torch.Generator().manual_seed(seed)
+    gradient = torch.zeros(len(bumps.centres), dtype=torch.float64)
+    curvature, square, count = torch.zeros_like(gradient), 0.0, 0
+    for learn in (True, False):
+        for lot in lots:
+            heard, moves = bumps.render(echoes.positions[lot], echoes.rotations[lot])
+            if heard is None:
+                continue
+            numbers = lot.tolist()
+            off, weight = differences(
+                heard, None, measured(echoes, numbers, heard), level, learn=learn
+            )
+            if learn:
+                continue
+            weight = weight * (weight > 0).sum((1, 2, 3), keepdim=True)
+            square += float((weight * off.detach().square()).sum())
+            count += int((weight > 0).sum())
+            own = weight * off.detach()
+            signs = [
+                torch.randint(0, 2, off.shape, generator=random) * 2 - 1 for _ in range(PROBES)
+            ]
+            for number, ways in enumerate([own, *(weight.sqrt() * one.to(off) for one in signs)]):
+                (found,) = torch.autograd.grad((off * ways).sum(), moves, retain_graph=True)
+                total = found.cpu().square().sum(0)
+                if number:
+                    curvature += total / PROBES
+                else:
+                    gradient += total
+    usual = max(square, 1e-30) / max(count, 1)
+    prior = (PRIOR * optics.wavelength) ** 2 * len(training) / len(chosen) / usual
+    return (gradient * prior / usual).numpy(), (curvature * prior).numpy()
+
+
+def _cover(places: Floats) -> Ints:
+    """Return which points (N, K) have all others within a distance of 1 of one of them."""
+    tree, left, found = cKDTree(places), np.ones(len(places), dtype=bool), []
+    for number, place in enumerate(places):
+        if left[number]:
+            found.append(number)
+            left[tree.query_ball_point(place, 1.0)] = False
+    return np.array(found, dtype=np.int64)
+
+
+def _weights(points: Floats, centres: Floats, spread: float) -> csr_array:
+    """Return Gaussian weights (N, B) of centres (B, K) around points (N, K); rows add up to 1."""
+    near = cKDTree(points).sparse_distance_matrix(
+        cKDTree(centres), 3.0 * spread, output_type="coo_matrix"
+    )
+    weights = csr_array(near)
+    weights.data = np.exp(-0.5 * (weights.data / spread) ** 2)
+    return csr_array(weights.multiply(1.0 / weights.sum(axis=1)[:, None]))

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: MIT
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from sononerf.surface.refine.surface_error import surface_error
+from tests.memory import changed
+from tests.surface.conftest import RADIUS
+
+
+def ball(height=lambda way: 0.0):
+    mesh = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS)
+    way = np.asarray(mesh.vertices) / RADIUS
+    return trimesh.Trimesh(way * (RADIUS + height(way))[:, None], mesh.faces, process=False)
+
+
+@pytest.fixture(scope="module")
+def right():
+    return ball(lambda way: np.zeros(len(way)))
+
+
+def of(mesh, echoes, optics, validation_db=2.0, seed=0):
+    return surface_error(mesh, echoes, optics, validation_db=validation_db, seed=seed)
+
+
+def test_a_dent_has_a_larger_error_than_the_surface_around_it(right, echoes, optics):
+    depth = 0.6 * optics.wavelength
+    dented = ball(lambda way: -depth * np.exp(-((1 - way[:, 2]) / 0.1)))
+    inside = right.vertices[:, 2] > 0.9 * RADIUS
+    away = right.vertices[:, 2] < 0.0
+    assert of(right, echoes, optics).heard.all()
+    found = of(dented, echoes, optics).error
+    assert np.median(found[inside]) > 1.5 * np.median(found[away])
+    before = of(right, echoes, optics).error
+    assert np.median(before[inside]) < 1.3 * np.median(before[away])
+
+
+def test_what_no_pose_hears_is_unheard(right, echoes, optics):
+    above = changed(echoes, split=np.where(echoes.positions[:, 2] > 0.1, 0, 2))
+    found = of(right, above, optics)
+    top, bottom = right.vertices[:, 2] > 0.6 * RADIUS, right.vertices[:, 2] < -0.8 * RADIUS
+    assert found.heard[top].mean() > 0.9
+    assert not found.heard[bottom].any()
+
+
+def test_the_error_grows_with_that_of_the_validation_poses(right, echoes, optics):
+    low, high = (of(right, echoes, optics, validation_db=one).error for one in (1.0, 3.0))
+    assert np.allclose(high, 3.0 * low)
+
+
+def test_the_same_seed_gives_the_same_error(right, echoes, optics):
+    first, again = (of(right, echoes, optics, seed=4).error for _ in range(2))
+    assert np.array_equal(first, again)
