@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sononerf.scene.material import Material
     from sononerf.scene.scene import Scene
     from sononerf.simulation.ensemble import simulate
+    from sononerf.surface.next_poses import next_poses
     from sononerf.surface.reconstruction import reconstruct, refine
     from sononerf.surface.surface import Surface
 
@@ -50,6 +51,7 @@ __all__ = [
     "compare",
     "evaluate",
     "fit",
+    "next_poses",
     "open_run",
     "predict",
     "read_recordings",
@@ -76,6 +78,7 @@ _HOMES = {
     "compare": "run.run",
     "evaluate": "evaluation.numbers",
     "fit": "field.fitting",
+    "next_poses": "surface.next_poses",
     "open_run": "run.run",
     "predict": "evaluation.prediction",
     "read_recordings": "run.import_recordings",

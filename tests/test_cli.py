@@ -42,7 +42,7 @@ pytestmark = pytest.mark.thorough
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 SMOKE = str(CONFIGS / "smoke.yaml")
 COMMANDS = (
-    "scenes new-scene new-field new-renderer simulate import fit predict reconstruct evaluate "
+    "scenes new-scene new-field new-renderer simulate import fit predict next reconstruct evaluate "
     "export calibrate compare report table doctor view".split()
 )
 SHORT = [  # of the smoke settings, so that a fit takes a second

@@ -13,6 +13,7 @@
     python tools/benchmark.py step [--accelerator cpu] [--compare OLD.json]
     python tools/benchmark.py fit [--scene three_spheres] [--error 0.45] [--compare OLD.json]
     python tools/benchmark.py reconstruct RUN [RUN ...] [--spacings 0.002 0.001]
+    python tools/benchmark.py errors RUN [RUN ...] [--calibrate]
 
 ``simulate``: seconds per pose, against those that embreex alone needs for the same rays, those for
 visibility included, and the greatest memory. ``cost``: CPU seconds per pose of a configuration, the
@@ -29,6 +30,9 @@ five, beside equation 17 of the paper written down as it stands (which takes 9 G
 machine's matrix product and its copying. ``fit``: how long the default takes to a held-out error.
 ``reconstruct``: how long fitted runs take to be read out. The files of these three are named by
 version, machine and device, and ``--compare`` prints what has changed.
+
+``errors``: the fractions of vertices and of held-out cells that the errors of finished runs hold,
+and the area under the sparsification error, beside that of the numbers of poses.
 
 ``surfaces``: how good the surfaces of all kinds of scenes are, some under
 changed conditions; one line of JSON for each run. What is ``scaled`` is measured in the unscaled
@@ -49,6 +53,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # the parts of this command, and the tests' exact solutions
 
+from tools.benchmarks.errors import errors  # noqa: E402
 from tools.benchmarks.exact import exact  # noqa: E402
 from tools.benchmarks.fit import fit  # noqa: E402
 from tools.benchmarks.physics import dechirp, physics  # noqa: E402
@@ -91,6 +96,9 @@ def main() -> None:
     command.add_argument("--scene", default="three_spheres")
     command.add_argument("--engines", nargs="+", default=["hybrid", "rays", "kirchhoff"])
     command.add_argument("--poses", type=int, default=8)
+    command = added(errors)
+    command.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="finished runs")
+    command.add_argument("--calibrate", action="store_true", help="print exponents and scale")
     command = added(wave)
     command.add_argument("--bodies", nargs="+", choices=("spheres", "leaf", "beaker"), help="all")
     command.add_argument("--poses", type=int, default=8)

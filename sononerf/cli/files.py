@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Commands around an experiment: scenes, import, export and self-calibration."""
+"""Commands around an experiment: scenes, next poses, import, export and self-calibration."""
 
 from __future__ import annotations
 
@@ -13,11 +13,41 @@ from sononerf.cli.options import (
     InFrame,
     Json,
     Overrides,
+    Run,
+    Within,
     app,
     print_json,
     say,
 )
 from sononerf.errors import SettingsError
+
+
+@app.command("next")
+def next_(
+    run: Run,
+    count: Annotated[int, typer.Option(help="Number of poses.", min=1)],
+    candidates: Annotated[
+        Path | None,
+        typer.Option(help="CSV of poses to choose among: x,y,z,yaw,pitch,roll (m, degrees)."),
+    ] = None,
+    within: Annotated[
+        Within | None,
+        typer.Option(
+            help="Places to choose among, without --candidates. sphere (default): all around, at "
+            "the median distance of the poses. cap: no farther from their middle than they are. "
+            "volume: between their least and greatest distance."
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option(help="CSV of the poses, the best first; RUN/next.csv by default.")
+    ] = None,
+) -> None:
+    """Propose the poses that would reduce the error of a run's surface most."""
+    if within is not None and candidates is not None:
+        raise SettingsError("--within and --candidates exclude each other; give one")
+    from sononerf.run.next import propose
+
+    say(f"wrote {propose(run, count, candidates, within or 'sphere', output)}")
 
 
 @app.command()

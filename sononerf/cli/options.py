@@ -29,6 +29,7 @@ FrameName = Literal["auto", "world", "original"]
 Figures = Literal["svg", "pdf"]
 Unit = Literal["m", "cm", "mm"]
 Split = Literal["test", "val", "train"]
+Within = Literal["sphere", "cap", "volume"]
 Config = Annotated[
     Path,
     typer.Argument(

@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: MIT
+"""Proposal of the next poses of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from sononerf import storage
+from sononerf.run.predict import read_poses
+from sononerf.run.run import open_run
+from sononerf.run.run_folder import RunFolder
+from sononerf.surface.next_poses import Within, next_poses
+
+
+def propose(
+    run: Path, count: int, candidates: Path | None, within: Within, output: Path | None
+) -> Path:
+    """Write the poses that would reduce the error of a run's surface most, the best first.
+
+    Args:
+        run: A fitted run whose surface was refined.
+        count: Number of poses.
+        candidates: Poses to choose among; see :func:`~sononerf.run.predict.read_poses`.
+        within: Places to choose among without candidates.
+        output: Table of poses; ``RUN/next.csv`` where None.
+
+    Returns:
+        file: The table, in the frame of the world, that ``simulate`` and ``predict`` read.
+
+    Raises:
+        InputError: If the run has no errors, or the candidates cannot be read or hear nothing.
+    """
+    opened, folder = open_run(run), RunFolder(run)
+    given = None if candidates is None else read_poses(folder, candidates)
+    found = next_poses(
+        opened.surface,
+        opened.echoes,
+        count,
+        candidates=given,
+        within=within,
+        seed=opened.settings.fit.seed,
+    )
+    file = output or folder.path / "next.csv"
+    with folder.locked(file.parent):
+        storage.commit_bytes(file, found.table().encode())
+    return file
