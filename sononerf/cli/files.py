@@ -39,7 +39,10 @@ def next_(
         ),
     ] = None,
     output: Annotated[
-        Path | None, typer.Option(help="CSV of the poses, the best first; RUN/next.csv by default.")
+        Path | None,
+        typer.Option(
+            help="CSV of the poses in the world's frame, the best first; RUN/next.csv by default."
+        ),
     ] = None,
 ) -> None:
     """Propose the poses that would reduce the error of a run's surface most."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from sononerf import storage
+from sononerf.errors import InputError
 from sononerf.run.predict import read_poses
 from sononerf.run.run import open_run
 from sononerf.run.run_folder import RunFolder
@@ -25,22 +26,26 @@ def propose(
         output: Table of poses; ``RUN/next.csv`` where None.
 
     Returns:
-        file: The table, in the frame of the world, that ``simulate`` and ``predict`` read.
+        file: The table in the frame of the world; ``predict --frame world`` reads it for
+            recordings too.
 
     Raises:
-        InputError: If the run has no errors, or the candidates cannot be read or hear nothing.
+        InputError: If the run has no errors, the candidates cannot be read or hear nothing, or the
+            output is a folder.
     """
     opened, folder = open_run(run), RunFolder(run)
-    given = None if candidates is None else read_poses(folder, candidates)
-    found = next_poses(
-        opened.surface,
-        opened.echoes,
-        count,
-        candidates=given,
-        within=within,
-        seed=opened.settings.fit.seed,
-    )
     file = output or folder.path / "next.csv"
+    if file.is_dir():
+        raise InputError(f"{file}: is a folder; give --output the name of a file")
+    given = None if candidates is None else read_poses(folder, candidates)
     with folder.locked(file.parent):
+        found = next_poses(
+            opened.surface,
+            opened.echoes,
+            count,
+            candidates=given,
+            within=within,
+            seed=opened.settings.fit.seed,
+        )
         storage.commit_bytes(file, found.table().encode())
     return file

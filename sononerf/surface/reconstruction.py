@@ -167,15 +167,16 @@ def refine(
             state=state,
             after_step=stepped,
         )
+    known = math.isfinite(refined.error_db)
     return finished_surface(
         refined.mesh,
         refined.start,
         reading,
         echoes=echoes,
         confidence=refined.confidence.round().astype(np.int32),
-        error=refined.error.astype(np.float32),
+        error=refined.error.astype(np.float32) if known else None,
         refined=refined.kept,
-        error_db=refined.error_db if math.isfinite(refined.error_db) else None,
+        error_db=refined.error_db if known else None,
         faults=refined.faults,
     )
 
