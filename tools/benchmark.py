@@ -14,6 +14,7 @@
     python tools/benchmark.py fit [--scene three_spheres] [--error 0.45] [--compare OLD.json]
     python tools/benchmark.py reconstruct RUN [RUN ...] [--spacings 0.002 0.001]
     python tools/benchmark.py errors RUN [RUN ...] [--calibrate]
+    python tools/benchmark.py next_poses [--only NAME ...] [--seeds 0 1 2]
 
 ``simulate``: seconds per pose, against those that embreex alone needs for the same rays, those for
 visibility included, and the greatest memory. ``cost``: CPU seconds per pose of a configuration, the
@@ -32,7 +33,8 @@ machine's matrix product and its copying. ``fit``: how long the default takes to
 version, machine and device, and ``--compare`` prints what has changed.
 
 ``errors``: the fractions of vertices and of held-out cells that the errors of finished runs hold,
-and the area under the sparsification error, beside that of the numbers of poses.
+and the area under the sparsification error, beside that of the numbers of poses. ``next_poses``:
+the calls that proposed poses need for an F-score, beside farthest and random ones.
 
 ``surfaces``: how good the surfaces of all kinds of scenes are, some under
 changed conditions; one line of JSON for each run. What is ``scaled`` is measured in the unscaled
@@ -56,6 +58,7 @@ sys.path.insert(0, str(ROOT))  # the parts of this command, and the tests' exact
 from tools.benchmarks.errors import errors  # noqa: E402
 from tools.benchmarks.exact import exact  # noqa: E402
 from tools.benchmarks.fit import fit  # noqa: E402
+from tools.benchmarks.next_poses import WAYS, next_poses  # noqa: E402
 from tools.benchmarks.physics import dechirp, physics  # noqa: E402
 from tools.benchmarks.reconstruct import reconstruct  # noqa: E402
 from tools.benchmarks.simulator import cost, noise, simulate  # noqa: E402
@@ -63,6 +66,7 @@ from tools.benchmarks.step import step  # noqa: E402
 from tools.benchmarks.surfaces import CASES, surfaces  # noqa: E402
 from tools.benchmarks.wave import wave  # noqa: E402
 
+LISTENED = ["three_spheres", "rings", "procedural-108", "procedural-113"]
 ERROR_HELP = "over all cells of held-out poses, dB (0.45)"
 ONLY_HELP = "rows of the table; all, but exact only with --exact"
 SEEDS_HELP = "of the fits of three_spheres, ua and leaf; of all others the first alone (0 1 2)"
@@ -99,6 +103,15 @@ def main() -> None:
     command = added(errors)
     command.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="finished runs")
     command.add_argument("--calibrate", action="store_true", help="print exponents and scale")
+    command = added(next_poses)
+    command.add_argument("--only", nargs="+", metavar="NAME", default=LISTENED, help="scenes")
+    command.add_argument(
+        "--seeds", type=int, nargs="+", default=[0, 1, 2], help="of poses and fits"
+    )
+    command.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS, help="all")
+    command.add_argument("--score", type=float, default=0.9, help="F-score at 2 mm (0.9)")
+    command.add_argument("--most", type=int, default=100, help="calls (100)")
+    command.add_argument("--output", type=Path, default=Path("runs") / "next_poses")
     command = added(wave)
     command.add_argument("--bodies", nargs="+", choices=("spheres", "leaf", "beaker"), help="all")
     command.add_argument("--poses", type=int, default=8)

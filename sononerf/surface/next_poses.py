@@ -7,6 +7,7 @@ import math
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
@@ -24,6 +25,10 @@ Within = Literal["sphere", "cap", "volume"]
 around, between the least and the greatest distance of the poses."""
 CANDIDATES = 300
 """Number of candidates: on a sphere they are 12 degrees apart."""
+
+SPREAD = 0.7
+"""Least gap between a chosen pose and all others; the unit is the greatest gap of a candidate.
+Where a surface is wrong, so are the directions of its mirrors, and poses far apart serve better."""
 
 
 def next_poses(
@@ -82,19 +87,36 @@ def next_poses(
         mesh.faces.ravel(), np.repeat(mesh.area_faces / 3.0, 3), minlength=len(mesh.vertices)
     )
     weight = bumps.spread.T @ (corners * surface.error)
-    return candidates[_greedy(weight, 1.0 + misfit.curvature, added, count)]
+    middle = mesh.bounds.mean(axis=0)
+    ways, heard = (
+        out / np.linalg.norm(out, axis=1, keepdims=True)
+        for out in (candidates.positions - middle, echoes.positions[echoes.training] - middle)
+    )
+    return candidates[_greedy(weight, 1.0 + misfit.curvature, added, count, ways, heard)]
 
 
-def _greedy(weight: Floats, known: Floats, added: Floats, count: int) -> list[int]:
-    """Return the rows of ``added`` (P, B) that reduce the sum of weight / sqrt(known) most."""
+def _greedy(
+    weight: Floats, known: Floats, added: Floats, count: int, ways: Floats, heard: Floats
+) -> list[int]:
+    """Return the rows of ``added`` (P, B) that reduce the sum of weight / sqrt(known) most.
+
+    Args:
+        weight, known (B,): Error before a pose is added, and the curvature.
+        added (P, B): Curvature that each candidate adds.
+        count: Number of rows.
+        ways, heard ((P, 3), (H, 3)): Directions of the candidates, and of the poses so far, from
+            the surface. Only candidates with ``SPREAD`` of the greatest gap are chosen.
+    """
     chosen: list[int] = []
     error = weight * np.sqrt(known)  # error = weight where nothing is added
-    left = np.ones(len(added), dtype=bool)
+    gap, _ = cKDTree(heard).query(ways)
     for _ in range(count):
         after = (error / np.sqrt(known + added)).sum(axis=1)
+        left = gap >= SPREAD * gap.max()
+        left[chosen] = False
         best = int(np.where(left, after, np.inf).argmin())
         chosen.append(best)
-        left[best] = False
+        gap = np.minimum(gap, np.linalg.norm(ways - ways[best], axis=1))
         known = known + added[best]
     return chosen
 

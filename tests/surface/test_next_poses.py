@@ -44,6 +44,15 @@ def test_where_the_error_is_larger_is_heard_first(mesh, echoes):
     assert (found.positions[:, 0] > 0.0).all()
 
 
+def test_poses_keep_apart_from_those_that_heard(mesh, from_above):
+    given = surface(mesh)
+    given.error[mesh.vertices[:, 2] > 0.5 * RADIUS] = 1.0  # where all poses are
+    found = next_poses(given, from_above, 1).positions / 0.3
+    heard = from_above.positions[from_above.training] / 0.3
+    below = np.linalg.norm(heard - [0.0, 0.0, -1.0], axis=1).min()
+    assert np.linalg.norm(heard - found, axis=1).min() > 0.5 * below
+
+
 def test_candidates_are_chosen_among(mesh, from_above):
     low, high = [0.0, 0.0, -0.3], [0.0, 0.0, 0.3]
     candidates = Poses.looking_at([high, low])
