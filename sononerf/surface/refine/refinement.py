@@ -31,6 +31,7 @@ from sononerf.surface.refine.descent import (
     poses_that_hear,
 )
 from sononerf.surface.refine.later_bounces import LaterBounces
+from sononerf.surface.refine.necks import without_necks
 from sononerf.surface.refine.objective import Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.remesh import finer, remesh
@@ -368,13 +369,20 @@ class Refinement:
             self._choose()
         course = self.courses[self._at]
         best = course.best
-        mesh = course.meshes[best]
-        confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
         objective = course.objectives[best]
+        mesh, doubtful = without_necks(
+            course.meshes[best],
+            self.optics.wavelength,
+            lambda mesh: self._objective(
+                mesh, "a surface with a cut neck", course.level, smooth=False
+            ),
+        )
+        confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
         known = surface_error(
             mesh, self.echoes, self.optics, validation_db=objective, seed=self.seed
         )
-        values = np.stack([confidence * known.heard, known.error], axis=1)
+        confidence *= known.heard & ~doubtful
+        values = np.stack([confidence, known.error], axis=1)
         if best:
             mesh, values = finer(mesh, values, self.optics.wavelength)
         return Refined(
