@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from sononerf import open_run
+from sononerf import open_run, reconstruct
 from sononerf.array_types import Floats
 from sononerf.evaluation.geometry import signed_error
 from sononerf.run.build import true_mesh
 from sononerf.run.run_folder import RunFolder
+from sononerf.surface.reconstruction import starts_of
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.surface_error import UNHEARD, error_factors
 from tools.benchmarks.experiment import Row, aligned
@@ -83,19 +84,25 @@ def sparsification(distance: Floats, error: Floats) -> float:
 
 def calibrated(runs: list[Path]) -> str:
     """Return exponents and scale of the errors, by least squares over the runs' logarithms."""
-    inputs, targets, ratios = [], [], []
+    inputs, targets = [], []
     for path in runs:
         run = open_run(path)
         surface, optics = run.surface, Optics(run.echoes.head)
-        factors = error_factors(surface.mesh, run.echoes, optics, seed=0)
+        factors = error_factors(
+            surface.mesh,
+            run.echoes,
+            optics,
+            starts=starts_of(reconstruct(run.model, run.echoes)).values(),
+            validation_db=surface.error_db,
+            seed=0,
+        )
         distance = off_truth(path) / optics.wavelength
         drawn = np.random.default_rng(0).choice(np.flatnonzero(factors[:, 1] < UNHEARD), DRAWN)
-        ones = np.ones((len(drawn), 1))
-        inputs.append(np.concatenate([np.log(factors[drawn]), ones], axis=1))
-        targets.append(np.log(distance[drawn] + LEAST) - np.log(surface.error_db))
-        ratios.append(distance[drawn] / surface.error_db)
-    found = np.linalg.lstsq(np.concatenate(inputs), np.concatenate(targets), rcond=None)[0]
-    usual = np.exp(np.concatenate(inputs)[:, :3] @ found[:3])
-    scale = np.quantile(np.concatenate(ratios) / usual, 0.9)
-    exponents = ", ".join(f"{one:.3f}" for one in found[:3])
+        inputs.append(np.log(factors[drawn]))
+        targets.append(np.log(distance[drawn] + LEAST))
+    given, wanted = np.concatenate(inputs), np.concatenate(targets)
+    ones = np.ones((len(given), 1))
+    *found, _ = np.linalg.lstsq(np.concatenate([given, ones], axis=1), wanted, rcond=None)[0]
+    scale = np.exp(np.quantile(wanted - given @ found, 0.9))
+    exponents = ", ".join(f"{one:.3f}" for one in found)
     return f"EXPONENTS ({exponents})  SCALE {scale:.3f}  from {len(runs)} runs"

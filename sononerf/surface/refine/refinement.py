@@ -379,7 +379,12 @@ class Refinement:
         )
         confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
         known = surface_error(
-            mesh, self.echoes, self.optics, validation_db=objective, seed=self.seed
+            mesh,
+            self.echoes,
+            self.optics,
+            starts=self.starts.values(),
+            validation_db=objective,
+            seed=self.seed,
         )
         confidence *= known.heard & ~doubtful
         values = np.stack([confidence, known.error], axis=1)

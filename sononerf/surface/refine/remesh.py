@@ -179,12 +179,7 @@ def _of_body(
     near = np.zeros(shape, dtype=bool)
     near[tuple(np.rint((points - lower) / spacing).astype(np.int64).T)] = True
     near = ndimage.binary_dilation(near, iterations=BAND)
-    places = lower + spacing * np.argwhere(near)
-    away, nearest = cKDTree(points, balanced_tree=False, compact_nodes=False).query(places)
-    height = ((places - points[nearest]) * normals[nearest]).sum(axis=1)
-    # Beside the edge of the nearest piece of surface its plane is not enough.
-    aside = np.sqrt(np.maximum(away**2 - height**2, 0.0)) > spacing
-    height = np.where(aside, np.copysign(away, height), height)
+    height = _heights(lower + spacing * np.argwhere(near), points, normals, spacing)
     farthest = (BAND + 0.5) * spacing
     distance = np.full(shape, farthest, dtype=np.float32)
     distance[near] = np.clip(height, -farthest, farthest)
@@ -193,6 +188,26 @@ def _of_body(
     enclosed = (distance > 0) & (labels != labels[0, 0, 0])
     distance[enclosed] = -distance[enclosed]
     return distance
+
+
+def distance_from(mesh: trimesh.Trimesh, places: Floats, spacing: float) -> Floats:
+    """Return the distance (N,), m, of places (N, 3), m, from a mesh.
+
+    Args:
+        mesh: Any mesh, m.
+        places: The places.
+        spacing (m): Distances of much less than this are less exact.
+    """
+    return np.abs(_heights(places, *_samples(mesh, 0.5 * spacing), spacing))
+
+
+def _heights(places: Floats, points: Floats, normals: Floats, spacing: float) -> Floats:
+    """Return the signed distance (N,) of places (N, 3) from samples of a surface, m."""
+    away, nearest = cKDTree(points, balanced_tree=False, compact_nodes=False).query(places)
+    height: Floats = ((places - points[nearest]) * normals[nearest]).sum(axis=1)
+    # Beside the edge of the nearest piece of surface its plane is not enough.
+    aside = np.sqrt(np.maximum(away**2 - height**2, 0.0)) > spacing
+    return np.where(aside, np.copysign(away, height), height)
 
 
 def _samples(mesh: trimesh.Trimesh, spacing: float) -> tuple[Floats, Floats]:
