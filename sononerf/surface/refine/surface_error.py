@@ -69,7 +69,7 @@ changes the area of the sparsification error by 0.002."""
 AROUND = 2.0
 """Standard deviation of the weights around a vertex over which u is averaged, wavelengths. The
 average lowers the area of the sparsification error from 0.37 to 0.33."""
-EXPONENTS = (0.12, 0.06, 0.16, 0.35, 1.28)
+EXPONENTS = (0.11, 0.06, 0.14, 0.32, 1.38)
 """Exponents a, b, c, e and f; from `tools/benchmark.py errors --calibrate`, rounded, as is the
 scale."""
 FLAT = 0.05
@@ -78,7 +78,7 @@ NEAR = 0.03
 """Distance of the start surfaces that is added, wavelengths: they may agree by chance."""
 TYPICAL = 0.3
 """The same distance where there are no two starts to compare, wavelengths: about their median."""
-SCALE = 0.38
+SCALE = 0.17
 """Error of a vertex where all factors are 1, wavelengths."""
 UNHEARD = 0.8
 """v above which a vertex is unheard: echoes lower the variance by less than a fifth."""
