@@ -264,6 +264,19 @@ def test_a_finished_run_is_left_as_it_is_and_says_so(at_home):
     assert tree(at_home.run) == before
 
 
+def test_the_error_is_told_and_what_twice_as_many_poses_would_change(at_home):
+    file = at_home.run / "reconstruction" / "read_out.json"
+    known = json.loads(file.read_text())
+    found = known | {"median_error_m": 5e-4, "median_error_from_twice_m": 4e-4}
+    file.write_text(json.dumps(found))
+    try:
+        said = done("fit", SMOKE, "--accelerator", "cpu").err
+    finally:
+        file.write_text(json.dumps(known))
+    assert "error of the surface: 0.50 mm" in said
+    assert "twice as many poses about 0.40 mm" in said
+
+
 def test_other_settings_in_the_same_folder_are_refused(at_home):
     before = tree(at_home.home)
     message = refused(8, "fit", SMOKE, "fit.learning_rate=0.1", "--seed", 3)

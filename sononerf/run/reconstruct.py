@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import math
 import time
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import safetensors.torch
 import trimesh
 from safetensors import SafetensorError, safe_open
@@ -29,6 +31,7 @@ from sononerf.surface.mesh_files import mesh_bytes
 from sononerf.surface.reconstruction import refine, starts_of
 from sononerf.surface.refine import descent as stages
 from sononerf.surface.refine.refinement import STATE_VERSION, Refinement
+from sononerf.surface.refine.surface_error import error_from_twice
 from sononerf.surface.start.read_out import Method
 from sononerf.surface.start.volume import vti_bytes
 from sononerf.surface.surface import FORMATS, Surface
@@ -242,6 +245,20 @@ def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None, frame:
             "surface": None if surface.openness is None else surface.openness.kind,
             "refined": surface.refined,
             "validation_error_db": surface.error_db,
+            **_errors(surface),
             "faults": list(surface.faults),
         },
     )
+
+
+def _errors(surface: Surface) -> dict[str, float | None]:
+    """Return the median error of what was heard, m, and that from twice as many poses."""
+    names = "median_error_m", "median_error_from_twice_m"
+    heard = surface.confidence is not None and surface.confidence > 0
+    if surface.error is None or surface.echoes is None or not np.any(heard):
+        return dict.fromkeys(names)
+    median = float(np.median(surface.error[heard]))
+    if not math.isfinite(median):
+        return dict.fromkeys(names)
+    twice = error_from_twice(median, surface.echoes.head.wavelength)
+    return dict(zip(names, (median, twice), strict=True))

@@ -79,6 +79,7 @@ def test_a_run_has_its_refined_surface(run, no_projections):
     found = read_json(folder / "read_out.json")
     assert isinstance(found["refined"], bool)
     assert found["validation_error_db"] > 0
+    assert 0 < found["median_error_from_twice_m"] < found["median_error_m"]
     events = EventAccumulator(str(run / "tensorboard" / run.name))
     events.Reload()
     # Event files of one second are read by their names, in which file 10 comes before file 9.
@@ -87,7 +88,8 @@ def test_a_run_has_its_refined_surface(run, no_projections):
     assert stages_shown == [1, 2, 3, 4, 5]
     assert "mesh/refinement_stages_VERTEX" in events.Tags()["tensors"]
     again = reconstruct(run, method="filled", spacing=0.008, accelerator="cpu")
-    assert read_json(again / "read_out.json")["validation_error_db"] is None
+    found = read_json(again / "read_out.json")
+    assert found["validation_error_db"] is found["median_error_m"] is None
 
 
 def test_without_its_echoes_a_surface_is_not_refined(run, no_projections):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.surface.refine.surface_error import surface_error
+from sononerf.surface.refine.surface_error import error_from_twice, surface_error
 from tests.memory import changed
 from tests.surface.conftest import RADIUS
 
@@ -66,3 +66,12 @@ def test_the_error_is_larger_where_the_starts_are_elsewhere(right, echoes, optic
 def test_the_same_seed_gives_the_same_error(right, echoes, optics):
     first, again = (of(right, echoes, optics, seed=4).error for _ in range(2))
     assert np.array_equal(first, again)
+
+
+def test_twice_as_many_poses_help_less_where_the_error_is_small():
+    wavelength = 4e-3
+    errors = (1e-5, 1e-3, 1e-2)
+    factor = [error_from_twice(one, wavelength) / one for one in errors]
+    assert factor[0] == 1.0
+    assert 1.0 > factor[1] > factor[2] > 0.3
+    assert error_from_twice(2e-3, 2 * wavelength) == pytest.approx(2 * factor[1] * 1e-3)
