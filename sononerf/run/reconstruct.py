@@ -258,7 +258,7 @@ def _errors(surface: Surface) -> dict[str, float | None]:
     if surface.error is None or surface.echoes is None or not np.any(heard):
         return dict.fromkeys(names)
     median = float(np.median(surface.error[heard]))
-    if not math.isfinite(median):
+    if not 0.0 < median < math.inf:
         return dict.fromkeys(names)
     twice = error_from_twice(median, surface.echoes.head.wavelength)
     return dict(zip(names, (median, twice), strict=True))

@@ -28,6 +28,9 @@ from sononerf.surface.refine.remesh import signed_distance
 
 SPACING = 0.4
 """Spacing of the lattice, shortest wavelengths: what sound resolves is two voxels wide."""
+VOXELS = 1_000_000
+"""Largest number of voxels of the box around the body, about: they take 0.2 GB. Larger bodies get a
+coarser lattice."""
 THIN = 0.6
 """Largest depth of a neck; the unit is the depth of the thinner of the parts that it links. Necks
 between spheres are less deep; the bumps of one body are linked by more."""
@@ -75,6 +78,8 @@ def without_necks(
     """
     necks = find_necks(mesh, wavelength)
     whole = compare(mesh) if necks else math.inf
+    if not math.isfinite(whole):
+        return mesh, np.zeros(len(mesh.vertices), dtype=bool)
     without = [_compared(_cut(mesh, [neck]), compare) for neck in necks]
     preferred = [neck for neck, one in zip(necks, without, strict=True) if LATER * one <= whole]
     cut = _cut(mesh, preferred) if preferred else mesh
@@ -105,7 +110,7 @@ def find_necks(mesh: trimesh.Trimesh, wavelength: float) -> list[Neck]:
     """
     if not mesh.is_watertight:
         return []
-    spacing = SPACING * wavelength
+    spacing = max(SPACING * wavelength, float(np.cbrt(np.prod(mesh.extents) / VOXELS)))
     lower, distance = signed_distance(mesh, spacing, margin=AROUND)
     depth = ndimage.distance_transform_edt(distance < 0)
     log = np.log(np.maximum(depth, 0.5))

@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
+import math
+import tracemalloc
+
 import numpy as np
 import pytest
 import trimesh
@@ -78,6 +81,21 @@ def test_two_cuts_that_are_worse_together_are_not_made(three):
     found, doubtful = without_necks(three, WAVELENGTH, lambda x: {1: 2.0, 2: 1.9, 3: 3.0}[parts(x)])
     assert found is three
     assert doubtful.any()
+
+
+def test_what_cannot_be_compared_is_left_alone(bridged):
+    found, doubtful = cut(bridged, math.inf, math.inf)
+    assert found is bridged
+    assert not doubtful.any()
+
+
+def test_a_large_body_takes_a_coarser_lattice(bridged):
+    tracemalloc.start()
+    found, _ = without_necks(bridged, WAVELENGTH / 12, lambda found: 2.0 / parts(found))
+    most = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert parts(found) == 2
+    assert most < 5e8
 
 
 def without_faces_above(mesh):
