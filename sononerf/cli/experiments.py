@@ -217,8 +217,8 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
     if found.get("median_error_m"):
         now, twice = (1e3 * found[f"median_error_{key}m"] for key in ("", "from_twice_"))
         say(
-            f"error of the surface: {now:.2f} mm (median; it holds for 90 %); from twice as many "
-            f"poses about {twice:.2f} mm"
+            f"error of the surface: {now:.2f} mm (90 %, median of the vertices); from twice as "
+            f"many poses about {twice:.2f} mm"
         )
     if (folder / "report.html").is_file():
         say(f"report:      {folder / 'report.html'}")
