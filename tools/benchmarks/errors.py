@@ -15,7 +15,7 @@ from sononerf.run.build import true_mesh
 from sononerf.run.run_folder import RunFolder
 from sononerf.surface.reconstruction import starts_of
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.surface_error import UNHEARD, error_factors
+from sononerf.surface.refine.surface_error import surface_error
 from tools.benchmarks.experiment import Row, aligned
 
 DRAWN = 2000
@@ -88,7 +88,7 @@ def calibrated(runs: list[Path]) -> str:
     for path in runs:
         run = open_run(path)
         surface, optics = run.surface, Optics(run.echoes.head)
-        factors = error_factors(
+        known = surface_error(
             surface.mesh,
             run.echoes,
             optics,
@@ -97,8 +97,8 @@ def calibrated(runs: list[Path]) -> str:
             seed=0,
         )
         distance = off_truth(path) / optics.wavelength
-        drawn = np.random.default_rng(0).choice(np.flatnonzero(factors[:, 1] < UNHEARD), DRAWN)
-        inputs.append(np.log(factors[drawn]))
+        drawn = np.random.default_rng(0).choice(np.flatnonzero(known.heard), DRAWN)
+        inputs.append(np.log(known.factors[drawn]))
         targets.append(np.log(distance[drawn] + LEAST))
     given, wanted = np.concatenate(inputs), np.concatenate(targets)
     ones = np.ones((len(given), 1))

@@ -19,7 +19,7 @@ from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.scene.scene import load_scene
 from sononerf.surface.next_poses import CANDIDATES
-from tools.benchmarks.experiment import Row, aligned, origin
+from tools.benchmarks.experiment import Row, aligned, ending, origin
 
 WAYS = ("proposed", "farthest", "random")
 FIRST = 12
@@ -39,14 +39,15 @@ def next_poses(arguments: argparse.Namespace) -> str:
     known: list[Row] = []
     if file.is_file():
         known = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
-    for name, seed in itertools.product(arguments.only, arguments.seeds):
-        series = _Series(name, seed, arguments.score, arguments.most)
-        for way in arguments.ways:
-            if any(series.is_end(row) for row in known if _key(row) == (name, seed, way)):
-                continue
-            for row in series.rows(way):  # a series that was interrupted begins again
-                storage.append_line(file, storage.to_json(row))
-                known.append(row)
+    with ending(arguments.output):
+        for name, seed in itertools.product(arguments.only, arguments.seeds):
+            series = _Series(name, seed, arguments.score, arguments.most)
+            for way in arguments.ways:
+                if any(series.is_end(row) for row in known if _key(row) == (name, seed, way)):
+                    continue
+                for row in series.rows(way):  # a series that was interrupted begins again
+                    storage.append_line(file, storage.to_json(row))
+                    known.append(row)
     return f"{table(known, arguments.score)}\nwrote {file}"
 
 

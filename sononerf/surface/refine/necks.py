@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Necks: thin links between thicker parts of a body, which no echo may bear out.
+"""Necks: thin links between thicker parts of a body, which may be there without an echo.
 
 The depth below the surface has a maximum in each part of a body [1]_. A neck is the narrowest place
 between two of them, if it is much less deep than both.
@@ -48,7 +48,7 @@ class Neck:
     """A neck of a surface.
 
     Attributes:
-        solid: Closed surface around the neck, m; it holds nothing else of the body.
+        solid: Closed surface around the neck and nothing else of the body, m.
         places ((N, 3), m): Points that fill the neck.
         reach (m): Distance from the points up to which the surface belongs to the neck.
     """
@@ -65,7 +65,7 @@ class Neck:
 def without_necks(
     mesh: trimesh.Trimesh, wavelength: float, compare: Callable[[trimesh.Trimesh], float]
 ) -> tuple[trimesh.Trimesh, Bools]:
-    """Cut the necks that a comparison prefers to be cut.
+    """Cut the necks without which the objective is lower.
 
     Args:
         mesh: Closed bodies, m; of an open surface nothing is cut.
@@ -74,7 +74,8 @@ def without_necks(
 
     Returns:
         mesh: The given one where nothing is cut.
-        doubtful (V,): True for vertices where a neck was cut, or is no better than none.
+        doubtful (V,): True for vertices where a neck was cut, or where the objective is about the
+            same without it.
     """
     necks = find_necks(mesh, wavelength)
     whole = compare(mesh) if necks else math.inf

@@ -98,10 +98,12 @@ class SurfaceError:
         error ((V,), m): The true surface is within this distance with a probability of 90 %, if
             the vertex was heard.
         heard (V,): True where echoes bound the place of the surface.
+        factors (V, 5): The factors of the error, without their exponents.
     """
 
     error: Floats
     heard: Bools
+    factors: Floats
 
 
 def surface_error(
@@ -124,38 +126,6 @@ def surface_error(
             :class:`~sononerf.surface.refine.comparison.Comparison`.
         seed: Seed of poses and probes.
     """
-    factors = error_factors(
-        mesh, echoes, optics, starts=starts, validation_db=validation_db, seed=seed
-    )
-    error = SCALE * optics.wavelength * np.prod(factors**EXPONENTS, axis=1)
-    return SurfaceError(error, factors[:, 1] < UNHEARD)
-
-
-def error_from_twice(error: float, wavelength: float) -> float:
-    """Return the error that a surface would have from twice as many poses, m.
-
-    Args:
-        error (m): Median error of its vertices that were heard.
-        wavelength (m): The shortest.
-    """
-    at_one, slope = TWICE
-    return error * min(1.0, math.exp(at_one + slope * math.log(error / wavelength)))
-
-
-def error_factors(
-    mesh: trimesh.Trimesh,
-    echoes: Echoes,
-    optics: Optics,
-    *,
-    starts: Collection[trimesh.Trimesh],
-    validation_db: float,
-    seed: int,
-) -> Floats:
-    """Return the factors (V, 5) of the error of each vertex, without their exponents.
-
-    Args:
-        mesh, echoes, optics, starts, validation_db, seed: As in :func:`surface_error`.
-    """
     bumps, wavelength = Bumps(mesh, optics), optics.wavelength
     misfit = Misfit(bumps, echoes, seed)
     points = bumps.vertices.cpu().numpy()
@@ -167,7 +137,20 @@ def error_factors(
         apart = np.median([distance_from(one, points, 0.5 * wavelength) for one in starts], axis=0)
     hollow, agreement = FLAT + wavelength * bumps.hollow, NEAR + apart / wavelength
     error_db = np.full(len(points), validation_db)
-    return np.stack([excess, variance, hollow, agreement, error_db], axis=1)
+    factors = np.stack([excess, variance, hollow, agreement, error_db], axis=1)
+    error = SCALE * wavelength * np.prod(factors**EXPONENTS, axis=1)
+    return SurfaceError(error, variance < UNHEARD, factors)
+
+
+def error_from_twice(error: float, wavelength: float) -> float:
+    """Return the error that a surface would have from twice as many poses, m.
+
+    Args:
+        error (m): Median error of its vertices that were heard.
+        wavelength (m): The shortest.
+    """
+    at_one, slope = TWICE
+    return error * min(1.0, math.exp(at_one + slope * math.log(error / wavelength)))
 
 
 class Bumps:

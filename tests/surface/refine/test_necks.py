@@ -39,7 +39,7 @@ def cut(mesh, one, two):
     return without_necks(mesh, WAVELENGTH, lambda found: one if parts(found) == 1 else two)
 
 
-def test_a_neck_that_is_not_borne_out_is_cut(bridged):
+def test_a_neck_that_echoes_contradict_is_cut(bridged):
     found, doubtful = cut(bridged, 2.0, 1.5)
     assert parts(found) == 2
     assert found.is_watertight
@@ -68,7 +68,7 @@ def three(bridged):
     return trimesh.boolean.union(parts, engine="manifold")
 
 
-def test_only_the_neck_that_is_not_borne_out_is_cut(three):
+def test_only_the_neck_that_echoes_contradict_is_cut(three):
     def compare(found):
         return 1.5 if any(part.bounds[1, 0] < 0 for part in found.split()) else 2.0 * parts(found)
 
