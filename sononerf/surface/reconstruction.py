@@ -138,7 +138,8 @@ def refine(
         progress: Display of progress; on stderr where None.
 
     Returns:
-        surface: The best one; the start where none explains the validation poses better.
+        surface: The best one; the start where the others explain the validation poses clearly
+            worse.
 
     Raises:
         SettingsError: If an option is not allowed, or the surface is an iso-surface.

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, cast
@@ -17,10 +18,13 @@ from sononerf.surface.refine.objective import Level
 from sononerf.surface.start.read_out import StartMethod
 
 TOLERATED = 1.15
-"""Ratio of two objectives of validation poses below which surfaces of two courses differ by chance.
-Within it, a sheet goes on after the first stage; or else the learned start before the other one,
-because it knows more bodies; and then its blurred surface before its sharp one, because that is
-smoother."""
+"""Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
+a sheet goes on after the first stage; or else the learned start before the other one, because it
+knows more bodies; and then its blurred surface before its sharp one, because that is smoother. A
+refined surface is also preferred to its start within it: ``hull`` is made from the onsets, so they
+do not tell how wrong it is. From 100 calls a cone, a stool and the procedural body 116 kept their
+hulls at F-scores of 0.77, 0.24 and 0.42 (2 mm) for 0.92, 0.31 and 0.72 of the refined surfaces,
+whose objectives are 1 to 5 % higher."""
 LATER = 1.03
 """Ratio of two objectives of one course below which the later stage is preferred: on smooth bodies
 later stages are nearer to the truth at the same objective. Edges lose in later stages, and there
@@ -52,10 +56,12 @@ class Course:
 
     @property
     def best(self) -> int:
-        """Number of the best surface: 0, the start, where none explains more."""
-        good = LATER * min(self.objectives)
-        better = [n for n, found in enumerate(self.objectives) if found < self.objectives[0]]
-        return max([n for n in better if self.objectives[n] <= good], default=0)
+        """Number of the best surface: 0, the start, where the others explain clearly less."""
+        start, *refined = self.objectives
+        least = min(refined, default=math.inf)
+        if math.isinf(least) or least > TOLERATED * start:
+            return 0
+        return max(n for n, found in enumerate(refined, 1) if found <= LATER * least)
 
     def state(self) -> dict[str, Tensor]:
         """Return all as plain tensors."""

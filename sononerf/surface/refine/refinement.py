@@ -58,7 +58,8 @@ class Refined:
             mirror; 0 where echoes do not bound its place.
         error ((V,), m): See :mod:`sononerf.surface.refine.surface_error`.
         start: Name of the start that was refined.
-        kept: True where the refined surface explains the validation poses better than the start.
+        kept: True where the refined surface explains the validation poses about as well as the
+            start, or better.
         error_db: Objective on validation poses, see
             :class:`~sononerf.surface.refine.comparison.Comparison`.
         history: Per stage: its number, the start, its way, the mismatch of its last step, and the
@@ -364,7 +365,7 @@ class Refinement:
             self._descent.load(parts)
 
     def result(self) -> Refined:
-        """Return the best surface so far; the start where none explains more."""
+        """Return the best surface so far; the start where the others explain clearly less."""
         if not self.courses:
             self._choose()
         course = self.courses[self._at]

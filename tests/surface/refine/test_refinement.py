@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -324,7 +325,11 @@ def test_the_learned_start_and_the_best_other_one_go_both_ways(
     [
         ((9.0, 5.0, 5.1, 5.4), 2),  # of equals the later one; a rise is none
         ((9.0, 5.0, 5.4, 4.0), 3),
-        ((4.0, 5.0, 6.0, 4.0), 0),  # no stage explains more than the start
+        ((4.0, 5.0, 4.4, 4.3), 3),  # the start is better by chance
+        ((4.0, 5.0, 6.0, 4.7), 0),  # no stage explains as much as the start
+        ((math.inf, 5.0, math.inf), 1),  # what cannot be traced
+        ((math.inf, math.inf), 0),
+        ((4.0,), 0),
     ],
 )
 def test_the_later_of_equal_surfaces_is_kept(bumpy, objectives, best):
