@@ -39,8 +39,9 @@ from sononerf.surface.surface import Surface, finished_surface
 UNREFINED: tuple[StartMethod, ...] = ("filled", "hull", "open", "sheet")
 """Start methods in order: without refinement the first that gives a surface is taken."""
 REFINED: tuple[StartMethod, ...] = ("open", "filled", "hull", "learned", "sheet")
-"""Start surfaces: the one that explains the validation poses best is refined, see
-:class:`~sononerf.surface.refine.refinement.Refinement`."""
+"""Start surfaces: one of them is refined, see
+:class:`~sononerf.surface.refine.refinement.Refinement`; how far they lie apart is part of the error
+of the surface."""
 RAYS = 20_000
 """Rays per pose, for the correction of the last stage."""
 

@@ -20,11 +20,9 @@ from sononerf.surface.start.read_out import StartMethod
 TOLERATED = 1.15
 """Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
 a sheet goes on after the first stage; or else the learned start before the other one, because it
-knows more bodies; and then its blurred surface before its sharp one, because that is smoother. A
-refined surface is also preferred to its start within it: ``hull`` is made from the onsets, so they
-do not tell how wrong it is. From 100 calls a cone, a stool and the procedural body 116 kept their
-hulls at F-scores of 0.77, 0.24 and 0.42 (2 mm) for 0.92, 0.31 and 0.72 of the refined surfaces,
-whose objectives are 1 to 5 % higher."""
+knows more bodies; and then its blurred surface before its sharp one, because that is smoother.
+A refined surface is also preferred to its start within it: the onsets do not tell how wrong a start
+is that was made from them."""
 LATER = 1.03
 """Ratio of two objectives of one course below which the later stage is preferred: on smooth bodies
 later stages are nearer to the truth at the same objective. Edges lose in later stages, and there

@@ -8,7 +8,9 @@ from typing import Literal
 
 import numpy as np
 import torch
+import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from sononerf.echoes.echoes import Echoes
@@ -260,6 +262,19 @@ class OnsetRanges:
 
     def __len__(self) -> int:
         return len(self._first)
+
+    def ridges(self, hull: trimesh.Trimesh) -> float:
+        """Return how far a hull (m) stands out between poses: the median over its vertices, m.
+
+        As that of tangent planes at a sphere, whose normals are the directions of the poses that
+        heard an onset; infinite if most vertices lie beside all poses.
+        """
+        outward, source = hull.vertices - hull.centroid, self._emitters - hull.centroid
+        radius = np.linalg.norm(outward, axis=1)
+        near, _ = cKDTree(trimesh.unitize(source)).query(trimesh.unitize(outward))
+        cosine = 1.0 - near**2 / 2.0
+        with np.errstate(divide="ignore"):
+            return float(np.median(radius * (1.0 / cosine.clip(0.0) - 1.0)))
 
     def misfit(self, vertices: Tensor) -> float:
         """Mean Huber loss of the least range of vertices (V, 3), m; no unit; 0 without onsets."""

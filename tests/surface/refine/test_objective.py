@@ -121,6 +121,16 @@ def test_the_body_itself_has_no_misfit_and_a_smaller_one_has(box):
     assert 0.5 < onsets.misfit(vertices_of(smaller)) < 2.5
 
 
+def test_ridges_of_a_hull_are_those_of_tangent_planes():
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.02)
+    few, many = (OnsetRanges(heard(ball, count=count), RESOLUTION, seed=0) for count in (50, 200))
+    # A plane belongs to 4 pi / 50 of the sphere; half of that lies within an angle of 0.2 of it.
+    assert few.ridges(ball) == pytest.approx(0.02 * (1 / np.cos(0.2) - 1), rel=0.3)
+    assert few.ridges(ball) == pytest.approx(4 * many.ridges(ball), rel=0.3)
+    moved = ball.copy().apply_translation([0.0, 0.0, 5.0])
+    assert few.ridges(moved) > 0.02  # heard from one side
+
+
 def test_going_against_the_gradient_lowers_the_misfit(box):
     onsets = OnsetRanges(heard(box), RESOLUTION, seed=0)
     places = vertices_of(box) * 0.97

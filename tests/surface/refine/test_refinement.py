@@ -9,7 +9,9 @@ import pytest
 import torch
 import trimesh
 
+from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import InputError
+from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.head import Head
 from sononerf.run.build import head_of
 from sononerf.simulation.hearing import Hearing, hearing_of
@@ -124,6 +126,19 @@ def test_of_two_starts_the_one_that_explains_more_is_refined(bumpy, echoes, opti
         again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
         again.load(work.state())
         assert again.course.start == "whole"
+
+
+@pytest.mark.parametrize(("count", "chosen"), [(20, "filled"), (1000, "hull")])
+def test_a_hull_takes_part_only_if_poses_are_dense(bumpy, echoes, optics, count, chosen):
+    places = 0.4 * fibonacci_sphere(count)
+    ears = np.repeat(places[:, None], 2, axis=1)
+    far = np.linalg.norm(places[:, None] - bumpy.vertices, axis=2).min(axis=1)
+    heard = EchoHull(places, ears, np.stack([far, far], axis=1), -places / 0.4)
+    echoes = changed(echoes, hull=heard)
+    starts = {"hull": bumpy, "filled": bumpy.copy().apply_scale(0.5)}
+    for given, found in ((starts, chosen), ({"hull": bumpy}, "hull")):
+        work = Refinement(given, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        assert work.course.start == found
 
 
 @pytest.fixture
