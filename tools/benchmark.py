@@ -33,8 +33,9 @@ machine's matrix product and its copying. ``fit``: how long the default takes to
 version, machine and device, and ``--compare`` prints what has changed.
 
 ``errors``: the fractions of vertices and of held-out cells that the errors of finished runs hold,
-and the area under the sparsification error, beside that of the numbers of poses. ``next_poses``:
-the calls that proposed poses need for an F-score, beside farthest and random ones.
+and the area under the sparsification error, beside that of the numbers of poses and, where runs of
+seeds 1 to 4 lie beside that of seed 0, of how far their surfaces lie apart. ``next_poses``: the
+calls that proposed poses need for an F-score, beside farthest and random ones.
 
 ``surfaces``: how good the surfaces of all kinds of scenes are, some under
 changed conditions; one line of JSON for each run. What is ``scaled`` is measured in the unscaled

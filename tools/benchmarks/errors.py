@@ -22,6 +22,8 @@ DRAWN = 2000
 """Vertices of each body that take part in the calibration, so that all bodies count the same."""
 LEAST = 0.01
 """Distance from the truth that is added before the logarithm is taken, shortest wavelengths."""
+MEMBERS = range(1, 5)
+"""Seeds of the further runs of the same echoes that make an ensemble with seed 0."""
 
 
 def errors(arguments: argparse.Namespace) -> str:
@@ -51,10 +53,26 @@ def measured(path: Path) -> Row:
         "unheard": float(1.0 - heard.mean()),
         "cells held": run.metrics["prediction"].get("interval_coverage"),
         "sparsification": sparsification(distance, surface.error),
+        "by ensemble": _by_ensemble(path, distance),
         "by poses": sparsification(distance, -surface.confidence.astype(np.float64)),
         "median distance, mm": float(1e3 * np.median(distance)),
         "median error, mm": float(1e3 * np.median(surface.error[heard])),
     }
+
+
+def _by_ensemble(path: Path, distance: Floats) -> float | None:
+    """Return the area where vertices are ranked by their mean distance from the members' surfaces.
+
+    The members are the runs beside it whose names end with another seed; None without them.
+    """
+    name = path.name.removesuffix("-0")
+    members = [path.with_name(f"{name}-{seed}") for seed in MEMBERS]
+    members = [member for member in members if RunFolder(member).config.is_file()]
+    if not members:
+        return None
+    mesh = open_run(path).surface.mesh
+    apart = [np.abs(signed_error(mesh, open_run(one).surface.mesh)) for one in members]
+    return sparsification(distance, np.mean(apart, axis=0))
 
 
 def off_truth(path: Path) -> Floats:
