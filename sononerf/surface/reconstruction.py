@@ -139,7 +139,7 @@ def refine(
         progress: Display of progress; on stderr where None.
 
     Returns:
-        surface: The best one; the start where the others explain the validation poses clearly
+        surface: The best one; the start where all refined ones explain the validation poses clearly
             worse.
 
     Raises:

@@ -27,8 +27,8 @@ FIRST = 12
 VALIDATION = 2
 """Further calls, drawn at random, that validate all surfaces."""
 GROWTH = 1.15
-"""Each fit has this many times the calls of the one before; 1.4 was too coarse to tell ways that
-differ by a third."""
+"""Each fit has this many times the calls of the one before; with 1.4, ways that differ by a third
+could look the same."""
 RADIUS = 0.4
 """Distance of all poses from the origin, m: that of the default settings."""
 

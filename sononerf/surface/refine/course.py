@@ -21,8 +21,8 @@ TOLERATED = 1.15
 """Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
 a sheet goes on after the first stage; or else the learned start before the other one, because it
 knows more bodies; and then its blurred surface before its sharp one, because that is smoother.
-A refined surface is also preferred to its start within it: the onsets do not tell how wrong a start
-is that was made from them."""
+A refined surface is also preferred to its start within it: a start that was made from the onsets
+fits them even where it is wrong."""
 LATER = 1.03
 """Ratio of two objectives of one course below which the later stage is preferred: on smooth bodies
 later stages are nearer to the truth at the same objective. Edges lose in later stages, and there
@@ -54,7 +54,7 @@ class Course:
 
     @property
     def best(self) -> int:
-        """Number of the best surface: 0, the start, where the others explain clearly less."""
+        """Number of the best surface: 0, the start, where all refined ones are clearly worse."""
         start, *refined = self.objectives
         least = min(refined, default=math.inf)
         if math.isinf(least) or least > TOLERATED * start:

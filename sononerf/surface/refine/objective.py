@@ -264,10 +264,11 @@ class OnsetRanges:
         return len(self._first)
 
     def ridges(self, hull: trimesh.Trimesh) -> float:
-        """Return how far a hull (m) stands out between poses: the median over its vertices, m.
+        """Return the height of the ridges of a hull (m) between poses, m.
 
-        As that of tangent planes at a sphere, whose normals are the directions of the poses that
-        heard an onset; infinite if most vertices lie beside all poses.
+        The hull is taken for a sphere's tangent planes, one for each pose that heard an onset. The
+        height is the median over the vertices: their distance from the centroid times 1/cos - 1 of
+        the angle to the nearest pose. It is infinite where most of these angles exceed 90 degrees.
         """
         outward, source = hull.vertices - hull.centroid, self._emitters - hull.centroid
         radius = np.linalg.norm(outward, axis=1)

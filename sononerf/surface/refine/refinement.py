@@ -43,11 +43,12 @@ logger = logging.getLogger("sononerf")
 SIMULATED = 96
 """Number of training poses for which a surface is simulated; each is drawn about three times."""
 SMOOTH = 1 / 16
-"""Height of the ridges of ``hull`` above which it takes no part, shortest wavelengths: an eighth of
-one there and back, a phase of 45 degrees. A hull fits the onsets by construction and looks better
-than it is. From 100 calls (0.08 and more) a stool, a cone and the procedural bodies 101 and 116,
-which had chosen it, came from F-scores at 2 mm of 0.24, 0.84, 0.70 and 0.42 to 0.45, 0.88, 0.95 and
-0.72 without it. From 400 calls (at most 0.04) body 106 has 0.96 with it and 0.75 without."""
+"""Largest height of the ridges of ``hull`` with which it is a start, shortest wavelengths. The way
+there and back counts it twice, so it changes phases by at most 45 degrees. A hull fits the
+onsets by construction, so its objective is too good where it is coarse. From 100 calls its ridges
+are 0.08 or higher. There a stool, a cone and the procedural bodies 101 and 116 had F-scores at 2 mm
+of 0.24, 0.84, 0.70 and 0.42 with it, and of 0.45, 0.88, 0.95 and 0.72 without it. From 400 calls
+they are at most 0.04, and body 106 has 0.96 with it and 0.75 without it."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
 STATE_VERSION = 4
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
@@ -376,7 +377,7 @@ class Refinement:
             self._descent.load(parts)
 
     def result(self) -> Refined:
-        """Return the best surface so far; the start where the others explain clearly less."""
+        """Return the best surface so far; the start where all refined ones are clearly worse."""
         if not self.courses:
             self._choose()
         course = self.courses[self._at]
