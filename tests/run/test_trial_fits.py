@@ -19,7 +19,7 @@ from sononerf.run.trial_fits import MOST, least_error
 from sononerf.settings.loading import validate_settings
 from sononerf.settings.schema import SpectrogramSettings
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.recording_errors import Body
+from sononerf.surface.refine.still_surface import StillSurface
 from tests.run.conftest import TINY
 from tests.surface.conftest import bumpy  # noqa: F401
 
@@ -60,8 +60,7 @@ def run(bumpy, tmp_path):  # noqa: F811
     head = Head(analysis=SpectrogramSettings(range_min=0.24, range_max=0.42))
     rng, split = np.random.default_rng(0), np.arange(40) % 10 == 5
     poses = cylinder_poses(40, radius=0.3, heights=(0.0, 0.1), aim_jitter=0.0, generator=rng)
-    still, late = np.ones(40), np.zeros(40)
-    heard = Body(bumpy, Optics(head)).render(poses.positions, poses.rotations, still, late)
+    heard = StillSurface(bumpy, Optics(head)).render(poses.positions, poses.rotations)
     stated = poses.positions * (1.0 + ERROR / 0.3 * np.array([1.0, 1.0, 0.0]))
     told = type(poses)(stated, poses.rotations)
     Echoes.from_arrays(heard, told, head, split=split.astype(int)).save(tmp_path / "store")

@@ -25,10 +25,9 @@ from sononerf.array_types import Ints
 from sononerf.echoes.echoes import Echoes
 from sononerf.simulation.ensemble import spectrograms
 from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
 from sononerf.surface.refine.objective import on_rows
 from sononerf.surface.refine.optics import Heard, Optics
-from sononerf.surface.refine.visibility import listen, sight_of
+from sononerf.surface.refine.still_surface import StillSurface
 
 
 class Correction:
@@ -54,15 +53,8 @@ class Correction:
         seed: int,
     ) -> None:
         self.numbers = numbers
-        self._optics, self._echoes = optics, echoes
-        like = optics.get_buffer("wavenumber")
-        faces = np.array(mesh.faces, dtype=np.int64)
-        self._vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
-        self._operators = MeshOperators(torch.as_tensor(faces).to(like.device), len(mesh.vertices))
-        self._area = self._operators.areas(self._vertices)
-        passes = smoothing_passes(optics.wavelength, self._operators.edge_length(self._vertices))
-        self._bending = self._operators.bending(self._vertices, unit(self._area), passes)
-        self._sight = sight_of(optics, np.asarray(mesh.vertices, dtype=np.float64), faces)
+        self._echoes = echoes
+        self._surface = StillSurface(mesh, optics)
         self._kept: dict[int, tuple[Tensor, Tensor]] = {}
         places = np.asarray(echoes.positions[numbers], dtype=np.float64)
         turns = np.asarray(echoes.rotations[numbers], dtype=np.float64)
@@ -86,35 +78,12 @@ class Correction:
         """
         for number in numbers:
             if number not in self._kept:
-                self._kept[number] = self._simulated[number], self._rendered(number)
+                at = slice(number, number + 1)
+                echoes = self._echoes.positions[at], self._echoes.rotations[at]
+                rendered = torch.as_tensor(self._surface.render(*echoes)[0])
+                self._kept[number] = self._simulated[number], rendered
         first, second = (
             on_rows([self._kept[number][part] for number in numbers], heard.row, heard.power)
             for part in (0, 1)
         )
         return first, second
-
-    def _rendered(self, number: int) -> Tensor:
-        position, rotation = (
-            torch.as_tensor(part[number : number + 1]).to(self._vertices)
-            for part in (self._echoes.positions, self._echoes.rotations)
-        )
-        pieces, heads, middle = listen(
-            self._optics,
-            self._operators,
-            self._vertices,
-            self._area,
-            self._bending,
-            self._sight,
-            position,
-            rotation,
-        )
-        found = torch.zeros(self._optics.ears, self._optics.rows, len(self._optics.frequencies))
-        if not len(pieces.pose):
-            return found
-        points = (self._vertices - middle).float()
-        heard = self._optics.render(points, self._area.float(), pieces, heads)
-        row, width = int(heard.row[0]), heard.power.shape[2]
-        first, last = max(row, 0), min(row + width, found.shape[1])
-        if last > first:
-            found[:, first:last] = heard.power[0, :, first - row : last - row].sqrt().cpu()
-        return found

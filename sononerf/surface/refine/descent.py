@@ -20,6 +20,7 @@ from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
 from sononerf.surface.refine.objective import Level, OnsetRanges, measured, mismatch
 from sononerf.surface.refine.optics import Heard, Optics
+from sononerf.surface.refine.still_surface import StillSurface
 from sononerf.surface.refine.visibility import listen, sight_of
 
 POSES = 8
@@ -216,20 +217,10 @@ class Descent:
 
 def poses_that_hear(mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics) -> Tensor:
     """Number of training poses that see each vertex near the direction of a mirror, (V,)."""
-    like = optics.get_buffer("wavenumber")
-    faces = np.array(mesh.faces, dtype=np.int64)
-    vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
-    operators = MeshOperators(torch.as_tensor(faces).to(like.device), len(vertices))
-    area = operators.areas(vertices)
-    passes = smoothing_passes(optics.wavelength, operators.edge_length(vertices))
-    bending = operators.bending(vertices, unit(area), passes)
-    sight = sight_of(optics, vertices.cpu().numpy(), faces)
-    count = torch.zeros(len(area), device=area.device)
-    for first in range(0, len(echoes.training), POSES):
-        some = echoes.training[first : first + POSES]
-        places = torch.as_tensor(echoes.positions[some]).to(area)
-        turns = torch.as_tensor(echoes.rotations[some]).to(area)
-        pieces, heads, _ = listen(optics, operators, vertices, area, bending, sight, places, turns)
+    surface, training = StillSurface(mesh, optics), echoes.training
+    count = torch.zeros(len(surface.vertices), device=surface.vertices.device)
+    for some in np.array_split(training, -(-len(training) // POSES)):
+        pieces, heads, _ = surface.listen(echoes.positions[some], echoes.rotations[some])
         near = pieces.reach.amax(1) > NEAR
         pose = pieces.pose[near] % heads.poses
         # On a support a pose may see a vertex in several ways.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Errors of a recording, and a surface as it is heard with them."""
+"""Errors of a recording."""
 
 from __future__ import annotations
 
@@ -8,14 +8,9 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
-import torch
-import trimesh
 
-from sononerf.array_types import Floats, Singles
+from sononerf.array_types import Floats
 from sononerf.head.head import Head
-from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
-from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.visibility import listen, sight_of
 
 Kind = Literal[
     "gain",
@@ -72,67 +67,6 @@ class Estimate:
     calibration: Calibration
     deviation: dict[str, float]
     error_db: list[float]
-
-
-class Body:
-    """A surface whose spectrograms are rendered for poses with errors.
-
-    Args:
-        mesh: m.
-        optics: The head.
-    """
-
-    def __init__(self, mesh: trimesh.Trimesh, optics: Optics) -> None:
-        self.optics = optics
-        like = optics.get_buffer("wavenumber")
-        faces = np.array(mesh.faces, dtype=np.int64)
-        self.vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
-        self.operators = MeshOperators(torch.as_tensor(faces).to(like.device), len(self.vertices))
-        self.area = self.operators.areas(self.vertices)
-        passes = smoothing_passes(optics.wavelength, self.operators.edge_length(self.vertices))
-        self.bending = self.operators.bending(self.vertices, unit(self.area), passes)
-        self.sight = sight_of(optics, self.vertices.cpu().numpy(), faces)
-
-    def render(
-        self, positions: Floats, rotations: Floats, stretch: Floats, late: Floats
-    ) -> Singles:
-        """Return magnitudes (P, E, R, F) on the whole axis.
-
-        Args:
-            positions, rotations ((P, 3), (P, 3, 3)): Places and rotations of the heads, m.
-            stretch, late ((P,), (P,)): Factor on paths, and m added to them.
-        """
-        optics = self.optics
-        shape = (len(positions), optics.ears, optics.rows, len(optics.frequencies))
-        found = np.zeros(shape, dtype=np.float32)
-        places, turns = (torch.as_tensor(part).to(self.vertices) for part in (positions, rotations))
-        with torch.no_grad():
-            pieces, heads, middle = listen(
-                optics,
-                self.operators,
-                self.vertices,
-                self.area,
-                self.bending,
-                self.sight,
-                places,
-                turns,
-            )
-            if not len(pieces.pose):
-                return found
-            heard = optics.render(
-                (self.vertices - middle).float(),
-                self.area.float(),
-                pieces,
-                heads,
-                stretch=torch.as_tensor(stretch).to(heads.emitters),
-                late=torch.as_tensor(late).to(heads.emitters),
-            )
-        magnitude = heard.power.sqrt().cpu().numpy()
-        for one, rendered, row in zip(found, magnitude, heard.row.tolist(), strict=True):
-            first, last = max(row, 0), min(row + rendered.shape[1], optics.rows)
-            if last > first:
-                one[:, first:last] = rendered[:, first - row : last - row]
-        return found
 
 
 def outward(positions: Floats) -> Floats:

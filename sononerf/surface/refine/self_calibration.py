@@ -31,13 +31,8 @@ from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.surface.refine.objective import FLOOR_DB, TRUST
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.recording_errors import (
-    Body,
-    Calibration,
-    Estimate,
-    Kind,
-    changed_head,
-)
+from sononerf.surface.refine.recording_errors import Calibration, Estimate, Kind, changed_head
+from sononerf.surface.refine.still_surface import StillSurface
 
 STEP = 0.02
 """Length of a finite difference, shortest wavelengths: small against interference, large against
@@ -178,13 +173,13 @@ class Calibrator:
         self.weight = power / power.mean()
         return self.error_db[-1]
 
-    def _level(self, body: Body) -> Floats:
+    def _level(self, body: StillSurface) -> Floats:
         """Return how much louder the receivers are than the surface's echoes, (E,) logarithms."""
         energy = np.zeros((2, self.optics.ears))
         for number in self.poses[:: max(len(self.poses) // LEVEL_POSES, 1)].tolist():
             pose = slice(number, number + 1)
             at = self.echoes.positions[pose], self.echoes.rotations[pose]
-            rendered = body.render(*at, np.ones(1), np.zeros(1))[0]
+            rendered = body.render(*at)[0]
             for row, magnitude in enumerate((self.echoes.magnitude(number).numpy(), rendered)):
                 energy[row] += np.square(magnitude, dtype=np.float64).sum(axis=(1, 2))
         return np.asarray(np.log(np.maximum(energy[0], 1e-300) / np.maximum(energy[1], 1e-300)) / 2)
@@ -340,15 +335,15 @@ class Calibrator:
             self._optics[beam_radius] = Optics(head)
         return self._optics[beam_radius]
 
-    def _bodies(self, unknowns: list[_Column]) -> dict[str, Body]:
+    def _bodies(self, unknowns: list[_Column]) -> dict[str, StillSurface]:
         """Return the surface as it is, and changed as unknowns of surface and head do."""
         normals = np.array(self.mesh.vertex_normals)
         middle, found = self.mesh.centroid, self.found
         self._optics = {0.0: self.optics}  # those of the step before go
 
-        def changed(layer: float, scale: float, beam_radius: float) -> Body:
+        def changed(layer: float, scale: float, beam_radius: float) -> StillSurface:
             places = (self.mesh.vertices - middle) * math.exp(scale) + middle + layer * normals
-            return Body(
+            return StillSurface(
                 trimesh.Trimesh(places, self.mesh.faces, process=False),
                 self._optics_of(beam_radius),
             )
@@ -362,7 +357,7 @@ class Calibrator:
         return bodies
 
     def _linear(
-        self, bodies: dict[str, Body], number: int, *, slopes: bool = True
+        self, bodies: dict[str, StillSurface], number: int, *, slopes: bool = True
     ) -> tuple[Floats, Floats, Floats]:
         """Return residual (E, R, F) dB, derivatives (U, E, R, F) and active cells of a pose.
 

@@ -46,16 +46,11 @@ from torch import Tensor
 
 from sononerf.array_types import Bools, Floats, Ints
 from sononerf.echoes.echoes import Echoes
-from sononerf.surface.refine.mesh_operators import (
-    MeshOperators,
-    smoothing_passes,
-    sparse_tensor,
-    unit,
-)
+from sononerf.surface.refine.mesh_operators import sparse_tensor
 from sononerf.surface.refine.objective import Level, differences, measured
 from sononerf.surface.refine.optics import Heard, Optics
 from sononerf.surface.refine.remesh import distance_from
-from sononerf.surface.refine.visibility import listen, sight_of
+from sononerf.surface.refine.still_surface import StillSurface
 
 ASKED = 48
 """Number of training poses, at most, that are rendered: 3 seconds for three spheres."""
@@ -169,17 +164,9 @@ class Bumps:
     """
 
     def __init__(self, mesh: trimesh.Trimesh, optics: Optics) -> None:
-        self.optics = optics
-        like = optics.get_buffer("wavenumber")
-        faces = np.array(mesh.faces, dtype=np.int64)
-        self.vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
-        self.operators = MeshOperators(torch.as_tensor(faces).to(like.device), len(self.vertices))
-        self._area = self.operators.areas(self.vertices)
-        self.normals = unit(self._area)
-        passes = smoothing_passes(optics.wavelength, self.operators.edge_length(self.vertices))
-        self._bending = self.operators.bending(self.vertices, self.normals, passes)
-        self._sight = sight_of(optics, self.vertices.cpu().numpy(), faces)
-        xx, yy, zz, xy, xz, yz = self._bending.cpu().numpy().T
+        self.optics, self._surface = optics, StillSurface(mesh, optics)
+        self.vertices, self.normals = self._surface.vertices, self._surface.normals
+        xx, yy, zz, xy, xz, yz = self._surface.bending.cpu().numpy().T
         tensors = np.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], axis=1).reshape(-1, 3, 3)
         self.hollow = np.maximum(-np.linalg.eigvalsh(tensors)[:, 0], 0.0)
         # The sides of a thin body have bumps of their own.
@@ -190,7 +177,7 @@ class Bumps:
         norm = np.sqrt(near.multiply(near).sum(axis=1))
         self.matrix = csr_array(near.multiply(1.0 / norm[:, None]))
         self.spread = self.matrix.multiply(self.matrix).tocsr()
-        self._moves = sparse_tensor(self.matrix).to(like.device)
+        self._moves = sparse_tensor(self.matrix).to(self.vertices.device)
 
     def render(self, positions: Floats, rotations: Floats) -> tuple[Heard | None, Tensor]:
         """Render poses.
@@ -205,17 +192,13 @@ class Bumps:
         """
         moves = torch.zeros(len(positions), len(self.centres), dtype=torch.float64)
         moves = moves.to(self.vertices).requires_grad_(True)
-        places, turns = (torch.as_tensor(part).to(self.vertices) for part in (positions, rotations))
-        pieces, heads, middle = listen(
-            self.optics, self.operators, self.vertices, self._area, self._bending, self._sight,
-            places, turns,
-        )  # fmt: skip
+        pieces, heads, middle = self._surface.listen(positions, rotations)
         if not len(pieces.pose):
             return None, moves
         # Each pose has a surface of its own, so that its gradients stay apart.
         moved = (self._moves @ moves.T).T[:, :, None] * self.normals + self.vertices
-        areas = torch.cat([self.operators.areas(one) for one in moved])
-        own = pieces.pose % len(places) * len(self.vertices) + pieces.vertex
+        areas = torch.cat([self._surface.operators.areas(one) for one in moved])
+        own = pieces.pose % len(positions) * len(self.vertices) + pieces.vertex
         points = (moved - middle).flatten(0, 1).float()
         pieces = dataclasses.replace(pieces, vertex=own)
         return self.optics.render(points, areas.float(), pieces, heads), moves

@@ -8,32 +8,17 @@ import trimesh
 
 from sononerf.run.build import head_of
 from sononerf.simulation.hearing import hearing_of
-from sononerf.surface.refine.mesh_operators import MeshOperators, unit
+from sononerf.surface.refine.mesh_operators import unit
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.visibility import listen, sight_of
+from sononerf.surface.refine.still_surface import StillSurface
 from tests.surface.conftest import RADIUS, given
 
 
 def hear(optics, mesh, poses):
-    faces = np.array(mesh.faces, dtype=np.int64)
-    vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
-    operators = MeshOperators(torch.as_tensor(faces), len(vertices))
-    area = operators.areas(vertices)
-    bending = operators.bending(vertices, unit(area), 1)
-    places, turns = torch.as_tensor(poses.positions), torch.as_tensor(poses.rotations)
-    sight = sight_of(optics, vertices.numpy(), faces)
-    pieces, heads, middle = listen(optics, operators, vertices, area, bending, sight, places, turns)
-    return pieces, heads, (vertices - middle).float(), area.float()
-
-
-def whole(optics, heard, like):
-    """Rendered magnitudes on the axis of the store."""
-    found = np.zeros_like(like)
-    for pose, row in enumerate(heard.row.tolist()):
-        magnitude = heard.power[pose].detach().sqrt().numpy()
-        first, last = max(row, 0), min(row + magnitude.shape[1], optics.rows)
-        found[pose, :, first:last] = magnitude[:, first - row : last - row]
-    return found
+    surface = StillSurface(mesh, optics)
+    pieces, heads, middle = surface.listen(poses.positions, poses.rotations)
+    area = surface.operators.areas(surface.vertices)
+    return pieces, heads, (surface.vertices - middle).float(), area.float()
 
 
 @pytest.mark.parametrize(
@@ -54,8 +39,7 @@ def test_a_sphere_sounds_as_the_simulator_says(call, front, ball, poses, simulat
     optics = Optics(head_of(settings))
     fine = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     wanted = simulated(fine, settings, poses)
-    pieces, heads, points, area = hear(optics, fine, poses)
-    found = whole(optics, optics.render(points, area, pieces, heads), wanted)
+    found = StillSurface(fine, optics).render(poses.positions, poses.rotations)
     high = optics.frequencies > 40e3
     errors = []
     for a, b in zip(found[..., high], wanted[..., high], strict=True):

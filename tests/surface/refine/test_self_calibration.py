@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from sononerf.geometry.poses import cylinder_poses
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.recording_errors import Body, changed_head
+from sononerf.surface.refine.recording_errors import changed_head
 from sononerf.surface.refine.self_calibration import Calibrator
+from sononerf.surface.refine.still_surface import StillSurface
 from tests.memory import echoes_of
 
 COUNT = 14
@@ -25,7 +26,7 @@ def heard(bumpy, optics, poses):
         positions, rotations = poses.positions[:COUNT], poses.rotations[:COUNT]
         positions = positions * np.linspace(0.8, 1.25, len(positions))[:, None]
         count = len(positions)
-        magnitude = Body(bumpy, optics).render(
+        magnitude = StillSurface(bumpy, optics).render(
             positions, rotations, np.full(count, np.exp(-speed)), np.full(count, 2 * offset)
         )
         magnitude = magnitude * np.exp(np.asarray(gain, dtype=np.float32))[:, None, None]
@@ -93,7 +94,7 @@ def turntable(optics, head, bumpy, *, radius=0.0):
     poses = cylinder_poses(
         24, radius=0.3, heights=(-0.1, 0.2), aim_jitter=0.0, generator=np.random.default_rng(0)
     )
-    heard = Body(bumpy, Optics(head)).render(
+    heard = StillSurface(bumpy, Optics(head)).render(
         poses.positions, poses.rotations, np.ones(24), np.zeros(24)
     )
     stated = poses.positions * (1.0 + radius / 0.3 * np.array([1.0, 1.0, 0.0]))

@@ -10,7 +10,7 @@ import trimesh
 from sononerf.errors import InputError
 from sononerf.geometry.poses import cylinder_poses
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.recording_errors import Body
+from sononerf.surface.refine.still_surface import StillSurface
 from sononerf.surface.refine.support_search import find_support, least, with_support
 from tests.memory import echoes_of
 from tests.surface.conftest import RADIUS
@@ -25,8 +25,7 @@ def heard(bumpy, optics):
     poses = cylinder_poses(
         12, radius=0.3, heights=(0.0, 0.2), aim_jitter=0.0, generator=np.random.default_rng(0)
     )
-    still, late = np.ones(12), np.zeros(12)
-    magnitude = 0.3 * Body(bumpy, standing).render(poses.positions, poses.rotations, still, late)
+    magnitude = 0.3 * StillSurface(bumpy, standing).render(poses.positions, poses.rotations)
     return echoes_of(
         optics.head,
         poses.positions,

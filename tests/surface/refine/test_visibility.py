@@ -2,12 +2,11 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 import trimesh
 
 from sononerf.geometry.raycast import Occlusion
-from sononerf.surface.refine.mesh_operators import MeshOperators, unit
-from sononerf.surface.refine.visibility import FREE, listen, seen
+from sononerf.surface.refine.still_surface import StillSurface
+from sononerf.surface.refine.visibility import FREE, seen
 
 
 def test_what_stands_before_a_point_hides_it_but_not_what_touches_it():
@@ -20,23 +19,9 @@ def test_what_stands_before_a_point_hides_it_but_not_what_touches_it():
 
 
 def heard(optics, mesh, at):
-    faces = np.array(mesh.faces, dtype=np.int64)
-    vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
-    operators = MeshOperators(torch.as_tensor(faces), len(vertices))
-    area = operators.areas(vertices)
-    bending = operators.bending(vertices, unit(area), 1)
-    turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0], dtype=torch.float64))[None]
-    pieces, _, _ = listen(
-        optics,
-        operators,
-        vertices,
-        area,
-        bending,
-        Occlusion(vertices.numpy(), faces),
-        torch.tensor([at], dtype=torch.float64),
-        turn,
-    )
-    return vertices[pieces.vertex].numpy(), pieces
+    surface = StillSurface(mesh, optics)
+    pieces, _, _ = surface.listen(np.array([at]), np.diag([-1.0, -1.0, 1.0])[None])
+    return surface.vertices[pieces.vertex].numpy(), pieces
 
 
 def test_a_body_hides_the_one_behind_it(optics, ball):

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: MIT
+"""A surface that does not move, as poses hear it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from sononerf.array_types import Floats, Singles
+from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
+from sononerf.surface.refine.optics import Heads, Optics, Pieces
+from sononerf.surface.refine.visibility import listen, sight_of
+
+
+class StillSurface:
+    """A surface, prepared once for all poses.
+
+    Args:
+        mesh: m.
+        optics: The head; its device is that of the computation.
+
+    Attributes:
+        operators: Operators on the surface.
+        vertices, normals ((V, 3) float64): Places (m) and outward unit normals.
+        bending ((V, 6), 1/m): Curvature, see :meth:`MeshOperators.bending`.
+    """
+
+    def __init__(self, mesh: trimesh.Trimesh, optics: Optics) -> None:
+        self.optics = optics
+        like = optics.get_buffer("wavenumber")
+        faces = np.array(mesh.faces, dtype=np.int64)
+        self.vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
+        self.operators = MeshOperators(torch.as_tensor(faces).to(like.device), len(self.vertices))
+        self._area = self.operators.areas(self.vertices)
+        self.normals = unit(self._area)
+        passes = smoothing_passes(optics.wavelength, self.operators.edge_length(self.vertices))
+        self.bending = self.operators.bending(self.vertices, self.normals, passes)
+        self._sight = sight_of(optics, self.vertices.cpu().numpy(), faces)
+
+    def listen(self, positions: Floats, rotations: Floats) -> tuple[Pieces, Heads, Tensor]:
+        """Return the pieces that poses hear, see :func:`~.visibility.listen`.
+
+        Args:
+            positions, rotations ((P, 3), (P, 3, 3)): Places (m) and rotations of the heads.
+        """
+        places, turns = (torch.as_tensor(part).to(self.vertices) for part in (positions, rotations))
+        return listen(
+            self.optics,
+            self.operators,
+            self.vertices,
+            self._area,
+            self.bending,
+            self._sight,
+            places,
+            turns,
+        )
+
+    @torch.no_grad()
+    def render(
+        self,
+        positions: Floats,
+        rotations: Floats,
+        stretch: Floats | None = None,
+        late: Floats | None = None,
+    ) -> Singles:
+        """Return magnitudes on the whole axis, (P, E, R, F).
+
+        Args:
+            positions, rotations ((P, 3), (P, 3, 3)): Places (m) and rotations of the heads.
+            stretch, late ((P,), (P,)): Factor on paths, and m added to them; none where None.
+        """
+        optics = self.optics
+        shape = (len(positions), optics.ears, optics.rows, len(optics.frequencies))
+        found = np.zeros(shape, dtype=np.float32)
+        pieces, heads, middle = self.listen(positions, rotations)
+        if not len(pieces.pose):
+            return found
+        points, area = (self.vertices - middle).float(), self._area.float()
+        given = {"stretch": stretch, "late": late}
+        paths = {
+            name: torch.as_tensor(part).to(points)
+            for name, part in given.items()
+            if part is not None
+        }
+        heard = optics.render(points, area, pieces, heads, **paths)
+        magnitude = heard.power.sqrt().cpu().numpy()
+        for one, rendered, row in zip(found, magnitude, heard.row.tolist(), strict=True):
+            first, last = max(row, 0), min(row + rendered.shape[1], optics.rows)
+            if last > first:
+                one[:, first:last] = rendered[:, first - row : last - row]
+        return found
