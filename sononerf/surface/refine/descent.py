@@ -18,7 +18,7 @@ from sononerf.geometry.raycast import Occlusion
 from sononerf.surface.refine.correction import Correction
 from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
-from sononerf.surface.refine.objective import Level, OnsetRanges, measured, mismatch
+from sononerf.surface.refine.objective import Level, OnsetRanges, differences, measured, mismatch
 from sononerf.surface.refine.optics import Heard, Optics
 from sononerf.surface.refine.still_surface import StillSurface
 from sononerf.surface.refine.visibility import listen, sight_of
@@ -180,9 +180,10 @@ class Descent:
         corrected = None
         if self._correction is not None:
             corrected = self._correction.magnitudes(numbers, heard)
-        errors = mismatch(
+        difference, weight = differences(
             heard, later, found, self.level, corrected=corrected, learn=True, band=self.band
         )
+        errors = mismatch(difference, weight)
         errors.mean().backward()
         moved = self.vertices.clone().requires_grad_(True)
         to_points, to_areas = points.grad, areas.grad

@@ -98,31 +98,6 @@ def measured(echoes: Echoes, numbers: list[int], heard: Heard) -> tuple[Tensor, 
     )
 
 
-def mismatch(
-    heard: Heard,
-    later: Tensor | None,
-    found: tuple[Tensor, Tensor, Tensor],
-    level: Level,
-    *,
-    corrected: tuple[Tensor, Tensor] | None = None,
-    learn: bool,
-    band: float = 0.0,
-) -> Tensor:
-    """Return the mean absolute difference over the active cells of each pose (P,), reported dB.
-
-    Args:
-        heard: Rendered first bounce.
-        later ((P, E, W, F) float32): Power of the later bounces.
-        found: From :func:`measured`.
-        level: Gains and weights.
-        corrected, learn, band: As in :func:`differences`.
-    """
-    difference, weight = differences(
-        heard, later, found, level, corrected=corrected, learn=learn, band=band
-    )
-    return (difference.abs() * weight).sum((1, 2, 3))
-
-
 def differences(
     heard: Heard,
     later: Tensor | None,
@@ -136,7 +111,10 @@ def differences(
     """Return the measured levels less the rendered ones, by cells.
 
     Args:
-        heard, later, found, level: As in :func:`mismatch`.
+        heard: Rendered first bounce.
+        later ((P, E, W, F) float32): Power of the later bounces.
+        found: From :func:`measured`.
+        level: Gains and weights.
         corrected (simulated, rendered, both (P, E, W, F) float32): Echoes of a surface nearby:
             their difference in decibels is added to what is rendered. Cells count less, the larger
             it is; the frequencies' weights are not needed then.
@@ -173,6 +151,11 @@ def differences(
         weight = active * weight
         weight = weight / weight.sum((1, 2, 3), keepdim=True).clamp_min(1e-12)
     return a - b, weight
+
+
+def mismatch(difference: Tensor, weight: Tensor) -> Tensor:
+    """Return the mean absolute difference of each pose, (P,) reported dB, from those of cells."""
+    return (difference.abs() * weight).sum((1, 2, 3))
 
 
 def over_band(power: Tensor, part: float) -> Tensor:

@@ -11,7 +11,7 @@ from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene
 from sononerf.surface.refine.correction import Correction
 from sononerf.surface.refine.descent import Descent
-from sononerf.surface.refine.objective import Level, measured, mismatch
+from sononerf.surface.refine.objective import Level, differences, measured, mismatch
 from sononerf.surface.refine.remesh import remesh
 from tests.memory import changed
 from tests.surface.conftest import RADIUS
@@ -77,8 +77,8 @@ def test_on_the_surface_itself_the_corrected_echo_is_the_simulated_one(
     inside = torch.ones(len(POSES), 1, heard.power.shape[2], 1, dtype=torch.bool)
     loudest = corrected[0].amax((1, 2, 3))
     found = (corrected[0], inside, loudest)
-    plain = mismatch(heard, None, found, level, learn=False)
-    exact = mismatch(heard, None, found, level, corrected=corrected, learn=False)
+    plain = mismatch(*differences(heard, None, found, level, learn=False))
+    exact = mismatch(*differences(heard, None, found, level, corrected=corrected, learn=False))
     assert float(exact.detach().max()) < 0.01
     assert float(plain.detach().min()) > 0.1
 

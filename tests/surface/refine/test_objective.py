@@ -13,6 +13,7 @@ from sononerf.surface.refine.objective import (
     SCALE,
     Level,
     OnsetRanges,
+    differences,
     measured,
     mismatch,
     over_band,
@@ -33,7 +34,9 @@ def example(gain=1.0, poses=3):
 def test_what_is_rendered_as_measured_has_no_mismatch():
     heard, echoes = example()
     level = Level(2, 4, heard.power)
-    errors = mismatch(heard, None, measured(echoes, [0, 1, 2], heard), level, learn=False)
+    errors = mismatch(
+        *differences(heard, None, measured(echoes, [0, 1, 2], heard), level, learn=False)
+    )
     assert float(errors.max()) < 1e-3
 
 
@@ -41,10 +44,10 @@ def test_a_gain_is_learned():
     heard, echoes = example(gain=2.0)
     level = Level(2, 4, heard.power)
     found = measured(echoes, [0, 1, 2], heard)
-    before = float(mismatch(heard, None, found, level, learn=False).mean())
+    before = float(mismatch(*differences(heard, None, found, level, learn=False)).mean())
     for _ in range(60):
-        mismatch(heard, None, found, level, learn=True)
-    after = float(mismatch(heard, None, found, level, learn=False).mean())
+        differences(heard, None, found, level, learn=True)
+    after = float(mismatch(*differences(heard, None, found, level, learn=False)).mean())
     assert level.gain.exp().numpy() == pytest.approx(2.0, rel=0.05)
     assert after < 0.1 * before
 
@@ -53,7 +56,7 @@ def test_later_bounces_add_power():
     heard, echoes = example(gain=np.sqrt(2.0))
     level = Level(2, 4, heard.power)
     found = measured(echoes, [0, 1, 2], heard)
-    errors = mismatch(heard, heard.power.clone(), found, level, learn=False)
+    errors = mismatch(*differences(heard, heard.power.clone(), found, level, learn=False))
     assert float(errors.max()) < 1e-3
 
 
@@ -65,7 +68,7 @@ def test_frequencies_that_are_always_wrong_count_less():
     level = Level(2, 4, heard.power)
     level.gain[:] = 0.0
     for _ in range(60):
-        mismatch(heard, None, (magnitude, *found[1:]), level, learn=True)
+        differences(heard, None, (magnitude, *found[1:]), level, learn=True)
         level.gain[:] = 0.0
     assert float(level.weight[:, 0].max()) < 0.2 * float(level.weight[:, 1:].min())
 
@@ -82,7 +85,7 @@ def test_rows_beyond_the_axis_do_not_count():
 def test_a_level_is_taken_over_whole():
     heard, echoes = example(gain=1.5)
     level, other = Level(2, 4, heard.power), Level(2, 4, heard.power)
-    mismatch(heard, None, measured(echoes, [0, 1, 2], heard), level, learn=True)
+    differences(heard, None, measured(echoes, [0, 1, 2], heard), level, learn=True)
     other.load(level.state())
     assert torch.equal(level.gain, other.gain)
     assert torch.equal(level.error, other.error)
