@@ -192,6 +192,7 @@ def reconstruct(
         update={"method": method, "level": level, "spacing": spacing or options.spacing}
     )
     with run.locked(None if refines else folder), results_folder(folder):
+        truth = _truth(run)
         if refines:
             check_state(run)
         # The learned start needs the echoes; all others do with the free space.
@@ -203,7 +204,7 @@ def reconstruct(
             surface = refine_surface(run, surface, accelerator=accelerator, progress=progress)
         if own:
             run.begin("surface")
-        _write(folder, surface, true_mesh(run.fitted.settings, run.provenance), run.frame())
+        _write(folder, surface, truth, run.frame())
         if surface.openness is not None and surface.openness.kind in OPEN:
             progress.say(OPEN[surface.openness.kind].format(surface.openness))
         if output is None:
@@ -218,6 +219,15 @@ def _has_echoes(run: RunFolder, progress: Progress) -> bool:
     except InputError as error:
         progress.say(f"the surface is not refined: {error}")
         return False
+
+
+def _truth(run: RunFolder) -> trimesh.Trimesh | None:
+    """Return the true surface, for the view; None, with a warning, where it cannot be read."""
+    try:
+        return true_mesh(run.fitted.settings, run.provenance)
+    except InputError as error:
+        logger.warning("the view shows no true surface: %s", error)
+        return None
 
 
 def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None, frame: Frame) -> None:

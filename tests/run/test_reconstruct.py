@@ -156,6 +156,19 @@ def test_what_the_caller_gives_replaces_the_settings(
     assert found["level"] == (level if expected == "isosurface" else None)
 
 
+def test_a_true_surface_that_is_gone_costs_nothing_but_its_view(
+    run, tmp_path, no_projections, caplog
+):
+    description = json.loads((run / "model.json").read_text())
+    description["settings"]["evaluation"]["truth"] = "gone.ply"
+    (run / "model.json").write_text(json.dumps(description))
+    folder = reconstruct(run, spacing=0.012, output=tmp_path / "out")
+    assert (folder / "view.png").is_file()
+    assert caplog.messages[0] == (
+        "the view shows no true surface: gone.ply: evaluation.truth: no such file"
+    )
+
+
 def test_only_an_isosurface_has_a_level(run):
     with pytest.raises(SettingsError, match="method hull has no level"):
         reconstruct(run, method="hull", level=0.5)
