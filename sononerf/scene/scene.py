@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -55,6 +55,9 @@ class SurfaceSizeError(InputError):
 class Scene(Shown):
     """A surface and its material.
 
+    Args:
+        warns: False leaves out warnings about the mesh, such as holes in it.
+
     Attributes:
         mesh: Metres, world frame; bodies may overlap.
         material: One for all of it, or one for each of its parts.
@@ -75,8 +78,9 @@ class Scene(Shown):
     part: Ints | None = None
     background: Bools | None = None
     to_original: Floats | None = None
+    warns: InitVar[bool] = True
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, warns: bool) -> None:
         expect(self.mesh, trimesh.Trimesh, "mesh")
         several = isinstance(self.material, tuple)
         if several != (self.part is not None):
@@ -94,7 +98,8 @@ class Scene(Shown):
         if self.background is not None:
             object.__setattr__(self, "background", self._checked(self.background))
         check_surface(self.mesh)
-        _warn_of_faults(self.mesh)
+        if warns:
+            _warn_of_faults(self.mesh)
 
     def _checked(self, background: Bools) -> Bools:
         background = np.asarray(background)
@@ -152,13 +157,14 @@ class Scene(Shown):
         """
         mesh, kept = plane.with_image(self.mesh)
         if self.part is None:
-            return Scene(mesh, self.material)
+            return Scene(mesh, self.material, warns=False)
         if kept is None:
             raise InputError(
                 "the scene reaches below its support and has several materials; cut it at the "
                 "support, or give it one material"
             )
-        return Scene(mesh, self.material, np.concatenate([self.part[kept], self.part[kept]]))
+        part = np.concatenate([self.part[kept], self.part[kept]])
+        return Scene(mesh, self.material, part, warns=False)
 
     def surroundings(self) -> Scene | None:
         """Return the background as a scene of its own; None if there is none."""
@@ -166,7 +172,7 @@ class Scene(Shown):
         if mesh is None or self.background is None:
             return None
         part = None if self.part is None else self.part[self.background]
-        return Scene(mesh, self.material, part)
+        return Scene(mesh, self.material, part, warns=False)
 
 
 def check_surface(mesh: trimesh.Trimesh) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 
 from sononerf.head.head import Head
+from sononerf.scene.scene import Scene
 from sononerf.settings.schema import (
     AirSettings,
     CallSettings,
@@ -16,7 +17,7 @@ from sononerf.settings.schema import (
     SpectrogramSettings,
 )
 from sononerf.simulation import workers
-from sononerf.simulation.simulator import Simulator, quiet_scene
+from sononerf.simulation.simulator import Simulator
 
 __all__ = ["workers"]
 
@@ -33,7 +34,7 @@ def trace_once() -> None:
         analysis=SpectrogramSettings(),
         noise=NoiseSettings(),
     )
-    simulator = Simulator.of(quiet_scene(trimesh.util.concatenate(balls)), head, options)
+    simulator = Simulator.of(Scene(trimesh.util.concatenate(balls), warns=False), head, options)
     simulator.spectrogram(np.array([-0.4, 0.0, 0.0]), np.eye(3), seed=0)
 
 

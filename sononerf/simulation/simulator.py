@@ -126,7 +126,7 @@ class Simulator:
             rays: Per pose.
         """
         wanted = options.model_copy(update={"engine": "hybrid", "rays": rays})
-        return cls.of(quiet_scene(mesh), head.without_noise(), wanted)
+        return cls.of(Scene(mesh, warns=False), head.without_noise(), wanted)
 
     def keep_equations(self) -> None:
         """Keep factorised equations in memory, so that single poses are solved for at once."""
@@ -208,17 +208,6 @@ def _solver(engine: str) -> type[Solved]:
     from sononerf.simulation.reference.boundary import Boundary  # imports torch: seconds
 
     return Boundary
-
-
-def quiet_scene(mesh: trimesh.Trimesh) -> Scene:
-    """Return the scene of a mesh that the program made itself, without warnings about it."""
-    talker = logging.getLogger("sononerf")
-    before = talker.level
-    talker.setLevel(logging.ERROR)
-    try:
-        return Scene(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
-    finally:
-        talker.setLevel(before)
 
 
 def solved_frequency(wanted: SimulationSettings, analysis: SpectrogramSettings) -> float:

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from sononerf.errors import InputError, SettingsError
+from sononerf.geometry.plane import Plane
 from sononerf.scene.material import LEAF, MATERIALS, RIGID, Material
 from sononerf.scene.scene import Scene, SurfaceSizeError, list_scenes, load_scene
 from sononerf.settings import plugins
@@ -68,6 +69,16 @@ def test_sizes_of_likely_another_unit_are_told_of(caplog, size, said):
     caplog.clear()
     Scene(box(min(max(size, 5.1e-3), 4.9)))
     assert not caplog.records
+
+
+def test_a_fault_is_told_of_once_and_its_image_in_a_plane_says_nothing(caplog):
+    inside_out = trimesh.util.concatenate([box(), box().apply_translation((0.3, 0.0, 0.0))])
+    inside_out.faces[:12] = inside_out.faces[:12, ::-1]
+    scene = Scene(inside_out)
+    assert len(caplog.messages) == 1
+    scene.with_image(Plane((0.0, 0.0, -0.05), (0.0, 0.0, 1.0)))
+    Scene(inside_out, warns=False)
+    assert len(caplog.messages) == 1
 
 
 def test_open_and_inside_out_meshes_are_told_of(caplog):

@@ -11,10 +11,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from sononerf.array_types import Floats, Ints, Singles
+from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.ensemble import spectrograms
 from sononerf.simulation.rays import Rays
-from sononerf.simulation.simulator import Simulator, quiet_scene
+from sononerf.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
     from sononerf.surface.refine.optics import Optics
@@ -60,7 +61,7 @@ class Tracer:
             bounces=BOUNCES,
             diffraction_points=max(rays // 30, 1),  # as many as the simulator's defaults have
         )
-        self._simulator = Simulator.of(quiet_scene(mesh), optics.head, wanted)
+        self._simulator = Simulator.of(Scene(mesh, warns=False), optics.head, wanted)
         self._nodes, self._seed = _Nodes.of(optics), seed
 
     def spectrograms(self, positions: Floats, rotations: Floats) -> Singles:

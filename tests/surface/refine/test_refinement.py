@@ -14,8 +14,9 @@ from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.head import Head
 from sononerf.run.build import head_of
+from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing, hearing_of
-from sononerf.simulation.simulator import Simulator, quiet_scene
+from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine import comparison
 from sononerf.surface.refine import refinement as module
 from sononerf.surface.refine.course import Course, number_of_steps
@@ -147,7 +148,7 @@ def simulated_stage(settings):
     few = settings.simulation.model_copy(update={"rays": 2000})
 
     def simulate(mesh):
-        return Simulator.of(quiet_scene(mesh), head_of(settings), few)
+        return Simulator.of(Scene(mesh, warns=False), head_of(settings), few)
 
     last = dataclasses.replace(SHORT[1], beyond="simulate")
     return {"simulate": simulate, "stages": (SHORT[0], last)}
