@@ -15,6 +15,7 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.range_levels import RangeLevels
 from sononerf.errors import InputError, NumericalError
 from sononerf.geometry.lattice import Lattice
+from sononerf.geometry.plane import Plane
 from sononerf.surface.start import learned
 from sononerf.surface.start.evidence import Evidence
 from sononerf.surface.start.learned import (
@@ -71,6 +72,34 @@ def sphere_heard(count=200, scale=1.0):
     return Gathered(
         evidence, weight, evidence.points, lattice, thin, bound, hull, resolution, levels
     )
+
+
+def gap(sources, plane=None):
+    first = np.linalg.norm(sources, axis=1)[:, None] - RADIUS
+    hull = EchoHull(sources, sources[:, None], first, -sources, plane=plane)
+    return learned.gap_of_poses(hull, np.zeros(3))
+
+
+@pytest.mark.parametrize("count", [12, 100, 400])
+def test_poses_from_all_around_leave_no_gap(count):
+    random = np.random.default_rng(count).standard_normal((count, 3))
+    assert gap(around(count)) < 1.0
+    assert 0.5 < gap(0.4 * trimesh.unitize(random)) < learned.GAP
+
+
+def test_the_image_of_a_support_closes_the_gap_below_it():
+    above = around(200)[:100]
+    table = Plane((0.0, 0.0, -RADIUS), (0.0, 0.0, 1.0))
+    assert gap(above, table) < learned.GAP < gap(above)
+
+
+def test_the_network_is_not_asked_about_what_was_heard_from_a_ring():
+    known = sphere_heard()
+    low = np.abs(known.hull.emitters[:, 2]) < 0.2
+    first = np.where(low[:, None], known.hull.first, -np.inf)
+    hull = EchoHull(known.hull.emitters, known.hull.receivers, first, known.hull.axes)
+    with pytest.raises(NumericalError, match="from all around"):
+        learned.learned_surface(dataclasses.replace(known, hull=hull))
 
 
 def test_a_sphere_is_seen_as_one():
