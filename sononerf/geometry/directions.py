@@ -56,6 +56,17 @@ def fibonacci_cap(
     return CapSpiral(count, axis, half_angle, offset).directions()
 
 
+def usual_gap(count: int) -> float:
+    """Return the angle (rad) from the middle of the largest gap between random directions to them.
+
+    That many caps of this angle cover the sphere log(count) times, so that few places are left out.
+
+    Args:
+        count: Number of directions, one or more.
+    """
+    return math.acos(max(1.0 - 2.0 * math.log(count) / count, -1.0)) if count > 1 else math.pi
+
+
 @dataclass(frozen=True, eq=False)
 class Cells:
     """Parallelograms on the plane of (share of a cap's area, turn about its axis).

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
+from sononerf.geometry.directions import usual_gap
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.surface.refine.optics import Heard
 
@@ -251,14 +252,16 @@ class OnsetRanges:
 
         The hull is taken for a sphere's tangent planes, one for each pose that heard an onset. The
         height is the median over the vertices: their distance from the centroid times 1/cos - 1 of
-        the angle to the nearest pose. It is infinite where most of these angles exceed 90 degrees.
+        the angle to the nearest pose. Vertices farther away than the usual gap take no part: no
+        pose bounds them.
         """
         outward, source = hull.vertices - hull.centroid, self._emitters - hull.centroid
-        radius = np.linalg.norm(outward, axis=1)
-        near, _ = cKDTree(trimesh.unitize(source)).query(trimesh.unitize(outward))
+        radius, poses = np.linalg.norm(outward, axis=1), np.unique(trimesh.unitize(source), axis=0)
+        near, _ = cKDTree(poses).query(trimesh.unitize(outward))
         cosine = 1.0 - near**2 / 2.0
-        with np.errstate(divide="ignore"):
-            return float(np.median(radius * (1.0 / cosine.clip(0.0) - 1.0)))
+        bounded = cosine > max(math.cos(usual_gap(len(poses))), 1e-9)
+        heights = radius[bounded] * (1.0 / cosine[bounded] - 1.0)
+        return float(np.median(heights)) if bounded.any() else math.inf
 
     def misfit(self, vertices: Tensor) -> float:
         """Mean Huber loss of the least range of vertices (V, 3), m; no unit; 0 without onsets."""

@@ -33,7 +33,7 @@ from sononerf.array_types import Floats, Singles
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.range_levels import STATISTICS
 from sononerf.errors import NumericalError
-from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.geometry.directions import fibonacci_sphere, usual_gap
 from sononerf.geometry.lattice import MARGIN, Lattice
 from sononerf.surface.start.occupancy import (
     THICKER,
@@ -66,10 +66,10 @@ SURE = 3.0
 """Distance from which a voxel is taken to be outside, voxels. Farther voxels are many, and their
 small probabilities would add up."""
 GAP = 2.0
-"""Largest gap between the directions of the poses, over that which is expected of as many random
-ones on a sphere. The training knows poses from all around alone. Even ones have 0.7 to 0.8, a cap
-on a support with its image 1.5, a turntable before a column 4 to 8. There the network harms: the
-F-score at 5 mm of a printed bunny is 0.36 with it and 0.60 without it."""
+"""Largest gap between the directions of the poses, over the usual one of as many random ones. The
+training knows poses from all around alone. Even ones have 0.7 to 0.8, a cap over a support with
+its image 1.5, a turntable before a column 4 to 8. There the network harms: the F-score at 5 mm of a
+printed bunny is 0.36 with it and 0.60 without it."""
 _LOOKS = 2000  # number of directions in which a gap is looked for: 5 degrees apart
 BLOCK = 16
 """Number of voxels along an axis that are one voxel at the coarsest level of the network."""
@@ -115,14 +115,12 @@ def gap_of_poses(hull: EchoHull, middle: Floats) -> float:
     """
     heard = hull.sources[np.isfinite(hull.trusted).any(axis=1)]
     count = len(heard)
-    if count < 2:
+    if not count:
         return math.inf
     if hull.plane is not None:
         heard = np.concatenate([heard, hull.plane.mirrored(heard)])
     near, _ = cKDTree(trimesh.unitize(heard - middle)).query(fibonacci_sphere(_LOOKS))
-    # N caps of the expected radius cover a sphere log(N) times.
-    expected = math.acos(max(1 - 2 * math.log(count) / count, -1.0))
-    return 2 * math.asin(min(float(near.max()) / 2, 1.0)) / expected
+    return 2 * math.asin(min(float(near.max()) / 2, 1.0)) / usual_gap(count)
 
 
 def features(known: Gathered, lattice: Lattice) -> Singles:
