@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -17,6 +17,7 @@ from sononerf.field.renderer import Renderer, tensor
 from sononerf.head.head import Head
 from sononerf.settings import plugins
 
+Made = TypeVar("Made")
 FieldFactory = Callable[..., Field]
 """Called with the region (2, 3), m, the frequencies (F,), Hz, and keyword options."""
 RendererFactory = Callable[..., Renderer]
@@ -57,12 +58,7 @@ def make_field(
         SettingsError: If the name or an option is not allowed, or the head is missing.
         InputError: If the plugin cannot be loaded, or makes something else.
     """
-    if isinstance(field, Field):
-        return field
-    made = _made(field, plugins.FIELDS, region, head, options)
-    if not isinstance(made, Field):
-        raise InputError(f"{field!r} makes a {type(made).__name__}, expected a sononerf Field")
-    return made
+    return _made(field, Field, plugins.FIELDS, region, head, options)
 
 
 def make_renderer(
@@ -82,35 +78,37 @@ def make_renderer(
     Raises:
         SettingsError, InputError: As :func:`make_field`.
     """
-    if isinstance(renderer, Renderer):
-        return renderer
-    made = _made(renderer, plugins.RENDERERS, region, head, options)
-    if not isinstance(made, Renderer):
-        raise InputError(
-            f"{renderer!r} makes a {type(made).__name__}, expected a sononerf Renderer"
-        )
-    return made
+    return _made(renderer, Renderer, plugins.RENDERERS, region, head, options)
 
 
 def _made(
-    given: Callable[..., object] | str,
+    given: Made | Callable[..., Made] | str,
+    kind: type[Made],
     group: str,
     region: Tensor,
     head: Head | None,
     options: Mapping[str, Any],
-) -> object:
-    """Return the object that a plugin's factory, or a factory, makes."""
-    what = "field" if group == plugins.FIELDS else "renderer"
+) -> Made:
+    """Return the object itself, or the one that a plugin's factory, or a factory, makes."""
+    if isinstance(given, kind):
+        return given
+    what = kind.__name__.lower()
     make = plugins.load(group, given) if isinstance(given, str) else given
     if not callable(make):
         raise InputError(
             f"{what} is a {type(make).__name__}, expected the name of a plugin, a factory or a "
-            f"sononerf {what.capitalize()}"
+            f"sononerf {kind.__name__}"
         )
     if head is None:
         raise SettingsError("head: missing; give the head that heard the echoes")
     chosen = plugins.check_options(make, options, where=f"{what}.options", given=2)
     heard = tensor(head.frequency) if group == plugins.FIELDS else head
-    if not isinstance(given, str):
-        return make(region, heard, **chosen)
-    return plugins.call(f"{what} {given!r}", make, region, heard, **chosen)
+    if isinstance(given, str):
+        made = plugins.call(f"{what} {given!r}", make, region, heard, **chosen)
+    else:
+        made = make(region, heard, **chosen)
+    if not isinstance(made, kind):
+        raise InputError(
+            f"{given!r} makes a {type(made).__name__}, expected a sononerf {kind.__name__}"
+        )
+    return made

@@ -37,7 +37,8 @@ class StillSurface:
         self.normals = unit(self._area)
         passes = smoothing_passes(optics.wavelength, self.operators.edge_length(self.vertices))
         self.bending = self.operators.bending(self.vertices, self.normals, passes)
-        self._sight = sight_of(optics, self.vertices.cpu().numpy(), faces)
+        sight = sight_of(optics, self.vertices.cpu().numpy(), faces)
+        self._parts = self.operators, self.vertices, self._area, self.bending, sight
 
     def listen(self, positions: Floats, rotations: Floats) -> tuple[Pieces, Heads, Tensor]:
         """Return the pieces that poses hear, see :func:`~.visibility.listen`.
@@ -46,16 +47,7 @@ class StillSurface:
             positions, rotations ((P, 3), (P, 3, 3)): Places (m) and rotations of the heads.
         """
         places, turns = (torch.as_tensor(part).to(self.vertices) for part in (positions, rotations))
-        return listen(
-            self.optics,
-            self.operators,
-            self.vertices,
-            self._area,
-            self.bending,
-            self._sight,
-            places,
-            turns,
-        )
+        return listen(self.optics, *self._parts, places, turns)
 
     @torch.no_grad()
     def render(
