@@ -57,9 +57,10 @@ def fibonacci_cap(
 
 
 def usual_gap(count: int) -> float:
-    """Return the angle (rad) from the middle of the largest gap between random directions to them.
+    """Return the usual radius of the largest gap between random directions, rad.
 
-    That many caps of this angle cover the sphere log(count) times, so that few places are left out.
+    The radius is the angle from the middle of the gap to the nearest direction. Caps of this
+    radius around all directions have log(count) times the area of the sphere.
 
     Args:
         count: Number of directions, one or more.

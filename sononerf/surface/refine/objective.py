@@ -155,7 +155,7 @@ def differences(
 
 
 def mismatch(difference: Tensor, weight: Tensor) -> Tensor:
-    """Return the mean absolute difference of each pose, (P,) reported dB, from those of cells."""
+    """Return the mean absolute difference over each pose's active cells, (P,) reported dB."""
     return (difference.abs() * weight).sum((1, 2, 3))
 
 
@@ -252,8 +252,8 @@ class OnsetRanges:
 
         The hull is taken for a sphere's tangent planes, one for each pose that heard an onset. The
         height is the median over the vertices: their distance from the centroid times 1/cos - 1 of
-        the angle to the nearest pose. Vertices farther away than the usual gap take no part: no
-        pose bounds them.
+        the angle to the nearest pose. Vertices with a larger angle than the usual gap between as
+        many random poses take no part, because no pose bounds them.
         """
         outward, source = hull.vertices - hull.centroid, self._emitters - hull.centroid
         radius, poses = np.linalg.norm(outward, axis=1), np.unique(trimesh.unitize(source), axis=0)

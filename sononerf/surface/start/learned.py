@@ -66,10 +66,10 @@ SURE = 3.0
 """Distance from which a voxel is taken to be outside, voxels. Farther voxels are many, and their
 small probabilities would add up."""
 GAP = 2.0
-"""Largest gap between the directions of the poses, over the usual one of as many random ones. The
-training knows poses from all around alone. Even ones have 0.7 to 0.8, a cap over a support with
-its image 1.5, a turntable before a column 4 to 8. There the network harms: the F-score at 5 mm of a
-printed bunny is 0.36 with it and 0.60 without it."""
+"""Largest allowed gap between the directions of the poses, over the usual gap of as many random
+directions, no unit. In the training, poses surrounded each body. Evenly spread poses have a ratio
+of 0.7 to 0.8, a cap over a support 1.5, a turntable before a column 4 to 8. On a column the network
+harms: a printed bunny has an F-score at 5 mm of 0.36 with it and of 0.60 without it."""
 _LOOKS = 2000  # number of directions in which a gap is looked for: 5 degrees apart
 BLOCK = 16
 """Number of voxels along an axis that are one voxel at the coarsest level of the network."""
@@ -107,7 +107,7 @@ def lattice_of(known: Gathered) -> Lattice | None:
 
 
 def gap_of_poses(hull: EchoHull, middle: Floats) -> float:
-    """Return the largest gap between the poses that heard something, see ``GAP``.
+    """Return the ratio of the largest gap between poses that heard something, see ``GAP``.
 
     Args:
         hull: Onsets and poses; on a support, the image of each pose counts too.
@@ -333,9 +333,9 @@ def learned_surface(known: Gathered) -> trimesh.Trimesh:
     gap = gap_of_poses(known.hull, middle)
     if gap > GAP:
         raise NumericalError(
-            "the start learned knows bodies that poses from all around heard; these poses leave a "
-            f"gap {gap:.1f} times as wide as that of random ones (at most {GAP:g}); take another "
-            "method, such as open"
+            "the start learned was trained on poses from all around a body; these poses leave a "
+            f"gap {gap:.1f} times as wide as random poses leave (at most {GAP:g} is allowed); "
+            "take another method, such as open"
         )
     with torch.no_grad():
         seen = torch.from_numpy(features(known, lattice))[None]
