@@ -54,14 +54,14 @@ class StillSurface:
         self,
         positions: Floats,
         rotations: Floats,
-        stretch: Floats | None = None,
-        late: Floats | None = None,
+        stretch: Floats | float = 1.0,
+        late: Floats | float = 0.0,
     ) -> Singles:
         """Return magnitudes on the whole axis, (P, E, R, F).
 
         Args:
             positions, rotations ((P, 3), (P, 3, 3)): Places (m) and rotations of the heads.
-            stretch, late ((P,), (P,)): Factor on paths, and m added to them; none where None.
+            stretch, late: Factor on the paths, and m added to them; (P,), or one for all poses.
         """
         optics = self.optics
         shape = (len(positions), optics.ears, optics.rows, len(optics.frequencies))
@@ -70,13 +70,8 @@ class StillSurface:
         if not len(pieces.pose):
             return found
         points, area = (self.vertices - middle).float(), self._area.float()
-        given = {"stretch": stretch, "late": late}
-        paths = {
-            name: torch.as_tensor(part).to(points)
-            for name, part in given.items()
-            if part is not None
-        }
-        heard = optics.render(points, area, pieces, heads, **paths)
+        factor, more = (points.new_tensor(part).expand(len(found)) for part in (stretch, late))
+        heard = optics.render(points, area, pieces, heads, stretch=factor, late=more)
         magnitude = heard.power.sqrt().cpu().numpy()
         for one, rendered, row in zip(found, magnitude, heard.row.tolist(), strict=True):
             first, last = max(row, 0), min(row + rendered.shape[1], optics.rows)
