@@ -35,6 +35,19 @@ def test_overlapping_bodies_become_one_without_walls_inside():
     assert found.volume == pytest.approx(2 * 4 / 3 * np.pi * 0.015**3 - lens, rel=0.02)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_surface_that_crosses_itself_does_not_empty_the_body(seed):
+    mesh = ball()
+    vertices = np.array(mesh.vertices)
+    top = vertices[:, 2] > 0.012
+    shape = int(top.sum()), 3
+    vertices[top] += np.random.default_rng(seed).normal(scale=EDGE, size=shape)
+    crumpled = trimesh.Trimesh(vertices, mesh.faces, process=False)
+    assert remesh(crumpled, EDGE).volume == pytest.approx(ball().volume, rel=0.15)
+    finer = remesh(crumpled, EDGE / 2)  # so fine that some crumpled tops are refused
+    assert finer is None or finer.volume == pytest.approx(ball().volume, rel=0.15)
+
+
 def test_a_blur_cuts_a_thin_neck():
     rod = trimesh.creation.cylinder(radius=0.0012, height=0.05, sections=24)
     rod.apply_transform(trimesh.transformations.rotation_matrix(np.pi / 2, [0, 1, 0]))
