@@ -10,6 +10,7 @@
     python tools/benchmark.py wave [--bodies spheres leaf beaker] [--poses 8]
     python tools/benchmark.py dechirp
     python tools/benchmark.py surfaces [--only NAME ...] [--seeds 0 1 2] [--exact STORE]
+    python tools/benchmark.py surfaces --foreign FOLDER [--calls 400 100 25]
     python tools/benchmark.py step [--accelerator cpu] [--compare OLD.json]
     python tools/benchmark.py fit [--scene three_spheres] [--error 0.45] [--compare OLD.json]
     python tools/benchmark.py reconstruct RUN [RUN ...] [--spacings 0.002 0.001]
@@ -39,9 +40,10 @@ calls that proposed poses need for an F-score, beside farthest and random ones.
 
 ``surfaces``: how good the surfaces of all kinds of scenes are, some under
 changed conditions; one line of JSON for each run. What is ``scaled`` is measured in the unscaled
-world's metres. ``fit`` and ``surfaces`` leave runs, a table as JSON and logs in a folder
-(``--output``), share ensembles (``--data``), go on where they were interrupted, and lay KEY=VALUE
-over the settings (``--set``).
+world's metres. With ``--foreign`` all bodies of a folder are reconstructed instead, and each start
+surface and each candidate of the refinement is compared with the truth too. ``fit`` and
+``surfaces`` leave runs, a table as JSON and logs in a folder (``--output``), share ensembles
+(``--data``), go on where they were interrupted, and lay KEY=VALUE over the settings (``--set``).
 """
 
 from __future__ import annotations
@@ -72,6 +74,7 @@ ERROR_HELP = "over all cells of held-out poses, dB (0.45)"
 ONLY_HELP = "rows of the table; all, but exact only with --exact"
 SEEDS_HELP = "of the fits of three_spheres, ua and leaf; of all others the first alone (0 1 2)"
 EXACT_HELP = "ensemble of exact echoes of three_spheres, 100 calls, analysed up to 80 kHz"
+FOREIGN_HELP = "closed meshes in metres, in place of the rows of the table"
 SPACINGS_HELP = "voxel sizes in metres; by default the run's own"
 SET_HELP = "laid over the settings of every run"
 
@@ -123,6 +126,10 @@ def main() -> None:
             command.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=ONLY_HELP)
             command.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help=SEEDS_HELP)
             command.add_argument("--exact", type=Path, metavar="STORE", help=EXACT_HELP)
+            command.add_argument("--foreign", type=Path, metavar="FOLDER", help=FOREIGN_HELP)
+            command.add_argument(
+                "--calls", type=int, nargs="+", default=[400, 100, 25], help="of --foreign"
+            )
         if series is step:
             command.add_argument("--accelerator", choices=("auto", "cpu", "gpu"), default="auto")
         if series in (step, fit, reconstruct):

@@ -278,17 +278,17 @@ def reconstruct(
     method: Annotated[
         SurfaceMethod | None,
         typer.Option(
-            help="Method of the read-out. open, filled, hull, sheet: from field and first "
-            "echoes; open opens hollows and gaps, filled leaves them closed, hull takes the first "
-            "echoes alone, sheet is for a thin sheet. isosurface: where the field has one value. "
-            "auto: the best of the first four, refined. A method other than auto is not refined."
+            help="levels: by a network from the echoes alone. open, filled, hull, sheet: from "
+            "field and first echoes; open opens hollows and gaps, filled leaves them closed, hull "
+            "takes the first echoes alone, sheet is for a thin sheet. isosurface: where the field "
+            "has one value. auto: the best of the first five, refined."
         ),
     ] = None,
+    refine: Annotated[bool | None, typer.Option(help="Refine; auto alone is by default.")] = None,
     level: Annotated[
         str | None,
         typer.Option(
-            help="Level of an iso-surface: auto, or a number. With a number the surface is an "
-            "iso-surface and is not refined."
+            help="Level of an iso-surface: auto, or a number, which implies an iso-surface."
         ),
     ] = None,
     output: Annotated[Path | None, typer.Option(help="Folder of the results.")] = None,
@@ -316,6 +316,7 @@ def reconstruct(
         spacing=spacing,
         level=number,
         method=method,
+        refine=refine,
         output=output,
         accelerator=accelerator,
         progress=Progress(),

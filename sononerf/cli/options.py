@@ -22,7 +22,7 @@ app = typer.Typer(
 
 
 Accelerator = Literal["auto", "cpu", "gpu"]
-SurfaceMethod = Literal["auto", "open", "filled", "hull", "sheet", "learned", "isosurface"]
+SurfaceMethod = Literal["auto", "open", "filled", "hull", "sheet", "levels", "isosurface"]
 Registration = Literal["none", "rigid", "similarity"]
 Exported = Literal["auto", "echoes", "prediction", "volume", "points", "mesh"]
 FrameName = Literal["auto", "world", "original"]

@@ -19,7 +19,7 @@ from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.detection import Onsets, asked_poses, find_onsets
 from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
-from sononerf.echoes.range_levels import RangeLevels
+from sononerf.echoes.range_levels import RangeLevels, evenly_chosen
 from sononerf.echoes.recorded_noise import seal_recorded
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
 from sononerf.echoes.splits import repeats, split_of
@@ -329,11 +329,14 @@ class Echoes(Shown):
 
     @cached_property
     def levels(self) -> RangeLevels:
-        """Levels of the training poses over range."""
-        poses, head = self.onsets.poses, self.head
+        """Levels of the training poses over range; of some of them where there are many."""
+        head, all_ = self.head, self.onsets.poses
+        some = evenly_chosen(len(all_), len(head.receivers))
+        poses = all_[some]
         emitters, receivers = head.places(self.positions[poses], self.rotations[poses])
         return RangeLevels.of(
             (self.store.read_pose(int(pose)) for pose in poses),
+            some,
             emitters,
             receivers,
             first=float(head.range[0]) - head.mean_lag,

@@ -101,6 +101,23 @@ class EchoHull:
         """Number of points that are processed at once."""
         return max(AT_ONCE // max(self.first.size, 1), 1)
 
+    def with_images(self) -> EchoHull:
+        """Return the hull of body and image, heard by the poses and by their images.
+
+        On a support sound comes to and from images as if there were two bodies and no support.
+        """
+        if self.plane is None:
+            return self
+        plane = self.plane
+        return EchoHull(
+            np.concatenate([self.emitters, plane.mirrored(self.emitters)]),
+            np.concatenate([self.receivers, plane.mirrored(self.receivers)]),
+            np.concatenate([self.first, self.first]),
+            np.concatenate([self.axes, self.axes @ plane.turn]),
+            self.within,
+            None if self.weight is None else np.concatenate([self.weight, self.weight]),
+        )
+
     def clearance(self, points: ArrayLike) -> tuple[Floats, NDArray[np.intp]]:
         """Return how far points lie behind the first echoes, and which pose leaves them least.
 

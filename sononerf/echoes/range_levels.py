@@ -1,59 +1,58 @@
 # SPDX-License-Identifier: MIT
-"""Levels of the echoes over range, and their statistics over all poses at a place.
-
-An edge or a corner is heard from nearly everywhere, so that most poses have a level at its range. A
-face is heard by few poses, but loudly and from its normal. Inside a body only chance gives levels.
-This needs no fit; the fitted field explains many of these echoes by other places.
-"""
+"""Levels of the echoes over range: power of bands of frequencies, averaged over few slices."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from sononerf.array_types import Floats, Singles
-from sononerf.compiled import compiled
+from sononerf.array_types import Floats, Ints, Singles
+from sononerf.geometry.plane import Plane
 
-STATISTICS = 10
-"""Number of statistics of a place; the last three are a vector."""
-MOST = 200
-"""Number of poses that are used, at most; it bounds the time."""
+BANDS = 3
+"""Number of bands of equally many frequencies; the mean power is that of their levels."""
+PER_RESOLUTION = 4
+"""Number of levels per range resolution, about; as in the training of the start network."""
+MOST_PAIRS, FEWEST_POSES = 1280, 40
+"""Number of pose-ear pairs that are used, at most, but of this many poses at least; it bounds time
+and memory."""
 WINDOW = 1.5
 """Distance within which a level is compared with the loudest one, range resolutions."""
-_QUIETEST, _BINS, _PER_DB = -44.0, 64, 1.25  # dB, number, 1/dB: bins of the levels of a place
-_LOUD = -40.0  # dB; quieter levels count as this one
-_PEAK, _OFF = 1.0, 12.0  # dB below the loudest level around: a peak, and the most that is counted
-_SILENT = 1e-6  # of the greatest power of all; quieter counts as this
+_QUIETEST = -60.0  # dB below the loudest level of all; quieter levels count as this one
+_OFF = 12.0  # dB below the loudest level around that are counted, at most
 
 
 @dataclass(frozen=True, eq=False)
 class RangeLevels:
-    """Levels of the echoes of all poses over range, averaged over frequency.
+    """Levels of the echoes of poses over range.
 
     Attributes:
+        poses (P,): Numbers of the poses among those that have onsets.
         emitters ((P, 3), m): World frame.
         receivers ((P, E, 3), m): World frame.
-        level ((P, E, R), dB): 0 dB is an arbitrary level.
-        below ((P, E, R), dB): Level minus the loudest one within ``WINDOW``, from -12 to 0.
+        level ((P, E, R, 3), dB): Levels of the lowest band, of the highest band, and of all
+            frequencies; 0 dB is the loudest level of all.
         first (m): Range of the first level: half of the way out and back.
         spacing (m): Distance between levels.
+        resolution (m): Range resolution.
     """
 
+    poses: Ints
     emitters: Floats
     receivers: Floats
     level: Singles
-    below: Singles
     first: float
     spacing: float
+    resolution: float
 
     @classmethod
     def of(
         cls,
         spectrograms: Iterable[Singles],
+        poses: Ints,
         emitters: Floats,
         receivers: Floats,
         *,
@@ -65,110 +64,68 @@ class RangeLevels:
 
         Args:
             spectrograms (P of (E, R, F)): Linear magnitudes.
-            emitters, receivers, first, spacing: As the attributes.
-            resolution (m): Range resolution.
+            poses, emitters, receivers, resolution: As the attributes.
+            first, spacing (m): Range of the first slice, and distance between slices.
         """
-        power = np.array([np.square(one, dtype=np.float64).mean(axis=2) for one in spectrograms])
-        power /= float(power.max(initial=0.0)) or 1.0
-        level = 10 * np.log10(np.maximum(power, _SILENT))
-        size = 2 * round(WINDOW * resolution / spacing) + 1
-        below = (level - maximum_filter1d(level, size, axis=2)).clip(-_OFF, 0)
-        below[power <= _SILENT] = -_OFF
+        step = max(1, round(resolution / spacing / PER_RESOLUTION))
+        power = np.array([_banded(one, step) for one in spectrograms])
+        power /= float(power.mean(axis=-1).max(initial=0.0)) or 1.0
+        power = np.maximum(power, 10 ** (_QUIETEST / 10))
+        kept = np.stack([power[..., 0], power[..., -1], power.mean(axis=-1)], axis=-1)
         return cls(
+            poses,
             emitters,
             receivers,
-            level.astype(np.float32),
-            below.astype(np.float32),
-            first,
-            spacing,
+            (10 * np.log10(kept)).astype(np.float32),
+            first + (step - 1) / 2 * spacing,
+            step * spacing,
+            resolution,
         )
 
-    def statistics(self, places: Floats, middle: Floats) -> Singles:
-        """Return the statistics of places over all poses and ears, (N, STATISTICS), no unit.
-
-        They are the mean level, its mean below the loudest around, the fraction of peaks, three
-        quantiles and the maximum, and the mean direction of the sound.
+    def with_images(self, plane: Plane, count: int) -> RangeLevels:
+        """Return the levels at the poses, and the same at their images in a support.
 
         Args:
-            places ((N, 3), m): World frame.
-            middle ((3,), m): Middle of the body; levels are relative to the median over poses of
-                the loudest one, as if it came from here.
+            plane: The support.
+            count: Number of poses with onsets; their images follow them.
         """
-        emitters, receivers, level, below = self.emitters, self.receivers, self.level, self.below
-        ways = (
-            np.linalg.norm(emitters - middle, axis=1)[:, None],
-            np.linalg.norm(receivers - middle, axis=2),
-        )
-        usual = float(np.median(level.max(axis=2) + 20 * np.log10(ways[0] * ways[1])))
-        count = len(emitters)
-        some = np.unique(np.linspace(0, count - 1, min(count, MOST)).astype(np.int64))
-        return _statistics(
-            np.ascontiguousarray(places, dtype=np.float64),
-            emitters[some],
-            receivers[some],
-            level[some] - np.float32(usual),
-            below[some],
-            self.first,
-            self.spacing,
+        return replace(
+            self,
+            poses=np.concatenate([self.poses, count + self.poses]),
+            emitters=np.concatenate([self.emitters, plane.mirrored(self.emitters)]),
+            receivers=np.concatenate([self.receivers, plane.mirrored(self.receivers)]),
+            level=np.concatenate([self.level, self.level]),
         )
 
+    def table(self, middle: Floats) -> Singles:
+        """Return the levels relative to the usual loudest one, and peaks, (P, E, R, 4) dB.
 
-@compiled
-def _statistics(
-    places: Floats,
-    emitters: Floats,
-    receivers: Floats,
-    level: Singles,
-    below: Singles,
-    first: float,
-    spacing: float,
-) -> Singles:
-    found = np.zeros((len(places), STATISTICS), np.float32)
-    for n in range(len(places)):
-        bins = np.zeros(_BINS, np.int64)
-        count, peaks = 0, 0
-        levels, off, total, highest = 0.0, 0.0, 0.0, -1e9
-        direction = np.zeros(3)
-        for p in range(emitters.shape[0]):
-            way = emitters[p] - places[n]
-            out = math.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
-            for ear in range(receivers.shape[1]):
-                x, y, z = (
-                    receivers[p, ear, 0] - places[n, 0],
-                    receivers[p, ear, 1] - places[n, 1],
-                    receivers[p, ear, 2] - places[n, 2],
-                )
-                back = math.sqrt(x * x + y * y + z * z)
-                at = ((out + back) / 2 - first) / spacing
-                row = math.floor(at)
-                if row < 0 or row >= level.shape[2] - 1:
-                    continue
-                part = at - row
-                heard = level[p, ear, row] * (1 - part) + level[p, ear, row + 1] * part
-                lower = below[p, ear, row] * (1 - part) + below[p, ear, row + 1] * part
-                heard += 20 * math.log10(out * back)  # without spreading
-                bins[min(max(int((heard - _QUIETEST) * _PER_DB), 0), _BINS - 1)] += 1
-                count += 1
-                levels += max(heard, _LOUD)
-                off += lower
-                peaks += lower > -_PEAK
-                highest = max(highest, heard)
-                amplitude = 10 ** (heard / 20)
-                total += amplitude
-                for k in range(3):
-                    direction[k] += amplitude * way[k] / out
-        if count == 0:
-            continue
-        found[n, 0] = levels / count / 20 + 1
-        found[n, 1] = off / count / 6 + 1
-        found[n, 2] = peaks / count
-        below_it, bin_ = 0, -1
-        for k, part in enumerate((0.1, 0.5, 0.9)):
-            while below_it < part * count:
-                bin_ += 1
-                below_it += bins[bin_]
-            found[n, 3 + k] = ((bin_ + 0.5) / _PER_DB + _QUIETEST) / 20 + 1
-        found[n, 6] = highest / 20 + 0.5
-        for k in range(3):
-            found[n, 7 + k] = 2 * direction[k] / total
-    return found
+        The first three are the attribute ``level``, less the median over poses and ears of the
+        loudest one, as if it came from the middle (3,), m. The last is how far a level is below the
+        loudest one within ``WINDOW``.
+        """
+        ways = np.linalg.norm(self.emitters - middle, axis=1)[:, None] * np.linalg.norm(
+            self.receivers - middle, axis=2
+        )
+        whole = self.level[..., 2]
+        usual = np.median(whole.max(axis=2) + 20 * np.log10(ways))
+        size = 2 * round(WINDOW * self.resolution / self.spacing) + 1
+        below = (whole - maximum_filter1d(whole, size, axis=2)).clip(-_OFF, 0)
+        return np.concatenate([self.level - np.float32(usual), below[..., None]], axis=3)
+
+
+def evenly_chosen(count: int, ears: int) -> Ints:
+    """Return the numbers of the poses, of so many, that are used, in order."""
+    most = max(MOST_PAIRS // ears, FEWEST_POSES)
+    if count <= most:
+        return np.arange(count)
+    return np.sort(np.random.default_rng(0).choice(count, most, replace=False))
+
+
+def _banded(spectrogram: Singles, step: int) -> Floats:
+    """Return the power (E, R // step, BANDS) of a spectrogram (E, R, F), averaged over slices."""
+    power = np.square(spectrogram, dtype=np.float64)
+    bands = [part.mean(axis=2) for part in np.array_split(power, BANDS, axis=2)]
+    found = np.stack(bands, axis=-1)
+    count = found.shape[1] // step
+    return found[:, : count * step].reshape(len(found), count, step, BANDS).mean(axis=2)

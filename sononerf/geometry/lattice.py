@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 from skimage.measure import marching_cubes
 
-from sononerf.array_types import Bools, Floats, Singles
+from sononerf.array_types import Floats, Singles
 
 MARGIN = 3
 """Number of empty voxels around the box: they close a surface at its border."""
@@ -44,12 +44,6 @@ class Lattice:
     def points(self) -> Floats:
         """Return the centres of all voxels, (N, 3) m."""
         return self.origin + self.spacing * np.argwhere(np.ones(self.shape, dtype=bool))
-
-    def at_wall(self, points: Floats) -> Bools:
-        """Return which points lie at the end of the box, within a voxel, or beyond, (N,)."""
-        place, last = self.coordinates(points), np.asarray(self.shape) - 1
-        inner = (place > MARGIN + 1) & (place < last - MARGIN - 1)
-        return np.asarray(~inner.all(axis=1))
 
     def spread(self, points: Floats, values: Floats, deviation: float = 0.0) -> Singles:
         """Add values (N,) of points to the voxels around them, and blur by a number of voxels."""

@@ -149,6 +149,7 @@ def reconstruct(
     spacing: float | None = None,
     level: float | Literal["auto"] | None = None,
     method: Method | Literal["auto"] | None = None,
+    refine: bool | None = None,
     output: Path | None = None,
     accelerator: str = "auto",
     progress: Progress | None = None,
@@ -156,7 +157,8 @@ def reconstruct(
     """Write mesh, volume, projections and a view.
 
     The surface is read out of the field and refined against the echoes that the field was fitted
-    to. It is not refined if a level or a method is given, or if the settings say so.
+    to. If a level or a method is given, or if the settings say so, it is not refined unless it is
+    asked for.
 
     Args:
         run: A fitted run.
@@ -164,6 +166,7 @@ def reconstruct(
         level ("auto" or None): A number asks for an iso-surface of this level; the settings' where
             None.
         method: Method of the read-out; that of the settings where None.
+        refine: Whether to refine the surface; where None, as above.
         output: Folder of the results; ``RUN/reconstruction`` where None.
         accelerator: Device that refines the surface.
         progress: Display of progress.
@@ -187,7 +190,10 @@ def reconstruct(
         method = "isosurface"
     if level != "auto" and method != "isosurface":
         raise SettingsError(f"method {method} has no level; leave out one of the two")
-    refines = method == "auto" and options.refine and _has_echoes(run, progress)
+    if refine and method == "isosurface":
+        raise SettingsError("an iso-surface is not refined; leave out --refine, or take a method")
+    asked = (method == "auto" and options.refine) if refine is None else refine
+    refines = asked and _has_echoes(run, progress)
     chosen = options.model_copy(
         update={"method": method, "level": level, "spacing": spacing or options.spacing}
     )
@@ -195,8 +201,8 @@ def reconstruct(
         truth = _truth(run)
         if refines:
             check_state(run)
-        # The learned start needs the echoes; all others do with the free space.
-        heard = run.echoes if refines or method == "learned" else run.fitted.hull
+        # The start levels needs the echoes; all others do with the free space.
+        heard = run.echoes if refines or method == "levels" else run.fitted.hull
         surface = reconstruction.reconstruct(
             run.fitted.module, heard, options=chosen, progress=progress
         )
@@ -257,6 +263,7 @@ def _write(folder: Path, surface: Surface, truth: trimesh.Trimesh | None, frame:
             "validation_error_db": surface.error_db,
             **_errors(surface),
             "faults": list(surface.faults),
+            "candidates": list(surface.candidates),
         },
     )
 

@@ -94,6 +94,7 @@ class Run(Shown):
             refined=known["refined"],
             error_db=known["validation_error_db"],
             faults=tuple(known["faults"]),
+            candidates=tuple(known.get("candidates", ())),
             echoes=echoes,
         )
         if self._traced is not None:

@@ -223,6 +223,7 @@ def _surface(page: Page, run: RunFolder, settings: Settings) -> None:
         run.fitted.head.resolution / 2,
     )
     page.view(views.meshes())
+    _candidates(page, run)
     page.pictures({"Four sides; colours are explained at the left.": views.png(SIDES)})
     page.heading("Maximum-intensity projections", 3)
     found = {}
@@ -233,6 +234,23 @@ def _surface(page: Page, run: RunFolder, settings: Settings) -> None:
         else:
             page.say(f"{file} is missing; {command} makes it.")
     page.pictures(found)
+
+
+def _candidates(page: Page, run: RunFolder) -> None:
+    """Show the starts of the refinement with their errors on validation poses."""
+    with damage_named(run.reconstruction / "read_out.json"):
+        found = run.read_out.get("candidates") or []
+        rows = [
+            (
+                one["start"] + (", taken" if one["chosen"] else ""),
+                *(NONE if one[k] is None else f"{one[k]:.2f}" for k in _ERRORS),
+            )
+            for one in found
+        ]
+    if rows:
+        page.table([("start", "its error, dB", "refined, dB"), *rows])
+        taken = _command("reconstruct", run.path, " --method open --refine")
+        page.say(f"Errors on validation poses. Another start is refined by {taken}.")
 
 
 def _truth_beside(page: Page, run: RunFolder, settings: Settings) -> trimesh.Trimesh | None:
@@ -249,6 +267,9 @@ def _truth_beside(page: Page, run: RunFolder, settings: Settings) -> trimesh.Tri
             true = true.copy()
             true.apply_transform(np.linalg.inv(np.asarray(motion, dtype=np.float64)))
     return true
+
+
+_ERRORS = ("start_error_db", "error_db")
 
 
 @dataclass(frozen=True, eq=False)

@@ -316,7 +316,7 @@ class ReconstructionSettings(Section):
 
     spacing: Spacing | None = None  # from the field's own resolution where it is not set
     level: Annotated[float, Field(ge=0)] | Literal["auto"] = "auto"  # of an iso-surface
-    method: Literal["auto", "open", "filled", "hull", "sheet", "learned", "isosurface"] = "auto"
+    method: Literal["auto", "open", "filled", "hull", "sheet", "levels", "isosurface"] = "auto"
     refine: bool = True  # fit the surface to the echoes by physical optics
     directions: Annotated[int, Field(ge=6)] = 100
     smoothing: Annotated[float, Field(ge=0, le=1)] = 0.0  # side of a box over the volume, m

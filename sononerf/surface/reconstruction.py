@@ -6,8 +6,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import torch
@@ -17,19 +18,21 @@ from torch import Tensor
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
-from sononerf.errors import SettingsError, expect
+from sononerf.errors import InputError, SettingsError, expect
 from sononerf.field.fitting import quiet_lightning, require_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.progress import Progress
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import ReconstructionSettings, SimulationSettings
 from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine.course import number_of_steps
+from sononerf.surface.refine.candidates import number_of_steps
+from sononerf.surface.refine.descent import poses_that_hear
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.refinement import Refinement
 from sononerf.surface.refine.refinement import refine as refine_starts
 from sononerf.surface.start.read_out import (
     StartMethod,
+    read_echoes,
     read_field,
     read_isosurface,
     start_surfaces,
@@ -38,25 +41,40 @@ from sononerf.surface.surface import Surface, finished_surface
 
 UNREFINED: tuple[StartMethod, ...] = ("filled", "hull", "open", "sheet")
 """Start methods in order: without refinement the first that gives a surface is taken."""
-REFINED: tuple[StartMethod, ...] = ("open", "filled", "hull", "learned", "sheet")
-"""Start surfaces: one of them is refined, see
-:class:`~sononerf.surface.refine.refinement.Refinement`; how far they lie apart is part of the error
-of the surface."""
 RAYS = 20_000
 """Rays per pose, for the correction of the last stage."""
 
 
+@overload
 def reconstruct(
     model: EchoModule,
     echoes: Echoes | EchoHull,
     *,
     options: ReconstructionSettings | Mapping[str, Any] | None = None,
     progress: Progress | None = None,
+) -> Surface: ...
+
+
+@overload
+def reconstruct(
+    model: Echoes,
+    *,
+    options: ReconstructionSettings | Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> Surface: ...
+
+
+def reconstruct(
+    model: EchoModule | Echoes,
+    echoes: Echoes | EchoHull | None = None,
+    *,
+    options: ReconstructionSettings | Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
 ) -> Surface:
-    """Read a surface out of a fitted field and the first echoes; :func:`refine` improves it.
+    """Read a surface out of echoes, with or without a field; :func:`refine` improves it.
 
     Args:
-        model: Fitted to the echoes.
+        model: Fitted to the echoes; or the echoes alone, from which a network makes the surface.
         echoes: The fitted echoes, or their free space.
         options: Keys of the section ``reconstruction`` of the settings, such as ``{"spacing":
             0.002, "method": "hull"}`` or ``{"method": "isosurface", "level": 0.5}``.
@@ -70,8 +88,12 @@ def reconstruct(
         NumericalError: If the field has no surface.
     """
     progress = progress or Progress()
-    expect(model, EchoModule, "model")
     chosen = checked_section(ReconstructionSettings, options or {}, "reconstruction")
+    if isinstance(model, Echoes):
+        return _without_field(model, chosen)
+    expect(model, EchoModule, "model")
+    if echoes is None:
+        raise InputError("echoes: missing; give the echoes that the model was fitted to")
     hull = echoes if isinstance(echoes, EchoHull) else echoes.hull
     heard = None if isinstance(echoes, EchoHull) else echoes
     field = model.field
@@ -98,7 +120,23 @@ def reconstruct(
         )
     methods = UNREFINED if chosen.method == "auto" else (chosen.method,)
     method, mesh = next(start_surfaces(reading, methods))
+    if chosen.method != "auto":
+        reading = replace(reading, methods=methods)
     return finished_surface(mesh, method, reading, echoes=heard)
+
+
+def _without_field(echoes: Echoes, options: ReconstructionSettings) -> Surface:
+    """Return the surface that the network makes of echoes."""
+    if options.method not in ("auto", "levels"):
+        raise SettingsError(
+            f"method {options.method} needs a fitted model; give one, or take the method levels"
+        )
+    reading = read_echoes(echoes)
+    with _one_thread():
+        method, mesh = next(start_surfaces(reading, ("levels",)))
+        heard = poses_that_hear(mesh, echoes, Optics(echoes.head))
+    count = heard.cpu().numpy().astype(np.int32)
+    return finished_surface(mesh, method, reading, echoes=echoes, confidence=count)
 
 
 def _resolution(model: EchoModule, echoes: Echoes | None) -> float:
@@ -122,8 +160,8 @@ def refine(
     """Move a surface until physical optics, corrected by the simulator, gives the echoes.
 
     Of a surface that :func:`reconstruct` read out of a field, all start surfaces are tried, and the
-    one that explains the validation poses best is refined. A surface of your own is refined as it
-    is.
+    one that explains the validation poses best after its refinement is taken. One of a method that
+    was asked for, one without a field and one of your own are refined as they are.
 
     Args:
         surface: The start.
@@ -180,6 +218,7 @@ def refine(
         refined=refined.kept,
         error_db=refined.error_db if known else None,
         faults=refined.faults,
+        candidates=refined.candidates,
     )
 
 
@@ -197,7 +236,7 @@ def starts_of(surface: Surface) -> dict[StartMethod, trimesh.Trimesh]:
         )
     if surface.reading is None:
         return {surface.method: surface.mesh}
-    return dict(start_surfaces(surface.reading, REFINED))
+    return dict(start_surfaces(surface.reading, surface.reading.methods))
 
 
 def _placed(optics: Optics, accelerator: str) -> Optics:

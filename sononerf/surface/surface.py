@@ -26,7 +26,7 @@ from sononerf.shown import Shown
 from sononerf.surface.mesh_files import MeshFormat, mesh_bytes
 from sononerf.surface.start.evidence import ALIGNED, poses_that_heard
 from sononerf.surface.start.occupancy import QUIET
-from sononerf.surface.start.read_out import FieldReading, Method
+from sononerf.surface.start.read_out import Method, Reading
 from sononerf.surface.start.sheet import THIN
 from sononerf.surface.start.volume import Volume
 
@@ -50,6 +50,8 @@ class Surface(Shown):
         refined: True where the refined mesh explains the validation poses better than its start.
         error_db (dB): Objective of the refinement on validation poses; None without a refinement.
         faults: Faults of the refinement, one line each.
+        candidates: The starts of the refinement with their objectives, see
+            :class:`~sononerf.surface.refine.refinement.Refined`.
         echoes: Echoes of its field; None if unknown.
         reading: Evidence that it was made from; None if there is none.
         learned: Weights of its echoes beside what a model renders, by model.
@@ -68,8 +70,9 @@ class Surface(Shown):
     refined: bool = False
     error_db: float | None = None
     faults: Sequence[str] = ()
+    candidates: Sequence[dict[str, Any]] = ()
     echoes: Echoes | None = field(default=None, repr=False)
-    reading: FieldReading | None = field(default=None, repr=False)
+    reading: Reading | None = field(default=None, repr=False)
     learned: list[tuple[weakref.ref[Any], object]] = field(default_factory=list, repr=False)
 
     def __post_init__(self) -> None:
@@ -101,7 +104,7 @@ class Surface(Shown):
 def finished_surface(
     mesh: trimesh.Trimesh,
     method: Method,
-    reading: FieldReading | None,
+    reading: Reading | None,
     *,
     echoes: Echoes | None = None,
     confidence: NDArray[np.int32] | None = None,
@@ -109,6 +112,7 @@ def finished_surface(
     refined: bool = False,
     error_db: float | None = None,
     faults: Sequence[str] = (),
+    candidates: Sequence[dict[str, Any]] = (),
 ) -> Surface:
     """Return the surface of a closed mesh, without the triangles that no pose can have heard.
 
@@ -118,25 +122,29 @@ def finished_surface(
         mesh: A start surface or a refined one, m.
         method: Method of its start.
         reading: Evidence of the start; without it the mesh stays whole.
-        confidence ((V,) int32): Number of poses that heard each vertex; counted in the evidence
-            where None.
+        confidence ((V,) int32): Number of poses that heard each vertex; counted in the evidence of
+            a field where None.
         error ((V,) float32, m): As in :class:`Surface`.
-        echoes, refined, error_db, faults: As in :class:`Surface`.
+        echoes, refined, error_db, faults, candidates: As in :class:`Surface`.
     """
     known: dict[str, Any] = {"echoes": echoes, "reading": reading}
     known |= {"refined": refined, "error_db": error_db, "faults": faults}
+    known["candidates"] = candidates
     if reading is None:
         return Surface(mesh, None, method, confidence=confidence, error=error, **known)
-    found = reading.gathered
+    found, hull, resolution = reading.gathered, reading.hull, reading.resolution
     if confidence is None:
-        confidence = poses_that_heard(mesh, found.evidence, found.resolution)
-    hull = found.hull
-    openness = judge_openness(mesh, hull.sources, resolution=found.resolution, plane=hull.plane)
+        assert found is not None  # without a field the caller counts
+        confidence = poses_that_heard(mesh, found.evidence, resolution)
+    openness = judge_openness(mesh, hull.sources, resolution=resolution, plane=hull.plane)
     if openness.kind == "one-sided":
-        reliable = found.evidence.where(found.weight > QUIET)
-        heard = poses_that_heard(mesh, reliable, found.resolution)
-        part = known_part(mesh, heard, hull, resolution=found.resolution)
-        part &= ~found.lattice.at_wall(mesh.triangles_center)
+        heard = confidence
+        if found is not None:
+            reliable = found.evidence.where(found.weight > QUIET)
+            heard = poses_that_heard(mesh, reliable, resolution)
+        part = known_part(mesh, heard, hull, resolution=resolution)
+        voxel = resolution / 2 if found is None else found.lattice.spacing
+        part &= ~at_wall(mesh.triangles_center, reading.box, voxel)
         if (part & ~openness.unseen).any():
             openness = leaving_out(openness, ~part, mesh.area_faces)
         used = np.unique(mesh.faces[~openness.unseen])
@@ -271,6 +279,12 @@ def known_part(
     for plane in planes:
         between &= middles @ plane[:3] + plane[3] <= ALIGNED * resolution
     return np.asarray(enough[mesh.faces].any(axis=1) | (between & bounded))
+
+
+def at_wall(points: Floats, box: Floats, voxel: float) -> Bools:
+    """Return which points (N, 3), m, lie within a voxel of the region's walls, or beyond, (N,)."""
+    inner = (points > box[0] + voxel) & (points < box[1] - voxel)
+    return np.asarray(~inner.all(axis=1))
 
 
 def leaving_out(openness: Openness, unknown: Bools, areas: Floats) -> Openness:

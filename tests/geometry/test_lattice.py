@@ -35,13 +35,3 @@ def test_reading_is_linear():
     plane = (lattice.points() @ [1.0, -2.0, 3.0]).reshape(lattice.shape)
     point = np.array([[0.0013, 0.0121, 0.0257]])
     np.testing.assert_allclose(lattice.read(plane, point), point @ [1.0, -2.0, 3.0], atol=1e-9)
-
-
-def test_the_last_voxel_of_the_box_is_its_wall():
-    lattice = Lattice.over(LOWER, UPPER, 0.002)
-    middle = (LOWER + UPPER) / 2
-    places = np.tile(middle, (4, 1))
-    places[:3, 1] = LOWER[1] + np.array([-0.001, 0.0019, 0.0021])
-    assert lattice.at_wall(places).tolist() == [True, True, False, False]
-    beside = UPPER - 0.0019
-    assert lattice.at_wall(np.stack([UPPER, [middle[0], middle[1], beside[2]]])).all()

@@ -136,7 +136,7 @@ def test_settings_do_not_change(write):
         ("reconstruction.level=high", ["reconstruction.level: found 'high'"]),
         (
             "reconstruction.method=oriented",
-            ["reconstruction.method: found 'oriented'", "'learned' or 'isosurface'"],
+            ["reconstruction.method: found 'oriented'", "'levels' or 'isosurface'"],
         ),
         (
             "reconstruction.spacing=2",

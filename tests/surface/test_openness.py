@@ -347,9 +347,6 @@ def test_where_nothing_was_heard_of_a_surface_the_onsets_bound_it_and_walls_do_n
 @pytest.fixture
 def read(monkeypatch):
     """Read out a field whose occupancy is the sphere, whatever was heard."""
-    region = torch.tensor([[-0.03] * 3, [0.03] * 3])
-    torch.manual_seed(0)
-    field = FourierField(region, torch.tensor([40e3, 60e3]), octaves=2, width=8)
 
     def body(gathered, belief):
         return sphere()
@@ -372,6 +369,9 @@ def read(monkeypatch):
     monkeypatch.setattr(read_out, "estimate_occupancy", body)
 
     def make(hull):
+        torch.manual_seed(0)
+        region = torch.tensor([[-WALL] * 3, [WALL] * 3])
+        field = FourierField(region, torch.tensor([40e3, 60e3]), octaves=2, width=8)
         reading = read_out.read_field(
             field, hull, spacing=0.02, directions=2, resolution=RESOLUTION
         )
@@ -410,3 +410,9 @@ def test_a_hole_of_a_closed_surface_stays_closed(read):
     assert found.openness.unseen.any()
     assert found.openness.kind == "closed"
     assert found.mesh.is_watertight
+
+
+def test_what_lies_within_a_voxel_of_the_region_is_at_its_wall():
+    box = np.array([[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]])
+    places = np.array([[0, 0, 0], [0.0979, 0, 0], [0, -0.0981, 0], [0, 0, 0.2]])
+    assert surface.at_wall(places, box, 0.002).tolist() == [False, False, True, True]

@@ -32,6 +32,7 @@ from tools.benchmarks.experiment import (
     run_experiment,
     shown,
 )
+from tools.benchmarks.foreign import foreign
 from tools.benchmarks.scaled import UNSCALED, scaled_settings, scaled_store
 
 FACTOR = 3.0
@@ -92,6 +93,8 @@ CASES = (
 
 def surfaces(arguments: argparse.Namespace) -> str:
     """Fit scenes, changed conditions and seeds; one line of JSON for each."""
+    if arguments.foreign is not None:
+        return foreign(arguments)
     output = arguments.output or Path("runs") / "surfaces"
     file = output / "surfaces.jsonl"
     lines = _Lines(file)

@@ -1,95 +1,122 @@
 # SPDX-License-Identifier: MIT
-"""Examples for the start network: evidence and true signed distance of procedural bodies.
+"""Examples for the start network: levels over range and true signed distance of a body.
 
-Each body goes through the whole pipeline: simulated echoes, a short fit, evidence of the field.
+A body is stored once, as levels. Poses, noise, orientation and crop are drawn at each step of the
+training.
 """
 
 from __future__ import annotations
 
-import math
+import dataclasses
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 import trimesh
+from scipy.ndimage import map_coordinates
 
 import sononerf
 from sononerf import storage
-from sononerf.array_types import Singles
+from sononerf.array_types import Floats, Ints, Singles
+from sononerf.echoes.free_space import EchoHull
+from sononerf.echoes.range_levels import RangeLevels
 from sononerf.errors import SonoNerfError
 from sononerf.evaluation.solid import Solid
 from sononerf.geometry.lattice import Lattice
 from sononerf.progress import Progress
-from sononerf.surface.start.learned import features, lattice_of
-from sononerf.surface.start.read_out import read_field
+from sononerf.surface.start.features import features_of, free_places
+from sononerf.surface.start.network import FRAMES, lattice_of
 from tools.learning.bodies import body
 
 FAR = 6.0
 """Distance at which the true signed distance is clipped, voxels."""
-EPOCHS = 6
-"""Epochs of a fit; a third of the default saves most of the time."""
-FEWEST, MOST = 25, 500
-"""Number of poses: drawn between these, half of the time above 200, because 400 are usual."""
-QUIETEST_DB, LOUDEST_DB = 20.0, 40.0
-"""Signal-to-noise ratio of the bodies that are heard in noise, dB."""
-NOISY = 0.3
-"""Fraction of the bodies that are heard in noise."""
-MANY = 1_400_000
+POSES, VALIDATING = 160, 2
+"""Number of simulated poses, and how many of them are for validation."""
+DB, STEPS = 0.5, 20
+"""Step of a stored level, dB, and number of steps of a stored distance per voxel."""
+LARGEST = 3_000_000
 """Number of voxels above which a body is left out, because its region was found too large."""
+FEWEST, LEAST = 25, 12
+"""Number of poses, at least, where some are drawn at random, and where those of one side are."""
 
 
-def make_example(seed: int, folder: Path) -> str:
-    """Make the example of a seed, unless it is there; return a line that tells of it.
+@dataclass(frozen=True, eq=False)
+class Example:
+    """One body.
+
+    Attributes:
+        levels: Levels of the echoes.
+        onsets ((P, E), m): Minus infinity without one.
+        lattice: The voxels of the truth.
+        true ((X, Y, Z), voxels): Signed distance.
+        kind: Kind of the body.
+        number: Its number.
+    """
+
+    levels: RangeLevels
+    onsets: Floats
+    lattice: Lattice
+    true: Singles
+    kind: str
+    number: int
+
+
+def make_example(number: int, folder: Path, meshes: Path | None = None) -> str:
+    """Make the example of a number, unless it is there; return a line that tells of it.
 
     Args:
-        seed: Seed of body, poses, noise and fit.
-        folder: Folder of the examples; the file is ``SEED.npz``.
+        number: Seed of poses and rays, and of the body; or the number of a mesh.
+        folder: Folder of the examples; the file is ``NUMBER.npz``.
+        meshes: Folder of closed bodies, m, taken in the order of their names; procedural bodies
+            where None.
     """
-    file = folder / f"{seed}.npz"
+    file = folder / f"{number}.npz"
     if file.is_file():
-        return f"{seed}: is there"
-    random = np.random.default_rng([47, seed])
-    kind, mesh = body(seed)
-    count = int(FEWEST * (MOST / FEWEST) ** math.sqrt(random.random()))
-    noisy = random.random() < NOISY
-    snr = random.uniform(QUIETEST_DB, LOUDEST_DB)
-    head = sononerf.Head(noise={"snr_db": float(snr)} if noisy else {})
-    poses = sononerf.Poses.sphere(
-        count, radius=0.4, aim_jitter=0.26, generator=np.random.default_rng(seed)
-    )
-    options = {"engine": "rays", "rays": int(random.integers(4000, 9000)), "seed": seed}
-    quiet = Progress(quiet=True)
+        return f"{number}: is there"
+    if meshes is None:
+        kind, mesh = body(number)
+    else:
+        source = sorted(meshes.glob("*.ply"))[number]
+        kind, mesh = source.stem, trimesh.load_mesh(source)
     try:
-        echoes = sononerf.simulate(
-            sononerf.Scene(mesh),
-            poses,
-            head,
-            split=np.where(np.arange(count) < 2, "val", "train"),
-            options={**options, "noise_floor_poses": 0},
-            workers=1,
-            progress=quiet,
-        )
-        model = sononerf.EchoModule.for_echoes(echoes, options={"epochs": EPOCHS, "seed": seed})
-        model = sononerf.fit(echoes, model, accelerator="cpu")
-        with torch.inference_mode():
-            reading = read_field(
-                model.field,
-                echoes.hull,
-                resolution=echoes.head.resolution,
-                levels=echoes.levels,
-            )
+        echoes = heard(mesh, number)
+        lattice = lattice_of(echoes.hull, echoes.region.box(), echoes.head.resolution)
     except SonoNerfError as error:
-        return f"{seed}: {kind}, {count} poses: {error}"
-    known = reading.gathered
-    lattice = lattice_of(known)
-    if lattice is None or np.prod(lattice.shape) > MANY:
-        return f"{seed}: {kind}, {count} poses: its region was found too large, or not at all"
-    seen = features(known, lattice).astype(np.float16)
-    true = true_distance(mesh, lattice).astype(np.float16)
-
+        return f"{number}: {kind}: {error}"
+    if lattice is None or np.prod(lattice.shape) > LARGEST:
+        return f"{number}: {kind}: its region was found too large, or not at all"
+    levels = echoes.levels
+    stored = {
+        "level": np.round(-levels.level / DB).astype(np.uint8),
+        "emitters": levels.emitters.astype(np.float32),
+        "receivers": levels.receivers.astype(np.float32),
+        "onsets": echoes.hull.trusted[levels.poses].astype(np.float32),
+        "axis": np.array([levels.first, levels.spacing, levels.resolution]),
+        "lattice": np.array([*lattice.origin, lattice.spacing]),
+        "true": np.round(STEPS * true_distance(mesh, lattice)).astype(np.int8),
+    }
     storage.make_folder(folder)
-    storage.commit(file, lambda opened: np.savez(opened, seen=seen, true=true, kind=kind))
-    return f"{seed}: {kind}, {count} poses, {len(known.evidence.points)} points, {lattice.shape}"
+    storage.commit(file, lambda opened: np.savez_compressed(opened, kind=kind, **stored))
+    return f"{number}: {kind}, {lattice.shape}"
+
+
+def heard(mesh: trimesh.Trimesh, seed: int) -> sononerf.Echoes:
+    """Return the echoes of a body from poses all around it, by few rays."""
+    random = np.random.default_rng([47, seed])
+    poses = sononerf.Poses.sphere(
+        POSES, radius=0.4, aim_jitter=0.26, generator=np.random.default_rng(seed)
+    )
+    rays = int(random.integers(4000, 9000))
+    return sononerf.simulate(
+        sononerf.Scene(mesh),
+        poses,
+        sononerf.Head(),
+        split=np.where(np.arange(POSES) < VALIDATING, "val", "train"),
+        options={"engine": "rays", "rays": rays, "seed": seed, "noise_floor_poses": 0},
+        workers=1,
+        progress=Progress(quiet=True),
+    )
 
 
 def true_distance(mesh: trimesh.Trimesh, lattice: Lattice) -> Singles:
@@ -100,3 +127,94 @@ def true_distance(mesh: trimesh.Trimesh, lattice: Lattice) -> Singles:
     distance[near] = np.minimum(solid.nearest.distance(places[near]) / lattice.spacing, FAR)
     signed = np.where(solid.contains(places), -distance, distance)
     return signed.reshape(lattice.shape).astype(np.float32)
+
+
+def load_example(file: Path) -> Example:
+    """Return the example of a file."""
+    with np.load(file) as stored:
+        found: dict[str, Any] = {name: stored[name] for name in stored.files}
+    first, spacing, resolution = (float(number) for number in found["axis"])
+    *origin, voxel = (float(number) for number in found["lattice"])
+    x, y, z = found["true"].shape
+    levels = RangeLevels(
+        np.arange(len(found["emitters"])),
+        found["emitters"].astype(np.float64),
+        found["receivers"].astype(np.float64),
+        -DB * found["level"].astype(np.float32),
+        first,
+        spacing,
+        resolution,
+    )
+    return Example(
+        levels,
+        found["onsets"].astype(np.float64),
+        Lattice(np.array(origin), voxel, (x, y, z)),
+        found["true"].astype(np.float32) / STEPS,
+        str(found["kind"]),
+        int(file.stem),
+    )
+
+
+def draw(
+    example: Example, random: np.random.Generator, side: int
+) -> tuple[Singles, Singles, Singles]:
+    """Return a crop of a body, heard by some of its poses and turned or mirrored at random.
+
+    Args:
+        example: The body.
+        random: Generator.
+        side: Number of places along each axis.
+
+    Returns:
+        features, bound, true: (FEATURES, side, side, side), the same of one, and twice as many
+            voxels along each axis, as the network takes and gives them.
+    """
+    lattice = example.lattice
+    size = lattice.spacing * np.asarray(lattice.shape)
+    room = np.maximum(size - 2 * side * lattice.spacing, 0) / 2 + 8 * lattice.spacing
+    centre = lattice.origin + size / 2 + 0.7 * room * random.uniform(-1, 1, 3)
+    turn = np.linalg.qr(random.normal(size=(3, 3)))[0]  # some of them mirror
+    some = _poses(example, random)
+    levels = dataclasses.replace(
+        example.levels,
+        emitters=(example.levels.emitters - centre) @ turn.T,
+        receivers=(example.levels.receivers - centre) @ turn.T,
+        level=_noisy(example.levels.level, random),
+    )
+    axes = np.zeros((len(example.onsets), 3))
+    hull = EchoHull(levels.emitters, levels.receivers, example.onsets, axes)
+    crop = Lattice(
+        np.full(3, -(2 * side - 1) / 2 * lattice.spacing), lattice.spacing, (2 * side,) * 3
+    )
+    places = features_of(levels, some, hull, crop, free_places(hull, crop))
+    features, bound = places.turned(*FRAMES[0])
+    at = lattice.coordinates(crop.points() @ turn + centre).T
+    true = map_coordinates(example.true, at, order=1, mode="constant", cval=FAR)
+    return features, bound, true.reshape(crop.shape)
+
+
+def _poses(example: Example, random: np.random.Generator) -> Ints:
+    """Return all poses, few of them, those of one side, or those of a belt."""
+    emitters = example.levels.emitters
+    count, which = len(emitters), random.random()
+    if which < 0.4:
+        return np.arange(count)
+    if which < 0.75:
+        few = int(FEWEST * (count / FEWEST) ** np.sqrt(random.random()))
+        return np.sort(random.choice(count, few, replace=False))
+    way = random.normal(size=3)
+    along = trimesh.unitize(emitters) @ (way / np.linalg.norm(way))
+    if which < 0.92:
+        some = np.flatnonzero(along > random.uniform(-0.5, 0.6))
+    else:
+        wide = random.uniform(0.15, 0.4)
+        some = np.flatnonzero(np.abs(along - random.uniform(-0.2, 0.5)) < wide)
+    return some if len(some) >= LEAST else np.arange(count)
+
+
+def _noisy(level: Singles, random: np.random.Generator) -> Singles:
+    """Return levels with noise of 15 to 40 dB below the loudest one, three times of ten."""
+    if random.random() > 0.3:
+        return level
+    noise = 10 ** random.uniform(-4, -1.5) * random.exponential(size=level.shape)
+    return (10 * np.log10(10 ** (level / 10) + noise)).astype(np.float32)

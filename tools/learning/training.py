@@ -4,109 +4,74 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from safetensors.torch import save as safetensors_bytes
 from torch import Tensor
 from torch.nn import functional
+from torch.utils.data import DataLoader, IterableDataset
 
 from sononerf import storage
 from sononerf.errors import InputError
-from sononerf.surface.start.learned import (
-    BLOCK,
-    FEATURES,
-    LOGIT,
-    OPEN,
-    OUTSIDE,
-    VECTORS,
-    StartNetwork,
-)
+from sononerf.surface.start.network import LOGIT, OUTSIDE, StartNetwork
+from tools.learning.examples import draw, load_example
 
-CROP = 64
-"""Side of a crop, voxels."""
-BATCH = 2
+SIDE = 40
+"""Side of a crop, places."""
+BATCH = 8
 """Number of crops per step."""
-RATE = 6e-4
+RATE = 1e-3
 """Largest learning rate of AdamW, no unit; cosine decay to a hundredth of it."""
-WARM = 0.03
-"""Fraction of the steps in which the rate rises linearly to its largest value, no unit."""
+WARM = 200
+"""Number of steps in which the rate rises linearly to its largest value."""
 CLASS = 0.7
 """Weight of the error of the sign beside that of the distance, no unit."""
 NEAR, NEAR_WEIGHT = 2.0, 4.0
 """Distance from the true surface, voxels, within which a voxel counts this many times."""
+FREE, FREE_WEIGHT = 3.0, 0.05
+"""Distance in front of the onsets, voxels, beyond which a voxel counts this many times."""
 BEYOND = 0.02
 """Weight of the error of a distance beyond OUTSIDE whose sign is right, no unit."""
 AVERAGE = 0.998
 """Decay per step of the running mean of the weights, no unit."""
-TOLD = 500
-"""Number of steps between two lines of progress."""
-WITHHELD = 9
-"""Every ninth seed is withheld from the training."""
-_VECTORS = tuple(FEATURES - 3 * (VECTORS - n) for n in range(VECTORS))  # first component of each
-_DISTANCES, _POSES = (0, OPEN, OPEN + 1), OPEN - 1  # features with a value outside of the lattice
+TOLD = 100
+"""Number of steps between two lines of progress, after which the state is saved."""
+WITHHELD = 12
+"""Every twelfth number is withheld from the training."""
+STATE = "training.pt"
+"""File of the state of a training, beside the examples."""
 
 
-@dataclass(frozen=True, eq=False)
-class Example:
-    """Evidence and truth of one body.
+class _Crops(IterableDataset[tuple[Tensor, Tensor, Tensor]]):
+    """Crops of examples, from a step on; each is drawn from seed and number."""
 
-    Attributes:
-        seen (FEATURES, X, Y, Z): float16.
-        true ((X, Y, Z), voxels): Signed distance, float16.
-        kind: Kind of the body.
-        seed: Its seed.
+    def __init__(self, files: list[Path], side: int, seed: int, first: int) -> None:
+        self.files, self.side, self.seed, self.first = files, side, seed, first
+
+    def __iter__(self) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        worker = torch.utils.data.get_worker_info()
+        number, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        # A loader takes whole batches from its workers in turn.
+        batch, within = self.first + number, 0
+        while True:
+            random = np.random.default_rng([self.seed, batch, within])
+            example = load_example(self.files[random.integers(len(self.files))])
+            yield tuple(torch.from_numpy(one) for one in draw(example, random, self.side))
+            within += 1
+            if within == BATCH:
+                batch, within = batch + step, 0
+
+
+def loss(found: Tensor, true: Tensor, bound: Tensor) -> Tensor:
+    """Return the mean loss of signed distances (B, X, Y, Z), voxels.
+
+    Args:
+        found, true: By the network, and the truth.
+        bound (B, X/2, Y/2, Z/2): Distance in front of the onsets.
     """
-
-    seen: Any
-    true: Any
-    kind: str
-    seed: int
-
-
-def load_examples(folder: Path) -> list[Example]:
-    """Return the examples of a folder by their seeds."""
-    found = []
-    for file in sorted(folder.glob("*.npz"), key=lambda file: int(file.stem)):
-        with np.load(file) as stored:
-            kind, seed = str(stored["kind"]), int(file.stem)
-            found.append(Example(stored["seen"], stored["true"], kind, seed))
-    return found
-
-
-def crop(example: Example, random: np.random.Generator) -> tuple[Any, Any]:
-    """Return a crop, turned and mirrored at random; air surrounds a small lattice."""
-    seen = np.zeros((FEATURES, CROP, CROP, CROP), np.float16)
-    for one in _DISTANCES:
-        seen[one] = 2.0
-    seen[_POSES] = example.seen[_POSES].flat[0]
-    true = np.full((CROP,) * 3, 1.5 * OUTSIDE, np.float16)
-    order, mirrored = random.permutation(3), random.random(3) < 0.5
-    features = np.arange(FEATURES)
-    for first in _VECTORS:
-        features[first : first + 3] = first + order
-    source, target = [], []
-    for size in np.asarray(example.true.shape)[order]:
-        shift = int(random.integers(0, abs(size - CROP) + 1))
-        start, length = max(0, size - CROP) and shift, min(size, CROP)
-        source.append(slice(start, start + length))
-        start = 0 if size >= CROP else shift
-        target.append(slice(start, start + length))
-    way = tuple(slice(None, None, -1 if back else 1) for back in mirrored)
-    true[way][tuple(target)] = example.true.transpose(order)[tuple(source)]
-    for made, given in zip(seen, features, strict=True):
-        made[way][tuple(target)] = example.seen[given].transpose(order)[tuple(source)]
-    for first in _VECTORS:
-        seen[first + np.flatnonzero(mirrored)] *= -1
-    return seen, true
-
-
-def loss(found: Tensor, true: Tensor) -> Tensor:
-    """Return the mean loss of signed distances (B, X, Y, Z), voxels."""
     aim = true.clamp(-OUTSIDE, OUTSIDE)
     right = (aim.abs() >= OUTSIDE) & (found * aim.sign() > OUTSIDE)
     off = torch.where(right, BEYOND * (found - aim), found - aim)
@@ -114,80 +79,81 @@ def loss(found: Tensor, true: Tensor) -> Tensor:
     sign = functional.binary_cross_entropy_with_logits(
         -found / LOGIT, (true < 0).float(), reduction="none"
     )
+    free = functional.interpolate(bound[:, None], scale_factor=2, mode="trilinear")[:, 0] > FREE
     weight = torch.where(true.abs() < NEAR, NEAR_WEIGHT, 1.0)
-    return (weight * (distance + CLASS * sign)).mean()
-
-
-@torch.no_grad()
-def overlaps(network: StartNetwork, examples: list[Example]) -> dict[str, tuple[float, float]]:
-    """Return the mean intersection over union of network and of the belief ``open``, by kind."""
-    found: dict[str, list[tuple[float, float]]] = {}
-    for one in examples:
-        wider = [(0, -size % BLOCK) for size in one.true.shape]
-        seen = np.pad(one.seen.astype(np.float32), [(0, 0), *wider], mode="edge")
-        made = network(torch.from_numpy(seen)[None])[0].numpy()
-        inside = one.true < 0
-        made = made[tuple(slice(size) for size in inside.shape)] < 0
-        start = one.seen[OPEN] < 0
-        both = [(part & inside).sum() / max(1, (part | inside).sum()) for part in (made, start)]
-        found.setdefault(one.kind, []).append((float(both[0]), float(both[1])))
-    return {kind: tuple(np.mean(all_, axis=0)) for kind, all_ in found.items()}
+    weight = weight * torch.where(free, FREE_WEIGHT, 1.0)
+    return (weight * (distance + CLASS * sign)).sum() / weight.sum()
 
 
 def train(
-    examples: list[Example],
+    folder: Path,
     *,
     steps: int,
     seed: int,
-    without: tuple[str, ...] = (),
+    side: int = SIDE,
+    workers: int = 0,
+    start: StartNetwork | None = None,
     tell: Callable[[str], None],
 ) -> StartNetwork:
     """Train, and return the network with the running mean of its weights.
 
+    The state is saved in the folder, and the same call goes on from it.
+
     Args:
-        examples: Every ``WITHHELD``-th seed is withheld.
-        steps: Number of steps; about 0.4 s of one core each.
+        folder: Folder of the examples; every ``WITHHELD``-th number is withheld.
+        steps: Number of steps.
         seed: Seed of weights and crops.
-        without: Kinds that are withheld too.
+        side: Side of a crop, places; a multiple of 8.
+        workers: Processes that draw crops; this one where 0.
+        start: Network to begin with; a new one where None.
         tell: Called with a line of progress every ``TOLD`` steps.
 
     Raises:
         InputError: If no example is left to train on.
     """
+    files = sorted(folder.glob("*.npz"), key=lambda file: int(file.stem))
+    files = [file for file in files if int(file.stem) % WITHHELD != 4]
+    if not files:
+        raise InputError("no examples to train on; make some first")
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     torch.manual_seed(seed)
-    random = np.random.default_rng(seed)
-    held = [one for one in examples if one.seed % WITHHELD == 4 or one.kind in without]
-    used = [one for one in examples if one.seed % WITHHELD != 4 and one.kind not in without]
-    if not used:
-        raise InputError("no examples to train on; make some, or withhold fewer kinds")
-    network = StartNetwork().to(memory_format=torch.channels_last_3d)
-    mean = StartNetwork()
+    network = (start or StartNetwork()).to(device, memory_format=torch.channels_last_3d).train()
+    mean = StartNetwork().to(device)
     mean.load_state_dict(network.state_dict())
     optimizer = torch.optim.AdamW(network.parameters(), RATE, betas=(0.9, 0.95), weight_decay=1e-2)
+    parts = {"network": network, "mean": mean, "optimizer": optimizer}
+    done, state = 0, folder / STATE
+    if state.is_file():
+        saved = torch.load(state, map_location=device, weights_only=True)
+        done = saved.pop("steps")
+        for name, part in parts.items():
+            part.load_state_dict(saved[name])
+    crops = DataLoader(_Crops(files, side, seed, done), BATCH, num_workers=workers)
     running = math.nan
-    for step in range(steps):
+    for step, batch in zip(range(done, steps), crops, strict=False):
+        seen, bound, true = (part.to(device) for part in batch)
         rate = RATE * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / steps)))
         for group in optimizer.param_groups:
-            group["lr"] = rate * min(1.0, (step + 1) / (WARM * steps))
-        crops = [crop(used[random.integers(len(used))], random) for _ in range(BATCH)]
-        seen, true = (torch.from_numpy(np.stack(both)) for both in zip(*crops, strict=True))
-        with torch.autocast("cpu", dtype=torch.bfloat16):
-            found = network(seen.bfloat16())
-        value = loss(found, true.float())
+            group["lr"] = rate * min(1.0, (step + 1) / WARM)
+        with torch.autocast(device.type, dtype=torch.bfloat16):
+            found = network(seen, bound)
+        value = loss(found, true, bound)
         optimizer.zero_grad()
         value.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 0.5)
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
-        share = 1 - min(AVERAGE, (step + 1) / (step + 11))
+        fraction = 1 - min(AVERAGE, (step + 1) / (step + 11))
         with torch.no_grad():
             for kept, new in zip(mean.parameters(), network.parameters(), strict=True):
-                kept.lerp_(new, share)
+                kept.lerp_(new, fraction)
         now = float(value.detach())
-        running = now if step == 0 else 0.98 * running + 0.02 * now
-        if (step + 1) % TOLD == 0:
-            shown = {k: f"{a:.2f}/{b:.2f}" for k, (a, b) in overlaps(mean, held[:24]).items()}
-            tell(f"step {step + 1} of {steps}, loss {running:.3f}, withheld {shown}")
-    return mean.eval()
+        running = now if math.isnan(running) else 0.98 * running + 0.02 * now
+        if (step + 1) % TOLD == 0 or step + 1 == steps:
+            tell(f"step {step + 1} of {steps}, loss {running:.3f}")
+            kept_state = {name: part.state_dict() for name, part in parts.items()}
+            data = {"steps": step + 1, **kept_state}
+            storage.commit(state, lambda opened, data=data: torch.save(data, opened))
+    return mean.cpu().eval()
 
 
 def weights_file(network: StartNetwork, target: Path) -> None:

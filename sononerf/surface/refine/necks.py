@@ -23,7 +23,7 @@ from skimage.segmentation import watershed
 
 from sononerf.array_types import Bools, Floats, Ints
 from sononerf.geometry.lattice import level_surface
-from sononerf.surface.refine.course import LATER
+from sononerf.surface.refine.candidates import LATER
 from sononerf.surface.refine.remesh import signed_distance
 
 SPACING = 0.4

@@ -19,9 +19,19 @@ from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import SonoNerfError
 from sononerf.simulation.simulator import Simulator
+from sononerf.surface.refine.candidates import (
+    ALIKE,
+    Candidate,
+    Way,
+    after_first_stage,
+    below,
+    best_of,
+    goes_on,
+    listed,
+    planned,
+)
 from sononerf.surface.refine.comparison import Comparison
 from sononerf.surface.refine.correction import Correction
-from sononerf.surface.refine.course import Course, Way, below, best_of, plans
 from sononerf.surface.refine.descent import (
     POSES,
     SHARP,
@@ -50,7 +60,7 @@ are 0.08 or higher. There a stool, a cone and the procedural bodies 101 and 116 
 of 0.24, 0.84, 0.70 and 0.42 with it, and of 0.45, 0.88, 0.95 and 0.72 without it. From 400 calls
 they are at most 0.04, and body 106 has 0.96 with it and 0.75 without it."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
-STATE_VERSION = 4
+STATE_VERSION = 5
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
 
 
@@ -69,8 +79,9 @@ class Refined:
             start, or better.
         error_db: Objective on validation poses, see
             :class:`~sononerf.surface.refine.comparison.Comparison`.
-        history: Per stage: its number, the start, its way, the mismatch of its last step, and the
-            objective on validation poses after it.
+        history: Per stage: its number, start, way, last mismatch, and objective after it.
+        candidates: Per start: its name, its objective, that of its best surface (None where it
+            did not get beyond the first stage), and whether it was chosen.
         faults: Faults of the refinement, one line each: a surface that could not be traced and
             counted as the worst, or a stage that went without the simulator's correction.
     """
@@ -84,6 +95,7 @@ class Refined:
     error_db: float
     history: list[dict[str, Any]]
     faults: list[str]
+    candidates: list[dict[str, Any]]
 
 
 def refine(
@@ -118,9 +130,9 @@ class Refinement:
     """Refinement, step by step; between any two steps it can be stopped, saved and resumed.
 
     Args:
-        meshes: Start surfaces, m. ``learned``, ``sheet`` and the best of the others go through the
-            first stage; one of the results goes through the later stages, see
-            :func:`~sononerf.surface.refine.course.best_of`.
+        meshes: Start surfaces, m. ``levels``, ``sheet`` and the best of the others go through the
+            first stage; one or two of the results go through the later stages, see
+            :func:`~sononerf.surface.refine.candidates.after_first_stage`.
         echoes: Measured spectrograms and onsets; the surface must begin at the onsets. If their
             level is absolute, gains are learned in the last stage alone: a rough surface is too
             faint, and a gain would hide that. Otherwise gains are learned from the first stage on.
@@ -130,7 +142,7 @@ class Refinement:
         stages: From coarse to fine; ``STAGES`` where None.
 
     Attributes:
-        courses: Those of the first stage; after it, the one that goes on.
+        candidates: Those of the first stage; after it, those that go on.
         history: As in :class:`Refined`, so far.
         newest: The surface that the last entry of the history tells of; None before the first, and
             after a state was taken over.
@@ -151,12 +163,14 @@ class Refinement:
         self.stages = stages or STAGES
         self.onsets = OnsetRanges(echoes.hull, optics.head.resolution, seed)
         self.starts = {name: _plain(mesh) for name, mesh in meshes.items()}
-        self.courses: list[Course] = []
+        self.candidates: list[Candidate] = []
         self.stage, self.step, self.drawn = 0, 0, 0
         self.history: list[dict[str, Any]] = []
         self.faults: list[str] = []
         self.newest: trimesh.Trimesh | None = None
-        self._at = 0  # number of the present course
+        self.compared: dict[StartMethod, float] = {}
+        self._far = optics.head.resolution
+        self._at = 0  # number of the present candidate
         self._descent: Descent | None = None
         self._later: LaterBounces | None = None
         self._source = 0  # number of the surface whose later bounces are added
@@ -168,18 +182,18 @@ class Refinement:
         return self.stage >= len(self.stages)
 
     @property
-    def course(self) -> Course:
-        """The present course."""
-        if not self.courses:
+    def candidate(self) -> Candidate:
+        """The present candidate."""
+        if not self.candidates:
             self._choose()
-        return self.courses[self._at]
+        return self.candidates[self._at]
 
     def advance(self) -> float:
         """Do one step; return its mismatch, dB."""
-        stage, course = self.stages[self.stage], self.course
+        stage, candidate = self.stages[self.stage], self.candidate
         if self._descent is None:
             if stage.beyond == "trace":
-                self._source = len(course.meshes) - 1
+                self._source = len(candidate.meshes) - 1
             self._descent = self._descend(self._prepared())
         mismatch = self._descent.step(self.drawn, self.step / stage.steps)
         self.step += 1
@@ -191,48 +205,53 @@ class Refinement:
     def _prepared(self) -> trimesh.Trimesh:
         """Return the surface that a stage begins with."""
         stage, unit = self.stages[self.stage], self.optics.wavelength
-        before, plane = self.course.meshes[-1], self.optics.plane
-        if self.course.way == "sheet":
+        before, plane = self.candidate.meshes[-1], self.optics.plane
+        if self.candidate.way == "sheet":
             return before
         made = None
-        if self.course.way == "blurred":
+        if self.candidate.way == "blurred":
             made = remesh(before, stage.edge * unit, stage.blur * unit, plane)
         if made is None:
             made = remesh(before, min(SHARP, stage.edge) * unit, 0.0, plane)
         return before if made is None else made
 
     def _finish(self, mismatch: float) -> None:
-        """End a stage of the present course."""
+        """End a stage of the present candidate."""
         assert self._descent is not None
-        course, mesh = self.course, self._descent.mesh()
+        candidate, mesh = self.candidate, self._descent.mesh()
         self._descent, self.step = None, 0
         name = f"the surface of stage {self.stage}"
-        objective = self._objective(mesh, name, course.level, smooth=True)
+        objective = self._objective(mesh, name, candidate.level, smooth=True)
         self.history.append(
             {
                 "stage": self.stage,
-                "start": course.start,
-                "way": course.way,
+                "start": candidate.start,
+                "way": candidate.way,
                 "mismatch_db": mismatch,
                 "objective_db": objective,
             }
         )
         self.newest = mesh
-        course.meshes.append(mesh)
-        course.objectives.append(objective)
-        if self.stage == 0 and self._at + 1 < len(self.courses):
+        candidate.meshes.append(mesh)
+        candidate.objectives.append(objective)
+        if self.stage == 0 and self._at + 1 < len(self.candidates):
             self._at += 1
             return
         if self.stage == 0:
-            course = best_of(self.courses)
-            if math.isnan(course.objectives[0]):
-                course.objectives[0] = self._compared(course.start)
-            self.courses, self._at, self._later = [course], 0, None
+            self.candidates, self._at = after_first_stage(self.candidates), 0
+            for one in self.candidates:
+                if math.isnan(one.objectives[0]):
+                    one.objectives[0] = self._compared(one.start)
+            self._later = None
         self.stage += 1
+        first, *others = self.candidates
+        if self.done and self._at < len(others) and len(self.stages) > 1:
+            if goes_on(others[self._at], first, ALIKE * self.optics.wavelength):
+                self._at, self.stage, self._later = self._at + 1, 1, None
 
     def _choose(self) -> None:
-        """Begin the courses; of the starts other than learned and sheet, the best takes part."""
-        names = [name for name in self.starts if name not in ("learned", "sheet")]
+        """Begin the candidates; of the starts other than levels and sheet, the best takes part."""
+        names = [name for name in self.starts if name not in ("levels", "sheet")]
         found = dict.fromkeys(self.starts, math.nan)
         if len(names) > 1 and "hull" in names:
             ridges = self.onsets.ridges(self.starts["hull"])
@@ -241,9 +260,9 @@ class Refinement:
                 del found["hull"]
         if len(names) > 1:
             found.update({name: self._compared(name) for name in names})
-        for start, way in plans(found):
-            mesh, objective = self.starts[start], found[start]
-            self.courses.append(Course(way, start, self._new_level(), [mesh], [objective]))
+        for start, way in planned(found):
+            begun = [self.starts[start]], [found[start]]
+            self.candidates.append(Candidate(way, start, self._new_level(), *begun, self._far))
 
     def _new_level(self) -> Level:
         like = self.optics.get_buffer("wavenumber")
@@ -252,7 +271,8 @@ class Refinement:
     def _compared(self, name: StartMethod) -> float:
         """Return the objective of a start."""
         mesh, level = self.starts[name], self._new_level()
-        return self._objective(mesh, f"the start {name}", level, smooth=False)
+        self.compared[name] = self._objective(mesh, f"the start {name}", level, smooth=False)
+        return self.compared[name]
 
     def _objective(self, mesh: trimesh.Trimesh, name: str, level: Level, *, smooth: bool) -> float:
         """Return the objective of a surface; infinite if it cannot be traced."""
@@ -269,30 +289,30 @@ class Refinement:
             logger.warning("%s", fault)
 
     def _descend(self, mesh: trimesh.Trimesh) -> Descent:
-        stage, course = self.stages[self.stage], self.course
+        stage, candidate = self.stages[self.stage], self.candidate
         last = self.stage == len(self.stages) - 1
-        course.level.learns = "none" if self.echoes.calibrated and not last else "each"
+        candidate.level.learns = "none" if self.echoes.calibrated and not last else "each"
         correction = None
         if stage.beyond == "simulate":
             self._later, correction = None, self._correction(mesh)
         elif stage.beyond == "none":
             self._later = None
         elif stage.beyond == "trace" or self._later is None:
-            source = course.meshes[self._source]
+            source = candidate.meshes[self._source]
             self._later = LaterBounces(self.optics, source, self.echoes, seed=self.seed)
             self._later.trace(self._coming())
         return Descent(
             mesh,
             self.echoes,
             self.optics,
-            course.level,
+            candidate.level,
             smoothing=stage.smoothing * self.optics.wavelength,
             rate=stage.rate,
             later=self._later,
             correction=correction,
             # The simulator's correction is more exact than the onsets.
             onsets=None if correction is not None else self.onsets,
-            sheet=course.way == "sheet",
+            sheet=candidate.way == "sheet",
             band=stage.band,
             seed=self.seed,
         )
@@ -341,10 +361,13 @@ class Refinement:
                 dtype=torch.float64,
             ).reshape(-1, 5),
             "faults": torch.tensor(list("\n".join(self.faults).encode()), dtype=torch.uint8),
+            "compared": torch.tensor(
+                [self.compared.get(name, math.nan) for name in starts], dtype=torch.float64
+            ),
         }
-        for number, course in enumerate(self.courses):
-            parts = course.state()
-            found.update({f"course.{number}.{name}": part for name, part in parts.items()})
+        for number, candidate in enumerate(self.candidates):
+            parts = candidate.state()
+            found.update({f"candidate.{number}.{name}": part for name, part in parts.items()})
         if self._descent is not None:
             parts = self._descent.state()
             found.update({f"descent.{name}": part for name, part in parts.items()})
@@ -356,9 +379,9 @@ class Refinement:
             int(part) for part in state["progress"]
         )
         starts, ways = list(self.starts), get_args(Way)
-        self.courses = []
-        while parts := below(state, f"course.{len(self.courses)}."):
-            self.courses.append(Course.of(parts, self._new_level()))
+        self.candidates = []
+        while parts := below(state, f"candidate.{len(self.candidates)}."):
+            self.candidates.append(Candidate.of(parts, self._new_level(), self._far))
         self.history = [
             {
                 "stage": int(stage),
@@ -370,6 +393,8 @@ class Refinement:
             for stage, start, way, mismatch, objective in state["history"].tolist()
         ]
         self.faults = bytes(state["faults"].tolist()).decode().splitlines()
+        compared = zip(starts, state["compared"].tolist(), strict=True)
+        self.compared = {name: error for name, error in compared if not math.isnan(error)}
         self._later, self._descent = None, None
         if parts := below(state, "descent."):
             begun = trimesh.Trimesh(parts["start"].numpy(), parts["faces"].numpy(), process=False)
@@ -378,16 +403,16 @@ class Refinement:
 
     def result(self) -> Refined:
         """Return the best surface so far; the start where all refined ones are clearly worse."""
-        if not self.courses:
+        if not self.candidates:
             self._choose()
-        course = self.courses[self._at]
-        best = course.best
-        objective = course.objectives[best]
+        candidate = best_of(self.candidates)
+        best = candidate.best
+        objective = candidate.objectives[best]
         mesh, doubtful = without_necks(
-            course.meshes[best],
+            candidate.meshes[best],
             self.optics.wavelength,
             lambda mesh: self._objective(
-                mesh, "a surface with a cut neck", course.level, smooth=False
+                mesh, "a surface with a cut neck", candidate.level, smooth=False
             ),
         )
         confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
@@ -405,14 +430,15 @@ class Refinement:
             mesh, values = finer(mesh, values, self.optics.wavelength)
         return Refined(
             mesh=mesh,
-            gain=course.level.gain.exp().cpu().double().numpy(),
+            gain=candidate.level.gain.exp().cpu().double().numpy(),
             confidence=values[:, 0],
             error=values[:, 1],
-            start=course.start,
+            start=candidate.start,
             kept=best > 0,
             error_db=objective,
             history=self.history,
             faults=self.faults,
+            candidates=listed(self.starts, self.compared, self.candidates),
         )
 
 

@@ -28,7 +28,6 @@ from scipy import fft, ndimage
 
 from sononerf.array_types import Floats, Singles
 from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.range_levels import RangeLevels
 from sononerf.errors import NumericalError
 from sononerf.field.field import Field
 from sononerf.geometry.lattice import MARGIN, Lattice, level_surface
@@ -211,7 +210,6 @@ class Gathered:
             it.
         hull: The free space.
         resolution (m): Range resolution.
-        levels: Levels of the echoes over range; None if only the free space is known.
     """
 
     evidence: Evidence
@@ -222,7 +220,6 @@ class Gathered:
     bound: Singles
     hull: EchoHull
     resolution: float
-    levels: RangeLevels | None = None
     _found: dict[str, Singles] = field(default_factory=dict, init=False, repr=False)
 
 
@@ -234,7 +231,6 @@ def gather_evidence(
     upper: Floats,
     spacing: float,
     resolution: float,
-    levels: RangeLevels | None = None,
 ) -> Gathered:
     """Return the evidence of field and onsets about a region.
 
@@ -245,7 +241,6 @@ def gather_evidence(
         lower, upper ((3,), m): The region.
         spacing (m): Spacing of the voxels.
         resolution (m): Range resolution of the analysis.
-        levels: Levels of the echoes over range, where they are known.
 
     Raises:
         NumericalError: If nothing was heard.
@@ -262,7 +257,7 @@ def gather_evidence(
     farthest = max(lattice.shape)
     bound = (-clearance_grid(hull, lattice) / spacing).clip(-farthest, farthest)
     bound = _walled(bound.astype(np.float32))
-    return Gathered(evidence, weight, points, lattice, thin, bound, hull, resolution, levels)
+    return Gathered(evidence, weight, points, lattice, thin, bound, hull, resolution)
 
 
 def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> trimesh.Trimesh:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""From a fitted field to its volume, its evidence, and the start surfaces of both."""
+"""From echoes, and a fitted field if there is one, to the start surfaces."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from scipy.ndimage import uniform_filter
 from torch import Tensor
 
 from sononerf.array_types import Floats
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.range_levels import RangeLevels
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
-from sononerf.surface.start.learned import learned_surface
+from sononerf.surface.start.network import levels_surface
 from sononerf.surface.start.occupancy import Gathered, estimate_occupancy, gather_evidence
 from sononerf.surface.start.sheet import fit_sheet
 from sononerf.surface.start.volume import (
@@ -34,27 +35,42 @@ _FAINTEST = (
 )
 _CHUNK = 16_384  # places at a time, a bound of memory
 
-StartMethod = Literal["open", "filled", "hull", "sheet", "learned"]
+StartMethod = Literal["open", "filled", "hull", "sheet", "levels"]
 """Method of a start surface. The first three are the surface of the occupancy
 (:mod:`sononerf.surface.start.occupancy`); ``sheet`` is one thin body
-(:mod:`sononerf.surface.start.sheet`); ``learned`` is that of a network
-(:mod:`sononerf.surface.start.learned`)."""
-Method = Literal["open", "filled", "hull", "sheet", "learned", "isosurface"]
+(:mod:`sononerf.surface.start.sheet`); ``levels`` is that of a network, and the only one that needs
+no fitted field (:mod:`sononerf.surface.start.network`)."""
+Method = Literal["open", "filled", "hull", "sheet", "levels", "isosurface"]
 """A start method, or ``isosurface``: a level of the field's volume."""
 
 
+STARTS: tuple[StartMethod, ...] = ("open", "filled", "hull", "levels", "sheet")
+"""Start surfaces that a refinement tries; how far they lie apart is part of the error of the
+surface."""
+
+
 @dataclass(frozen=True, eq=False)
-class FieldReading:
-    """A field on a grid, and the evidence that field and onsets give.
+class Reading:
+    """All that start surfaces are made of.
 
     Attributes:
-        volume: The field's energy.
-        gathered: The evidence.
+        hull: The onsets and the poses that they were heard from.
+        box ((2, 3), m): Lower and upper corner of the region.
+        resolution (m): Range resolution of the analysis.
+        levels: Levels of the echoes over range; None if only the free space is known.
+        volume: Energy of the field; None without a field, like the next one.
+        gathered: Evidence of field and onsets.
+        methods: Start surfaces that a refinement tries.
         found: Start surfaces that were made of it, by method.
     """
 
-    volume: Volume
-    gathered: Gathered
+    hull: EchoHull
+    box: Floats
+    resolution: float
+    levels: RangeLevels | None = None
+    volume: Volume | None = None
+    gathered: Gathered | None = None
+    methods: tuple[StartMethod, ...] = STARTS
     found: dict[StartMethod, trimesh.Trimesh] = field(default_factory=dict, repr=False)
 
 
@@ -67,7 +83,7 @@ def read_field(
     directions: int = 100,
     levels: RangeLevels | None = None,
     progress: Callable[[int, int], None] | None = None,
-) -> FieldReading:
+) -> Reading:
     """Read volume and evidence out of a field.
 
     Args:
@@ -76,24 +92,38 @@ def read_field(
         resolution (m): Range resolution of the analysis.
         spacing (m): Voxel size; half of the field's own resolution where None.
         directions: Size of the spherical lattice that is summed over where the field has no lobes.
-        levels: Levels of the echoes over range, for the method ``learned``.
+        levels: Levels of the echoes over range, for the method ``levels``.
         progress: Called with the voxels done and the voxels in all.
     """
     lower, upper, step = _grid_of(field, spacing)
     energy = _energy(field, directions)
     volume = volume_from_function(energy, lower, upper, step, chunk=_CHUNK, progress=progress)
     places = _places(field, lower, upper, directions)
-    known = gather_evidence(field, places, hull, lower, upper, step, resolution, levels)
-    return FieldReading(volume, known)
+    known = gather_evidence(field, places, hull, lower, upper, step, resolution)
+    return Reading(hull, np.stack([lower, upper]), resolution, levels, volume, known)
+
+
+def read_echoes(echoes: Echoes) -> Reading:
+    """Return what start surfaces are made of where there is no field.
+
+    Args:
+        echoes: Measured echoes; their region is the box that they are known to come from, or else
+            the one that they leave possible.
+
+    Raises:
+        NumericalError: If no pose received an echo that another one confirms.
+    """
+    box = echoes.region.box() if echoes.box is None else echoes.box
+    return Reading(echoes.hull, box, echoes.head.resolution, echoes.levels, methods=("levels",))
 
 
 def start_surfaces(
-    reading: FieldReading, methods: Sequence[StartMethod]
+    reading: Reading, methods: Sequence[StartMethod]
 ) -> Iterator[tuple[StartMethod, trimesh.Trimesh]]:
     """Yield each method that gives a surface, and its closed mesh, m.
 
     Args:
-        reading: Evidence of a field.
+        reading: Evidence that they are made of.
         methods: In this order.
 
     Raises:
@@ -105,7 +135,7 @@ def start_surfaces(
     for method in methods:
         try:
             if method not in reading.found:
-                reading.found[method] = _start(reading.gathered, method)
+                reading.found[method] = _start(reading, method)
         except NumericalError as error:
             first = first or error
             continue
@@ -115,10 +145,14 @@ def start_surfaces(
         raise first
 
 
-def _start(known: Gathered, method: StartMethod) -> trimesh.Trimesh:
+def _start(reading: Reading, method: StartMethod) -> trimesh.Trimesh:
+    if method == "levels":
+        return levels_surface(reading.levels, reading.hull, reading.box, reading.resolution)
+    if reading.gathered is None:
+        raise NumericalError(f"the start {method} needs a fitted field; without one take levels")
     if method == "sheet":
-        return fit_sheet(known)
-    return learned_surface(known) if method == "learned" else estimate_occupancy(known, method)
+        return fit_sheet(reading.gathered)
+    return estimate_occupancy(reading.gathered, method)
 
 
 def read_isosurface(

@@ -19,7 +19,7 @@ from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine import comparison
 from sononerf.surface.refine import refinement as module
-from sononerf.surface.refine.course import Course, number_of_steps
+from sononerf.surface.refine.candidates import Candidate, number_of_steps
 from sononerf.surface.refine.descent import Descent, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
@@ -66,7 +66,7 @@ def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, e
     )
     while work.stage == 0:
         work.advance()
-    gain = work.course.level.gain[0].exp().numpy()
+    gain = work.candidate.level.gain[0].exp().numpy()
     assert gain[-1] / gain[0] > 5.0
 
 
@@ -118,15 +118,15 @@ def test_of_two_starts_the_one_that_explains_more_is_refined(bumpy, echoes, opti
     for starts in ({"whole": bumpy, "half": half}, {"half": half, "whole": bumpy}):
         work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
         work.advance()
-        assert [(one.start, one.way) for one in work.courses] == [
+        assert [(one.start, one.way) for one in work.candidates] == [
             ("whole", "blurred"),
             ("whole", "sharp"),
         ]
-        (begun,) = work.course.meshes
+        (begun,) = work.candidate.meshes
         np.testing.assert_array_equal(begun.vertices, bumpy.vertices)
         again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
         again.load(work.state())
-        assert again.course.start == "whole"
+        assert again.candidate.start == "whole"
 
 
 @pytest.mark.parametrize(("count", "chosen"), [(20, "filled"), (1000, "hull")])
@@ -139,7 +139,7 @@ def test_a_hull_takes_part_only_if_poses_are_dense(bumpy, echoes, optics, count,
     starts = {"hull": bumpy, "filled": bumpy.copy().apply_scale(0.5)}
     for given, found in ((starts, chosen), ({"hull": bumpy}, "hull")):
         work = Refinement(given, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-        assert work.course.start == found
+        assert work.candidate.start == found
 
 
 @pytest.fixture
@@ -205,7 +205,7 @@ def test_going_on_from_any_step_ends_the_same(bumpy, echoes, optics, simulated_s
         again.load(states[step])
         while not again.done:
             again.advance()
-        one, other = again.course, whole.course
+        one, other = again.candidate, whole.candidate
         assert np.array_equal(one.meshes[-1].vertices, other.meshes[-1].vertices)
         assert torch.equal(one.level.gain, other.level.gain)
 
@@ -290,50 +290,73 @@ def test_the_better_of_the_blurred_and_the_sharp_surface_goes_on(
             work.advance()
             if work.step == 0:
                 ends.append(work.newest)
-        (course,) = work.courses
-        assert course.way == better
-        assert course.meshes[1:] == [ends[0] if better == "blurred" else ends[1]]
+        (candidate,) = work.candidates
+        assert candidate.way == better
+        assert candidate.meshes[1:] == [ends[0] if better == "blurred" else ends[1]]
 
 
 def way_of(work):
-    return work.courses[work._at].way if work.courses else "start"
+    return work.candidates[work._at].way if work.candidates else "start"
+
+
+PLANS = [("levels", "sharp"), ("body", "blurred"), ("body", "sharp")]
 
 
 @pytest.mark.thorough
 @pytest.mark.parametrize(
-    ("objectives", "chosen"),
+    ("objectives", "last", "chosen", "stages"),
     [
-        ((1.1, 1.2, 1.0, 1.0), ("learned", "blurred")),
-        ((2.0, 1.1, 1.0, 1.0), ("learned", "sharp")),
-        ((2.0, 1.2, 1.1, 1.0), ("body", "blurred")),
-        ((2.0, 1.2, 2.0, 1.0), ("body", "sharp")),
+        # Both go through all stages; the better one is chosen, levels in doubt above 4 dB.
+        ((1.0, 1.1, 1.1), {"levels": 1.0, "body": 0.9}, ("body", "blurred"), 5),
+        ((1.0, 1.4, 1.1), {"levels": 0.8, "body": 0.9}, ("levels", "sharp"), 5),
+        ((5.0, 5.4, 5.0), {"levels": 5.0, "body": 4.5}, ("levels", "sharp"), 5),
+        ((5.0, 5.4, 5.0), {"levels": 5.0, "body": 4.1}, ("body", "blurred"), 5),
+        # One that is clearly worse after the first stage is left behind.
+        ((1.0, 1.3, 1.2), {"levels": 1.0}, ("levels", "sharp"), 4),
+        ((6.5, 5.4, 5.0), {"body": 4.1}, ("body", "blurred"), 4),
     ],
 )
-def test_the_learned_start_and_the_best_other_one_go_both_ways(
-    bumpy, echoes, optics, monkeypatch, objectives, chosen
+def test_levels_and_the_best_other_start_stay_until_they_lose(
+    bumpy, echoes, optics, monkeypatch, objectives, last, chosen, stages
 ):
-    small, large = (bumpy.copy().apply_scale(factor) for factor in (0.8, 1.02))
-    starts = {"small": small, "body": bumpy, "learned": large}
+    small, large = (bumpy.copy().apply_scale(factor) for factor in (0.8, 1.1))
+    starts = {"small": small, "body": bumpy, "levels": large}
     work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-    plans = [(name, way) for name in ("learned", "body") for way in ("blurred", "sharp")]
-    found = dict(zip(plans, objectives, strict=True))
+    first = dict(zip(PLANS, objectives, strict=True))
 
     def objective(mesh, *given, **named):
         if any(mesh is start for start in work.starts.values()):
             return 9.0 + abs(np.ptp(mesh.vertices[:, 0]) / np.ptp(bumpy.vertices[:, 0]) - 1.0)
-        return found[work.course.start, work.course.way]
+        if work.stage == 0:
+            return first[work.candidate.start, work.candidate.way]
+        return last[work.candidate.start]
 
     monkeypatch.setattr(work.comparison, "objective", objective)
     while not work.done:
         work.advance()
-    assert [(one["start"], one["way"]) for one in work.history[:4]] == plans
-    assert work.drawn == number_of_steps(starts, SHORT)
-    assert (work.course.start, work.course.way) == chosen
-    assert work.result().kept
+    assert [(one["start"], one["way"]) for one in work.history[:3]] == PLANS
+    assert len(work.history) == stages
+    assert work.drawn == 8 * stages <= number_of_steps(starts, SHORT)
     again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
     again.load(work.state())
-    assert (again.course.start, again.course.way) == chosen
     assert again.history == work.history
+    for one in (work, again):
+        found = one.result()
+        assert (found.start, found.kept) == (chosen[0], True)
+        listed = {each["start"]: each for each in found.candidates}
+        assert [name for name, each in listed.items() if each["chosen"]] == [chosen[0]]
+        assert listed["small"]["error_db"] is None
+        assert all(each["start_error_db"] >= 9 for each in listed.values())
+        assert {name: listed[name]["error_db"] for name in last} == pytest.approx(last)
+
+
+def test_of_two_surfaces_that_sound_alike_one_goes_on(bumpy, echoes, optics):
+    starts = {"body": bumpy, "levels": bumpy.copy()}
+    work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+    while not work.done:
+        work.advance()
+    assert len(work.history) == 4
+    assert sum(one["start"] == "body" for one in work.history[3:]) <= 1
 
 
 @pytest.mark.parametrize(
@@ -349,8 +372,36 @@ def test_the_learned_start_and_the_best_other_one_go_both_ways(
     ],
 )
 def test_the_later_of_equal_surfaces_is_kept(bumpy, objectives, best):
-    course = Course("sharp", "body", None, [bumpy] * len(objectives), list(objectives))
-    assert course.best == best
+    candidate = Candidate("sharp", "body", None, [bumpy] * len(objectives), list(objectives))
+    assert candidate.best == best
+
+
+@pytest.mark.parametrize(
+    ("objectives", "best"),
+    [
+        ((9.0, 5.0, 4.8, 4.7), 1),  # the earliest that explains about as much
+        ((9.0, 6.0, 5.0, 4.7), 2),
+        ((5.0, 5.2, 4.8, 4.7), 0),
+        ((5.0, 3.5, 3.45, 3.4), 3),  # it ranks rightly
+    ],
+)
+def test_where_the_error_hardly_ranks_the_earliest_surface_of_levels_is_kept(
+    bumpy, objectives, best
+):
+    candidate = Candidate("sharp", "levels", None, [bumpy] * len(objectives), list(objectives))
+    assert candidate.best == best
+
+
+@pytest.mark.parametrize(("error", "kept"), [(6.0, False), (3.0, True)])
+def test_a_torn_surface_loses_unless_its_error_is_low(bumpy, error, kept):
+    other = bumpy.copy()
+    other.apply_translation([0.1, 0, 0])
+    in_two = trimesh.util.concatenate([bumpy, other])
+    moved = bumpy.copy()
+    moved.apply_scale(2.0)
+    for mesh in (in_two, moved):
+        candidate = Candidate("sharp", "open", None, [bumpy, mesh], [9.0, error], 0.006)
+        assert (candidate.best > 0) == kept
 
 
 def slab(height):
@@ -375,14 +426,14 @@ def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
         while not work.done:
             work.advance()
         assert work.drawn == number_of_steps(starts, SHORT)
-        (course,) = work.courses
-        assert course.start == start
+        (candidate,) = work.candidates
+        assert candidate.start == start
         again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
         again.load(work.state())
-        assert (again.course.start, again.course.way) == (start, course.way)
+        assert (again.candidate.start, again.candidate.way) == (start, candidate.way)
         assert again.history == work.history
         if start == "sheet":
-            assert all(len(mesh.faces) == len(thin.faces) for mesh in course.meshes)
+            assert all(len(mesh.faces) == len(thin.faces) for mesh in candidate.meshes)
 
 
 def test_a_sheet_alone_is_refined(echoes, optics):

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: MIT
+"""Candidates of a refinement: each is one start that goes through the stages in one way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, cast
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from sononerf.array_types import Floats
+from sononerf.surface.refine.descent import STAGES, Stage
+from sononerf.surface.refine.objective import Level
+from sononerf.surface.refine.remesh import distance_from
+from sononerf.surface.start.read_out import StartMethod
+
+TOLERATED = 1.15
+"""Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
+a sheet goes on after the first stage; or else the blurred surface before the sharp one, because it
+is smoother. A refined surface is preferred to its start within it: a start that was made from the
+onsets fits them even where it is wrong."""
+RANKS_DB = 4.0
+"""Objective below which it ranks surfaces rightly, dB. Above it, surfaces with a lower objective
+are often worse: on bodies of bars and blocks it falls from stage to stage while the F-score falls
+too (``docs/notes/surface.md``). Then a torn surface loses against its start, ``levels``, which has
+heard many bodies, is preferred to other starts, and of its surfaces the earliest one to later ones,
+all within ``TOLERATED``."""
+ALIKE = 1 / 16
+"""Mean distance below which two surfaces sound alike, shortest wavelengths: the way there and back
+counts it twice, so it changes phases by at most 45 degrees. One of them is enough."""
+LATER = 1.03
+"""Ratio of two objectives of one candidate below which the later stage is preferred: on smooth
+bodies later stages are nearer to the truth at the same objective. Edges lose in later stages, and
+there the objective rises by 5 % and more (beaker, star)."""
+Way = Literal["blurred", "sharp", "sheet"]
+"""Way of a surface through the stages. ``blurred``: with the blur and the edges of each stage,
+unless the blur would take away thin parts. ``sharp``: without blur, on fine triangles. ``sheet``:
+its triangles are kept, because a signed distance on voxels would tear it."""
+
+
+@dataclass(eq=False)
+class Candidate:
+    """A start that goes through the stages in one way.
+
+    Attributes:
+        way: The way.
+        start: Name of the start.
+        level: Its gains and errors.
+        meshes: The start, and the surface after each stage so far, m.
+        objectives: Objectives of these on the validation poses; NaN for a start that was not
+            compared.
+        far (m): Range resolution. A surface that is farther from its start at the median is torn.
+    """
+
+    way: Way
+    start: StartMethod
+    level: Level
+    meshes: list[trimesh.Trimesh]
+    objectives: list[float]
+    far: float = math.inf
+    _torn: dict[int, bool] = field(default_factory=dict, repr=False)
+
+    @property
+    def best(self) -> int:
+        """Number of the best surface: 0, the start, where all refined ones are clearly worse.
+
+        Of surfaces that explain the echoes about as well it is the latest one; but the earliest one
+        of ``levels`` where the objective hardly ranks.
+        """
+        start, *refined = self.objectives
+        refined = [
+            math.inf if self.torn(number) and one > RANKS_DB else one
+            for number, one in enumerate(refined, 1)
+        ]
+        least = min(refined, default=math.inf)
+        if math.isinf(least) or least > TOLERATED * start:
+            return 0
+        if self.start == "levels" and least > RANKS_DB:
+            return next(n for n, one in enumerate([start, *refined]) if one <= TOLERATED * least)
+        return max(n for n, found in enumerate(refined, 1) if found <= LATER * least)
+
+    @property
+    def objective(self) -> float:
+        """Objective of the best surface, dB."""
+        return self.objectives[self.best]
+
+    def torn(self, number: int) -> bool:
+        """Whether a surface has more parts than its start, or is farther from it than ``far``."""
+        if number not in self._torn:
+            start, mesh = self.meshes[0], self.meshes[number]
+            self._torn[number] = parts_of(mesh) > parts_of(start) or (
+                float(np.median(distances(mesh, start))) > self.far
+            )
+        return self._torn[number]
+
+    def state(self) -> dict[str, Tensor]:
+        """Return all as plain tensors."""
+        found = {f"level.{name}": part for name, part in self.level.state().items()}
+        found["names"] = torch.tensor(list(f"{self.way} {self.start}".encode()), dtype=torch.uint8)
+        found["objectives"] = torch.tensor(self.objectives, dtype=torch.float64)
+        for stage, mesh in enumerate(self.meshes):
+            found[f"mesh.{stage}.vertices"] = torch.as_tensor(np.array(mesh.vertices))
+            found[f"mesh.{stage}.faces"] = torch.as_tensor(np.array(mesh.faces))
+        return found
+
+    @classmethod
+    def of(cls, state: dict[str, Tensor], level: Level, far: float) -> Candidate:
+        """Return the candidate of a state.
+
+        Args:
+            state: From :meth:`state`.
+            level: Takes over that of the state.
+            far (m): As the attribute.
+        """
+        level.load(below(state, "level."))
+        way, start = bytes(state["names"].tolist()).decode().split(" ", 1)
+        meshes: list[trimesh.Trimesh] = []
+        while parts := below(state, f"mesh.{len(meshes)}."):
+            vertices, faces = parts["vertices"].numpy(), parts["faces"].numpy()
+            meshes.append(trimesh.Trimesh(vertices, faces, process=False))
+        return cls(
+            cast(Any, way), cast(Any, start), level, meshes, state["objectives"].tolist(), far
+        )
+
+
+def below(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    """Return the tensors whose names begin with a name, by the rest of theirs."""
+    return {key.removeprefix(name): part for key, part in state.items() if key.startswith(name)}
+
+
+def planned(starts: Mapping[StartMethod, float]) -> list[tuple[StartMethod, Way]]:
+    """Return the start and the way of each candidate.
+
+    Args:
+        starts: Start methods, and their objectives before the first stage.
+
+    Returns:
+        plans: ``levels`` is smooth already, so it goes sharp; the best of the others goes both
+            ways; a sheet has its own.
+    """
+    others = [name for name in starts if name not in ("levels", "sheet")]
+    chosen = sorted(others, key=lambda name: starts[name])[:1]
+    found: list[tuple[StartMethod, Way]] = [(name, "sharp") for name in starts if name == "levels"]
+    found += [(name, way) for name in chosen for way in ("blurred", "sharp")]
+    return [*found, *((name, "sheet") for name in starts if name == "sheet")]
+
+
+def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = STAGES) -> int:
+    """Return the steps of a refinement of start methods, at most; a sheet goes on alone."""
+    plans = planned(dict.fromkeys(starts, 0.0))
+    further = max(1, len({start for start, _ in plans if start != "sheet"}))
+    return len(plans) * stages[0].steps + further * sum(stage.steps for stage in stages[1:])
+
+
+def after_first_stage(candidates: list[Candidate]) -> list[Candidate]:
+    """Return the candidates that go on after the first stage, the best one first.
+
+    A sheet that is about as good as the best one goes on alone. Else each start goes on in its
+    better way.
+    """
+    good = TOLERATED * min(one.objectives[-1] for one in candidates)
+    sheets = [one for one in candidates if one.way == "sheet"]
+    if any(one.objectives[-1] <= good for one in sheets):
+        return sheets
+    left = [one for one in candidates if one.way != "sheet"] or sheets
+    chosen = []
+    for start in dict.fromkeys(one.start for one in left):
+        ways = [one for one in left if one.start == start]
+        near = TOLERATED * min(one.objectives[-1] for one in ways)
+        chosen.append(min(ways, key=lambda one: (one.objectives[-1] > near, one.way != "blurred")))
+    return sorted(chosen, key=lambda one: one.objectives[-1])
+
+
+def goes_on(candidate: Candidate, first: Candidate, alike: float) -> bool:
+    """Return whether a candidate goes on after the first stage beside a better one.
+
+    Args:
+        candidate: The worse one.
+        first: The better one, after all its stages.
+        alike (m): Mean distance below which surfaces sound alike.
+    """
+    if candidate.objectives[1] > TOLERATED * first.objectives[1]:
+        return False
+    return float(distances(candidate.meshes[1], first.meshes[1]).mean()) > alike
+
+
+def best_of(candidates: list[Candidate]) -> Candidate:
+    """Return the best candidate: that of the least objective, or ``levels`` in doubt."""
+    least = min(candidates, key=lambda one: one.objective)
+    if least.objective > RANKS_DB:
+        for one in candidates:
+            if one.start == "levels" and one.objective <= TOLERATED * least.objective:
+                return one
+    return least
+
+
+def listed(
+    starts: Iterable[StartMethod],
+    compared: Mapping[StartMethod, float],
+    candidates: list[Candidate],
+) -> list[dict[str, Any]]:
+    """Return what is told of the candidates, see ``Refined.candidates``.
+
+    Args:
+        starts: All start methods.
+        compared: Objectives of those that were compared before the first stage.
+        candidates: Those that went on after it.
+    """
+
+    def finite(value: float | None) -> float | None:
+        return value if value is not None and math.isfinite(value) else None
+
+    refined = {one.start: one.objective for one in candidates if len(one.meshes) > 1}
+    chosen = best_of(candidates).start
+    return [
+        {
+            "start": name,
+            "start_error_db": finite(compared.get(name)),
+            "error_db": finite(refined.get(name)),
+            "chosen": name == chosen,
+        }
+        for name in starts
+    ]
+
+
+def parts_of(mesh: trimesh.Trimesh) -> int:
+    """Return the number of parts with more than 1 % of the area of the largest one."""
+    areas = [part.area for part in mesh.split(only_watertight=False)]
+    return int(np.sum(np.asarray(areas) > 0.01 * max(areas, default=0.0)))
+
+
+def distances(mesh: trimesh.Trimesh, other: trimesh.Trimesh) -> Floats:
+    """Return the distance of each vertex of a mesh from another one, (V,) m."""
+    spacing = float(np.median(other.edges_unique_length))
+    return distance_from(other, np.asarray(mesh.vertices), spacing)
