@@ -65,8 +65,36 @@ def test_from_a_scene_to_numbers(made, tmp_path):
     assert len(trimesh.load_mesh(tmp_path / "mesh.ply").faces) == len(surface.mesh.faces)
 
 
+def test_echoes_alone_give_a_surface(made):
+    _, echoes, model, _ = made
+    surface = sn.reconstruct(echoes, progress=QUIET)
+    assert surface.method == "levels"
+    assert surface.mesh.is_watertight
+    off = np.abs(np.linalg.norm(surface.mesh.vertices, axis=1) - 0.02)
+    assert np.median(off) < echoes.head.resolution / 2
+    assert len(surface.confidence) == len(surface.mesh.vertices)
+    assert surface.confidence.max() > 0
+    with pytest.raises(SettingsError, match="method open needs a fitted model"):
+        sn.reconstruct(echoes, options={"method": "open"})
+    with pytest.raises(InputError, match="give the echoes that the model was fitted to"):
+        sn.reconstruct(model)
+
+
+def test_a_start_that_was_asked_for_is_the_only_one_that_is_refined(made, monkeypatch):
+    _, echoes, model, best = made
+    monkeypatch.setattr(reconstruction, "RAYS", 500)
+    for where in (refinement, stages):
+        monkeypatch.setattr(where, "STAGES", SHORT)
+    start = sn.reconstruct(model, echoes, options={"method": "filled"}, progress=QUIET)
+    surface = sn.refine(start, echoes, progress=QUIET)
+    assert [one["start"] for one in surface.candidates] == ["filled"]
+    assert {"open", "filled", "levels"} <= {one["start"] for one in best.candidates}
+    assert [one["start"] for one in best.candidates if one["chosen"]] == [best.method]
+
+
 def test_a_prediction_traces_echoes_off_the_surface_it_is_given(made, monkeypatch):
-    _, echoes, model, surface = made
+    scene, echoes, model, _ = made
+    surface = sn.Surface(scene.mesh, echoes=echoes)
     from sononerf.evaluation import traced
 
     monkeypatch.setattr(traced, "RAYS", 500)

@@ -135,14 +135,6 @@ def _saved_state(run: RunFolder, file: Path, belongs: dict[str, str]) -> dict[st
         return {name: opened.get_tensor(name) for name in opened.keys()}
 
 
-OPEN = {
-    "sheet": "the surface is a sheet: {0.thin_share:.0%} of it has its other side right behind it",
-    "one-sided": "the surface is open: {0.unseen_share:.0%} of it, which no pose heard, is "
-    "left out",
-}
-"""Messages about surfaces that do not enclose a body."""
-
-
 def reconstruct(
     run: Path | RunFolder,
     *,
@@ -211,8 +203,8 @@ def reconstruct(
         if own:
             run.begin("surface")
         _write(folder, surface, truth, run.frame())
-        if surface.openness is not None and surface.openness.kind in OPEN:
-            progress.say(OPEN[surface.openness.kind].format(surface.openness))
+        if surface.openness is not None and surface.openness.text:
+            progress.say(surface.openness.text)
         if output is None:
             run.write_metrics("cost", {"reconstruct_s": time.monotonic() - started}, merge=True)
     return folder

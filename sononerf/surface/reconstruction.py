@@ -90,7 +90,7 @@ def reconstruct(
     progress = progress or Progress()
     chosen = checked_section(ReconstructionSettings, options or {}, "reconstruction")
     if isinstance(model, Echoes):
-        return _without_field(model, chosen)
+        return _without_field(model, chosen, progress)
     expect(model, EchoModule, "model")
     if echoes is None:
         raise InputError("echoes: missing; give the echoes that the model was fitted to")
@@ -125,7 +125,7 @@ def reconstruct(
     return finished_surface(mesh, method, reading, echoes=heard)
 
 
-def _without_field(echoes: Echoes, options: ReconstructionSettings) -> Surface:
+def _without_field(echoes: Echoes, options: ReconstructionSettings, progress: Progress) -> Surface:
     """Return the surface that the network makes of echoes."""
     if options.method not in ("auto", "levels"):
         raise SettingsError(
@@ -136,7 +136,10 @@ def _without_field(echoes: Echoes, options: ReconstructionSettings) -> Surface:
         method, mesh = next(start_surfaces(reading, ("levels",)))
         heard = poses_that_hear(mesh, echoes, Optics(echoes.head))
     count = heard.cpu().numpy().astype(np.int32)
-    return finished_surface(mesh, method, reading, echoes=echoes, confidence=count)
+    surface = finished_surface(mesh, method, reading, echoes=echoes, confidence=count)
+    if surface.openness is not None and surface.openness.text:
+        progress.say(surface.openness.text)
+    return surface
 
 
 def _resolution(model: EchoModule, echoes: Echoes | None) -> float:

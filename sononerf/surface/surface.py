@@ -191,6 +191,21 @@ class Openness:
             return "one-sided"
         return "sheet" if self.thin_share > THIN_SHARE else "closed"
 
+    @property
+    def text(self) -> str:
+        """What is told of a surface that does not enclose a body; empty for a closed one."""
+        if self.kind == "sheet":
+            return (
+                f"the surface is a sheet: {self.thin_share:.0%} of it has its other side right "
+                "behind it"
+            )
+        if self.kind == "one-sided":
+            return (
+                f"the surface is open: {self.unseen_share:.0%} of it, which no pose heard, is left "
+                "out"
+            )
+        return ""
+
 
 def judge_openness(
     mesh: trimesh.Trimesh, sources: Floats, *, resolution: float, plane: Plane | None = None

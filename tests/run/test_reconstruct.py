@@ -18,8 +18,10 @@ from sononerf.run.fitted import load_fitted
 from sononerf.run.reconstruct import reconstruct
 from sononerf.surface import reconstruction
 from sononerf.surface import surface as surface_module
+from sononerf.surface.refine import descent, refinement
 from sononerf.surface.start import read_out as read_out_module
 from sononerf.surface.surface import Openness
+from tests.run.test_refine import SHORT
 
 
 def read_out(folder):
@@ -69,6 +71,21 @@ def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
     same = reconstruct(run, spacing=0.007, level=level, output=tmp_path / "same")
     assert (fine / "mesh.ply").read_bytes() == (same / "mesh.ply").read_bytes()
     assert not (run / "metrics.json").exists()
+
+
+@pytest.mark.thorough
+def test_a_method_is_refined_where_that_is_asked_for(run, tmp_path, no_projections, monkeypatch):
+    monkeypatch.setattr(reconstruction, "RAYS", 500)
+    for where in (refinement, descent):
+        monkeypatch.setattr(where, "STAGES", SHORT)
+    plain = reconstruct(run, method="filled", output=tmp_path / "plain")
+    assert read_out(plain)["candidates"] == []
+    folder = reconstruct(run, method="filled", refine=True, output=tmp_path / "refined")
+    (found,) = read_out(folder)["candidates"]
+    assert (found["start"], found["chosen"]) == ("filled", True)
+    assert found["error_db"] == pytest.approx(read_out(folder)["validation_error_db"])
+    with pytest.raises(SettingsError, match="an iso-surface is not refined"):
+        reconstruct(run, method="isosurface", refine=True, output=tmp_path / "level")
 
 
 @pytest.mark.thorough

@@ -200,7 +200,8 @@ def _poses(example: Example, random: np.random.Generator) -> Ints:
     if which < 0.4:
         return np.arange(count)
     if which < 0.75:
-        few = int(FEWEST * (count / FEWEST) ** np.sqrt(random.random()))
+        few = min(FEWEST, count)
+        few = int(few * (count / few) ** np.sqrt(random.random()))
         return np.sort(random.choice(count, few, replace=False))
     way = random.normal(size=3)
     along = trimesh.unitize(emitters) @ (way / np.linalg.norm(way))

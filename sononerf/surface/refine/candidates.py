@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
@@ -14,10 +14,12 @@ import trimesh
 from torch import Tensor
 
 from sononerf.array_types import Floats
+from sononerf.echoes.free_space import EchoHull
 from sononerf.surface.refine.descent import STAGES, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.remesh import distance_from
 from sononerf.surface.start.read_out import StartMethod
+from sononerf.surface.surface import judge_openness
 
 TOLERATED = 1.15
 """Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
@@ -189,20 +191,38 @@ def goes_on(candidate: Candidate, first: Candidate, alike: float) -> bool:
     return float(distances(candidate.meshes[1], first.meshes[1]).mean()) > alike
 
 
-def best_of(candidates: list[Candidate]) -> Candidate:
-    """Return the best candidate: that of the least objective, or ``levels`` in doubt."""
+def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], bool]) -> Candidate:
+    """Return the best candidate: that of the least objective, or ``levels`` in doubt.
+
+    Args:
+        candidates: After their stages.
+        is_closed: Whether a surface encloses a body, as far as poses can have heard it. ``levels``
+            wins in doubt only if it does.
+    """
     least = min(candidates, key=lambda one: one.objective)
     if least.objective > RANKS_DB:
         for one in candidates:
-            if one.start == "levels" and one.objective <= TOLERATED * least.objective:
+            near = one.objective <= TOLERATED * least.objective
+            if one.start == "levels" and near and is_closed(one.meshes[one.best]):
                 return one
     return least
+
+
+def closed_before(hull: EchoHull, resolution: float) -> Callable[[trimesh.Trimesh], bool]:
+    """Return whether a surface encloses a body, as far as the poses of a hull can have heard it."""
+
+    def is_closed(mesh: trimesh.Trimesh) -> bool:
+        found = judge_openness(mesh, hull.sources, resolution=resolution, plane=hull.plane)
+        return found.kind != "one-sided"
+
+    return is_closed
 
 
 def listed(
     starts: Iterable[StartMethod],
     compared: Mapping[StartMethod, float],
     candidates: list[Candidate],
+    chosen: Candidate,
 ) -> list[dict[str, Any]]:
     """Return what is told of the candidates, see ``Refined.candidates``.
 
@@ -210,19 +230,19 @@ def listed(
         starts: All start methods.
         compared: Objectives of those that were compared before the first stage.
         candidates: Those that went on after it.
+        chosen: One of them.
     """
 
     def finite(value: float | None) -> float | None:
         return value if value is not None and math.isfinite(value) else None
 
     refined = {one.start: one.objective for one in candidates if len(one.meshes) > 1}
-    chosen = best_of(candidates).start
     return [
         {
             "start": name,
             "start_error_db": finite(compared.get(name)),
             "error_db": finite(refined.get(name)),
-            "chosen": name == chosen,
+            "chosen": name == chosen.start,
         }
         for name in starts
     ]

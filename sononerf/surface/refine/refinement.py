@@ -26,6 +26,7 @@ from sononerf.surface.refine.candidates import (
     after_first_stage,
     below,
     best_of,
+    closed_before,
     goes_on,
     listed,
     planned,
@@ -53,12 +54,10 @@ logger = logging.getLogger("sononerf")
 SIMULATED = 96
 """Number of training poses for which a surface is simulated; each is drawn about three times."""
 SMOOTH = 1 / 16
-"""Largest height of the ridges of ``hull`` with which it is a start, shortest wavelengths. The way
-there and back counts it twice, so it changes phases by at most 45 degrees. A hull fits the
-onsets by construction, so its objective is too good where it is coarse. From 100 calls its ridges
-are 0.08 or higher. There a stool, a cone and the procedural bodies 101 and 116 had F-scores at 2 mm
-of 0.24, 0.84, 0.70 and 0.42 with it, and of 0.45, 0.88, 0.95 and 0.72 without it. From 400 calls
-they are at most 0.04, and body 106 has 0.96 with it and 0.75 without it."""
+"""Largest height of the ridges of ``hull`` with which it is a start, shortest wavelengths; phases
+change by at most 45 degrees. A hull fits the onsets by construction, so its objective is too good
+where it is coarse. From 100 calls its ridges are 0.08 or higher; there a stool had an F-score at
+2 mm of 0.24 with it and of 0.45 without. From 400 calls they are at most 0.04."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
 STATE_VERSION = 5
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
@@ -405,7 +404,7 @@ class Refinement:
         """Return the best surface so far; the start where all refined ones are clearly worse."""
         if not self.candidates:
             self._choose()
-        candidate = best_of(self.candidates)
+        candidate = best_of(self.candidates, closed_before(self.echoes.hull, self._far))
         best = candidate.best
         objective = candidate.objectives[best]
         mesh, doubtful = without_necks(
@@ -438,7 +437,7 @@ class Refinement:
             error_db=objective,
             history=self.history,
             faults=self.faults,
-            candidates=listed(self.starts, self.compared, self.candidates),
+            candidates=listed(self.starts, self.compared, self.candidates, candidate),
         )
 
 

@@ -19,7 +19,7 @@ from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine import comparison
 from sononerf.surface.refine import refinement as module
-from sononerf.surface.refine.candidates import Candidate, number_of_steps
+from sononerf.surface.refine.candidates import Candidate, best_of, number_of_steps
 from sononerf.surface.refine.descent import Descent, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
@@ -306,10 +306,9 @@ PLANS = [("levels", "sharp"), ("body", "blurred"), ("body", "sharp")]
 @pytest.mark.parametrize(
     ("objectives", "last", "chosen", "stages"),
     [
-        # Both go through all stages; the better one is chosen, levels in doubt above 4 dB.
+        # Both go through all stages; the better one is chosen.
         ((1.0, 1.1, 1.1), {"levels": 1.0, "body": 0.9}, ("body", "blurred"), 5),
         ((1.0, 1.4, 1.1), {"levels": 0.8, "body": 0.9}, ("levels", "sharp"), 5),
-        ((5.0, 5.4, 5.0), {"levels": 5.0, "body": 4.5}, ("levels", "sharp"), 5),
         ((5.0, 5.4, 5.0), {"levels": 5.0, "body": 4.1}, ("body", "blurred"), 5),
         # One that is clearly worse after the first stage is left behind.
         ((1.0, 1.3, 1.2), {"levels": 1.0}, ("levels", "sharp"), 4),
@@ -348,6 +347,16 @@ def test_levels_and_the_best_other_start_stay_until_they_lose(
         assert listed["small"]["error_db"] is None
         assert all(each["start_error_db"] >= 9 for each in listed.values())
         assert {name: listed[name]["error_db"] for name in last} == pytest.approx(last)
+
+
+@pytest.mark.parametrize(
+    ("error", "closed", "chosen"),
+    [(5.2, True, "levels"), (5.2, False, "open"), (5.9, True, "open")],
+)
+def test_in_doubt_levels_is_chosen_if_it_is_closed(bumpy, error, closed, chosen):
+    levels = Candidate("sharp", "levels", None, [bumpy] * 2, [9.0, error])
+    other = Candidate("sharp", "open", None, [bumpy] * 2, [8.0, 5.0])
+    assert best_of([other, levels], lambda mesh: closed).start == chosen
 
 
 def test_of_two_surfaces_that_sound_alike_one_goes_on(bumpy, echoes, optics):

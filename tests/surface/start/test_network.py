@@ -139,8 +139,8 @@ def test_a_support_is_heard_as_the_image_of_body_and_poses():
     levels, hull = heard(above, (*balls, image), plane=table)
     found = levels_surface(levels, hull, BOX, RESOLUTION)
     assert found.body_count == 1
-    assert found.vertices[:, 2].min() > -0.035 - 0.1 * RESOLUTION
-    assert off(found, balls).mean() < 0.2 * RESOLUTION
+    assert found.vertices[:, 2].min() < -0.018  # its underside is heard by the images alone
+    assert off(found, balls).mean() < 0.25 * RESOLUTION
 
 
 @pytest.mark.parametrize("sources", [around(1), around(60)[:20]], ids=["one pose", "one side"])
@@ -195,8 +195,10 @@ def test_the_kernel_is_the_formula():
         resolution=0.006,
     )
     table = levels.table(np.zeros(3))
-    onsets = 0.4 + random.normal(scale=0.01, size=(7, 2))
-    places = random.uniform(-0.15, 0.15, (20, 3))  # some beyond the axis of ranges
+    ranges = (np.linalg.norm(emitters, axis=1)[:, None] + np.linalg.norm(receivers, axis=2)) / 2
+    onsets = ranges + random.normal(scale=0.002, size=(7, 2))
+    near = random.normal(scale=0.002, size=(30, 3))
+    places = np.concatenate([near, random.uniform(-0.15, 0.15, (20, 3))])  # some out of range
     given = levels.first, levels.spacing, 0.006
     means, behind, direction = pooled(places, emitters, receivers, onsets, table, *given)
     for place, *found in zip(places, means, behind, direction, strict=True):
