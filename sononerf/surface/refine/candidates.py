@@ -142,13 +142,13 @@ def planned(starts: Mapping[StartMethod, float]) -> list[tuple[StartMethod, Way]
         starts: Start methods, and their objectives before the first stage.
 
     Returns:
-        plans: ``levels`` is smooth already, so it goes sharp; the best of the others goes both
-            ways; a sheet has its own.
+        plans: ``levels`` and the best of the others go both ways; a sheet has its own.
     """
     others = [name for name in starts if name not in ("levels", "sheet")]
-    chosen = sorted(others, key=lambda name: starts[name])[:1]
-    found: list[tuple[StartMethod, Way]] = [(name, "sharp") for name in starts if name == "levels"]
-    found += [(name, way) for name in chosen for way in ("blurred", "sharp")]
+    chosen = [name for name in starts if name == "levels"]
+    chosen += sorted(others, key=lambda name: starts[name])[:1]
+    ways: tuple[Way, ...] = ("blurred", "sharp")
+    found: list[tuple[StartMethod, Way]] = [(name, way) for name in chosen for way in ways]
     return [*found, *((name, "sheet") for name in starts if name == "sheet")]
 
 
