@@ -66,7 +66,7 @@ def asked(monkeypatch):
 
 def arguments(output, **changed):
     plain = {"only": None, "seeds": [0, 1], "exact": None, "data": None, "set": ["fit.epochs=1"]}
-    return Namespace(**{**plain, "output": output, **changed})
+    return Namespace(foreign=None, **{**plain, "output": output, **changed})
 
 
 def written(output):
