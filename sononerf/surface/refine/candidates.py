@@ -56,6 +56,8 @@ class Candidate:
         meshes: The start, and the surface after each stage so far, m.
         objectives: Objectives of these on the validation poses; NaN for a start that was not
             compared.
+        drawn: Number of its steps so far; it determines their poses, so that a candidate does not
+            depend on the others.
         far (m): Range resolution. A surface that is farther from its start at the median is torn.
     """
 
@@ -65,6 +67,7 @@ class Candidate:
     meshes: list[trimesh.Trimesh]
     objectives: list[float]
     far: float = math.inf
+    drawn: int = 0
     _torn: dict[int, bool] = field(default_factory=dict, repr=False)
 
     @property
@@ -104,6 +107,7 @@ class Candidate:
         """Return all as plain tensors."""
         found = {f"level.{name}": part for name, part in self.level.state().items()}
         found["names"] = torch.tensor(list(f"{self.way} {self.start}".encode()), dtype=torch.uint8)
+        found["drawn"] = torch.tensor(self.drawn)
         found["objectives"] = torch.tensor(self.objectives, dtype=torch.float64)
         for stage, mesh in enumerate(self.meshes):
             found[f"mesh.{stage}.vertices"] = torch.as_tensor(np.array(mesh.vertices))
@@ -125,9 +129,8 @@ class Candidate:
         while parts := below(state, f"mesh.{len(meshes)}."):
             vertices, faces = parts["vertices"].numpy(), parts["faces"].numpy()
             meshes.append(trimesh.Trimesh(vertices, faces, process=False))
-        return cls(
-            cast(Any, way), cast(Any, start), level, meshes, state["objectives"].tolist(), far
-        )
+        objectives, drawn = state["objectives"].tolist(), int(state["drawn"])
+        return cls(cast(Any, way), cast(Any, start), level, meshes, objectives, far, drawn)
 
 
 def below(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
@@ -145,7 +148,7 @@ def planned(starts: Mapping[StartMethod, float]) -> list[tuple[StartMethod, Way]
         plans: ``levels`` and the best of the others go both ways; a sheet has its own.
     """
     others = [name for name in starts if name not in ("levels", "sheet")]
-    chosen = [name for name in starts if name == "levels"]
+    chosen: list[StartMethod] = [name for name in starts if name == "levels"]
     chosen += sorted(others, key=lambda name: starts[name])[:1]
     ways: tuple[Way, ...] = ("blurred", "sharp")
     found: list[tuple[StartMethod, Way]] = [(name, way) for name in chosen for way in ways]

@@ -59,7 +59,7 @@ change by at most 45 degrees. A hull fits the onsets by construction, so its obj
 where it is coarse. From 100 calls its ridges are 0.08 or higher; there a stool had an F-score at
 2 mm of 0.24 with it and of 0.45 without. From 400 calls they are at most 0.04."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
-STATE_VERSION = 5
+STATE_VERSION = 6
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
 
 
@@ -194,7 +194,8 @@ class Refinement:
             if stage.beyond == "trace":
                 self._source = len(candidate.meshes) - 1
             self._descent = self._descend(self._prepared())
-        mismatch = self._descent.step(self.drawn, self.step / stage.steps)
+        mismatch = self._descent.step(candidate.drawn, self.step / stage.steps)
+        candidate.drawn += 1
         self.step += 1
         self.drawn += 1
         if self.step == stage.steps:
@@ -318,13 +319,13 @@ class Refinement:
 
     def _coming(self) -> list[int]:
         """Return the poses of all further steps that use the later bounces of this surface."""
-        steps = self.stages[self.stage].steps - self.step
+        steps, first = self.stages[self.stage].steps - self.step, self.candidate.drawn
         for stage in itertools.takewhile(
             lambda stage: stage.beyond == "keep", self.stages[self.stage + 1 :]
         ):
             steps += stage.steps
         drawn = [
-            self.echoes.batch(self.seed, self.drawn + step, POSES).tolist() for step in range(steps)
+            self.echoes.batch(self.seed, first + step, POSES).tolist() for step in range(steps)
         ]
         return sorted(set(itertools.chain.from_iterable(drawn)))
 

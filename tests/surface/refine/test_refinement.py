@@ -361,6 +361,21 @@ def test_in_doubt_levels_is_chosen_if_it_is_closed(bumpy, error, closed, chosen)
     assert best_of([other, levels], lambda mesh: closed).start == chosen
 
 
+def test_a_candidate_does_not_depend_on_the_others(bumpy, echoes, optics):
+    ends = []
+    for starts in ({"body": bumpy}, {"levels": bumpy.copy().apply_scale(1.05), "body": bumpy}):
+        work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+        found = {}
+        while work.stage == 0:
+            work.advance()
+            if work.step == 0:
+                last = work.history[-1]
+                found[last["start"], last["way"]] = work.newest.vertices
+        ends.append(found)
+    for way in ("blurred", "sharp"):
+        np.testing.assert_array_equal(ends[0]["body", way], ends[1]["body", way])
+
+
 def test_of_two_surfaces_that_sound_alike_one_goes_on(bumpy, echoes, optics):
     starts = {"body": bumpy, "levels": bumpy.copy()}
     work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
