@@ -195,20 +195,19 @@ def goes_on(candidate: Candidate, first: Candidate, alike: float) -> bool:
 
 
 def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], bool]) -> Candidate:
-    """Return the best candidate: that of the least objective, or ``levels`` in doubt.
+    """Return the best candidate: that of the least objective, in doubt a closed one, or ``levels``.
 
     Args:
         candidates: After their stages.
-        is_closed: Whether a surface encloses a body, as far as poses can have heard it. ``levels``
-            wins in doubt only if it does.
+        is_closed: Whether a surface encloses a body, as far as poses can have heard it.
     """
     least = min(candidates, key=lambda one: one.objective)
-    if least.objective > RANKS_DB:
-        for one in candidates:
-            near = one.objective <= TOLERATED * least.objective
-            if one.start == "levels" and near and is_closed(one.meshes[one.best]):
-                return one
-    return least
+    if least.objective <= RANKS_DB or len(candidates) == 1:
+        return least
+    closed = [one for one in candidates if is_closed(one.meshes[one.best])] or candidates
+    least = min(closed, key=lambda one: one.objective)
+    near = (one for one in closed if one.objective <= TOLERATED * least.objective)
+    return next((one for one in near if one.start == "levels"), least)
 
 
 def closed_before(hull: EchoHull, resolution: float) -> Callable[[trimesh.Trimesh], bool]:

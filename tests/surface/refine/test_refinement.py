@@ -353,12 +353,25 @@ def test_levels_and_the_best_other_start_stay_until_they_lose(
 
 @pytest.mark.parametrize(
     ("error", "closed", "chosen"),
-    [(5.2, True, "levels"), (5.2, False, "open"), (5.9, True, "open")],
+    [
+        (5.2, {"levels", "open"}, "levels"),
+        (5.9, {"levels", "open"}, "open"),
+        (4.5, {"open"}, "open"),  # what no pose can have heard is no body
+        (5.2, {"open"}, "open"),
+        (5.2, set(), "levels"),
+        (3.9, {"open"}, "levels"),  # its error is low
+    ],
 )
-def test_in_doubt_levels_is_chosen_if_it_is_closed(bumpy, error, closed, chosen):
-    levels = Candidate("sharp", "levels", None, [bumpy] * 2, [9.0, error])
-    other = Candidate("sharp", "open", None, [bumpy] * 2, [8.0, 5.0])
-    assert best_of([other, levels], lambda mesh: closed).start == chosen
+def test_in_doubt_a_closed_candidate_is_chosen_and_levels_before_others(
+    bumpy, error, closed, chosen
+):
+    meshes = {name: bumpy.copy() for name in ("levels", "open")}
+    candidates = [
+        Candidate("sharp", name, None, [bumpy, mesh], [9.0, 5.0 if name == "open" else error])
+        for name, mesh in meshes.items()
+    ]
+    inside = [meshes[name] for name in closed]
+    assert best_of(candidates, lambda mesh: any(mesh is one for one in inside)).start == chosen
 
 
 def test_a_candidate_does_not_depend_on_the_others(bumpy, echoes, optics):
