@@ -29,9 +29,10 @@ onsets fits them even where it is wrong."""
 RANKS_DB = 4.0
 """Objective below which it ranks surfaces rightly, dB. Above it, surfaces with a lower objective
 are often worse: on bodies of bars and blocks it falls from stage to stage while the F-score falls
-too (``docs/notes/surface.md``). Then a torn surface loses against its start, ``levels``, which has
-heard many bodies, is preferred to other starts, and of its surfaces the earliest one to later ones,
-all within ``TOLERATED``."""
+too (``docs/notes/surface.md``). So above it a torn surface loses against its start. A closed
+candidate wins against one that is not closed. Within ``TOLERATED``, ``levels`` is preferred to the
+other start, because the network was trained on many bodies. Of the surfaces of ``levels``, the
+earliest one within ``TOLERATED`` of the best is kept."""
 ALIKE = 1 / 16
 """Mean distance below which two surfaces sound alike, shortest wavelengths: the way there and back
 counts it twice, so it changes phases by at most 45 degrees. One of them is enough."""
