@@ -27,7 +27,7 @@ sys.path.insert(0, str(ROOT))  # the parts of this command, and the package of t
 from sononerf.errors import InputError  # noqa: E402
 from sononerf.surface.start.network import WEIGHTS, trained_network  # noqa: E402
 from tools.learning.examples import make_example  # noqa: E402
-from tools.learning.training import train, weights_file  # noqa: E402
+from tools.learning.training import SIDE, train, weights_file  # noqa: E402
 
 
 def _tell(line: str) -> None:
@@ -45,6 +45,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=0)
+    parser.add_argument("--side", type=int, default=SIDE)
     parser.add_argument("--further", action="store_true")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--output", type=Path, default=WEIGHTS)
@@ -61,6 +62,7 @@ def main() -> None:
             given.folder,
             steps=given.steps,
             seed=given.seed,
+            side=given.side,
             workers=given.workers,
             start=trained_network() if given.further else None,
             tell=_tell,

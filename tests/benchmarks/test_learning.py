@@ -50,7 +50,8 @@ def test_a_drawn_crop_is_turned_as_its_truth(folder, monkeypatch):
     example = load_example(folder / "0.npz")
     monkeypatch.setattr(examples, "_noisy", lambda level, random: level)
     for seed in range(3):
-        features, bound, true = draw(example, np.random.default_rng(seed), 16)
+        crop = draw(example, np.random.default_rng(seed), 16)
+        features, bound, true = crop.turned((1, 2, 0), (1, -1, 1))
         assert features.shape == (FEATURES, 16, 16, 16)
         assert true.shape == (32, 32, 32)
         if (true < -1).any():  # inside no place is in front of the onsets by much

@@ -25,10 +25,11 @@ from sononerf.errors import SonoNerfError
 from sononerf.evaluation.solid import Solid
 from sononerf.geometry.lattice import Lattice
 from sononerf.progress import Progress
-from sononerf.surface.start.features import features_of, free_places
-from sononerf.surface.start.network import FRAMES, lattice_of
+from sononerf.surface.start.features import PlaceFeatures, features_of, free_places
+from sononerf.surface.start.network import lattice_of
 from tools.learning.bodies import body
 
+Axes = tuple[int, ...]
 FAR = 6.0
 """Distance at which the true signed distance is clipped, voxels."""
 POSES, VALIDATING = 160, 2
@@ -155,19 +156,37 @@ def load_example(file: Path) -> Example:
     )
 
 
-def draw(
-    example: Example, random: np.random.Generator, side: int
-) -> tuple[Singles, Singles, Singles]:
+@dataclass(frozen=True, eq=False)
+class Crop:
+    """A part of a body.
+
+    Attributes:
+        places: Features of its places.
+        true ((2X, 2Y, 2Z), voxels): Signed distance, two voxels per place and axis.
+    """
+
+    places: PlaceFeatures
+    true: Singles
+
+    def turned(self, order: Axes, signs: Axes) -> tuple[Singles, Singles, Singles]:
+        """Return features, bound and truth in a turned or mirrored frame.
+
+        Args:
+            order: Axis of the crop that becomes each axis of the frame.
+            signs: -1 for the axes of the frame that point backwards.
+        """
+        back = tuple(axis for axis, sign in enumerate(signs) if sign < 0)
+        true = np.ascontiguousarray(np.flip(self.true.transpose(order), back))
+        return *self.places.turned(order, signs), true
+
+
+def draw(example: Example, random: np.random.Generator, side: int) -> Crop:
     """Return a crop of a body, heard by some of its poses and turned or mirrored at random.
 
     Args:
         example: The body.
         random: Generator.
         side: Number of places along each axis.
-
-    Returns:
-        features, bound, true: (FEATURES, side, side, side), the same of one, and twice as many
-            voxels along each axis, as the network takes and gives them.
     """
     lattice = example.lattice
     size = lattice.spacing * np.asarray(lattice.shape)
@@ -187,10 +206,9 @@ def draw(
         np.full(3, -(2 * side - 1) / 2 * lattice.spacing), lattice.spacing, (2 * side,) * 3
     )
     places = features_of(levels, some, hull, crop, free_places(hull, crop))
-    features, bound = places.turned(*FRAMES[0])
     at = lattice.coordinates(crop.points() @ turn + centre).T
     true = map_coordinates(example.true, at, order=1, mode="constant", cval=FAR)
-    return features, bound, true.reshape(crop.shape)
+    return Crop(places, true.reshape(crop.shape))
 
 
 def _poses(example: Example, random: np.random.Generator) -> Ints:
