@@ -156,6 +156,21 @@ def planned(starts: Mapping[StartMethod, float]) -> list[tuple[StartMethod, Way]
     return [*found, *((name, "sheet") for name in starts if name == "sheet")]
 
 
+def without_twin(candidate: Candidate, candidates: list[Candidate]) -> list[Candidate]:
+    """Return the candidates after one refused the blur: it goes on sharp, without its twin.
+
+    Args:
+        candidate: Its start is too thin for the blur of the first stage.
+        candidates: It, and others; its start in the way ``sharp`` among them.
+    """
+    candidate.way = "sharp"
+    return [
+        one
+        for one in candidates
+        if one is candidate or (one.start, one.way) != (candidate.start, candidate.way)
+    ]
+
+
 def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = STAGES) -> int:
     """Return the steps of a refinement of start methods, at most; a sheet goes on alone."""
     plans = planned(dict.fromkeys(starts, 0.0))

@@ -30,6 +30,7 @@ from sononerf.surface.refine.candidates import (
     goes_on,
     listed,
     planned,
+    without_twin,
 )
 from sononerf.surface.refine.comparison import Comparison
 from sononerf.surface.refine.correction import Correction
@@ -205,12 +206,15 @@ class Refinement:
     def _prepared(self) -> trimesh.Trimesh:
         """Return the surface that a stage begins with."""
         stage, unit = self.stages[self.stage], self.optics.wavelength
-        before, plane = self.candidate.meshes[-1], self.optics.plane
-        if self.candidate.way == "sheet":
+        candidate, plane = self.candidate, self.optics.plane
+        before = candidate.meshes[-1]
+        if candidate.way == "sheet":
             return before
         made = None
-        if self.candidate.way == "blurred":
+        if candidate.way == "blurred":
             made = remesh(before, stage.edge * unit, stage.blur * unit, plane)
+            if made is None and self.stage == 0:  # it is thin: later blurs would wear it away
+                self.candidates = without_twin(candidate, self.candidates)
         if made is None:
             made = remesh(before, min(SHARP, stage.edge) * unit, 0.0, plane)
         return before if made is None else made
@@ -407,7 +411,6 @@ class Refinement:
             self._choose()
         candidate = best_of(self.candidates, closed_before(self.echoes.hull, self._far))
         best = candidate.best
-        objective = candidate.objectives[best]
         mesh, doubtful = without_necks(
             candidate.meshes[best],
             self.optics.wavelength,
@@ -421,7 +424,7 @@ class Refinement:
             self.echoes,
             self.optics,
             starts=self.starts.values(),
-            validation_db=objective,
+            validation_db=candidate.objective,
             seed=self.seed,
         )
         confidence *= known.heard & ~doubtful
@@ -435,7 +438,7 @@ class Refinement:
             error=values[:, 1],
             start=candidate.start,
             kept=best > 0,
-            error_db=objective,
+            error_db=candidate.objective,
             history=self.history,
             faults=self.faults,
             candidates=listed(self.starts, self.compared, self.candidates, candidate),
@@ -443,8 +446,5 @@ class Refinement:
 
 
 def _plain(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    return trimesh.Trimesh(
-        np.array(mesh.vertices, dtype=np.float64),
-        np.array(mesh.faces, dtype=np.int64),
-        process=False,
-    )
+    vertices, faces = np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)
+    return trimesh.Trimesh(vertices, faces, process=False)

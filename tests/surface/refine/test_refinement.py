@@ -295,6 +295,21 @@ def test_the_better_of_the_blurred_and_the_sharp_surface_goes_on(
         assert candidate.meshes[1:] == [ends[0] if better == "blurred" else ends[1]]
 
 
+def test_what_is_too_thin_for_the_first_blur_is_never_blurred(bumpy, echoes, optics):
+    thick = 0.5 * optics.wavelength
+    disc = trimesh.creation.cylinder(RADIUS, thick, sections=96).subdivide_to_size(thick / 2)
+    stages = (dataclasses.replace(SHORT[0], blur=1.2, steps=2), SHORT[1])
+    work = started(disc, echoes, optics, stages=stages)
+    work.advance()
+    again = started(disc, echoes, optics, stages=stages)
+    again.load(work.state())
+    for one in (work, again):
+        while one.stage == 0:
+            one.advance()
+        assert [(each["stage"], each["way"]) for each in one.history] == [(0, "sharp")]
+        assert [each.way for each in one.candidates] == ["sharp"]
+
+
 def way_of(work):
     return work.candidates[work._at].way if work.candidates else "start"
 
