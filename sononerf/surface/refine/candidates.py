@@ -79,7 +79,10 @@ class Candidate:
         of ``levels`` where the objective hardly ranks.
         """
         start, *refined = self.objectives
-        refined = [math.inf if self.spoiled(n) else one for n, one in enumerate(refined, 1)]
+        refined = [
+            math.inf if one > RANKS_DB and self.torn(number) else one
+            for number, one in enumerate(refined, 1)
+        ]
         least = min(refined, default=math.inf)
         if math.isinf(least) or least > TOLERATED * start:
             return 0
@@ -91,10 +94,6 @@ class Candidate:
     def objective(self) -> float:
         """Objective of the best surface, dB."""
         return self.objectives[self.best]
-
-    def spoiled(self, number: int) -> bool:
-        """Whether a surface is torn, and its objective so large that it hardly ranks."""
-        return self.objectives[number] > RANKS_DB and self.torn(number)
 
     def torn(self, number: int) -> bool:
         """Whether a surface has more parts than its start, or is farther from it than ``far``."""
@@ -193,7 +192,6 @@ def after_first_stage(candidates: list[Candidate]) -> list[Candidate]:
     chosen = []
     for start in dict.fromkeys(one.start for one in left):
         ways = [one for one in left if one.start == start]
-        ways = [one for one in ways if not one.spoiled(1)] or ways
         near = TOLERATED * min(one.objectives[-1] for one in ways)
         chosen.append(min(ways, key=lambda one: (one.objectives[-1] > near, one.way != "blurred")))
     return sorted(chosen, key=lambda one: one.objectives[-1])

@@ -19,12 +19,7 @@ from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine import comparison
 from sononerf.surface.refine import refinement as module
-from sononerf.surface.refine.candidates import (
-    Candidate,
-    after_first_stage,
-    best_of,
-    number_of_steps,
-)
+from sononerf.surface.refine.candidates import Candidate, best_of, number_of_steps
 from sononerf.surface.refine.descent import Descent, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
@@ -460,18 +455,6 @@ def test_a_torn_surface_loses_unless_its_error_is_low(bumpy, error, kept):
     for mesh in (in_two, moved):
         candidate = Candidate("sharp", "open", None, [bumpy, mesh], [9.0, error], 0.006)
         assert (candidate.best > 0) == kept
-
-
-@pytest.mark.parametrize(("error", "way"), [(6.0, "sharp"), (2.0, "blurred")])
-def test_a_way_that_tears_the_start_loses_unless_its_error_is_low(bumpy, error, way):
-    other = bumpy.copy()
-    other.apply_translation([0.1, 0, 0])
-    torn = trimesh.util.concatenate([bumpy, other])
-    ways = (("blurred", torn, error), ("sharp", bumpy, 1.1 * error))
-    candidates = [
-        Candidate(name, "levels", None, [bumpy, mesh], [9.0, found]) for name, mesh, found in ways
-    ]
-    assert [one.way for one in after_first_stage(candidates)] == [way]
 
 
 def slab(height):
