@@ -3,7 +3,7 @@
 """Train the network of the start surface ``levels``.
 
     python tools/learn_start.py examples FOLDER [--numbers FIRST LAST] [--every N] [--meshes FOLDER]
-    python tools/learn_start.py train FOLDER [--steps N] [--seed S] [--workers N] [--further]
+    python tools/learn_start.py train FOLDER [--steps N] [--workers N] [--side N] [--further]
 
 ``examples`` makes one example per number: a procedural body or one of a folder of meshes, the
 levels of its echoes, and the true signed distance; some 15 s of one core each. Examples that exist

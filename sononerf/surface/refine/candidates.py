@@ -157,11 +157,11 @@ def planned(starts: Mapping[StartMethod, float]) -> list[tuple[StartMethod, Way]
 
 
 def without_twin(candidate: Candidate, candidates: list[Candidate]) -> list[Candidate]:
-    """Return the candidates after one refused the blur: it goes on sharp, without its twin.
+    """Make a candidate sharp, and return all candidates without the other sharp one of its start.
 
     Args:
         candidate: Its start is too thin for the blur of the first stage.
-        candidates: It, and others; its start in the way ``sharp`` among them.
+        candidates: It and the others.
     """
     candidate.way = "sharp"
     return [

@@ -213,7 +213,7 @@ class Refinement:
         made = None
         if candidate.way == "blurred":
             made = remesh(before, stage.edge * unit, stage.blur * unit, plane)
-            if made is None and self.stage == 0:  # it is thin: later blurs would wear it away
+            if made is None and self.stage == 0:  # later blurs would remove thin parts
                 self.candidates = without_twin(candidate, self.candidates)
         if made is None:
             made = remesh(before, min(SHARP, stage.edge) * unit, 0.0, plane)
