@@ -31,6 +31,7 @@ from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.refinement import Refinement
 from sononerf.surface.refine.refinement import refine as refine_starts
 from sononerf.surface.start.read_out import (
+    LEVELS,
     StartMethod,
     read_echoes,
     read_field,
@@ -121,7 +122,7 @@ def reconstruct(
     methods = UNREFINED if chosen.method == "auto" else (chosen.method,)
     method, mesh = next(start_surfaces(reading, methods))
     if chosen.method != "auto":
-        reading = replace(reading, methods=methods)
+        reading = replace(reading, methods=LEVELS if method == "levels" else methods)
     return finished_surface(mesh, method, reading, echoes=heard)
 
 

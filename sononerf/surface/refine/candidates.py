@@ -18,21 +18,24 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.surface.refine.descent import STAGES, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.remesh import distance_from
-from sononerf.surface.start.read_out import StartMethod
+from sononerf.surface.start.read_out import LEVELS, StartMethod
 from sononerf.surface.surface import judge_openness
 
 TOLERATED = 1.15
 """Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
-a sheet goes on after the first stage; or else the blurred surface before the sharp one, because it
-is smoother. A refined surface is preferred to its start within it: a start that was made from the
-onsets fits them even where it is wrong."""
-RANKS_DB = 3.0
+a sheet goes on after the first stage; or else the blurred or the sharp surface, see ``SMOOTH_DB``.
+A refined surface is preferred to its start within it: a start that was made from the onsets fits
+them even where it is wrong."""
+RANKS_DB = 4.0
 """Objective below which it ranks surfaces rightly, dB. Above it, surfaces with a lower objective
 are often worse: on bodies of bars and blocks it falls from stage to stage while the F-score falls
-too (``docs/notes/surface.md``). So above it a torn surface loses against its start. A closed
-candidate wins against one that is not closed. Within ``TOLERATED``, ``levels`` is preferred to the
-other start, because the network was trained on many bodies. Of the surfaces of ``levels``, the
-earliest one within ``TOLERATED`` of the best is kept."""
+too (``docs/notes/surface.md``). So above it a torn surface loses against its start. ``levels`` wins
+where it is closed, because the network was trained on many bodies; if not, a closed candidate wins.
+Of the surfaces of ``levels``, the earliest one within ``TOLERATED`` of the best is kept."""
+SMOOTH_DB = 3.0
+"""Objective after the first stage up to which a body is taken for a smooth one, dB. In doubt it
+goes on blurred, because that is smoother; others go on sharp, because blur wears edges and strokes
+away. Smooth bodies have 0.8 to 2.9 dB, letters 3.3 dB and more."""
 ALIKE = 1 / 16
 """Mean distance below which two surfaces sound alike, shortest wavelengths: the way there and back
 counts it twice, so it changes phases by at most 45 degrees. One of them is enough."""
@@ -146,13 +149,17 @@ def planned(starts: Mapping[StartMethod, float]) -> list[tuple[StartMethod, Way]
         starts: Start methods, and their objectives before the first stage.
 
     Returns:
-        plans: ``levels`` and the best of the others go both ways; a sheet has its own.
+        plans: ``fuller`` and the best of the others go both ways, ``levels`` is not blurred beside
+            ``fuller``, and a sheet has its own way.
     """
-    others = [name for name in starts if name not in ("levels", "sheet")]
-    chosen: list[StartMethod] = [name for name in starts if name == "levels"]
+    others = [name for name in starts if name not in (*LEVELS, "sheet")]
+    chosen: list[StartMethod] = [name for name in LEVELS if name in starts]
     chosen += sorted(others, key=lambda name: starts[name])[:1]
-    ways: tuple[Way, ...] = ("blurred", "sharp")
-    found: list[tuple[StartMethod, Way]] = [(name, way) for name in chosen for way in ways]
+    found: list[tuple[StartMethod, Way]] = []
+    for name in chosen:
+        if name != "levels" or "fuller" not in starts:
+            found.append((name, "blurred"))
+        found.append((name, "sharp"))
     return [*found, *((name, "sheet") for name in starts if name == "sheet")]
 
 
@@ -174,7 +181,7 @@ def without_twin(candidate: Candidate, candidates: list[Candidate]) -> list[Cand
 def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = STAGES) -> int:
     """Return the steps of a refinement of start methods, at most; a sheet goes on alone."""
     plans = planned(dict.fromkeys(starts, 0.0))
-    further = max(1, len({start for start, _ in plans if start != "sheet"}))
+    further = max(1, len({start for start, _ in plans if start not in ("fuller", "sheet")}))
     return len(plans) * stages[0].steps + further * sum(stage.steps for stage in stages[1:])
 
 
@@ -182,19 +189,32 @@ def after_first_stage(candidates: list[Candidate]) -> list[Candidate]:
     """Return the candidates that go on after the first stage, the best one first.
 
     A sheet that is about as good as the best one goes on alone. Else each start goes on in its
-    better way.
+    better way, ``levels`` and ``fuller`` as one.
     """
     good = TOLERATED * min(one.objectives[-1] for one in candidates)
     sheets = [one for one in candidates if one.way == "sheet"]
     if any(one.objectives[-1] <= good for one in sheets):
         return sheets
     left = [one for one in candidates if one.way != "sheet"] or sheets
-    chosen = []
-    for start in dict.fromkeys(one.start for one in left):
-        ways = [one for one in left if one.start == start]
-        near = TOLERATED * min(one.objectives[-1] for one in ways)
-        chosen.append(min(ways, key=lambda one: (one.objectives[-1] > near, one.way != "blurred")))
+    network = [one for one in left if one.start in LEVELS]
+    others = [one for one in left if one.start not in LEVELS]
+    chosen = [_better(ways) for ways in (network, others) if ways]
+    for one in chosen:
+        if one.start == "fuller":  # it goes on as levels, and is compared with that start
+            one.start = "levels"
+            one.meshes[0] = next(each.meshes[0] for each in network if each.start == "levels")
     return sorted(chosen, key=lambda one: one.objectives[-1])
+
+
+def _better(ways: list[Candidate]) -> Candidate:
+    """Return the way of the least objective; in doubt by SMOOTH_DB."""
+    least = min(one.objectives[-1] for one in ways)
+
+    def order(one: Candidate) -> tuple[bool, bool, float]:
+        smooth = (one.way == "blurred") == (least <= SMOOTH_DB)
+        return one.objectives[-1] > TOLERATED * least, not smooth, one.objectives[-1]
+
+    return min(ways, key=order)
 
 
 def goes_on(candidate: Candidate, first: Candidate, alike: float) -> bool:
@@ -211,7 +231,7 @@ def goes_on(candidate: Candidate, first: Candidate, alike: float) -> bool:
 
 
 def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], bool]) -> Candidate:
-    """Return the best candidate: that of the least objective, in doubt a closed one, or ``levels``.
+    """Return the best candidate: that of the least objective, in doubt ``levels`` or a closed one.
 
     Args:
         candidates: After their stages.
@@ -221,9 +241,7 @@ def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], 
     if least.objective <= RANKS_DB or len(candidates) == 1:
         return least
     closed = [one for one in candidates if is_closed(one.meshes[one.best])] or candidates
-    least = min(closed, key=lambda one: one.objective)
-    near = (one for one in closed if one.objective <= TOLERATED * least.objective)
-    return next((one for one in near if one.start == "levels"), least)
+    return min(closed, key=lambda one: (one.start != "levels", one.objective))
 
 
 def closed_before(hull: EchoHull, resolution: float) -> Callable[[trimesh.Trimesh], bool]:
@@ -263,6 +281,7 @@ def listed(
             "chosen": name == chosen.start,
         }
         for name in starts
+        if name != "fuller"
     ]
 
 

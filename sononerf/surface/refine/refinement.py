@@ -48,7 +48,7 @@ from sononerf.surface.refine.objective import Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.remesh import finer, remesh
 from sononerf.surface.refine.surface_error import surface_error
-from sononerf.surface.start.read_out import StartMethod
+from sononerf.surface.start.read_out import LEVELS, StartMethod
 
 logger = logging.getLogger("sononerf")
 
@@ -60,7 +60,7 @@ change by at most 45 degrees. A hull fits the onsets by construction, so its obj
 where it is coarse. From 100 calls its ridges are 0.08 or higher; there a stool had an F-score at
 2 mm of 0.24 with it and of 0.45 without. From 400 calls they are at most 0.04."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
-STATE_VERSION = 6
+STATE_VERSION = 7
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
 
 
@@ -255,7 +255,7 @@ class Refinement:
 
     def _choose(self) -> None:
         """Begin the candidates; of the starts other than levels and sheet, the best takes part."""
-        names = [name for name in self.starts if name not in ("levels", "sheet")]
+        names = [name for name in self.starts if name not in (*LEVELS, "sheet")]
         found = dict.fromkeys(self.starts, math.nan)
         if len(names) > 1 and "hull" in names:
             ridges = self.onsets.ridges(self.starts["hull"])
@@ -423,7 +423,7 @@ class Refinement:
             mesh,
             self.echoes,
             self.optics,
-            starts=self.starts.values(),
+            starts=[mesh for name, mesh in self.starts.items() if name != "fuller"],
             validation_db=candidate.objective,
             seed=self.seed,
         )

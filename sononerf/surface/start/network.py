@@ -52,6 +52,10 @@ LARGEST = 3_000_000
 one core per voxel."""
 OUTSIDE = 4.0
 """Distance outside of the lattice, voxels; the training clips larger ones to it."""
+FULLER = 0.4
+"""Distance outside of the surface at which the fuller one lies, voxels. A refinement thins a body
+but does not close gaps in it: four letters, refined from here, lose less of their strokes, with
+twice this distance they run together (``docs/notes/surface.md``)."""
 LOGIT = 0.7
 """Distance at which the logit of the probability that a voxel is outside is 1, voxels; the same in
 the training."""
@@ -217,10 +221,10 @@ def _in_frame(places: PlaceFeatures, order: tuple[int, ...], signs: tuple[int, .
     return found
 
 
-def levels_surface(
+def levels_surfaces(
     levels: RangeLevels | None, hull: EchoHull, box: Floats, resolution: float
-) -> trimesh.Trimesh:
-    """Return the closed surface of the body by the network, m, normals outward.
+) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
+    """Return the closed surface of the body by the network, and a fuller one, m, normals outward.
 
     Args:
         levels: Levels of the echoes.
@@ -249,8 +253,13 @@ def levels_surface(
         distance = np.maximum(distance, -height).astype(np.float32)
     if not (distance < SURE).any():
         raise NumericalError("no surface: the network finds no body in the levels of the echoes")
-    distance = np.minimum(distance - expected_level(distance), OUTSIDE)
+    level = expected_level(distance)
+    return _at_level(distance, level, lattice), _at_level(distance, level + FULLER, lattice)
+
+
+def _at_level(distance: Singles, level: float, lattice: Lattice) -> trimesh.Trimesh:
+    """Return the closed surface where a signed distance has a level, voxels."""
     x, y, z = (n + 2 * MARGIN for n in lattice.shape)
     wider = Lattice(lattice.origin - MARGIN * lattice.spacing, lattice.spacing, (x, y, z))
-    distance = np.pad(distance, MARGIN, constant_values=OUTSIDE)
+    distance = np.pad(np.minimum(distance - level, OUTSIDE), MARGIN, constant_values=OUTSIDE)
     return surface_of(without_parts(without_hollows(distance), wider, None), wider)

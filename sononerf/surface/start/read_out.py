@@ -19,7 +19,7 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.range_levels import RangeLevels
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
-from sononerf.surface.start.network import levels_surface
+from sononerf.surface.start.network import levels_surfaces
 from sononerf.surface.start.occupancy import Gathered, estimate_occupancy, gather_evidence
 from sononerf.surface.start.sheet import fit_sheet
 from sononerf.surface.start.volume import (
@@ -35,16 +35,19 @@ _FAINTEST = (
 )
 _CHUNK = 16_384  # places at a time, a bound of memory
 
-StartMethod = Literal["open", "filled", "hull", "sheet", "levels"]
+StartMethod = Literal["open", "filled", "hull", "sheet", "levels", "fuller"]
 """Method of a start surface. The first three are the surface of the occupancy
 (:mod:`sononerf.surface.start.occupancy`); ``sheet`` is one thin body
 (:mod:`sononerf.surface.start.sheet`); ``levels`` is that of a network, and the only one that needs
-no fitted field (:mod:`sononerf.surface.start.network`)."""
-Method = Literal["open", "filled", "hull", "sheet", "levels", "isosurface"]
+no fitted field (:mod:`sononerf.surface.start.network`). ``fuller`` is that of the network with gaps
+closed; the refinement of ``levels`` begins with it too."""
+LEVELS: tuple[StartMethod, ...] = ("levels", "fuller")
+"""Start surfaces that the network makes at once."""
+Method = StartMethod | Literal["isosurface"]
 """A start method, or ``isosurface``: a level of the field's volume."""
 
 
-STARTS: tuple[StartMethod, ...] = ("open", "filled", "hull", "levels", "sheet")
+STARTS: tuple[StartMethod, ...] = ("open", "filled", "hull", *LEVELS, "sheet")
 """Start surfaces that a refinement tries; how far they lie apart is part of the error of the
 surface."""
 
@@ -114,7 +117,7 @@ def read_echoes(echoes: Echoes) -> Reading:
         NumericalError: If no pose received an echo that another one confirms.
     """
     box = echoes.region.box() if echoes.box is None else echoes.box
-    return Reading(echoes.hull, box, echoes.head.resolution, echoes.levels, methods=("levels",))
+    return Reading(echoes.hull, box, echoes.head.resolution, echoes.levels, methods=LEVELS)
 
 
 def start_surfaces(
@@ -146,8 +149,10 @@ def start_surfaces(
 
 
 def _start(reading: Reading, method: StartMethod) -> trimesh.Trimesh:
-    if method == "levels":
-        return levels_surface(reading.levels, reading.hull, reading.box, reading.resolution)
+    if method == "levels" or method == "fuller":
+        made = levels_surfaces(reading.levels, reading.hull, reading.box, reading.resolution)
+        reading.found.update(zip(LEVELS, made, strict=True))
+        return reading.found[method]
     if reading.gathered is None:
         raise NumericalError(f"the start {method} needs a fitted field; without one take levels")
     if method == "sheet":

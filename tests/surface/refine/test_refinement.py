@@ -19,7 +19,13 @@ from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine import comparison
 from sononerf.surface.refine import refinement as module
-from sononerf.surface.refine.candidates import Candidate, best_of, number_of_steps
+from sononerf.surface.refine.candidates import (
+    Candidate,
+    after_first_stage,
+    best_of,
+    number_of_steps,
+    planned,
+)
 from sononerf.surface.refine.descent import Descent, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
@@ -324,10 +330,10 @@ PLANS = [(start, way) for start in ("levels", "body") for way in ("blurred", "sh
         # Both go through all stages; the better one is chosen.
         ((2.0, 1.0, 1.1, 1.1), {"levels": 1.0, "body": 0.9}, ("body", "blurred"), 6),
         ((1.1, 1.0, 1.4, 1.1), {"levels": 0.8, "body": 0.9}, ("levels", "blurred"), 6),
-        ((9.0, 5.0, 5.4, 5.0), {"levels": 5.0, "body": 4.1}, ("body", "blurred"), 6),
+        ((9.0, 5.0, 5.4, 5.0), {"levels": 5.0, "body": 2.9}, ("body", "sharp"), 6),
         # One that is clearly worse after the first stage is left behind.
         ((2.0, 1.0, 1.3, 1.2), {"levels": 1.0}, ("levels", "sharp"), 5),
-        ((8.0, 6.5, 5.4, 5.0), {"body": 4.1}, ("body", "blurred"), 5),
+        ((8.0, 6.5, 5.4, 5.0), {"body": 2.9}, ("body", "sharp"), 5),
     ],
 )
 def test_levels_and_the_best_other_start_stay_until_they_lose(
@@ -370,7 +376,7 @@ def test_levels_and_the_best_other_start_stay_until_they_lose(
     ("error", "closed", "chosen"),
     [
         (5.2, {"levels", "open"}, "levels"),
-        (5.9, {"levels", "open"}, "open"),
+        (7.0, {"levels", "open"}, "levels"),
         (4.5, {"open"}, "open"),  # what no pose can have heard is no body
         (5.2, {"open"}, "open"),
         (5.2, set(), "levels"),
@@ -387,6 +393,39 @@ def test_in_doubt_a_closed_candidate_is_chosen_and_levels_before_others(
     ]
     inside = [meshes[name] for name in closed]
     assert best_of(candidates, lambda mesh: any(mesh is one for one in inside)).start == chosen
+
+
+@pytest.mark.parametrize(
+    ("errors", "way", "kept"),
+    [
+        ({"levels sharp": 3.0, "fuller sharp": 5.0, "fuller blurred": 5.0}, "sharp", "levels"),
+        ({"levels sharp": 5.0, "fuller sharp": 3.0, "fuller blurred": 5.0}, "sharp", "fuller"),
+        ({"levels sharp": 2.2, "fuller sharp": 2.0, "fuller blurred": 2.3}, "blurred", "fuller"),
+        ({"levels sharp": 3.5, "fuller sharp": 3.4, "fuller blurred": 3.3}, "sharp", "fuller"),
+    ],
+)
+def test_the_better_surface_of_the_network_goes_on_as_levels(bumpy, errors, way, kept):
+    starts = {name: bumpy.copy() for name in ("levels", "fuller")}
+    candidates = []
+    for name, error in errors.items():
+        start, way_of = name.split()
+        after = bumpy.copy()
+        after.metadata["of"] = start
+        candidates.append(Candidate(way_of, start, None, [starts[start], after], [9.0, error]))
+    (found,) = after_first_stage(candidates)
+    assert (found.start, found.way) == ("levels", way)
+    assert found.meshes[1].metadata["of"] == kept
+    assert found.meshes[0] is starts["levels"]  # what is kept where no refined one is better
+
+
+def test_levels_is_refined_from_the_fuller_surface_too():
+    assert planned({"levels": math.nan, "fuller": math.nan, "open": 5.0, "filled": 4.0}) == [
+        ("levels", "sharp"),
+        ("fuller", "blurred"),
+        ("fuller", "sharp"),
+        ("filled", "blurred"),
+        ("filled", "sharp"),
+    ]
 
 
 def test_a_candidate_does_not_depend_on_the_others(bumpy, echoes, optics):

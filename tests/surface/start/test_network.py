@@ -30,11 +30,13 @@ from sononerf.surface.start.features import (
 from sononerf.surface.start.network import (
     BLOCK,
     FRAMES,
+    FULLER,
     LOGIT,
+    VOXEL,
     StartNetwork,
     expected_level,
     lattice_of,
-    levels_surface,
+    levels_surfaces,
     lots_of,
 )
 
@@ -99,18 +101,27 @@ def apart(one, other):
 
 
 def test_two_spheres_are_seen_as_two():
-    found = levels_surface(*heard(around(80)), BOX, RESOLUTION)
+    found = levels_surfaces(*heard(around(80)), BOX, RESOLUTION)[0]
     assert found.is_watertight
     assert found.body_count == 2
     assert off(found, BALLS).mean() < 0.25 * RESOLUTION
+
+
+def test_the_fuller_surface_lies_outside():
+    one, fuller = levels_surfaces(*heard(around(80)), BOX, RESOLUTION)
+    assert fuller.is_watertight
+    middle, radius = np.array(BALLS[0][:3]), BALLS[0][3]
+    far = [np.linalg.norm(found.vertices - middle, axis=1) for found in (one, fuller)]
+    thin, thick = (np.median(of[of < 1.2 * radius]) for of in far)
+    assert thick - thin == pytest.approx(FULLER * VOXEL * RESOLUTION, rel=0.3)
 
 
 def test_a_turned_scene_gives_a_turned_surface():
     turn = random_rotation_matrix(np.array([0.2, 0.4, 0.7]))[:3, :3]
     balls = tuple((*(turn @ ball[:3]), ball[3]) for ball in BALLS)
     sources = around(80)
-    one = levels_surface(*heard(sources), BOX, RESOLUTION)
-    other = levels_surface(*heard(sources @ turn.T, balls), BOX, RESOLUTION)
+    one = levels_surfaces(*heard(sources), BOX, RESOLUTION)[0]
+    other = levels_surfaces(*heard(sources @ turn.T, balls), BOX, RESOLUTION)[0]
     one.vertices = one.vertices @ turn.T
     assert other.body_count == 2
     assert apart(one, other) < 0.1 * RESOLUTION
@@ -120,14 +131,14 @@ def test_poses_in_another_order_give_the_same_surface():
     sources = around(500)  # more than one pass takes
     assert len(lots_of(heard(sources)[0])) == 2
     order = np.random.default_rng(0).permutation(500)
-    one = levels_surface(*heard(sources), BOX, RESOLUTION)
-    other = levels_surface(*heard(sources[order]), BOX, RESOLUTION)
+    one = levels_surfaces(*heard(sources), BOX, RESOLUTION)[0]
+    other = levels_surfaces(*heard(sources[order]), BOX, RESOLUTION)[0]
     np.testing.assert_allclose(one.vertices, other.vertices, atol=1e-4 * RESOLUTION)
 
 
 def test_lengths_are_seen_in_range_resolutions():
-    one = levels_surface(*heard(around(60)), BOX, RESOLUTION)
-    large = levels_surface(*heard(around(60), scale=3.0), 3 * BOX, 3 * RESOLUTION)
+    one = levels_surfaces(*heard(around(60)), BOX, RESOLUTION)[0]
+    large = levels_surfaces(*heard(around(60), scale=3.0), 3 * BOX, 3 * RESOLUTION)[0]
     np.testing.assert_allclose(large.vertices, 3 * one.vertices, atol=0.01 * RESOLUTION)
 
 
@@ -137,7 +148,7 @@ def test_a_support_is_heard_as_the_image_of_body_and_poses():
     balls = (BALLS[0],)
     image = (0.0, 0.0, -0.07, 0.02)
     levels, hull = heard(above, (*balls, image), plane=table)
-    found = levels_surface(levels, hull, BOX, RESOLUTION)
+    found = levels_surfaces(levels, hull, BOX, RESOLUTION)[0]
     assert found.body_count == 1
     assert found.vertices[:, 2].min() < -0.018  # its underside is heard by the images alone
     assert off(found, balls).mean() < 0.25 * RESOLUTION
@@ -146,7 +157,7 @@ def test_a_support_is_heard_as_the_image_of_body_and_poses():
 @pytest.mark.parametrize("sources", [around(1), around(60)[:20]], ids=["one pose", "one side"])
 def test_few_poses_give_a_surface(sources):
     levels, hull = heard(sources, BALLS[:1])
-    assert levels_surface(levels, hull, BOX, RESOLUTION).is_watertight
+    assert levels_surfaces(levels, hull, BOX, RESOLUTION)[0].is_watertight
 
 
 def formula(place, levels, onsets, table, resolution):
@@ -258,7 +269,7 @@ def test_a_large_body_gets_a_coarser_lattice(monkeypatch):
     lattice = lattice_of(hull, BOX, RESOLUTION)
     assert np.prod(lattice.shape) < 100_000
     assert all(size % BLOCK == 0 for size in lattice.shape)
-    assert levels_surface(levels, hull, BOX, RESOLUTION).is_watertight
+    assert levels_surfaces(levels, hull, BOX, RESOLUTION)[0].is_watertight
 
 
 def test_each_channel_is_a_voxel_of_its_place():
@@ -285,12 +296,12 @@ def test_without_room_for_a_body_there_is_no_surface():
     levels, hull = heard(around(60))
     late = dataclasses.replace(hull, first=hull.first + 0.2)
     with pytest.raises(NumericalError, match="no room"):
-        levels_surface(levels, late, BOX, RESOLUTION)
+        levels_surfaces(levels, late, BOX, RESOLUTION)
 
 
 def test_without_the_echoes_there_is_no_surface():
     with pytest.raises(NumericalError, match="needs the echoes"):
-        levels_surface(None, heard(around(60))[1], BOX, RESOLUTION)
+        levels_surfaces(None, heard(around(60))[1], BOX, RESOLUTION)
 
 
 def test_the_weights_fit_the_network():
