@@ -38,7 +38,7 @@ from tools.benchmarks.experiment import (
 
 KINDS = (".ply", ".stl", ".obj", ".off")
 """Endings of the files that are taken."""
-STARTS = ("levels", "open", "filled", "hull", "sheet")
+STARTS = ("levels", "fuller", "open", "filled", "hull", "sheet")
 """Order of the starts in the table."""
 
 
@@ -145,10 +145,11 @@ def _columns(row: Row) -> Iterator[tuple[str, float]]:
 def table(rows: Iterable[Row]) -> str:
     """Return F-scores at 2 mm by start, refined or not, and of the result, as lines of text."""
     parts = []
-    titles = [*STARTS, *(f"{name}, refined" for name in STARTS), "best", "result", "F 5mm", "mm"]
+    every = [*STARTS, *(f"{name}, refined" for name in STARTS), "best", "result", "F 5mm", "mm"]
     for calls in sorted({row["calls"] for row in rows}, reverse=True):
         some = sorted((row for row in rows if row["calls"] == calls), key=lambda row: row["name"])
         columns: list[dict[str, float]] = [dict(_columns(row)) for row in some]
+        titles = [title for title in every if any(title in found for found in columns)]
         lines = [[f"{calls} calls", *titles, "parts", "true", "s", "chosen"]]
         for row, found in zip(some, columns, strict=True):
             result: dict[str, Any] = row["result"]
