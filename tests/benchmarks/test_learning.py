@@ -76,6 +76,22 @@ def test_training_lowers_the_loss_goes_on_and_is_read_again(folder, tmp_path, mo
         torch.testing.assert_close(state[name].float(), part, atol=1e-3, rtol=1e-3)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_a_further_training_keeps_its_share_of_the_weights(folder, tmp_path, monkeypatch, share):
+    monkeypatch.setattr(training, "BATCH", 1)
+    monkeypatch.setattr(training, "WARM", 1)
+    monkeypatch.setattr(training, "OLD", share)
+    there = tmp_path / "examples"
+    there.mkdir()
+    (there / "0.npz").write_bytes((folder / "0.npz").read_bytes())
+    start = StartNetwork()
+    before = [part.detach().clone() for part in start.parameters()]
+    after = train(there, steps=2, seed=0, side=16, start=start, tell=lambda line: None).parameters()
+    same = [bool((old == new).all()) for old, new in zip(before, after, strict=True)]
+    assert all(same) == (share == 1.0)
+
+
 def test_without_examples_nothing_is_trained(tmp_path):
     with pytest.raises(InputError, match="no examples to train on"):
         train(tmp_path, steps=1, seed=0, tell=lambda line: None)
