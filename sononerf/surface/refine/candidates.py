@@ -29,9 +29,10 @@ them even where it is wrong."""
 RANKS_DB = 4.0
 """Objective below which it ranks surfaces rightly, dB. Above it, surfaces with a lower objective
 are often worse: on bodies of bars and blocks it falls from stage to stage while the F-score falls
-too (``docs/notes/surface.md``). So above it a torn surface loses against its start. ``levels`` wins
-where it is closed, because the network was trained on many bodies; if not, a closed candidate wins.
-Of the surfaces of ``levels``, the earliest one within ``TOLERATED`` of the best is kept."""
+too (``docs/notes/surface.md``). So above it a torn surface loses against its start. A closed
+candidate wins against one that is not closed. Within ``TOLERATED``, ``levels`` is preferred to the
+other start, because the network was trained on many bodies. Of the surfaces of ``levels``, the
+earliest one within ``TOLERATED`` of the best is kept."""
 SMOOTH_DB = 3.0
 """Objective after the first stage up to which a body is taken for a smooth one, dB. In doubt it
 goes on blurred, because that is smoother; others go on sharp, because blur wears edges and strokes
@@ -207,12 +208,16 @@ def after_first_stage(candidates: list[Candidate]) -> list[Candidate]:
 
 
 def _better(ways: list[Candidate]) -> Candidate:
-    """Return the way of the least objective; in doubt by SMOOTH_DB."""
+    """Return the way of the least objective; in doubt by SMOOTH_DB, then a fuller one.
+
+    A fuller one, because gaps stay and what is too thick becomes thinner.
+    """
     least = min(one.objectives[-1] for one in ways)
 
-    def order(one: Candidate) -> tuple[bool, bool, float]:
-        smooth = (one.way == "blurred") == (least <= SMOOTH_DB)
-        return one.objectives[-1] > TOLERATED * least, not smooth, one.objectives[-1]
+    def order(one: Candidate) -> tuple[bool, bool, bool, float]:
+        fits = (one.way == "blurred") == (least <= SMOOTH_DB)
+        worse = one.objectives[-1] > TOLERATED * least
+        return worse, not fits, one.start == "levels", one.objectives[-1]
 
     return min(ways, key=order)
 
@@ -241,7 +246,8 @@ def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], 
     if least.objective <= RANKS_DB or len(candidates) == 1:
         return least
     closed = [one for one in candidates if is_closed(one.meshes[one.best])] or candidates
-    return min(closed, key=lambda one: (one.start != "levels", one.objective))
+    near = TOLERATED * min(one.objective for one in closed)
+    return min(closed, key=lambda one: (one.objective > near, one.start != "levels", one.objective))
 
 
 def closed_before(hull: EchoHull, resolution: float) -> Callable[[trimesh.Trimesh], bool]:
