@@ -23,8 +23,7 @@ from sononerf.surface.surface import judge_openness
 
 TOLERATED = 1.15
 """Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
-a sheet goes on after the first stage; or else the blurred or the sharp surface, see ``SMOOTH_DB``.
-A refined surface is preferred to its start within it: a start that was made from the onsets fits
+a sheet goes on after the first stage, or else one way before another. A refined surface is preferred to its start within it: a start that was made from the onsets fits
 them even where it is wrong."""
 RANKS_DB = 4.0
 """Objective below which it ranks surfaces rightly, dB. Above it, surfaces with a lower objective
@@ -33,10 +32,6 @@ too (``docs/notes/surface.md``). So above it a torn surface loses against its st
 candidate wins against one that is not closed. Within ``TOLERATED``, ``levels`` is preferred to the
 other start, because the network was trained on many bodies. Of the surfaces of ``levels``, the
 earliest one within ``TOLERATED`` of the best is kept."""
-SMOOTH_DB = 3.0
-"""Objective after the first stage up to which a body is taken for a smooth one, dB. In doubt it
-goes on blurred, because that is smoother; others go on sharp, because blur wears edges and strokes
-away. Smooth bodies have 0.8 to 2.9 dB, letters 3.3 dB and more."""
 ALIKE = 1 / 16
 """Mean distance below which two surfaces sound alike, shortest wavelengths: the way there and back
 counts it twice, so it changes phases by at most 45 degrees. One of them is enough."""
@@ -208,16 +203,18 @@ def after_first_stage(candidates: list[Candidate]) -> list[Candidate]:
 
 
 def _better(ways: list[Candidate]) -> Candidate:
-    """Return the way of the least objective; in doubt by SMOOTH_DB, then a fuller one.
+    """Return the way that explains the echoes best, of one start or of both by the network.
 
-    A fuller one, because gaps stay and what is too thick becomes thinner.
+    In doubt, a sharp one by the network, whose surfaces are smooth, so that blur wears edges and
+    strokes away; of these a fuller one, because gaps stay and what is too thick becomes thinner.
+    Other starts are rough, and in doubt a blurred one goes on.
     """
-    least = min(one.objectives[-1] for one in ways)
+    near = TOLERATED * min(one.objectives[-1] for one in ways)
 
     def order(one: Candidate) -> tuple[bool, bool, bool, float]:
-        fits = (one.way == "blurred") == (least <= SMOOTH_DB)
-        worse = one.objectives[-1] > TOLERATED * least
-        return worse, not fits, one.start == "levels", one.objectives[-1]
+        network = one.start in LEVELS
+        unfit = (one.way == "blurred") == network
+        return one.objectives[-1] > near, unfit, one.start == "levels", one.objectives[-1]
 
     return min(ways, key=order)
 

@@ -329,11 +329,11 @@ PLANS = [(start, way) for start in ("levels", "body") for way in ("blurred", "sh
     [
         # Both go through all stages; the better one is chosen.
         ((2.0, 1.0, 1.1, 1.1), {"levels": 1.0, "body": 0.9}, ("body", "blurred"), 6),
-        ((1.1, 1.0, 1.4, 1.1), {"levels": 0.8, "body": 0.9}, ("levels", "blurred"), 6),
-        ((9.0, 5.0, 5.4, 5.0), {"levels": 5.0, "body": 2.9}, ("body", "sharp"), 6),
+        ((1.1, 1.0, 1.4, 1.1), {"levels": 0.8, "body": 0.9}, ("levels", "sharp"), 6),
+        ((9.0, 5.0, 5.4, 5.0), {"levels": 5.0, "body": 2.9}, ("body", "blurred"), 6),
         # One that is clearly worse after the first stage is left behind.
         ((2.0, 1.0, 1.3, 1.2), {"levels": 1.0}, ("levels", "sharp"), 5),
-        ((8.0, 6.5, 5.4, 5.0), {"body": 2.9}, ("body", "sharp"), 5),
+        ((8.0, 6.5, 5.4, 5.0), {"body": 2.9}, ("body", "blurred"), 5),
     ],
 )
 def test_levels_and_the_best_other_start_stay_until_they_lose(
@@ -400,7 +400,7 @@ def test_in_doubt_a_closed_candidate_is_chosen_and_levels_before_others(
     [
         ({"levels sharp": 3.0, "fuller sharp": 5.0, "fuller blurred": 5.0}, "sharp", "levels"),
         ({"levels sharp": 5.0, "fuller sharp": 3.0, "fuller blurred": 5.0}, "sharp", "fuller"),
-        ({"levels sharp": 2.2, "fuller sharp": 2.0, "fuller blurred": 2.3}, "blurred", "fuller"),
+        ({"levels sharp": 3.2, "fuller sharp": 3.0, "fuller blurred": 2.3}, "blurred", "fuller"),
         ({"levels sharp": 3.5, "fuller sharp": 3.4, "fuller blurred": 3.3}, "sharp", "fuller"),
         ({"levels sharp": 3.4, "fuller sharp": 3.5, "fuller blurred": 5.0}, "sharp", "fuller"),
     ],
