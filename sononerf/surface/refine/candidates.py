@@ -23,8 +23,9 @@ from sononerf.surface.surface import judge_openness
 
 TOLERATED = 1.15
 """Ratio of two objectives of validation poses below which two surfaces differ by chance. Within it,
-a sheet goes on after the first stage, or else one way before another. A refined surface is preferred to its start within it: a start that was made from the onsets fits
-them even where it is wrong."""
+a sheet goes on after the first stage, or else one way before another. A refined surface is
+preferred to its start within it: a start that was made from the onsets fits them even where it is
+wrong."""
 RANKS_DB = 4.0
 """Objective below which it ranks surfaces rightly, dB. Above it, surfaces with a lower objective
 are often worse: on bodies of bars and blocks it falls from stage to stage while the F-score falls
