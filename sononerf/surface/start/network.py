@@ -232,6 +232,10 @@ def levels_surfaces(
         box ((2, 3), m): Region that holds the body.
         resolution (m): Range resolution.
 
+    Returns:
+        surface: At the level that :func:`expected_level` gives.
+        fuller: ``FULLER`` outside of it; narrow gaps are closed.
+
     Raises:
         NumericalError: If the onsets leave no place for a body, or the network finds none, or the
             levels of the echoes are not known.
