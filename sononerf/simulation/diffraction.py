@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -16,6 +17,10 @@ from sononerf.geometry.raycast import RayCaster
 from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing, Sound
 from sononerf.simulation.reflection import Reflection
+
+Array = Any
+"""An array of NumPy, or a tensor."""
+_LEAST = 1e-12  # keeps divisions and roots, and their gradients, finite
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,13 +97,14 @@ def _thin(corners: Floats) -> Bools:
 
 
 def wedge_directivity(
-    inward: Floats,
-    normal: Floats,
-    open_angle: Floats,
-    to_source: Floats,
-    to_receiver: Floats,
-    fade: Floats,
-) -> Floats:
+    inward: Array,
+    normal: Array,
+    open_angle: Array,
+    to_source: Array,
+    to_receiver: Array,
+    fade: Array,
+    xp: Any = np,
+) -> Array:
     r"""Return the diffraction by the edge of a rigid wedge from a source to a receiver.
 
     .. math:: -\frac{\nu}{2} \sum_{\pm \pm}
@@ -117,6 +123,7 @@ def wedge_directivity(
         open_angle ((N,), rad): :math:`\theta_w`, of the air around the edge.
         to_source, to_receiver ((N, 3), m): From the point.
         fade ((F,), 1/m): Decay over the detour from the mirror's path.
+        xp: ``numpy``; or ``torch``, for tensors with gradients.
 
     Returns:
         directivity (N, F): Finite everywhere.
@@ -125,34 +132,33 @@ def wedge_directivity(
         .. [1] U. P. Svensson, R. I. Fred and J. Vanderkooy, "An analytic secondary source model of
            edge diffraction impulse responses", JASA 106, 1999, equations (5) to (7).
     """
-    along = np.cross(normal, inward)
+    along = xp.linalg.cross(normal, inward)
     angles, heights, radii, distances = [], [], [], []
     for vector in (to_source, to_receiver):
-        out, across = (np.einsum("nd,nd->n", vector, axis) for axis in (normal, inward))
-        angles.append(np.mod(np.arctan2(out, across), 2.0 * math.pi))
-        heights.append(np.einsum("nd,nd->n", vector, along))
-        radii.append(np.maximum(np.hypot(out, across), 1e-12))
-        distances.append(np.linalg.norm(vector, axis=1))
+        out, across = (xp.einsum("nd,nd->n", vector, axis) for axis in (normal, inward))
+        angles.append(xp.remainder(xp.arctan2(out, across), 2.0 * math.pi))
+        heights.append(xp.einsum("nd,nd->n", vector, along))
+        radii.append(xp.clip(xp.hypot(out, across), _LEAST, None))
+        distances.append(xp.sqrt(xp.einsum("nd,nd->n", vector, vector)))
     nu = math.pi / open_angle
     bent = (distances[0] * distances[1] + heights[0] * heights[1]) / (radii[0] * radii[1])
-    hyperbolic = np.cosh(nu * np.arccosh(np.maximum(bent, 1.0)))
-    total = np.zeros((len(nu), len(fade)))
+    hyperbolic = xp.cosh(nu * xp.arccosh(xp.clip(bent, 1.0 + _LEAST, None)))
+    total = 0.0
     way = distances[0] + distances[1]
-    square = np.square(radii[0]) + np.square(radii[1]) + np.square(heights[0] - heights[1])
+    square = xp.square(radii[0]) + xp.square(radii[1]) + xp.square(heights[0] - heights[1])
     for one in (-1.0, 1.0):
         for two in (-1.0, 1.0):
             angle = math.pi + one * angles[0] + two * angles[1]
-            below = hyperbolic - np.cos(nu * angle)
-            term = np.sin(nu * angle) / np.where(below > 1e-12, below, np.inf)
+            below = hyperbolic - xp.cos(nu * angle)
+            term = (xp.sin(nu * angle) / xp.where(below > _LEAST, below, math.inf))[:, None]
             if one == two:
                 both = (
                     angles[0] + angles[1] if one < 0.0 else 2.0 * open_angle - angles[0] - angles[1]
                 )
-                mirrored = np.sqrt(square - 2.0 * radii[0] * radii[1] * np.cos(both))
-                detour = np.maximum(way - mirrored, 0.0)
-                total -= term[:, None] * np.expm1(np.multiply.outer(detour, -fade))
-            else:
-                total += term[:, None]
+                mirrored = square - 2.0 * radii[0] * radii[1] * xp.cos(both)
+                detour = xp.clip(way - xp.sqrt(xp.clip(mirrored, _LEAST**2, None)), 0.0, None)
+                term = -term * xp.expm1(-detour[:, None] * fade)
+            total = total + term
     return -0.5 * nu[:, None] * total
 
 

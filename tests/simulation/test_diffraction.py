@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 
 from sononerf.geometry.raycast import RayCaster
@@ -139,6 +140,24 @@ def test_the_directivity_is_reciprocal_and_the_same_from_either_face(open_angle)
     other = np.tile([c, s, 0.0], (len(source), 1)), np.tile([s, -c, 0.0], (len(source), 1))
     again = wedge_directivity(*other, opening, source, receiver, fade)
     np.testing.assert_allclose(again, found, rtol=1e-5, atol=1e-7)
+
+
+def test_tensors_give_the_same_directivity_and_its_gradients():
+    faces, (source, receiver) = wedge()
+    fade = np.array([500.0, 2000.0])
+    given = [torch.as_tensor(part) for part in (*faces, source, receiver, fade)]
+    given[3].requires_grad_(True)
+    found = wedge_directivity(*given, xp=torch)
+    assert np.allclose(found.detach(), wedge_directivity(*faces, source, receiver, fade))
+    found.sum().backward()
+    for axis in range(3):
+        step = 1e-6 * np.eye(3)[axis]
+        ends = [
+            wedge_directivity(*faces, source + sign * step, receiver, fade).sum(axis=1)
+            for sign in (1, -1)
+        ]
+        wanted = (ends[0] - ends[1]) / 2e-6
+        np.testing.assert_allclose(given[3].grad[:, axis], wanted, rtol=1e-3, atol=1e-3)
 
 
 def test_a_plane_has_no_edge():

@@ -4,13 +4,16 @@
 Echoes are laid into time bins per node; the bins' spectra, each with the part of the spectrum that
 its node stands for, are added up; each row of the spectrogram is a filter of that, with its own,
 call and dechirp in it, and is transformed back at the rate of its frames. For any call this equals
-:func:`sononerf.head.spectrogram.spectrogram` of the simulator's echo.
+:func:`sononerf.head.spectrogram.spectrogram` of the simulator's echo. Echoes of surfaces grow with
+the frequency, and come a quarter of a period early; those of edges do neither.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 import scipy.fft
@@ -24,6 +27,26 @@ from sononerf.simulation.impulse_response import between
 FINE = 5.0
 """Least number of time bins per period of the highest frequency; quadratic splines between them err
 by 0.3 %."""
+
+
+Source = Literal["surface", "edge"]
+
+
+@dataclass(frozen=True, eq=False)
+class Arrivals:
+    """Echoes, one row each.
+
+    Attributes:
+        strength ((Q,) float32): Strengths.
+        at ((Q,) float32): Arrival times, in samples from the start of the first frame.
+        weight ((Q, N') float32): Factors at the kept nodes.
+        receiver (Q,): Index of the receiver.
+    """
+
+    strength: Tensor
+    at: Tensor
+    weight: Tensor
+    receiver: Tensor
 
 
 class FilterBank:
@@ -50,44 +73,37 @@ class FilterBank:
         # Interpolation uses nodes on both sides; the ones beyond the band hardly count.
         self.kept_nodes: Ints = np.flatnonzero(nodes <= self._band[1] + self.spacing)
         self.finer = max(1, math.ceil(FINE * self._band[1] / rate))
-        self._filters: dict[tuple[int, str], tuple[Tensor, Tensor]] = {}
+        self._filters: dict[tuple[int, str], tuple[Tensor, Tensor, Tensor]] = {}
 
-    def power(
-        self,
-        strength: Tensor,
-        at: Tensor,
-        weight: Tensor,
-        receiver: Tensor,
-        *,
-        receivers: int,
-        frames: int,
-    ) -> Tensor:
+    def power(self, arrivals: Mapping[Source, Arrivals], *, receivers: int, frames: int) -> Tensor:
         """Power of echoes in each frame and row.
 
         Args:
-            strength ((Q,) float32): Strengths of the echoes.
-            at ((Q,) float32): Arrival times, in samples from the start of the first frame.
-            weight ((Q, N') float32): At the kept nodes.
-            receiver (Q,): Index of the receiver.
+            arrivals: By what sends them; they add up in phase.
             receivers, frames: Numbers of receivers and frames.
 
         Returns:
-            power ((receivers, frames, F) float32): Gradients run to strength and time.
+            power ((receivers, frames, F) float32): Gradients run to strength, time and weight.
         """
         length = frames * self.analysis.hop * self.finer
-        bins = _Deposit.apply(
-            strength, at * self.finer, weight, receiver * length, (receivers, length)
-        )
-        return self._analysed(bins, frames)
+        spectra = []
+        for source, some in arrivals.items():
+            first, at = some.receiver * length, some.at * self.finer
+            bins = _Deposit.apply(some.strength, at, some.weight, first, (receivers, length))
+            basis, rows = self._filter(frames, source, bins)
+            spectrum = torch.fft.rfft(bins.transpose(1, 2))[..., : basis.shape[1]]
+            spectra.append((spectrum * basis).sum(1))
+        return self._rows(torch.stack(spectra).sum(0), rows, frames)
 
-    def _filter(self, frames: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    def _filter(self, frames: int, source: Source, like: Tensor) -> tuple[Tensor, Tensor]:
         """Return the nodes' spectra (N, K) and the rows' filters (F, K'), complex64."""
         key = (frames, str(like.device))
         if key not in self._filters:
             self._filters[key] = self._make_filter(frames, like)
-        return self._filters[key]
+        surface, edge, rows = self._filters[key]
+        return (surface if source == "surface" else edge), rows
 
-    def _make_filter(self, frames: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    def _make_filter(self, frames: int, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         analysis, rate = self.analysis, self.analysis.sampling_rate
         length = frames * analysis.hop
         step = rate / length
@@ -99,9 +115,8 @@ class FilterBank:
         absolute = np.abs(frequency[low:])
         hats = between(np.minimum(absolute, self._top), self.nodes)[0][:, self.kept_nodes]
         fine = self.finer * rate
-        level = absolute * 1j + np.hypot(absolute, self.soft)
-        level = level / np.sinc(absolute / fine) ** 3
-        basis = (hats * level[:, None]).T
+        edge = (hats / np.sinc(absolute / fine)[:, None] ** 3).T
+        surface = edge * (absolute * 1j + np.hypot(absolute, self.soft))
         filters = self.filters
         time = np.arange(filters.envelope.shape[1]) + filters.origin
         rows = np.stack(
@@ -116,15 +131,9 @@ class FilterBank:
         )
         rows = rows * np.exp(2j * np.pi * np.outer(self.head.delay, frequency))
         rows = rows / analysis.hop
-        made = [torch.as_tensor(part.astype(np.complex64)) for part in (basis, rows)]
-        return made[0].to(like.device), made[1].to(like.device)
-
-    def _analysed(self, bins: Tensor, frames: int) -> Tensor:
-        """Power (Q, W, F) of time bins (Q, B, N)."""
-        basis, rows = self._filter(frames, bins)
-        kept = basis.shape[1]
-        spectrum = torch.fft.rfft(bins.transpose(1, 2))[..., :kept]
-        return self._rows((spectrum * basis).sum(1), rows, frames)
+        made = (torch.as_tensor(part.astype(np.complex64)) for part in (surface, edge, rows))
+        first, second, third = (part.to(like.device) for part in made)
+        return first, second, third
 
     def _rows(self, spectrum: Tensor, rows: Tensor, frames: int) -> Tensor:
         """Power (Q, W, F) in each row, of spectra (Q, K) from frequency zero on."""
@@ -145,7 +154,7 @@ class FilterBank:
 
 
 class _Deposit(torch.autograd.Function):
-    """Lay echoes into time bins by quadratic splines; weights and bins have no gradient path."""
+    """Lay echoes into time bins by quadratic splines; the bins' numbers have no gradient path."""
 
     @staticmethod
     def forward(
@@ -163,16 +172,26 @@ class _Deposit(torch.autograd.Function):
         return bins.view(*size, -1)
 
     @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, None, None, None]:
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, Tensor | None, None, None]:
         strength, off, weight, rows = ctx.saved_tensors
         flat = grads[0].reshape(-1, weight.shape[1])
-        low, middle, high = (
-            torch.einsum("qn,qn->q", flat[rows + shift], weight) for shift in (-1, 0, 1)
-        )
         parts = (0.5 * (0.5 - off) ** 2, 0.75 - off**2, 0.5 * (0.5 + off) ** 2)
-        to_strength = low * parts[0] + middle * parts[1] + high * parts[2]
-        to_place = strength * ((off - 0.5) * low - 2.0 * off * middle + (off + 0.5) * high)
-        return to_strength, to_place, None, None, None
+        if not ctx.needs_input_grad[2]:
+            low, middle, high = (
+                torch.einsum("qn,qn->q", flat[rows + shift], weight) for shift in (-1, 0, 1)
+            )
+            to_strength = low * parts[0] + middle * parts[1] + high * parts[2]
+            to_place = strength * ((off - 0.5) * low - 2.0 * off * middle + (off + 0.5) * high)
+            return to_strength, to_place, None, None, None
+        # Each bin's gradient is read once for all three.
+        slopes = (off - 0.5, -2.0 * off, off + 0.5)
+        to_bins, to_place = torch.zeros_like(weight), torch.zeros_like(strength)
+        for shift, part, slope in zip((-1, 0, 1), parts, slopes, strict=True):
+            near = flat[rows + shift]
+            to_bins = torch.addcmul(to_bins, near, part[:, None])
+            to_place = torch.addcmul(to_place, torch.einsum("qn,qn->q", near, weight), slope)
+        to_strength = torch.einsum("qn,qn->q", to_bins, weight)
+        return to_strength, strength * to_place, to_bins * strength[:, None], None, None
 
 
 def fast_length(count: int) -> int:

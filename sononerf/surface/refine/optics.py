@@ -27,7 +27,7 @@ from torch import Tensor, nn
 
 from sononerf.head.head import Head
 from sononerf.simulation.hearing import Hearing, hearing_of
-from sononerf.surface.refine.filter_bank import FilterBank, fast_length
+from sononerf.surface.refine.filter_bank import Arrivals, FilterBank, Source, fast_length
 from sononerf.surface.refine.mesh_operators import tangents
 
 FADE_FREQUENCY = 0.25
@@ -95,6 +95,23 @@ class Pieces:
     vertex: Tensor
     weight: Tensor
     reach: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Ways of the sound of a pose by a place to its ears.
+
+    Attributes:
+        pose (Q,): Row of :class:`Heads`.
+        strength ((Q, E) float32): Gradients run to it, to the length and to the weight.
+        length ((Q, E) float32, m): From the emitter to the ear.
+        weight ((Q, E, N) float32): Factors at the nodes.
+    """
+
+    pose: Tensor
+    strength: Tensor
+    length: Tensor
+    weight: Tensor
 
 
 class Optics(nn.Module):
@@ -194,7 +211,7 @@ class Optics(nn.Module):
                 frequency.
         """
         size = area.norm(dim=-1)
-        normal = area / size.clamp_min(1e-30)[..., None]
+        normal = area / size.clamp_min(1e-18)[..., None]  # squares of less are zero in float32
         u, v = points - emitters, points - ears
         d1, d2 = u.norm(dim=-1), v.norm(dim=-1)
         u, v = u / d1[..., None], v / d2[..., None]
@@ -301,12 +318,14 @@ class Optics(nn.Module):
         pieces: Pieces,
         heads: Heads,
         *,
+        edges: Paths | None = None,
         stretch: Tensor | None = None,
         late: Tensor | None = None,
     ) -> Heard:
         """Return the spectrograms of poses; gradients run to points and areas (V, 3) float32.
 
-        The paths of a pose are multiplied by ``stretch`` (P,) and lengthened by ``late`` (P,), m.
+        The sound by ``edges`` is added in phase. The paths of a pose are multiplied by ``stretch``
+        (P,) and lengthened by ``late`` (P,), m.
         """
         emitters, ears = heads.emitters, heads.ears
         place, normal = points[pieces.vertex], area[pieces.vertex]
@@ -314,29 +333,39 @@ class Optics(nn.Module):
         v = place[:, None] - ears[pieces.pose]
         d1, d2 = u.norm(dim=1), v.norm(dim=2)
         both = (u / d1[:, None])[:, None] + v / d2[:, :, None]
-        # Sound by different ways adds up in phase.
-        pose, poses = pieces.pose % heads.poses, heads.poses
         strength = -(both * normal[:, None]).sum(2) * 0.5 / (self.speed_of_sound * d1[:, None] * d2)
-        rate = self.analysis.sampling_rate
-        path = d1[:, None] + d2
-        if stretch is not None:
-            path = path * stretch[pose][:, None]
-        if late is not None:
-            path = path + late[pose][:, None]
-        path = path * (rate / self.speed_of_sound)  # samples
-        frames, row = self._span(path.detach(), pose, poses)
-        hop = self.analysis.hop
-        origin = ((row + self._first) * hop).to(path.dtype)
-        at = path - origin[pose][:, None]
-        receiver = pose[:, None] * self.ears + torch.arange(self.ears, device=at.device)
-        power = self.bank.power(
-            strength.reshape(-1),
-            at.reshape(-1),
-            pieces.weight.flatten(0, 1),
-            receiver.reshape(-1),
-            receivers=poses * self.ears,
-            frames=frames,
-        )
+        ways: dict[Source, Paths] = {
+            "surface": Paths(pieces.pose, strength, d1[:, None] + d2, pieces.weight)
+        }
+        if edges is not None:
+            ways["edge"] = edges
+        # Sound by different ways adds up in phase.
+        poses = heads.poses
+        pose = {source: some.pose % poses for source, some in ways.items()}
+        samples = self.analysis.sampling_rate / self.speed_of_sound
+        paths = {}
+        for source, some in ways.items():
+            path = some.length
+            if stretch is not None:
+                path = path * stretch[pose[source]][:, None]
+            if late is not None:
+                path = path + late[pose[source]][:, None]
+            paths[source] = path * samples
+        whole = torch.cat([path.detach() for path in paths.values()])
+        frames, row = self._span(whole, torch.cat([*pose.values()]), poses)
+        origin = (row + self._first) * self.analysis.hop
+        ear = torch.arange(self.ears, device=row.device)
+        arrivals = {}
+        for source, some in ways.items():
+            at = paths[source] - origin.to(paths[source].dtype)[pose[source]][:, None]
+            receiver = pose[source][:, None] * self.ears + ear
+            arrivals[source] = Arrivals(
+                some.strength.reshape(-1),
+                at.reshape(-1),
+                some.weight.flatten(0, 1),
+                receiver.reshape(-1),
+            )
+        power = self.bank.power(arrivals, receivers=poses * self.ears, frames=frames)
         return Heard(power.unflatten(0, (poses, self.ears)), row)
 
     def later_power(
@@ -356,14 +385,9 @@ class Optics(nn.Module):
         last = frames * self.analysis.hop - self._pad
         inside = torch.nonzero((at > self._pad) & (at < last))[:, 0]
         at = at[inside].float()
-        power = self.bank.power(
-            torch.ones_like(at),
-            at,
-            weight[inside],
-            (pose * self.ears + ear)[inside],
-            receivers=poses * self.ears,
-            frames=frames,
-        )
+        receiver = (pose * self.ears + ear)[inside]
+        arrivals = Arrivals(torch.ones_like(at), at, weight[inside], receiver)
+        power = self.bank.power({"surface": arrivals}, receivers=poses * self.ears, frames=frames)
         return power.unflatten(0, (poses, self.ears))
 
     def _span(self, path: Tensor, pose: Tensor, poses: int) -> tuple[int, Tensor]:

@@ -10,7 +10,7 @@ from sononerf.head.call import emit
 from sononerf.head.head import Head
 from sononerf.head.spectrogram import range_axis, spectrogram
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
-from sononerf.surface.refine.filter_bank import FilterBank, fast_length
+from sononerf.surface.refine.filter_bank import Arrivals, FilterBank, fast_length
 
 NODES = (np.arange(19) + 0.5) * 8e3
 SOFT = 25e3
@@ -25,14 +25,10 @@ def bank_of(kind, harmonics=(1.0,), analysis_kind="stft", **changes):
 
 def power(bank, strength, at, frames, receiver=0, receivers=1):
     count = len(at)
-    return bank.power(
-        strength,
-        at,
-        torch.ones(count, len(bank.kept_nodes)),
-        torch.full((count,), receiver, dtype=torch.int64),
-        receivers=receivers,
-        frames=frames,
-    )
+    weight = torch.ones(count, len(bank.kept_nodes))
+    of = torch.full((count,), receiver, dtype=torch.int64)
+    arrivals = Arrivals(strength, at, weight, of)
+    return bank.power({"surface": arrivals}, receivers=receivers, frames=frames)
 
 
 @pytest.mark.parametrize(
@@ -104,6 +100,21 @@ def test_gradients_are_those_of_finite_differences():
                 moved.append(float(torch.log(whole + 0.01 * fixed).double().mean()))
             wanted = (moved[0] - moved[1]) / (2 * step)
             assert float(tensor.grad[number]) == pytest.approx(wanted, rel=0.05, abs=2e-3)
+
+
+def test_the_gradients_of_weights_do_not_change_those_of_strengths():
+    bank, _ = bank_of("impulse")
+    at, of = torch.tensor([300.2, 306.7]), torch.zeros(2, dtype=torch.int64)
+    found = []
+    for both in (False, True):
+        strength = torch.tensor([1.0, 0.7], requires_grad=True)
+        weight = torch.ones(2, len(bank.kept_nodes), requires_grad=both)
+        arrivals = Arrivals(strength, at, weight, of)
+        bank.power({"edge": arrivals}, receivers=1, frames=128).sum().backward()
+        found.append(strength.grad)
+    torch.testing.assert_close(found[0], found[1])
+    # A strength multiplies all of its weights.
+    torch.testing.assert_close((weight.grad * weight).sum(1), strength.grad * strength)
 
 
 def test_lengths_are_few_and_no_shorter_than_asked():

@@ -90,6 +90,16 @@ def test_a_plate_seen_straight_on_is_at_its_mirror_point_and_one_on_edge_is_not(
     assert float(slant[2]) == pytest.approx(0.5 * 1.2**2 / (2 * 0.8**2 / 0.3), rel=0.02)
 
 
+def test_a_piece_whose_squared_area_is_zero_in_single_precision_is_no_error(optics):
+    place, tiny = (
+        torch.tensor([[0.015, 0.033, -0.002]]),
+        torch.tensor([[-1.44e-23, -1.32e-23, 0.0]]),
+    )
+    emitter, ear = torch.tensor([[-0.349, 0.141, -0.130]]), torch.tensor([[-0.358, 0.157, -0.122]])
+    found = optics.near_mirror(place, tiny, torch.zeros(1, 6), emitter, ear)
+    assert all(bool(torch.isfinite(part).all()) for part in found[1:])
+
+
 def test_gains_are_those_of_the_tables(optics):
     ears = hearing_of(optics.head).ears
     row, column = 40, 100

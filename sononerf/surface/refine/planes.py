@@ -1,0 +1,351 @@
+# SPDX-License-Identifier: MIT
+"""Flat parts of a surface: found, put on planes that meet in sharp edges, and moved as planes.
+
+Off the mirror a flat face is silent, and a wave of a two-hundredth of a wavelength on it is as loud
+as its edges. So vertices that move freely never find one. A plane has three numbers; the error
+falls steadily towards the true ones, from a wavelength away.
+
+Parts are found by hierarchical clustering of the triangles [1]_. A vertex lies on the planes of all
+triangles about it: on one, on an edge of two, or on a corner.
+
+References:
+    .. [1] M. Garland, A. Willmott and P. S. Heckbert, "Hierarchical face clustering on polygonal
+       surfaces", I3D 2001.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+
+import numpy as np
+import trimesh
+from scipy.sparse import csr_array
+
+from sononerf.array_types import Floats, Ints
+from sononerf.compiled import compiled
+
+COHERENT = 0.9
+"""Length of the mean normal of a part, at least; the sides of a bar stay apart."""
+SMOOTHING = 0.3
+"""Cost of a border along one side of a triangle, beside the squared distance from its plane over
+the squared tolerance."""
+UPRIGHT = 0.5
+"""Cost of a triangle that lies square to its plane, likewise."""
+SWEEPS = 15
+"""Number of times that triangles are given to the plane that fits them best, at most."""
+PARALLEL = 0.05
+"""Eigenvalue of the sum of squared normals below which planes do not determine where they meet:
+two planes at less than 26 degrees."""
+EVEN = 20
+"""Number of steps that make the triangles even again."""
+SOFT = 0.02
+"""The same for motions of planes, which need no exact meeting: a soft limit."""
+
+
+def flat_parts(mesh: trimesh.Trimesh, tolerance: float, least: float) -> Ints:
+    """Return the number of the flat part (T,) that each triangle belongs to.
+
+    Args:
+        mesh: A closed surface, m.
+        tolerance (m): Standard deviation of a part from its plane, at most.
+        least (m²): Parts with a smaller area are given to their neighbours.
+    """
+    corners = np.asarray(mesh.triangles, dtype=np.float64)
+    pairs = np.asarray(mesh.face_adjacency, dtype=np.int64)
+    part = _clustered(*_moments(corners), pairs, tolerance**2, COHERENT)
+    part = _given_to_the_best(mesh, _counted(part), tolerance)
+    area = np.bincount(part, mesh.area_faces)
+    for number in sorted(np.flatnonzero(area < least), key=lambda one: area[one]):
+        own = part == number
+        beside = np.unique(part[pairs[own[pairs].any(axis=1)]])
+        beside = beside[beside != number]
+        if len(beside):
+            normal, offset = planes_of(mesh, part, tolerance)
+            off = mesh.triangles_center[own] @ normal[beside].T - offset[beside]
+            part[own] = beside[np.abs(off).mean(axis=0).argmin()]
+    return _counted(_given_to_the_best(mesh, _counted(part), tolerance))
+
+
+def planes_of(mesh: trimesh.Trimesh, part: Ints, tolerance: float) -> tuple[Floats, Floats]:
+    """Return the planes of parts; what is far off them, such as a rounded edge, counts little.
+
+    Args:
+        mesh: The surface, m.
+        part (T,): Number of each triangle's part.
+        tolerance (m): Distance from the plane at which a triangle has half the weight.
+
+    Returns:
+        normal (N, 3): Outward unit normals.
+        offset ((N,), m): Distances of the planes from the origin along them.
+    """
+    middle, area = np.asarray(mesh.triangles_center), np.asarray(mesh.area_faces)
+    upright = np.asarray(mesh.face_normals)
+    count, weight = int(part.max()) + 1, area
+    normal, offset = np.zeros((count, 3)), np.zeros(count)
+    outward = _summed(part, area[:, None] * upright, count)
+    for _ in range(9):
+        whole = np.maximum(np.bincount(part, weight, count), 1e-300)
+        centre = _summed(part, weight[:, None] * middle, count) / whole[:, None]
+        off = middle - centre[part]
+        square = (weight[:, None, None] * off[:, :, None] * off[:, None]).reshape(-1, 9)
+        spread = _summed(part, square, count).reshape(-1, 3, 3)
+        normal = np.linalg.eigh(spread)[1][:, :, 0]
+        normal *= np.where((normal * outward).sum(1) < 0.0, -1.0, 1.0)[:, None]
+        offset = (normal * centre).sum(1)
+        away = (middle * normal[part]).sum(1) - offset[part]
+        tilt = np.clip(((upright * normal[part]).sum(1) - 0.7) / 0.3, 0.01, 1.0)
+        weight = area * tilt**2 / (1.0 + np.square(away / tolerance))
+    return normal, offset
+
+
+def on_planes(mesh: trimesh.Trimesh, part: Ints, normal: Floats, offset: Floats) -> trimesh.Trimesh:
+    """Return a mesh with each part on its plane, and sharp edges where planes meet.
+
+    Args:
+        mesh: The surface, m.
+        part (T,): Number of each triangle's plane.
+        normal, offset: From :func:`planes_of`.
+    """
+    vertex, plane = _members(np.asarray(mesh.faces), part)
+    count = len(mesh.vertices)
+    upright = normal[plane]
+    square = _summed(vertex, (upright[:, :, None] * upright[:, None]).reshape(-1, 9), count)
+    size, axes = np.linalg.eigh(square.reshape(-1, 3, 3))
+    inverse = np.where(size > PARALLEL, 1.0 / np.maximum(size, PARALLEL), 0.0)
+
+    def put(places: Floats) -> Floats:
+        short = offset[plane] - (upright * places[vertex]).sum(1)
+        wanted = _summed(vertex, short[:, None] * upright, count)
+        found: Floats = places + np.einsum("vij,vj,vkj,vk->vi", axes, inverse, axes, wanted)
+        return found
+
+    # Each vertex goes half-way to the mean of the neighbours that lie on all of its planes.
+    own = csr_array((np.ones(len(vertex)), (vertex, plane)), shape=(count, len(normal)))
+    ends = np.asarray(mesh.edges_unique)
+    common = np.asarray(own[ends[:, 0]].multiply(own[ends[:, 1]]).sum(axis=1)).ravel()
+    number = np.bincount(vertex, minlength=count)
+    pairs = np.concatenate(
+        [ends[common == number[ends[:, 0]]], ends[common == number[ends[:, 1]], ::-1]]
+    )
+    near = csr_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
+    degree = near.sum(axis=1)[:, None]
+    places = put(np.asarray(mesh.vertices))
+    for _ in range(EVEN):
+        mean = np.where(degree > 0, (near @ places) / np.maximum(degree, 1), places)
+        places = put(0.5 * (places + mean))
+    return trimesh.Trimesh(places, np.asarray(mesh.faces), process=False)
+
+
+def motions(vertices: Floats, faces: Ints, part: Ints) -> csr_array:
+    """Return how the vertices move with the planes.
+
+    Args:
+        vertices ((V, 3), m): On their planes.
+        faces (T, 3): Triangles.
+        part (T,): Numbers of their planes.
+
+    Returns:
+        motion (3 V, 3 N): Three numbers of each plane, m, move it along its normal and tilt it
+            about two axes; each moves it by one in the mean square.
+    """
+    corners = vertices[faces]
+    area = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size, count = np.linalg.norm(area, axis=1), int(part.max()) + 1
+    normal = _summed(part, area, count)
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
+    whole = np.maximum(np.bincount(part, size, count), 1e-300)
+    centre = _summed(part, size[:, None] * corners.mean(axis=1), count) / whole[:, None]
+    other = np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
+    first = np.cross(normal, other)
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
+    second = np.cross(normal, first)
+    vertex, plane = _members(faces, part)
+    upright = normal[plane]
+    square = _summed(vertex, (upright[:, :, None] * upright[:, None]).reshape(-1, 9), len(vertices))
+    inverse = np.linalg.inv(square.reshape(-1, 3, 3) + SOFT * np.eye(3))
+    moved = np.einsum("mij,mj->mi", inverse[vertex], upright)
+    off = (vertices[vertex] - centre[plane]) / np.sqrt(whole / (4.0 * math.pi))[plane, None]
+    height = np.stack(
+        [np.ones(len(off)), (off * first[plane]).sum(1), (off * second[plane]).sum(1)], axis=1
+    )
+    values = moved[:, :, None] * height[:, None]
+    rows = (3 * vertex)[:, None, None] + np.arange(3)[:, None] + np.zeros(3, dtype=np.int64)
+    columns = (3 * plane)[:, None, None] + np.zeros((3, 1), dtype=np.int64) + np.arange(3)
+    shape = (3 * len(vertices), 3 * count)
+    return csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
+
+
+def _given_to_the_best(mesh: trimesh.Trimesh, part: Ints, tolerance: float) -> Ints:
+    """Give triangles at borders to the part on whose plane they lie best, of those beside them."""
+    pairs = np.asarray(mesh.face_adjacency)
+    middle, upright = np.asarray(mesh.triangles_center), np.asarray(mesh.face_normals)
+    beside = np.repeat(np.arange(len(part))[:, None], 3, axis=1)
+    both = np.concatenate([pairs, pairs[:, ::-1]])
+    both = both[np.argsort(both[:, 0], kind="stable")]
+    rank = np.arange(len(both)) - np.searchsorted(both[:, 0], both[:, 0])
+    inner = rank < 3
+    beside[both[inner, 0], rank[inner]] = both[inner, 1]
+    for _ in range(2):
+        normal, offset = planes_of(mesh, part, tolerance)
+        for sweep in range(SWEEPS):
+            choice = np.concatenate([part[:, None], part[beside]], axis=1)
+            off = np.einsum("td,tcd->tc", middle, normal[choice]) - offset[choice]
+            tilt = 1.0 - np.einsum("td,tcd->tc", upright, normal[choice])
+            like = (choice[:, :, None] == part[beside][:, None]).sum(axis=2)
+            cost = np.square(off / tolerance) + UPRIGHT * tilt - SMOOTHING * like
+            best = choice[np.arange(len(part)), cost.argmin(axis=1)]
+            # Half of them at a time, so that neighbours do not change places for ever.
+            best = np.where(np.arange(len(part)) % 2 == sweep % 2, best, part)
+            if sweep and (best == part).all():
+                break
+            part = best
+        part = _counted(part)
+    return part
+
+
+def _members(faces: Ints, part: Ints) -> tuple[Ints, Ints]:
+    """Return vertices and their planes (M,), each pair once."""
+    both = np.unique(np.stack([faces.ravel(), np.repeat(part, 3)], axis=1), axis=0)
+    return both[:, 0], both[:, 1]
+
+
+def _counted(part: Ints) -> Ints:
+    """Return the parts with numbers from 0 on."""
+    found: Ints = np.unique(part, return_inverse=True)[1].reshape(-1)
+    return found
+
+
+def _summed(of: Ints, values: Floats, count: int) -> Floats:
+    """Sum of rows (N, K) by their numbers (N,), (count, K)."""
+    columns = [np.bincount(of, column, count) for column in values.T]
+    return np.stack(columns, axis=1)
+
+
+def _moments(corners: Floats) -> tuple[Floats, Floats, Floats, Floats]:
+    """Area (T,), first (T, 3) and second (T, 3, 3) moments, and vector area (T, 3) of triangles."""
+    vector = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(vector, axis=1)
+    middle = corners.mean(axis=1)
+    square = (
+        np.einsum("tci,tcj->tij", corners, corners) + 9.0 * middle[:, :, None] * middle[:, None]
+    )
+    return area, area[:, None] * middle, area[:, None, None] / 12.0 * square, vector
+
+
+@compiled
+def _flatness(area: float, first: Floats, second: Floats) -> float:
+    """Mean square of the distance from the best plane, m²: the least eigenvalue."""
+    xx = second[0, 0] / area - (first[0] / area) ** 2
+    yy = second[1, 1] / area - (first[1] / area) ** 2
+    zz = second[2, 2] / area - (first[2] / area) ** 2
+    xy = second[0, 1] / area - first[0] * first[1] / area**2
+    xz = second[0, 2] / area - first[0] * first[2] / area**2
+    yz = second[1, 2] / area - first[1] * first[2] / area**2
+    mean = (xx + yy + zz) / 3.0
+    p = (xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2
+    p = math.sqrt((p + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
+    if p <= 0.0:
+        return max(mean, 0.0)
+    a, b, c = (xx - mean) / p, (yy - mean) / p, (zz - mean) / p
+    d, e, f = xy / p, xz / p, yz / p
+    half = 0.5 * (a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e))
+    angle = math.acos(min(max(half, -1.0), 1.0)) / 3.0
+    return max(mean + 2.0 * p * math.cos(angle + 2.0 * math.pi / 3.0), 0.0)
+
+
+@compiled
+def _clustered(
+    area: Floats,
+    first: Floats,
+    second: Floats,
+    vector: Floats,
+    pairs: Ints,
+    most: float,
+    coherent: float,
+) -> Ints:
+    """Merge neighbouring triangles, those first that lie best on one plane; return roots (T,).
+
+    Arguments are :func:`_moments`, pairs of neighbours (K, 2), the largest mean square of the
+    distance from the plane, m², and the least length of a mean normal.
+    """
+    count = len(area)
+    root = np.arange(count)
+    version = np.zeros(count, dtype=np.int64)
+    # Chains of each part's pairs: pair k stands in the chain of its first triangle as 2 k, and in
+    # that of its second one as 2 k + 1.
+    head = np.full(count, -1)
+    tail = np.full(count, -1)
+    after = np.full(2 * len(pairs), -1)
+    mark = np.full(count, -1)
+    for place in range(2 * len(pairs)):
+        of = pairs[place // 2, place % 2]
+        after[place] = head[of]
+        if head[of] < 0:
+            tail[of] = place
+        head[of] = place
+    heap = [(0.0, 0, 0, 0, 0)]
+    heap.pop()
+    for start in range(-len(pairs), count):
+        # First each pair is offered; then the best one is merged, and its neighbours are offered.
+        if start < 0:
+            one, other = pairs[start + len(pairs), 0], pairs[start + len(pairs), 1]
+        else:
+            found = False
+            while len(heap) > 0 and not found:
+                _, one, other, old, older = heapq.heappop(heap)
+                found = version[one] == old and version[other] == older
+            if not found:
+                break
+            area[one] += area[other]
+            first[one] += first[other]
+            second[one] += second[other]
+            vector[one] += vector[other]
+            root[other] = one
+            version[one] += 1
+            version[other] = -1
+            if head[other] >= 0:
+                if head[one] < 0:
+                    head[one] = head[other]
+                else:
+                    after[tail[one]] = head[other]
+                tail[one] = tail[other]
+        place, before = (0, -1) if start < 0 else (head[one], -1)
+        while place >= 0:
+            following = -1
+            if start >= 0:
+                following = after[place]
+                other = pairs[place // 2, 1 - place % 2]
+                while root[other] != other:
+                    root[other] = root[root[other]]
+                    other = root[other]
+                if other == one or mark[other] == start:
+                    if other == one:  # the pair lies inside now
+                        if before < 0:
+                            head[one] = following
+                        else:
+                            after[before] = following
+                        if following < 0:
+                            tail[one] = before
+                    else:
+                        before = place
+                    place = following
+                    continue
+                mark[other] = start
+                before = place
+            whole = area[one] + area[other]
+            mean = vector[one] + vector[other]
+            length = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2) / max(whole, 1e-300)
+            off = _flatness(
+                max(whole, 1e-300), first[one] + first[other], second[one] + second[other]
+            )
+            if off <= most and length >= coherent:
+                key = (off + (1.0 - length) * most) * whole
+                heapq.heappush(heap, (key, one, other, version[one], version[other]))
+            place = following
+    for number in range(count):
+        at = number
+        while root[at] != at:
+            at = root[at]
+        root[number] = at
+    return root
