@@ -14,7 +14,6 @@ from sononerf.array_types import Floats, Ints
 from sononerf.echoes.echoes import Echoes
 from sononerf.surface.refine.descent import LAST, MEMORY, MOMENTUM
 from sononerf.surface.refine.edges import Edges
-from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
 from sononerf.surface.refine.objective import Level, differences, measured, mismatch
 from sononerf.surface.refine.optics import Heard, Optics
@@ -42,7 +41,6 @@ class PlaneDescent:
         part (T,): Number of each triangle's plane.
         echoes, optics, level: Measurement, head, and gains, which are updated.
         rate (m): Length of the first steps.
-        later: Later bounces, added as power.
         band: As in :class:`~sononerf.surface.refine.descent.Stage`.
         seed: Seed of the poses.
 
@@ -59,12 +57,11 @@ class PlaneDescent:
         level: Level,
         *,
         rate: float,
-        later: LaterBounces | None = None,
         band: float = 0.0,
         seed: int,
     ) -> None:
         self.echoes, self.optics, self.level, self.seed = echoes, optics, level, seed
-        self.rate, self.band, self._later = rate, band, later
+        self.rate, self.band = rate, band
         self.faces, self.part = np.array(mesh.faces, dtype=np.int64), part
         self.vertices: Floats = np.array(mesh.vertices, dtype=np.float64)
         self._start = self.vertices
@@ -143,11 +140,8 @@ class PlaneDescent:
         heard = self.render(numbers, vertices)
         if heard is None:
             return None, math.inf
-        later = None if self._later is None else self._later.power(numbers, heard)
         found = measured(self.echoes, numbers, heard)
-        difference, weight = differences(
-            heard, later, found, self.level, learn=True, band=self.band
-        )
+        difference, weight = differences(heard, None, found, self.level, learn=True, band=self.band)
         error = mismatch(difference, weight).mean()
         (gradient,) = torch.autograd.grad(error, vertices)
         return gradient.cpu().numpy(), float(error.detach())

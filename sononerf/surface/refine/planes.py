@@ -26,21 +26,23 @@ from sononerf.array_types import Floats, Ints
 from sononerf.compiled import compiled
 
 COHERENT = 0.9
-"""Length of the mean normal of a part, at least; the sides of a bar stay apart."""
+"""Least length of the mean of a part's unit normals, no unit. The two sides of a thin plate have a
+mean of zero, so they stay apart."""
 SMOOTHING = 0.3
-"""Cost of a border along one side of a triangle, beside the squared distance from its plane over
-the squared tolerance."""
+"""What a triangle gains by each neighbour of the same part, no unit; its cost is the square of its
+distance from the plane over the tolerance."""
 UPRIGHT = 0.5
-"""Cost of a triangle that lies square to its plane, likewise."""
+"""Further cost of a triangle whose normal is square to that of the plane, no unit."""
 SWEEPS = 15
 """Number of times that triangles are given to the plane that fits them best, at most."""
 PARALLEL = 0.05
-"""Eigenvalue of the sum of squared normals below which planes do not determine where they meet:
-two planes at less than 26 degrees."""
+"""Eigenvalue of the sum of the normals' outer products below which planes do not determine where
+they meet, no unit: that of two planes at 18 degrees."""
 EVEN = 20
 """Number of steps that make the triangles even again."""
 SOFT = 0.02
-"""The same for motions of planes, which need no exact meeting: a soft limit."""
+"""Added to these eigenvalues where planes move, no unit: vertices between planes that are nearly
+parallel then move by little, and not far along them."""
 
 
 def flat_parts(mesh: trimesh.Trimesh, tolerance: float, least: float) -> Ints:
@@ -255,6 +257,27 @@ def _flatness(area: float, first: Floats, second: Floats) -> float:
 
 
 @compiled
+def _cost(
+    one: int,
+    other: int,
+    area: Floats,
+    first: Floats,
+    second: Floats,
+    vector: Floats,
+    most: float,
+    coherent: float,
+) -> float:
+    """Cost of making two parts one, m⁴; -1 if they do not lie on one plane."""
+    whole = max(area[one] + area[other], 1e-300)
+    mean = vector[one] + vector[other]
+    length = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2) / whole
+    off = _flatness(whole, first[one] + first[other], second[one] + second[other])
+    if off > most or length < coherent:
+        return -1.0
+    return (off + (1.0 - length) * most) * whole
+
+
+@compiled
 def _clustered(
     area: Floats,
     first: Floats,
@@ -286,62 +309,50 @@ def _clustered(
         head[of] = place
     heap = [(0.0, 0, 0, 0, 0)]
     heap.pop()
-    for start in range(-len(pairs), count):
-        # First each pair is offered; then the best one is merged, and its neighbours are offered.
-        if start < 0:
-            one, other = pairs[start + len(pairs), 0], pairs[start + len(pairs), 1]
-        else:
-            found = False
-            while len(heap) > 0 and not found:
-                _, one, other, old, older = heapq.heappop(heap)
-                found = version[one] == old and version[other] == older
-            if not found:
-                break
-            area[one] += area[other]
-            first[one] += first[other]
-            second[one] += second[other]
-            vector[one] += vector[other]
-            root[other] = one
-            version[one] += 1
-            version[other] = -1
-            if head[other] >= 0:
-                if head[one] < 0:
-                    head[one] = head[other]
-                else:
-                    after[tail[one]] = head[other]
-                tail[one] = tail[other]
-        place, before = (0, -1) if start < 0 else (head[one], -1)
+    for pair in pairs:
+        one, other = pair[0], pair[1]
+        cost = _cost(one, other, area, first, second, vector, most, coherent)
+        if cost >= 0.0:
+            heapq.heappush(heap, (cost, one, other, 0, 0))
+    merges = 0
+    while len(heap) > 0:
+        _, one, other, old, older = heapq.heappop(heap)
+        if version[one] != old or version[other] != older:
+            continue
+        area[one] += area[other]
+        first[one] += first[other]
+        second[one] += second[other]
+        vector[one] += vector[other]
+        root[other] = one
+        version[one] += 1
+        version[other] = -1
+        if head[one] < 0:
+            head[one] = head[other]
+        elif head[other] >= 0:
+            after[tail[one]] = head[other]
+        if head[other] >= 0:
+            tail[one] = tail[other]
+        merges += 1
+        place, before = head[one], -1
         while place >= 0:
-            following = -1
-            if start >= 0:
-                following = after[place]
-                other = pairs[place // 2, 1 - place % 2]
-                while root[other] != other:
-                    root[other] = root[root[other]]
-                    other = root[other]
-                if other == one or mark[other] == start:
-                    if other == one:  # the pair lies inside now
-                        if before < 0:
-                            head[one] = following
-                        else:
-                            after[before] = following
-                        if following < 0:
-                            tail[one] = before
-                    else:
-                        before = place
-                    place = following
-                    continue
-                mark[other] = start
+            following = after[place]
+            beside = pairs[place // 2, 1 - place % 2]
+            while root[beside] != beside:
+                root[beside] = root[root[beside]]
+                beside = root[beside]
+            if beside != one:
                 before = place
-            whole = area[one] + area[other]
-            mean = vector[one] + vector[other]
-            length = math.sqrt(mean[0] ** 2 + mean[1] ** 2 + mean[2] ** 2) / max(whole, 1e-300)
-            off = _flatness(
-                max(whole, 1e-300), first[one] + first[other], second[one] + second[other]
-            )
-            if off <= most and length >= coherent:
-                key = (off + (1.0 - length) * most) * whole
-                heapq.heappush(heap, (key, one, other, version[one], version[other]))
+            elif before >= 0:  # the pair lies inside now, and leaves the chain
+                after[before] = following
+            else:
+                head[one] = following
+            if following < 0:
+                tail[one] = before
+            if beside != one and mark[beside] != merges:
+                mark[beside] = merges
+                cost = _cost(one, beside, area, first, second, vector, most, coherent)
+                if cost >= 0.0:
+                    heapq.heappush(heap, (cost, one, beside, version[one], version[beside]))
             place = following
     for number in range(count):
         at = number

@@ -73,7 +73,7 @@ four frames raises the median F-score at 2 mm of 19 withheld bodies from 0.83 to
 from 0.59 to 0.65; eight frames give no more."""
 CHANNELS = (48, 80, 112, 144)
 """Channels of the network, from fine to coarse."""
-_ROOM = 1.0  # distance in front of the onsets that the lattice covers, range resolutions
+_ROOM = 1.0  # distance in front of the onsets that the lattice covers, steps of the search
 
 
 def lattice_of(hull: EchoHull, box: Floats, resolution: float) -> Lattice | None:
@@ -84,8 +84,9 @@ def lattice_of(hull: EchoHull, box: Floats, resolution: float) -> Lattice | None
         box ((2, 3), m): Lower and upper corner of the region.
         resolution (m): Range resolution.
     """
-    coarse = Lattice.over(box[0], box[1], resolution)
-    left = np.argwhere(clearance_grid(hull, coarse) > -_ROOM * resolution)
+    step = max(resolution, float(np.prod(box[1] - box[0]) / LARGEST) ** (1 / 3))
+    coarse = Lattice.over(box[0], box[1], step)
+    left = np.argwhere(clearance_grid(hull, coarse) > -_ROOM * step)
     if not len(left):
         return None
     lower = coarse.origin + coarse.spacing * (left.min(axis=0) - 1.5)

@@ -79,6 +79,28 @@ def test_planes_move_and_tilt_what_lies_on_them_and_keep_it_flat(worn):
     assert np.abs(shift[np.setdiff1d(faces, faces[part == 0])]).max() == 0.0
 
 
+def test_vertices_on_edges_follow_all_of_their_planes():
+    axes = np.concatenate([np.eye(3), -np.eye(3)])
+    body = trimesh.convex.convex_hull(0.03 * axes)  # an octahedron: its planes are not square
+    fine = body.subdivide_to_size(3e-3)
+    normal = np.asarray(body.face_normals)
+    part = (np.asarray(fine.face_normals) @ normal.T).argmax(axis=1)
+    places, faces = np.asarray(fine.vertices), np.asarray(fine.faces)
+    motion = motions(places, faces, part)
+    outward = np.tile([1e-4, 0.0, 0.0], 8)
+    shift = (motion @ outward).reshape(-1, 3)
+    height = np.einsum("tcd,td->tc", shift[faces], normal[part])
+    assert np.allclose(height, 1e-4, rtol=0.06)
+    assert np.linalg.matrix_rank(motion[:, :3].toarray()) == 3
+
+
+def test_the_sides_of_a_thin_plate_stay_apart():
+    plate = trimesh.creation.box((0.05, 0.04, 1e-3)).subdivide_to_size(2e-3)
+    part = flat_parts(plate, TOLERANCE, LEAST)
+    up = np.asarray(plate.face_normals)[:, 2]
+    assert not set(part[up > 0.9]) & set(part[up < -0.9])
+
+
 def test_a_smooth_body_has_many_parts():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.03)
     assert flat_parts(ball, 3e-4, 0.0).max() > 20

@@ -263,6 +263,12 @@ def test_in_free_space_every_second_place_stands_for_those_beside_it():
     np.testing.assert_array_equal(some.means[free], whole.means[like])
 
 
+def test_the_lattice_has_a_bound_however_large_the_region_is():
+    _, hull = heard(around(20))
+    lattice = lattice_of(hull, 500 * BOX, RESOLUTION)
+    assert np.prod(lattice.shape) < 2 * network.LARGEST
+
+
 def test_a_large_body_gets_a_coarser_lattice(monkeypatch):
     monkeypatch.setattr(network, "LARGEST", 40_000)
     levels, hull = heard(around(60))
