@@ -51,7 +51,7 @@ class Surface(Shown):
         error_db (dB): Objective of the refinement on validation poses; None without a refinement.
         faults: Faults of the refinement, one line each.
         candidates: The starts of the refinement with their objectives, see
-            :class:`~sononerf.surface.refine.refinement.Refined`.
+            :class:`~sononerf.surface.refine.refined.Refined`.
         echoes: Echoes of its field; None if unknown.
         reading: Evidence that it was made from; None if there is none.
         learned: Weights of its echoes beside what a model renders, by model.

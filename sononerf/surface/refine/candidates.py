@@ -40,10 +40,11 @@ LATER = 1.03
 """Ratio of two objectives of one candidate below which the later stage is preferred: on smooth
 bodies later stages are nearer to the truth at the same objective. Edges lose in later stages, and
 there the objective rises by 5 % and more (beaker, star)."""
-Way = Literal["blurred", "sharp", "sheet"]
+Way = Literal["blurred", "sharp", "sheet", "planes"]
 """Way of a surface through the stages. ``blurred``: with the blur and the edges of each stage,
 unless the blur would take away thin parts. ``sharp``: without blur, on fine triangles. ``sheet``:
-its triangles are kept, because a signed distance on voxels would tear it."""
+its triangles are kept, because a signed distance on voxels would tear it. ``planes``: its flat
+parts move as planes, and are found anew in each stage."""
 
 
 @dataclass(eq=False)
@@ -86,7 +87,7 @@ class Candidate:
         least = min(refined, default=math.inf)
         if math.isinf(least) or least > TOLERATED * start:
             return 0
-        if self.start == "levels" and least > RANKS_DB:
+        if self.start == "levels" and self.way != "planes" and least > RANKS_DB:
             return next(n for n, one in enumerate([start, *refined]) if one <= TOLERATED * least)
         return max(n for n, found in enumerate(refined, 1) if found <= LATER * least)
 
@@ -179,7 +180,8 @@ def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = S
     """Return the steps of a refinement of start methods, at most; a sheet goes on alone."""
     plans = planned(dict.fromkeys(starts, 0.0))
     further = max(1, len({start for start, _ in plans if start not in ("fuller", "sheet")}))
-    return len(plans) * stages[0].steps + further * sum(stage.steps for stage in stages[1:])
+    first = len(plans) + ("levels" in dict(plans))  # its flat parts may move as planes
+    return first * stages[0].steps + further * sum(stage.steps for stage in stages[1:])
 
 
 def after_first_stage(candidates: list[Candidate]) -> list[Candidate]:

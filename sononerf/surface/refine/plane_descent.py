@@ -14,12 +14,21 @@ from sononerf.array_types import Floats, Ints
 from sononerf.echoes.echoes import Echoes
 from sononerf.surface.refine.descent import LAST, MEMORY, MOMENTUM
 from sononerf.surface.refine.edges import Edges
+from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
 from sononerf.surface.refine.objective import Level, differences, measured, mismatch
 from sononerf.surface.refine.optics import Heard, Optics
-from sononerf.surface.refine.planes import motions, on_planes, planes_of
+from sononerf.surface.refine.planes import flat_parts, motions, on_planes, planes_of
 from sononerf.surface.refine.visibility import listen, sight_of
 
+TOLERANCE = 0.3
+"""Standard deviation of a flat part from its plane, at most, shortest wavelengths: a start is known
+to a third of a wavelength."""
+LEAST = 2.0
+"""Square root of the least area of a flat part, shortest wavelengths; a smaller one is no
+mirror."""
+RATE = 0.4
+"""Length of the first steps of a plane, shortest wavelengths, over the rate of the stage."""
 POSES = 16
 """Number of training poses per step; a plane is heard by few of them. A body of bars ends at
 1.05 mm with 8 and at 0.98 mm with 16, in 1.07 times the time."""
@@ -33,38 +42,51 @@ EVENED = 5
 edge would sound like many edges."""
 
 
+def flattened(mesh: trimesh.Trimesh, wavelength: float) -> tuple[trimesh.Trimesh, Ints]:
+    """Return a mesh with its flat parts on planes, and the part of each triangle (T,).
+
+    Args:
+        mesh: m.
+        wavelength (m): The shortest.
+    """
+    tolerance = TOLERANCE * wavelength
+    part = flat_parts(mesh, tolerance, (LEAST * wavelength) ** 2)
+    return on_planes(mesh, part, *planes_of(mesh, part, tolerance)), part
+
+
 class PlaneDescent:
     """Descent of the numbers of planes.
 
     Args:
-        mesh: Its triangles lie on the planes, m.
-        part (T,): Number of each triangle's plane.
+        mesh: Its flat parts are put on planes, m.
         echoes, optics, level: Measurement, head, and gains, which are updated.
-        rate (m): Length of the first steps.
+        rate: As in :class:`~sononerf.surface.refine.descent.Stage`; ``RATE`` of it are wavelengths.
+        later: Later bounces, added as power.
         band: As in :class:`~sononerf.surface.refine.descent.Stage`.
         seed: Seed of the poses.
 
     Attributes:
+        part (T,): Number of each triangle's plane.
         vertices ((V, 3) float64, m): Present places.
     """
 
     def __init__(
         self,
         mesh: trimesh.Trimesh,
-        part: Ints,
         echoes: Echoes,
         optics: Optics,
         level: Level,
         *,
         rate: float,
+        later: LaterBounces | None = None,
         band: float = 0.0,
         seed: int,
     ) -> None:
         self.echoes, self.optics, self.level, self.seed = echoes, optics, level, seed
-        self.rate, self.band = rate, band
-        self.faces, self.part = np.array(mesh.faces, dtype=np.int64), part
-        self.vertices: Floats = np.array(mesh.vertices, dtype=np.float64)
-        self._start = self.vertices
+        self.rate, self.band, self._later = RATE * rate * optics.wavelength, band, later
+        self.faces, self._start = np.array(mesh.faces, dtype=np.int64), np.array(mesh.vertices)
+        flat, part = flattened(mesh, optics.wavelength)
+        self.part, self.vertices = part, np.array(flat.vertices, dtype=np.float64)
         pairs, ends = mesh.face_adjacency, mesh.face_adjacency_edges
         self.edges = Edges(self.faces, part, np.asarray(pairs), np.asarray(ends))
         # At an edge each face has vertices of its own, so that its normals are not averaged.
@@ -141,7 +163,10 @@ class PlaneDescent:
         if heard is None:
             return None, math.inf
         found = measured(self.echoes, numbers, heard)
-        difference, weight = differences(heard, None, found, self.level, learn=True, band=self.band)
+        later = None if self._later is None else self._later.power(numbers, heard)
+        difference, weight = differences(
+            heard, later, found, self.level, learn=True, band=self.band
+        )
         error = mismatch(difference, weight).mean()
         (gradient,) = torch.autograd.grad(error, vertices)
         return gradient.cpu().numpy(), float(error.detach())
@@ -151,7 +176,6 @@ class PlaneDescent:
         parts = {
             "start": self._start,
             "faces": self.faces,
-            "part": self.part,
             "vertices": self.vertices,
             "direction": self.direction,
             "square": self.square,

@@ -58,12 +58,12 @@ def flat_parts(mesh: trimesh.Trimesh, tolerance: float, least: float) -> Ints:
     part = _clustered(*_moments(corners), pairs, tolerance**2, COHERENT)
     part = _given_to_the_best(mesh, _counted(part), tolerance)
     area = np.bincount(part, mesh.area_faces)
+    normal, offset = planes_of(mesh, part, tolerance)
     for number in sorted(np.flatnonzero(area < least), key=lambda one: area[one]):
         own = part == number
         beside = np.unique(part[pairs[own[pairs].any(axis=1)]])
         beside = beside[beside != number]
         if len(beside):
-            normal, offset = planes_of(mesh, part, tolerance)
             off = mesh.triangles_center[own] @ normal[beside].T - offset[beside]
             part[own] = beside[np.abs(off).mean(axis=0).argmin()]
     return _counted(_given_to_the_best(mesh, _counted(part), tolerance))

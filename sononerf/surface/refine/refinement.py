@@ -7,7 +7,6 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
@@ -15,12 +14,12 @@ import torch
 import trimesh
 from torch import Tensor
 
-from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import SonoNerfError
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.candidates import (
     ALIKE,
+    TOLERATED,
     Candidate,
     Way,
     after_first_stage,
@@ -46,6 +45,9 @@ from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.necks import without_necks
 from sononerf.surface.refine.objective import Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
+from sononerf.surface.refine.plane_descent import POSES as PLANE_POSES
+from sononerf.surface.refine.plane_descent import PlaneDescent, flattened
+from sononerf.surface.refine.refined import Refined
 from sononerf.surface.refine.remesh import finer, remesh
 from sononerf.surface.refine.surface_error import surface_error
 from sononerf.surface.start.read_out import LEVELS, StartMethod
@@ -60,42 +62,8 @@ change by at most 45 degrees. A hull fits the onsets by construction, so its obj
 where it is coarse. From 100 calls its ridges are 0.08 or higher; there a stool had an F-score at
 2 mm of 0.24 with it and of 0.45 without. From 400 calls they are at most 0.04."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
-STATE_VERSION = 7
+STATE_VERSION = 8
 """Version of :meth:`Refinement.state`; to be raised when its tensors change."""
-
-
-@dataclass(frozen=True, eq=False)
-class Refined:
-    """A refined surface.
-
-    Attributes:
-        mesh: m.
-        gain (E, F): Factor of rendered magnitudes, learned on training poses.
-        confidence (V,): Number of training poses that see each vertex near the direction of a
-            mirror; 0 where echoes do not bound its place.
-        error ((V,), m): See :mod:`sononerf.surface.refine.surface_error`.
-        start: Name of the start that was refined.
-        kept: True where the refined surface explains the validation poses about as well as the
-            start, or better.
-        error_db: Objective on validation poses, see
-            :class:`~sononerf.surface.refine.comparison.Comparison`.
-        history: Per stage: its number, start, way, last mismatch, and objective after it.
-        candidates: Per start: its name, its objective, that of its best surface (None where it
-            did not get beyond the first stage), and whether it was chosen.
-        faults: Faults of the refinement, one line each: a surface that could not be traced and
-            counted as the worst, or a stage that went without the simulator's correction.
-    """
-
-    mesh: trimesh.Trimesh
-    gain: Floats
-    confidence: Floats
-    error: Floats
-    start: StartMethod
-    kept: bool
-    error_db: float
-    history: list[dict[str, Any]]
-    faults: list[str]
-    candidates: list[dict[str, Any]]
 
 
 def refine(
@@ -171,10 +139,10 @@ class Refinement:
         self.compared: dict[StartMethod, float] = {}
         self._far = optics.head.resolution
         self._at = 0  # number of the present candidate
-        self._descent: Descent | None = None
+        self._descent: Descent | PlaneDescent | None = None
         self._later: LaterBounces | None = None
         self._source = 0  # number of the surface whose later bounces are added
-        self.comparison = Comparison(echoes, optics, self.onsets, seed)
+        self.comparison = Comparison(echoes, optics, seed)
 
     @property
     def done(self) -> bool:
@@ -208,7 +176,7 @@ class Refinement:
         stage, unit = self.stages[self.stage], self.optics.wavelength
         candidate, plane = self.candidate, self.optics.plane
         before = candidate.meshes[-1]
-        if candidate.way == "sheet":
+        if candidate.way in ("sheet", "planes"):
             return before
         made = None
         if candidate.way == "blurred":
@@ -225,7 +193,7 @@ class Refinement:
         candidate, mesh = self.candidate, self._descent.mesh()
         self._descent, self.step = None, 0
         name = f"the surface of stage {self.stage}"
-        objective = self._objective(mesh, name, candidate.level, smooth=True)
+        objective = self._objective(mesh, name, candidate.level, smooth=candidate.way != "planes")
         self.history.append(
             {
                 "stage": self.stage,
@@ -238,6 +206,12 @@ class Refinement:
         self.newest = mesh
         candidate.meshes.append(mesh)
         candidate.objectives.append(objective)
+        if candidate.way == "planes" and self.stage == 0:
+            # Planes that are clearly better than their start go on alone; else they end here.
+            if TOLERATED * objective > candidate.objectives[0]:
+                del self.candidates[0]
+                return
+            self.candidates = [candidate]
         if self.stage == 0 and self._at + 1 < len(self.candidates):
             self._at += 1
             return
@@ -264,9 +238,21 @@ class Refinement:
                 del found["hull"]
         if len(names) > 1:
             found.update({name: self._compared(name) for name in names})
-        for start, way in planned(found):
+        plans = planned(found)
+        if "levels" in self.starts and self._has_flat_parts(self.starts["levels"]):
+            found["levels"] = self.compared["levels"]
+            plans.insert(0, ("levels", "planes"))
+        for start, way in plans:
             begun = [self.starts[start]], [found[start]]
             self.candidates.append(Candidate(way, start, self._new_level(), *begun, self._far))
+
+    def _has_flat_parts(self, mesh: trimesh.Trimesh) -> bool:
+        """Return whether a surface explains the echoes better with its flat parts on planes."""
+        if self.optics.plane is not None or not mesh.is_watertight:
+            return False
+        flat, _ = flattened(mesh, self.optics.wavelength)
+        error = self._objective(flat, "its flat parts", self._new_level(), smooth=False)
+        return error < self._compared("levels")
 
     def _new_level(self) -> Level:
         like = self.optics.get_buffer("wavenumber")
@@ -292,12 +278,13 @@ class Refinement:
             self.faults.append(fault)
             logger.warning("%s", fault)
 
-    def _descend(self, mesh: trimesh.Trimesh) -> Descent:
+    def _descend(self, mesh: trimesh.Trimesh) -> Descent | PlaneDescent:
         stage, candidate = self.stages[self.stage], self.candidate
         last = self.stage == len(self.stages) - 1
         candidate.level.learns = "none" if self.echoes.calibrated and not last else "each"
         correction = None
-        if stage.beyond == "simulate":
+        planes = candidate.way == "planes"
+        if stage.beyond == "simulate" and not planes:
             self._later, correction = None, self._correction(mesh)
         elif stage.beyond == "none":
             self._later = None
@@ -305,6 +292,17 @@ class Refinement:
             source = candidate.meshes[self._source]
             self._later = LaterBounces(self.optics, source, self.echoes, seed=self.seed)
             self._later.trace(self._coming())
+        if planes:
+            return PlaneDescent(
+                mesh,
+                self.echoes,
+                self.optics,
+                candidate.level,
+                rate=stage.rate,
+                later=self._later,
+                band=stage.band,
+                seed=self.seed,
+            )
         return Descent(
             mesh,
             self.echoes,
@@ -324,12 +322,13 @@ class Refinement:
     def _coming(self) -> list[int]:
         """Return the poses of all further steps that use the later bounces of this surface."""
         steps, first = self.stages[self.stage].steps - self.step, self.candidate.drawn
+        poses = PLANE_POSES if self.candidate.way == "planes" else POSES
         for stage in itertools.takewhile(
             lambda stage: stage.beyond == "keep", self.stages[self.stage + 1 :]
         ):
             steps += stage.steps
         drawn = [
-            self.echoes.batch(self.seed, first + step, POSES).tolist() for step in range(steps)
+            self.echoes.batch(self.seed, first + step, poses).tolist() for step in range(steps)
         ]
         return sorted(set(itertools.chain.from_iterable(drawn)))
 
@@ -429,7 +428,7 @@ class Refinement:
         )
         confidence *= known.heard & ~doubtful
         values = np.stack([confidence, known.error], axis=1)
-        if best:
+        if best and candidate.way != "planes":
             mesh, values = finer(mesh, values, self.optics.wavelength)
         return Refined(
             mesh=mesh,

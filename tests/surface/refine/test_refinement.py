@@ -347,6 +347,8 @@ def test_levels_and_the_best_other_start_stay_until_they_lose(
     def objective(mesh, *given, **named):
         if any(mesh is start for start in work.starts.values()):
             return 9.0 + abs(np.ptp(mesh.vertices[:, 0]) / np.ptp(bumpy.vertices[:, 0]) - 1.0)
+        if not work.candidates:
+            return math.inf  # its flat parts
         if work.stage == 0:
             return first[work.candidate.start, work.candidate.way]
         return last[work.candidate.start]
