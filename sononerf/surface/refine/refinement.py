@@ -238,21 +238,30 @@ class Refinement:
                 del found["hull"]
         if len(names) > 1:
             found.update({name: self._compared(name) for name in names})
-        plans = planned(found)
-        if "levels" in self.starts and self._has_flat_parts(self.starts["levels"]):
-            found["levels"] = self.compared["levels"]
-            plans.insert(0, ("levels", "planes"))
-        for start, way in plans:
+        if (flat := self._flat_start()) is not None:
+            begun = [flat[0]], [flat[1]]
+            self.candidates.append(
+                Candidate("planes", "levels", self._new_level(), *begun, self._far)
+            )
+        for start, way in planned(found):
             begun = [self.starts[start]], [found[start]]
             self.candidates.append(Candidate(way, start, self._new_level(), *begun, self._far))
 
-    def _has_flat_parts(self, mesh: trimesh.Trimesh) -> bool:
-        """Return whether a surface explains the echoes better with its flat parts on planes."""
-        if self.optics.plane is not None or not mesh.is_watertight:
-            return False
-        flat, _ = flattened(mesh, self.optics.wavelength)
-        error = self._objective(flat, "its flat parts", self._new_level(), smooth=False)
-        return error < self._compared("levels")
+    def _flat_start(self) -> tuple[trimesh.Trimesh, float] | None:
+        """Return the surface of the network that is best on planes, and its own objective, dB.
+
+        None where it explains the echoes better as it is, or lies on a support.
+        """
+        found = []
+        for name in LEVELS:
+            mesh = self.starts.get(name)
+            if mesh is None or not mesh.is_watertight or self.optics.plane is not None:
+                continue
+            flat, _ = flattened(mesh, self.optics.wavelength)
+            error = self._objective(flat, "its flat parts", self._new_level(), smooth=False)
+            found.append((error, self._compared(name), mesh))
+        error, own, mesh = min(found, key=lambda one: one[0], default=(math.inf, 0.0, None))
+        return (mesh, own) if mesh is not None and error < own else None
 
     def _new_level(self) -> Level:
         like = self.optics.get_buffer("wavenumber")
