@@ -140,25 +140,30 @@ def below(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
     return {key.removeprefix(name): part for key, part in state.items() if key.startswith(name)}
 
 
-def planned(starts: Mapping[StartMethod, float]) -> list[tuple[StartMethod, Way]]:
+def planned(
+    starts: Mapping[StartMethod, float], *, flat: bool = False
+) -> list[tuple[StartMethod, Way]]:
     """Return the start and the way of each candidate.
 
     Args:
         starts: Start methods, and their objectives before the first stage.
+        flat: True if ``levels`` explains the echoes better with its flat parts on planes.
 
     Returns:
         plans: ``fuller`` and the best of the others go both ways, ``levels`` is not blurred beside
-            ``fuller``, and a sheet has its own way.
+            ``fuller``, and a sheet has its own way. What is flat has edges, which blur would wear
+            away: nothing is blurred then.
     """
     others = [name for name in starts if name not in (*LEVELS, "sheet")]
     chosen: list[StartMethod] = [name for name in LEVELS if name in starts]
     chosen += sorted(others, key=lambda name: starts[name])[:1]
     found: list[tuple[StartMethod, Way]] = []
     for name in chosen:
-        if name != "levels" or "fuller" not in starts:
+        if not flat and (name != "levels" or "fuller" not in starts):
             found.append((name, "blurred"))
         found.append((name, "sharp"))
-    return [*found, *((name, "sheet") for name in starts if name == "sheet")]
+    found += [("sheet", "sheet")] if "sheet" in starts else []
+    return [("levels", "planes"), *found] if flat else found
 
 
 def without_twin(candidate: Candidate, candidates: list[Candidate]) -> list[Candidate]:
@@ -180,16 +185,30 @@ def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = S
     """Return the steps of a refinement of start methods, at most; a sheet goes on alone."""
     plans = planned(dict.fromkeys(starts, 0.0))
     further = max(1, len({start for start, _ in plans if start not in ("fuller", "sheet")}))
-    first = len(plans) + ("levels" in dict(plans))  # its flat parts may move as planes
-    return first * stages[0].steps + further * sum(stage.steps for stage in stages[1:])
+    return len(plans) * stages[0].steps + further * sum(stage.steps for stage in stages[1:])
 
 
-def after_first_stage(candidates: list[Candidate]) -> list[Candidate]:
+def after_first_stage(
+    candidates: list[Candidate], error: Callable[[trimesh.Trimesh, Level, bool], float]
+) -> list[Candidate]:
     """Return the candidates that go on after the first stage, the best one first.
 
-    A sheet that is about as good as the best one goes on alone. Else each start goes on in its
-    better way, ``levels`` and ``fuller`` as one.
+    Planes that are clearly better than the best one go on alone, or else end here. A sheet that is
+    about as good as the best one goes on alone. Else each start goes on in its better way,
+    ``levels`` and ``fuller`` as one.
+
+    Args:
+        candidates: All of them.
+        error: Error of a surface on the validation poses without onsets, dB; its arguments are a
+            mesh, gains, and whether it is smooth. Planes do not follow the errors of the onsets.
     """
+    if candidates[0].way == "planes" and len(candidates) > 1:
+        planes, *candidates = candidates
+        others = after_first_stage(candidates, error)
+        errors = [
+            error(one.meshes[-1], one.level, one is not planes) for one in (planes, others[0])
+        ]
+        return [planes] if TOLERATED * errors[0] < errors[1] else others
     good = TOLERATED * min(one.objectives[-1] for one in candidates)
     sheets = [one for one in candidates if one.way == "sheet"]
     if any(one.objectives[-1] <= good for one in sheets):

@@ -60,12 +60,12 @@ class Edges:
         Args:
             optics: The head.
             vertices ((V, 3) float64, m): Gradients run to them,
-            normals ((N, 3) float64): and to the outward unit normals of the planes.
+            normals ((K', 2, 3) float64): and to the outward unit normals of both sides.
             sight: Search structure of the surface.
             heads: In float64.
         """
         places, upright = (part.detach().cpu().numpy() for part in (vertices, normals))
-        first, second = upright[self.planes[:, 0]], upright[self.planes[:, 1]]
+        first, second = upright[:, 0], upright[:, 1]
         start, end = places[self.ends[:, 0]], places[self.ends[:, 1]]
         turned = np.einsum("kd,kd->k", np.cross(first, second), end - start)
         cosine = np.einsum("kd,kd->k", first, second)
@@ -76,14 +76,12 @@ class Edges:
         if not len(pose):
             return None
         of = sharp[edge]
-        ends, planes = (
-            torch.as_tensor(part[of]).to(vertices.device) for part in (self.ends, self.planes)
-        )
+        ends = torch.as_tensor(self.ends[of]).to(vertices.device)
         heard = torch.as_tensor(visible).to(vertices.device)
         return _sound(
             optics,
             vertices[ends],
-            normals[planes],
+            normals[torch.as_tensor(of).to(normals.device)],
             torch.as_tensor(pose).to(vertices.device),
             heard,
             heads,

@@ -167,8 +167,8 @@ def sparse_tensor(matrix: coo_array | csr_array) -> Tensor:
 
 
 def unit(vectors: Tensor) -> Tensor:
-    """Vectors (N, 3) of length 1; those of length 0 stay."""
-    return vectors / vectors.norm(dim=1, keepdim=True).clamp_min(1e-300)
+    """Vectors (..., 3) of length 1; those of length 0 stay."""
+    return vectors / vectors.norm(dim=-1, keepdim=True).clamp_min(1e-300)
 
 
 def tangents(normals: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: MIT
-"""A stage of a refinement in which flat parts move as planes, with the sound of their edges."""
+"""A stage of a refinement in which flat parts move as patches, with the sound of their edges."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,7 +20,8 @@ from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
 from sononerf.surface.refine.objective import Level, differences, measured, mismatch
 from sononerf.surface.refine.optics import Heard, Optics
-from sononerf.surface.refine.planes import flat_parts, motions, on_planes, planes_of
+from sononerf.surface.refine.patches import Patches, motions, on_patches, patches_of
+from sononerf.surface.refine.planes import flat_parts
 from sononerf.surface.refine.visibility import listen, sight_of
 
 TOLERANCE = 0.3
@@ -35,23 +38,52 @@ POSES = 16
 QUIET = 0.1
 """Floor of a motion's usual gradient, as a fraction of the mean over all of them: planes move
 little where little is heard."""
-FARTHEST = 3.0
+LARGEST = 3.0
 """Largest step of a motion, in steps of the usual length."""
+FARTHEST = 1.5
+"""Distance that a vertex of an edge can move in a stage, shortest wavelengths: a corner that is
+rounded by a wavelength comes back, but no spike grows."""
 EVENED = 5
 """Number of steps after which triangles are made even again; those that were turned over along an
 edge would sound like many edges."""
 
 
-def flattened(mesh: trimesh.Trimesh, wavelength: float) -> tuple[trimesh.Trimesh, Ints]:
-    """Return a mesh with its flat parts on planes, and the part of each triangle (T,).
+def flattened(
+    mesh: trimesh.Trimesh, wavelength: float, *, bent: bool = False
+) -> tuple[trimesh.Trimesh, Ints, Patches]:
+    """Return a mesh with its parts on patches, the part of each triangle (T,), and the patches.
 
     Args:
         mesh: m.
         wavelength (m): The shortest.
+        bent: False for planes.
     """
     tolerance = TOLERANCE * wavelength
     part = flat_parts(mesh, tolerance, (LEAST * wavelength) ** 2)
-    return on_planes(mesh, part, *planes_of(mesh, part, tolerance)), part
+    patches = patches_of(mesh, part, tolerance, bent=bent)
+    home = np.asarray(mesh.vertices)
+    return on_patches(mesh, part, patches, home, FARTHEST * wavelength), part, patches
+
+
+def flattest(
+    meshes: Iterable[trimesh.Trimesh], error: Callable[[trimesh.Trimesh], float], optics: Optics
+) -> trimesh.Trimesh | None:
+    """Return the surface that explains the echoes best with its flat parts on planes.
+
+    Args:
+        meshes: Surfaces, m; open ones take no part.
+        error: Error of a surface, dB.
+        optics: The head.
+
+    Returns:
+        surface: None where it explains them better as it is.
+    """
+    closed = [mesh for mesh in meshes if mesh.is_watertight]
+    errors = [error(flattened(mesh, optics.wavelength)[0]) for mesh in closed]
+    if not errors:
+        return None
+    best = int(np.argmin(errors))
+    return closed[best] if errors[best] < error(closed[best]) else None
 
 
 class PlaneDescent:
@@ -85,7 +117,8 @@ class PlaneDescent:
         self.echoes, self.optics, self.level, self.seed = echoes, optics, level, seed
         self.rate, self.band, self._later = RATE * rate * optics.wavelength, band, later
         self.faces, self._start = np.array(mesh.faces, dtype=np.int64), np.array(mesh.vertices)
-        flat, part = flattened(mesh, optics.wavelength)
+        self.bent = band < 1.0
+        flat, part, self.patches = flattened(mesh, optics.wavelength, bent=self.bent)
         self.part, self.vertices = part, np.array(flat.vertices, dtype=np.float64)
         pairs, ends = mesh.face_adjacency, mesh.face_adjacency_edges
         self.edges = Edges(self.faces, part, np.asarray(pairs), np.asarray(ends))
@@ -96,8 +129,9 @@ class PlaneDescent:
         self._plane = torch.as_tensor(own % count)
         apart = torch.as_tensor(corner.reshape(-1, 3)).to(optics.get_buffer("wavenumber").device)
         self._operators = MeshOperators(apart, len(own))
-        self.direction = np.zeros(3 * count)
-        self.square = np.zeros(3 * count)
+        self.terms = 6 if self.bent else 3
+        self.direction = np.zeros(self.terms * count)
+        self.square = np.zeros(self.terms * count)
         self.count = 0
 
     def mesh(self) -> trimesh.Trimesh:
@@ -110,7 +144,7 @@ class PlaneDescent:
         if gradient is None:
             return error
         self.count += 1
-        motion = motions(self.vertices, self.faces, self.part)
+        motion = motions(self.vertices, self.faces, self.part, self.patches, self.terms)
         slope = motion.T @ gradient.ravel()
         self.direction = MOMENTUM * self.direction + (1 - MOMENTUM) * slope
         self.square = MEMORY * self.square + (1 - MEMORY) * np.square(slope)
@@ -118,12 +152,15 @@ class PlaneDescent:
         usual = np.sqrt(usual + QUIET**2 * usual.mean()) + 1e-300
         rate = self.rate * (LAST + (1 - LAST) * 0.5 * (1 + math.cos(math.pi * part)))
         step = self.direction / (1 - MOMENTUM**self.count) / usual
-        moved = motion @ (-rate * np.clip(step, -FARTHEST, FARTHEST))
-        self.vertices = self.vertices + moved.reshape(-1, 3)
+        change = -rate * np.clip(step, -LARGEST, LARGEST)
+        self.vertices = self.vertices + (motion @ change).reshape(-1, 3)
+        numbers = self.patches.numbers.copy()
+        numbers[:, : self.terms] += change.reshape(-1, self.terms)
+        self.patches = replace(self.patches, numbers=numbers)
         if self.count % EVENED == 0:
-            mesh = self.mesh()
-            planes = planes_of(mesh, self.part, self.optics.wavelength)
-            self.vertices = np.array(on_planes(mesh, self.part, *planes).vertices)
+            far = FARTHEST * self.optics.wavelength
+            mesh = on_patches(self.mesh(), self.part, self.patches, self._start, far)
+            self.vertices = np.array(mesh.vertices)
         return error
 
     def render(self, numbers: list[int], vertices: Tensor) -> Heard | None:
@@ -146,13 +183,30 @@ class PlaneDescent:
             self.optics, self._operators, still, area.detach(), flat, sight, positions, rotations
         )
         whole = area.new_zeros(int(self.part.max()) + 1, 3)
-        normals = unit(whole.index_add(0, self._plane.to(area.device), area))
+        means = unit(whole.index_add(0, self._plane.to(area.device), area))
+        normals = self._at_edges(vertices, means)
         far = self.optics.heads(positions, rotations)
         edges = self.edges.heard(self.optics, vertices, normals, sight, far)
         if edges is None and not len(pieces.pose):
             return None
         points = (apart - middle).float()
         return self.optics.render(points, area.float(), pieces, heads, edges=edges)
+
+    def _at_edges(self, vertices: Tensor, means: Tensor) -> Tensor:
+        """Return the normals (K, 2, 3) of the patches that meet at edges.
+
+        Args:
+            vertices ((V, 3), m): Present places.
+            means (N, 3): Mean normals of the patches; gradients run to them.
+        """
+        middle = vertices.detach().cpu().numpy()[self.edges.ends].mean(axis=1)
+        patches = self.patches
+        turned = [
+            patches.normals(side, middle) - patches.normals(side, patches.centre[side])
+            for side in self.edges.planes.T
+        ]
+        found = means[torch.as_tensor(self.edges.planes).to(means.device)]
+        return unit(found + torch.as_tensor(np.stack(turned, axis=1)).to(found))
 
     def _gradient(self, number: int) -> tuple[Floats | None, float]:
         """Return the gradient (V, 3), dB/m, and the mean mismatch, dB."""
@@ -179,13 +233,15 @@ class PlaneDescent:
             "vertices": self.vertices,
             "direction": self.direction,
             "square": self.square,
+            "numbers": self.patches.numbers,
         }
         found = {name: torch.as_tensor(np.array(part)) for name, part in parts.items()}
         return {**found, "count": torch.tensor(self.count)}
 
     def load(self, state: dict[str, Tensor]) -> None:
         """Load the state of a descent on the same mesh."""
-        self.vertices, self.direction, self.square = (
-            state[name].numpy() for name in ("vertices", "direction", "square")
+        self.vertices, self.direction, self.square, numbers = (
+            state[name].numpy() for name in ("vertices", "direction", "square", "numbers")
         )
+        self.patches = replace(self.patches, numbers=numbers)
         self.count = int(state["count"])

@@ -1,12 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Flat parts of a surface: found, put on planes that meet in sharp edges, and moved as planes.
-
-Off the mirror a flat face is silent, and a wave of a two-hundredth of a wavelength on it is as loud
-as its edges. So vertices that move freely never find one. A plane has three numbers; the error
-falls steadily towards the true ones, from a wavelength away.
-
-Parts are found by hierarchical clustering of the triangles [1]_. A vertex lies on the planes of all
-triangles about it: on one, on an edge of two, or on a corner.
+"""Flat parts of a surface, found by hierarchical clustering of its triangles [1]_.
 
 References:
     .. [1] M. Garland, A. Willmott and P. S. Heckbert, "Hierarchical face clustering on polygonal
@@ -20,7 +13,6 @@ import math
 
 import numpy as np
 import trimesh
-from scipy.sparse import csr_array
 
 from sononerf.array_types import Floats, Ints
 from sononerf.compiled import compiled
@@ -35,14 +27,6 @@ UPRIGHT = 0.5
 """Further cost of a triangle whose normal is square to that of the plane, no unit."""
 SWEEPS = 15
 """Number of times that triangles are given to the plane that fits them best, at most."""
-PARALLEL = 0.05
-"""Eigenvalue of the sum of the normals' outer products below which planes do not determine where
-they meet, no unit: that of two planes at 18 degrees."""
-EVEN = 20
-"""Number of steps that make the triangles even again."""
-SOFT = 0.02
-"""Added to these eigenvalues where planes move, no unit: vertices between planes that are nearly
-parallel then move by little, and not far along them."""
 
 
 def flat_parts(mesh: trimesh.Trimesh, tolerance: float, least: float) -> Ints:
@@ -85,13 +69,13 @@ def planes_of(mesh: trimesh.Trimesh, part: Ints, tolerance: float) -> tuple[Floa
     upright = np.asarray(mesh.face_normals)
     count, weight = int(part.max()) + 1, area
     normal, offset = np.zeros((count, 3)), np.zeros(count)
-    outward = _summed(part, area[:, None] * upright, count)
+    outward = summed(part, area[:, None] * upright, count)
     for _ in range(9):
         whole = np.maximum(np.bincount(part, weight, count), 1e-300)
-        centre = _summed(part, weight[:, None] * middle, count) / whole[:, None]
+        centre = summed(part, weight[:, None] * middle, count) / whole[:, None]
         off = middle - centre[part]
         square = (weight[:, None, None] * off[:, :, None] * off[:, None]).reshape(-1, 9)
-        spread = _summed(part, square, count).reshape(-1, 3, 3)
+        spread = summed(part, square, count).reshape(-1, 3, 3)
         normal = np.linalg.eigh(spread)[1][:, :, 0]
         normal *= np.where((normal * outward).sum(1) < 0.0, -1.0, 1.0)[:, None]
         offset = (normal * centre).sum(1)
@@ -99,83 +83,6 @@ def planes_of(mesh: trimesh.Trimesh, part: Ints, tolerance: float) -> tuple[Floa
         tilt = np.clip(((upright * normal[part]).sum(1) - 0.7) / 0.3, 0.01, 1.0)
         weight = area * tilt**2 / (1.0 + np.square(away / tolerance))
     return normal, offset
-
-
-def on_planes(mesh: trimesh.Trimesh, part: Ints, normal: Floats, offset: Floats) -> trimesh.Trimesh:
-    """Return a mesh with each part on its plane, and sharp edges where planes meet.
-
-    Args:
-        mesh: The surface, m.
-        part (T,): Number of each triangle's plane.
-        normal, offset: From :func:`planes_of`.
-    """
-    vertex, plane = _members(np.asarray(mesh.faces), part)
-    count = len(mesh.vertices)
-    upright = normal[plane]
-    square = _summed(vertex, (upright[:, :, None] * upright[:, None]).reshape(-1, 9), count)
-    size, axes = np.linalg.eigh(square.reshape(-1, 3, 3))
-    inverse = np.where(size > PARALLEL, 1.0 / np.maximum(size, PARALLEL), 0.0)
-
-    def put(places: Floats) -> Floats:
-        short = offset[plane] - (upright * places[vertex]).sum(1)
-        wanted = _summed(vertex, short[:, None] * upright, count)
-        found: Floats = places + np.einsum("vij,vj,vkj,vk->vi", axes, inverse, axes, wanted)
-        return found
-
-    # Each vertex goes half-way to the mean of the neighbours that lie on all of its planes.
-    own = csr_array((np.ones(len(vertex)), (vertex, plane)), shape=(count, len(normal)))
-    ends = np.asarray(mesh.edges_unique)
-    common = np.asarray(own[ends[:, 0]].multiply(own[ends[:, 1]]).sum(axis=1)).ravel()
-    number = np.bincount(vertex, minlength=count)
-    pairs = np.concatenate(
-        [ends[common == number[ends[:, 0]]], ends[common == number[ends[:, 1]], ::-1]]
-    )
-    near = csr_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    degree = near.sum(axis=1)[:, None]
-    places = put(np.asarray(mesh.vertices))
-    for _ in range(EVEN):
-        mean = np.where(degree > 0, (near @ places) / np.maximum(degree, 1), places)
-        places = put(0.5 * (places + mean))
-    return trimesh.Trimesh(places, np.asarray(mesh.faces), process=False)
-
-
-def motions(vertices: Floats, faces: Ints, part: Ints) -> csr_array:
-    """Return how the vertices move with the planes.
-
-    Args:
-        vertices ((V, 3), m): On their planes.
-        faces (T, 3): Triangles.
-        part (T,): Numbers of their planes.
-
-    Returns:
-        motion (3 V, 3 N): Three numbers of each plane, m, move it along its normal and tilt it
-            about two axes; each moves it by one in the mean square.
-    """
-    corners = vertices[faces]
-    area = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    size, count = np.linalg.norm(area, axis=1), int(part.max()) + 1
-    normal = _summed(part, area, count)
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-300)
-    whole = np.maximum(np.bincount(part, size, count), 1e-300)
-    centre = _summed(part, size[:, None] * corners.mean(axis=1), count) / whole[:, None]
-    other = np.where(np.abs(normal[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    first = np.cross(normal, other)
-    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-300)
-    second = np.cross(normal, first)
-    vertex, plane = _members(faces, part)
-    upright = normal[plane]
-    square = _summed(vertex, (upright[:, :, None] * upright[:, None]).reshape(-1, 9), len(vertices))
-    inverse = np.linalg.inv(square.reshape(-1, 3, 3) + SOFT * np.eye(3))
-    moved = np.einsum("mij,mj->mi", inverse[vertex], upright)
-    off = (vertices[vertex] - centre[plane]) / np.sqrt(whole / (4.0 * math.pi))[plane, None]
-    height = np.stack(
-        [np.ones(len(off)), (off * first[plane]).sum(1), (off * second[plane]).sum(1)], axis=1
-    )
-    values = moved[:, :, None] * height[:, None]
-    rows = (3 * vertex)[:, None, None] + np.arange(3)[:, None] + np.zeros(3, dtype=np.int64)
-    columns = (3 * plane)[:, None, None] + np.zeros((3, 1), dtype=np.int64) + np.arange(3)
-    shape = (3 * len(vertices), 3 * count)
-    return csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
 
 
 def _given_to_the_best(mesh: trimesh.Trimesh, part: Ints, tolerance: float) -> Ints:
@@ -206,19 +113,13 @@ def _given_to_the_best(mesh: trimesh.Trimesh, part: Ints, tolerance: float) -> I
     return part
 
 
-def _members(faces: Ints, part: Ints) -> tuple[Ints, Ints]:
-    """Return vertices and their planes (M,), each pair once."""
-    both = np.unique(np.stack([faces.ravel(), np.repeat(part, 3)], axis=1), axis=0)
-    return both[:, 0], both[:, 1]
-
-
 def _counted(part: Ints) -> Ints:
     """Return the parts with numbers from 0 on."""
     found: Ints = np.unique(part, return_inverse=True)[1].reshape(-1)
     return found
 
 
-def _summed(of: Ints, values: Floats, count: int) -> Floats:
+def summed(of: Ints, values: Floats, count: int) -> Floats:
     """Sum of rows (N, K) by their numbers (N,), (count, K)."""
     columns = [np.bincount(of, column, count) for column in values.T]
     return np.stack(columns, axis=1)

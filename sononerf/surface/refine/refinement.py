@@ -19,7 +19,6 @@ from sononerf.errors import SonoNerfError
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.candidates import (
     ALIKE,
-    TOLERATED,
     Candidate,
     Way,
     after_first_stage,
@@ -46,7 +45,7 @@ from sononerf.surface.refine.necks import without_necks
 from sononerf.surface.refine.objective import Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.plane_descent import POSES as PLANE_POSES
-from sononerf.surface.refine.plane_descent import PlaneDescent, flattened
+from sononerf.surface.refine.plane_descent import PlaneDescent, flattest
 from sononerf.surface.refine.refined import Refined
 from sononerf.surface.refine.remesh import finer, remesh
 from sononerf.surface.refine.surface_error import surface_error
@@ -142,7 +141,7 @@ class Refinement:
         self._descent: Descent | PlaneDescent | None = None
         self._later: LaterBounces | None = None
         self._source = 0  # number of the surface whose later bounces are added
-        self.comparison = Comparison(echoes, optics, seed)
+        self.comparison = Comparison(echoes, optics, self.onsets, seed)
 
     @property
     def done(self) -> bool:
@@ -206,17 +205,11 @@ class Refinement:
         self.newest = mesh
         candidate.meshes.append(mesh)
         candidate.objectives.append(objective)
-        if candidate.way == "planes" and self.stage == 0:
-            # Planes that are clearly better than their start go on alone; else they end here.
-            if TOLERATED * objective > candidate.objectives[0]:
-                del self.candidates[0]
-                return
-            self.candidates = [candidate]
         if self.stage == 0 and self._at + 1 < len(self.candidates):
             self._at += 1
             return
         if self.stage == 0:
-            self.candidates, self._at = after_first_stage(self.candidates), 0
+            self.candidates, self._at = after_first_stage(self.candidates, self._error), 0
             for one in self.candidates:
                 if math.isnan(one.objectives[0]):
                     one.objectives[0] = self._compared(one.start)
@@ -238,30 +231,19 @@ class Refinement:
                 del found["hull"]
         if len(names) > 1:
             found.update({name: self._compared(name) for name in names})
-        if (flat := self._flat_start()) is not None:
-            begun = [flat[0]], [flat[1]]
-            self.candidates.append(
-                Candidate("planes", "levels", self._new_level(), *begun, self._far)
-            )
-        for start, way in planned(found):
-            begun = [self.starts[start]], [found[start]]
-            self.candidates.append(Candidate(way, start, self._new_level(), *begun, self._far))
+        network = [self.starts[name] for name in LEVELS if name in self.starts]
+        flat = None if self.optics.plane else flattest(network, self._error, self.optics)
+        for start, way in planned(found, flat=flat is not None):
+            mesh = flat if way == "planes" and flat is not None else self.starts[start]
+            begun = Candidate(way, start, self._new_level(), [mesh], [found[start]], self._far)
+            self.candidates.append(begun)
 
-    def _flat_start(self) -> tuple[trimesh.Trimesh, float] | None:
-        """Return the surface of the network that is best on planes, and its own objective, dB.
-
-        None where it explains the echoes better as it is, or lies on a support.
-        """
-        found = []
-        for name in LEVELS:
-            mesh = self.starts.get(name)
-            if mesh is None or not mesh.is_watertight or self.optics.plane is not None:
-                continue
-            flat, _ = flattened(mesh, self.optics.wavelength)
-            error = self._objective(flat, "its flat parts", self._new_level(), smooth=False)
-            found.append((error, self._compared(name), mesh))
-        error, own, mesh = min(found, key=lambda one: one[0], default=(math.inf, 0.0, None))
-        return (mesh, own) if mesh is not None and error < own else None
+    def _error(
+        self, mesh: trimesh.Trimesh, level: Level | None = None, smooth: bool = False
+    ) -> float:
+        """Return the error of a surface without onsets, dB."""
+        level = level or self._new_level()
+        return self._objective(mesh, "a surface", level, smooth=smooth, onsets=False)
 
     def _new_level(self) -> Level:
         like = self.optics.get_buffer("wavenumber")
@@ -273,10 +255,18 @@ class Refinement:
         self.compared[name] = self._objective(mesh, f"the start {name}", level, smooth=False)
         return self.compared[name]
 
-    def _objective(self, mesh: trimesh.Trimesh, name: str, level: Level, *, smooth: bool) -> float:
+    def _objective(
+        self,
+        mesh: trimesh.Trimesh,
+        name: str,
+        level: Level,
+        *,
+        smooth: bool = False,
+        onsets: bool = True,
+    ) -> float:
         """Return the objective of a surface; infinite if it cannot be traced."""
         try:
-            return self.comparison.objective(mesh, level, smooth=smooth)
+            return self.comparison.objective(mesh, level, smooth=smooth, onsets=onsets)
         except SonoNerfError as error:
             self._note(f"{name} cannot be compared and counts as the worst: {error}")
             return math.inf

@@ -8,9 +8,10 @@ import trimesh
 from sononerf.errors import SonoNerfError
 from sononerf.surface.refine import comparison as module
 from sononerf.surface.refine.comparison import Comparison
-from sononerf.surface.refine.objective import Level
-from tests.memory import changed
+from sononerf.surface.refine.objective import Level, OnsetRanges
+from tests.memory import changed, deaf_hull
 from tests.surface.conftest import RADIUS
+from tests.surface.refine.test_objective import heard
 
 
 @pytest.fixture(autouse=True)
@@ -23,12 +24,18 @@ def level(optics):
     return Level(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
 
 
+@pytest.fixture
+def silent(optics):
+    """No onsets."""
+    return OnsetRanges(deaf_hull(), optics.head.resolution, seed=0)
+
+
 def ball(radius):
     return trimesh.creation.icosphere(subdivisions=4, radius=radius)
 
 
-def test_the_farther_from_the_truth_the_worse(echoes, optics, level):
-    compared = Comparison(echoes, optics, seed=0)
+def test_the_farther_from_the_truth_the_worse(echoes, optics, level, silent):
+    compared = Comparison(echoes, optics, silent, seed=0)
     found = [
         compared.objective(ball(RADIUS + off), level, smooth=True) for off in (0.0, 5e-4, 2e-3)
     ]
@@ -36,23 +43,31 @@ def test_the_farther_from_the_truth_the_worse(echoes, optics, level):
     assert found == sorted(found)
 
 
-def test_training_poses_take_no_part(echoes, optics, level):
-    compared = Comparison(echoes, optics, seed=0)
+def test_onsets_count_beside_the_echoes(echoes, optics, level, silent):
+    onsets = OnsetRanges(heard(ball(0.02)), optics.head.resolution, seed=0)
+    mesh = ball(RADIUS)
+    without = Comparison(echoes, optics, silent, seed=0).objective(mesh, level, smooth=True)
+    beside = Comparison(echoes, optics, onsets, seed=0).objective(mesh, level, smooth=True)
+    assert beside > without + 3.0
+
+
+def test_training_poses_take_no_part(echoes, optics, level, silent):
+    compared = Comparison(echoes, optics, silent, seed=0)
     assert set(compared.poses) <= set(echoes.validation)
 
 
-def test_a_surface_that_cannot_be_traced_is_an_error(echoes, optics, level):
+def test_a_surface_that_cannot_be_traced_is_an_error(echoes, optics, level, silent):
     flat = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False)
     with pytest.raises(SonoNerfError):
-        Comparison(echoes, optics, seed=0).objective(flat, level, smooth=False)
+        Comparison(echoes, optics, silent, seed=0).objective(flat, level, smooth=False)
 
 
-def test_without_an_absolute_level_one_gain_is_found(echoes, optics, level):
+def test_without_an_absolute_level_one_gain_is_found(echoes, optics, level, silent):
     louder, free = (
         changed(echoes, read=lambda n: 8 * echoes.store.read_pose(n), origin=origin)
         for origin in ("simulated", "recorded")
     )
-    wrong = Comparison(louder, optics, seed=0).objective(ball(RADIUS), level, smooth=True)
-    right = Comparison(echoes, optics, seed=0).objective(ball(RADIUS), level, smooth=True)
-    found = Comparison(free, optics, seed=0).objective(ball(RADIUS), level, smooth=True)
+    wrong = Comparison(louder, optics, silent, seed=0).objective(ball(RADIUS), level, smooth=True)
+    right = Comparison(echoes, optics, silent, seed=0).objective(ball(RADIUS), level, smooth=True)
+    found = Comparison(free, optics, silent, seed=0).objective(ball(RADIUS), level, smooth=True)
     assert found < right + 0.3 < wrong - 2.0

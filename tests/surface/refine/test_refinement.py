@@ -415,7 +415,7 @@ def test_the_better_surface_of_the_network_goes_on_as_levels(bumpy, errors, way,
         after = bumpy.copy()
         after.metadata["of"] = start
         candidates.append(Candidate(way_of, start, None, [starts[start], after], [9.0, error]))
-    (found,) = after_first_stage(candidates)
+    (found,) = after_first_stage(candidates, unasked)
     assert (found.start, found.way) == ("levels", way)
     assert found.meshes[1].metadata["of"] == kept
     assert found.meshes[0] is starts["levels"]  # what is kept where no refined one is better
