@@ -8,8 +8,8 @@ import trimesh
 
 from sononerf.run.build import head_of
 from sononerf.surface.refine.objective import Level, differences, measured, mismatch
-from sononerf.surface.refine.plane_descent import PlaneDescent
-from sononerf.surface.refine.planes import motions
+from sononerf.surface.refine.patches import motions
+from sononerf.surface.refine.plane_descent import PlaneDescent, flattest
 from sononerf.surface.refine.remesh import distance_from
 from tests.memory import deaf_hull, echoes_of
 
@@ -36,10 +36,10 @@ def fine(box, optics):
     return box.subdivide_to_size(0.6 * optics.wavelength)
 
 
-def descent(mesh, echoes, optics):
+def descent(mesh, echoes, optics, band=1.0):
     level = Level(optics.ears, len(optics.frequencies), optics.get_buffer("wavenumber"))
     level.learns = "none"
-    return PlaneDescent(mesh, echoes, optics, level, rate=0.08, band=1.0, seed=0)
+    return PlaneDescent(mesh, echoes, optics, level, rate=0.08, band=band, seed=0)
 
 
 def distance(mesh, places):
@@ -66,7 +66,7 @@ def test_a_box_sounds_as_in_the_simulator_and_most_poses_hear_its_edges_alone(fi
 
 def test_gradients_of_edges_are_those_of_differences(fine, heard, optics):
     work = descent(fine, heard, optics)
-    motion = motions(work.vertices, work.faces, work.part)
+    motion = motions(work.vertices, work.faces, work.part, work.patches, 3)
     start = work.vertices + (motion @ np.tile([3e-4, 2e-4, -2e-4], 6)).reshape(-1, 3)
     vertices = torch.as_tensor(start).requires_grad_(True)
     error(work, vertices, heard).mean().backward()
@@ -84,8 +84,8 @@ def test_gradients_of_edges_are_those_of_differences(fine, heard, optics):
 
 
 def test_a_box_with_wrong_planes_and_worn_edges_comes_back(fine, heard, optics):
-    part = descent(fine, heard, optics).part
-    motion = motions(np.asarray(fine.vertices), np.asarray(fine.faces), part)
+    begun = descent(fine, heard, optics)
+    motion = motions(begun.vertices, begun.faces, begun.part, begun.patches, 3)
     numbers = np.random.default_rng(1).normal(0.0, 3e-4, 18)
     off = np.asarray(fine.vertices) + (motion @ numbers).reshape(-1, 3)
     worn = trimesh.smoothing.filter_laplacian(
@@ -100,12 +100,31 @@ def test_a_box_with_wrong_planes_and_worn_edges_comes_back(fine, heard, optics):
     assert np.mean(errors[-3:]) < 0.3 * np.mean(errors[:3])
 
 
-def test_a_step_depends_on_the_state_alone(fine, heard, optics):
-    work = descent(fine, heard, optics)
-    work.step(0, 0.0)
-    again = descent(fine, heard, optics)
+@pytest.mark.parametrize("band", [1.0, 0.0])
+def test_a_step_depends_on_the_state_alone(fine, heard, optics, band):
+    work = descent(fine, heard, optics, band)
+    for number in range(6):
+        work.step(number, 0.0)
+    again = descent(fine, heard, optics, band)
     again.load(work.state())
     again.level.load(work.level.state())
     for one in (work, again):
-        one.step(1, 0.1)
+        one.step(6, 0.1)
     assert np.array_equal(work.vertices, again.vertices)
+
+
+def test_of_surfaces_the_one_that_is_best_on_planes_is_chosen(fine, optics):
+    worn = trimesh.smoothing.filter_laplacian(fine.copy(), iterations=3)
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=0.02)
+    open_box = trimesh.Trimesh(fine.vertices, fine.faces[1:], process=False)
+
+    def error(mesh):
+        return distance(fine, mesh.vertices)
+
+    assert flattest([ball, worn, open_box], error, optics) is worn
+    assert flattest([open_box], error, optics) is None
+
+    def from_ball(mesh):
+        return np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.02).mean()
+
+    assert flattest([ball], from_ball, optics) is None

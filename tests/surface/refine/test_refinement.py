@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -30,7 +31,8 @@ from sononerf.surface.refine.descent import Descent, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.refinement import Refinement
-from tests.memory import changed, deaf_hull
+from sononerf.surface.refine.remesh import distance_from
+from tests.memory import changed, deaf_hull, echoes_of
 from tests.surface.conftest import RADIUS
 
 
@@ -429,6 +431,52 @@ def test_levels_is_refined_from_the_fuller_surface_too():
         ("filled", "blurred"),
         ("filled", "sharp"),
     ]
+
+
+@pytest.fixture(scope="module")
+def box():
+    found = trimesh.creation.box((0.03, 0.024, 0.02))
+    return found.apply_transform(trimesh.transformations.euler_matrix(0.3, 0.8, 1.9))
+
+
+@pytest.fixture(scope="module")
+def box_echoes(box, settings, poses, simulated):
+    head, at = head_of(settings), (poses.positions, poses.rotations)
+    found = simulated(box, settings, poses)
+    return echoes_of(head, *at, lambda i: found[i], hull=deaf_hull())
+
+
+@pytest.mark.thorough
+def test_flat_parts_move_as_planes_and_go_on_alone_where_they_are_right(box, box_echoes, optics):
+    fine = box.subdivide_to_size(0.6 * optics.wavelength)
+    worn = trimesh.smoothing.filter_laplacian(fine.copy().apply_scale(1.02), iterations=3)
+    work = Refinement({"levels": worn}, box_echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+    again = Refinement({"levels": worn}, box_echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+    for step in itertools.count():
+        if work.done:
+            break
+        if step == 20:
+            again.load(work.state())
+        work.advance()
+    assert [(one["stage"], one["way"]) for one in work.history] == [
+        (0, "planes"),
+        (0, "sharp"),
+        (1, "planes"),
+    ]
+    while not again.done:
+        again.advance()
+    found = work.result()
+    np.testing.assert_array_equal(found.mesh.vertices, again.result().mesh.vertices)
+    off = [distance_from(box, np.asarray(m.vertices), 1e-3).mean() for m in (worn, found.mesh)]
+    assert off[1] < 0.5 * off[0]
+    angles = np.sort(found.mesh.face_adjacency_angles)
+    assert np.degrees(angles[-20:]).min() > 80.0
+
+
+def test_a_ball_has_no_flat_parts(bumpy, echoes, optics):
+    work = Refinement({"levels": bumpy}, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+    assert work.candidate.way == "blurred"
+    assert [one.way for one in work.candidates] == ["blurred", "sharp"]
 
 
 def test_a_candidate_does_not_depend_on_the_others(bumpy, echoes, optics):
