@@ -189,26 +189,23 @@ def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = S
 
 
 def after_first_stage(
-    candidates: list[Candidate], error: Callable[[trimesh.Trimesh, Level, bool], float]
+    candidates: list[Candidate], error: Callable[[Candidate], float]
 ) -> list[Candidate]:
     """Return the candidates that go on after the first stage, the best one first.
 
-    Planes that are clearly better than the best one go on alone, or else end here. A sheet that is
+    Of planes and the best of the others the better one goes on, in doubt both. A sheet that is
     about as good as the best one goes on alone. Else each start goes on in its better way,
-    ``levels`` and ``fuller`` as one.
+    ``levels`` and ``fuller`` as one, but none that is clearly worse.
 
     Args:
         candidates: All of them.
-        error: Error of a surface on the validation poses without onsets, dB; its arguments are a
-            mesh, gains, and whether it is smooth. Planes do not follow the errors of the onsets.
+        error: Error of a candidate on the validation poses without onsets, dB. Planes do not follow
+            the errors of the onsets.
     """
     if candidates[0].way == "planes" and len(candidates) > 1:
-        planes, *candidates = candidates
-        others = after_first_stage(candidates, error)
-        errors = [
-            error(one.meshes[-1], one.level, one is not planes) for one in (planes, others[0])
-        ]
-        return [planes] if TOLERATED * errors[0] < errors[1] else others
+        planes, other = candidates[0], after_first_stage(candidates[1:], error)[0]
+        first, second = sorted((planes, other), key=error)
+        return [first] if TOLERATED * error(first) < error(second) else [first, second]
     good = TOLERATED * min(one.objectives[-1] for one in candidates)
     sheets = [one for one in candidates if one.way == "sheet"]
     if any(one.objectives[-1] <= good for one in sheets):
@@ -221,6 +218,7 @@ def after_first_stage(
         if one.start == "fuller":  # it goes on as levels, and is compared with that start
             one.start = "levels"
             one.meshes[0] = next(each.meshes[0] for each in network if each.start == "levels")
+    chosen = [one for one in chosen if one.objectives[-1] <= good]
     return sorted(chosen, key=lambda one: one.objectives[-1])
 
 
@@ -241,26 +239,25 @@ def _better(ways: list[Candidate]) -> Candidate:
     return min(ways, key=order)
 
 
-def goes_on(candidate: Candidate, first: Candidate, alike: float) -> bool:
-    """Return whether a candidate goes on after the first stage beside a better one.
-
-    Args:
-        candidate: The worse one.
-        first: The better one, after all its stages.
-        alike (m): Mean distance below which surfaces sound alike.
-    """
-    if candidate.objectives[1] > TOLERATED * first.objectives[1]:
-        return False
-    return float(distances(candidate.meshes[1], first.meshes[1]).mean()) > alike
+def are_alike(one: Candidate, other: Candidate, wavelength: float) -> bool:
+    """Return whether two surfaces sound alike after the first stage, at the shortest wavelength."""
+    return float(distances(one.meshes[1], other.meshes[1]).mean()) <= ALIKE * wavelength
 
 
-def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], bool]) -> Candidate:
+def best_of(
+    candidates: list[Candidate],
+    is_closed: Callable[[trimesh.Trimesh], bool],
+    error: Callable[[Candidate], float],
+) -> Candidate:
     """Return the best candidate: that of the least objective, in doubt ``levels`` or a closed one.
 
     Args:
         candidates: After their stages.
         is_closed: Whether a surface encloses a body, as far as poses can have heard it.
+        error: Error of a candidate without onsets, dB, which decides beside planes.
     """
+    if len(candidates) > 1 and any(one.way == "planes" for one in candidates):
+        return min(candidates, key=error)
     least = min(candidates, key=lambda one: one.objective)
     if least.objective <= RANKS_DB or len(candidates) == 1:
         return least

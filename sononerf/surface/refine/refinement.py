@@ -7,6 +7,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, get_args
 
 import numpy as np
@@ -18,14 +19,13 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.errors import SonoNerfError
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.candidates import (
-    ALIKE,
     Candidate,
     Way,
     after_first_stage,
+    are_alike,
     below,
     best_of,
     closed_before,
-    goes_on,
     listed,
     planned,
     without_twin,
@@ -217,7 +217,7 @@ class Refinement:
         self.stage += 1
         first, *others = self.candidates
         if self.done and self._at < len(others) and len(self.stages) > 1:
-            if goes_on(others[self._at], first, ALIKE * self.optics.wavelength):
+            if not are_alike(others[self._at], first, self.optics.wavelength):
                 self._at, self.stage, self._later = self._at + 1, 1, None
 
     def _choose(self) -> None:
@@ -232,18 +232,17 @@ class Refinement:
         if len(names) > 1:
             found.update({name: self._compared(name) for name in names})
         network = [self.starts[name] for name in LEVELS if name in self.starts]
-        flat = None if self.optics.plane else flattest(network, self._error, self.optics)
+        with_planes = [] if self.optics.plane else network
+        flat = flattest(with_planes, partial(self._objective, onsets=False), self.optics)
         for start, way in planned(found, flat=flat is not None):
             mesh = flat if way == "planes" and flat is not None else self.starts[start]
             begun = Candidate(way, start, self._new_level(), [mesh], [found[start]], self._far)
             self.candidates.append(begun)
 
-    def _error(
-        self, mesh: trimesh.Trimesh, level: Level | None = None, smooth: bool = False
-    ) -> float:
-        """Return the error of a surface without onsets, dB."""
-        level = level or self._new_level()
-        return self._objective(mesh, "a surface", level, smooth=smooth, onsets=False)
+    def _error(self, candidate: Candidate) -> float:
+        """Return the error of a candidate's best surface without onsets, dB."""
+        mesh, smooth = candidate.meshes[candidate.best], candidate.way != "planes"
+        return self._objective(mesh, "a surface", candidate.level, smooth=smooth, onsets=False)
 
     def _new_level(self) -> Level:
         like = self.optics.get_buffer("wavenumber")
@@ -258,14 +257,15 @@ class Refinement:
     def _objective(
         self,
         mesh: trimesh.Trimesh,
-        name: str,
-        level: Level,
+        name: str = "a surface",
+        level: Level | None = None,
         *,
         smooth: bool = False,
         onsets: bool = True,
     ) -> float:
         """Return the objective of a surface; infinite if it cannot be traced."""
         try:
+            level = level or self._new_level()
             return self.comparison.objective(mesh, level, smooth=smooth, onsets=onsets)
         except SonoNerfError as error:
             self._note(f"{name} cannot be compared and counts as the worst: {error}")
@@ -407,7 +407,9 @@ class Refinement:
         """Return the best surface so far; the start where all refined ones are clearly worse."""
         if not self.candidates:
             self._choose()
-        candidate = best_of(self.candidates, closed_before(self.echoes.hull, self._far))
+        candidate = best_of(
+            self.candidates, closed_before(self.echoes.hull, self._far), self._error
+        )
         best = candidate.best
         mesh, doubtful = without_necks(
             candidate.meshes[best],
