@@ -87,7 +87,7 @@ def flattest(
 
 
 class PlaneDescent:
-    """Descent of the numbers of planes.
+    """Descent of the numbers of patches: planes, and paraboloids where ``band`` is below 1.
 
     Args:
         mesh: Its flat parts are put on planes, m.
