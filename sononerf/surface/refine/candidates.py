@@ -188,24 +188,18 @@ def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = S
     return len(plans) * stages[0].steps + further * sum(stage.steps for stage in stages[1:])
 
 
-def after_first_stage(
-    candidates: list[Candidate], error: Callable[[Candidate], float]
-) -> list[Candidate]:
+def after_first_stage(candidates: list[Candidate]) -> list[Candidate]:
     """Return the candidates that go on after the first stage, the best one first.
 
     Of planes and the best of the others the better one goes on, in doubt both. A sheet that is
     about as good as the best one goes on alone. Else each start goes on in its better way,
     ``levels`` and ``fuller`` as one, but none that is clearly worse.
-
-    Args:
-        candidates: All of them.
-        error: Error of a candidate on the validation poses without onsets, dB. Planes do not follow
-            the errors of the onsets.
     """
     if candidates[0].way == "planes" and len(candidates) > 1:
-        planes, other = candidates[0], after_first_stage(candidates[1:], error)[0]
-        first, second = sorted((planes, other), key=error)
-        return [first] if TOLERATED * error(first) < error(second) else [first, second]
+        pair = [candidates[0], after_first_stage(candidates[1:])[0]]
+        first, second = sorted(pair, key=lambda one: one.objectives[-1])
+        clear = TOLERATED * first.objectives[-1] < second.objectives[-1]
+        return [first] if clear else [first, second]
     good = TOLERATED * min(one.objectives[-1] for one in candidates)
     sheets = [one for one in candidates if one.way == "sheet"]
     if any(one.objectives[-1] <= good for one in sheets):
@@ -244,20 +238,13 @@ def are_alike(one: Candidate, other: Candidate, wavelength: float) -> bool:
     return float(distances(one.meshes[1], other.meshes[1]).mean()) <= ALIKE * wavelength
 
 
-def best_of(
-    candidates: list[Candidate],
-    is_closed: Callable[[trimesh.Trimesh], bool],
-    error: Callable[[Candidate], float],
-) -> Candidate:
+def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], bool]) -> Candidate:
     """Return the best candidate: that of the least objective, in doubt ``levels`` or a closed one.
 
     Args:
         candidates: After their stages.
         is_closed: Whether a surface encloses a body, as far as poses can have heard it.
-        error: Error of a candidate without onsets, dB, which decides beside planes.
     """
-    if len(candidates) > 1 and any(one.way == "planes" for one in candidates):
-        return min(candidates, key=error)
     least = min(candidates, key=lambda one: one.objective)
     if least.objective <= RANKS_DB or len(candidates) == 1:
         return least

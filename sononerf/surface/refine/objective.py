@@ -263,12 +263,18 @@ class OnsetRanges:
         heights = radius[bounded] * (1.0 / cosine[bounded] - 1.0)
         return float(np.median(heights)) if bounded.any() else math.inf
 
-    def misfit(self, vertices: Tensor) -> float:
-        """Mean Huber loss of the least range of vertices (V, 3), m; no unit; 0 without onsets."""
+    def misfit(self, vertices: Tensor, late: float = 0.0) -> float:
+        """Return the mean Huber loss of the least range; no unit; 0 without onsets.
+
+        Args:
+            vertices ((V, 3), m): Of the surface.
+            late (m): The onsets may all come late by as much, or less.
+        """
         if not len(self):
             return 0.0
         lots = np.array_split(np.arange(len(self)), -(-len(self) // _POSES))
-        off = torch.cat([self._off(vertices, some)[0] for some in lots]).abs()
+        off = torch.cat([self._off(vertices, some)[0] for some in lots])
+        off = (off + (-off.median()).clamp(0.0, late / self.scale)).abs()
         return float(torch.where(off < 1.0, 0.5 * off.square(), off - 0.5).mean())
 
     def gradient(self, vertices: Tensor, number: int) -> Tensor:

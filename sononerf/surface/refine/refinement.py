@@ -7,7 +7,6 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, get_args
 
 import numpy as np
@@ -209,7 +208,7 @@ class Refinement:
             self._at += 1
             return
         if self.stage == 0:
-            self.candidates, self._at = after_first_stage(self.candidates, self._error), 0
+            self.candidates, self._at = after_first_stage(self.candidates), 0
             for one in self.candidates:
                 if math.isnan(one.objectives[0]):
                     one.objectives[0] = self._compared(one.start)
@@ -233,16 +232,11 @@ class Refinement:
             found.update({name: self._compared(name) for name in names})
         network = [self.starts[name] for name in LEVELS if name in self.starts]
         with_planes = [] if self.optics.plane else network
-        flat = flattest(with_planes, partial(self._objective, onsets=False), self.optics)
+        flat = flattest(with_planes, self._objective, self.optics)
         for start, way in planned(found, flat=flat is not None):
             mesh = flat if way == "planes" and flat is not None else self.starts[start]
             begun = Candidate(way, start, self._new_level(), [mesh], [found[start]], self._far)
             self.candidates.append(begun)
-
-    def _error(self, candidate: Candidate) -> float:
-        """Return the error of a candidate's best surface without onsets, dB."""
-        mesh, smooth = candidate.meshes[candidate.best], candidate.way != "planes"
-        return self._objective(mesh, "a surface", candidate.level, smooth=smooth, onsets=False)
 
     def _new_level(self) -> Level:
         like = self.optics.get_buffer("wavenumber")
@@ -261,12 +255,11 @@ class Refinement:
         level: Level | None = None,
         *,
         smooth: bool = False,
-        onsets: bool = True,
     ) -> float:
         """Return the objective of a surface; infinite if it cannot be traced."""
         try:
             level = level or self._new_level()
-            return self.comparison.objective(mesh, level, smooth=smooth, onsets=onsets)
+            return self.comparison.objective(mesh, level, smooth=smooth)
         except SonoNerfError as error:
             self._note(f"{name} cannot be compared and counts as the worst: {error}")
             return math.inf
@@ -407,9 +400,7 @@ class Refinement:
         """Return the best surface so far; the start where all refined ones are clearly worse."""
         if not self.candidates:
             self._choose()
-        candidate = best_of(
-            self.candidates, closed_before(self.echoes.hull, self._far), self._error
-        )
+        candidate = best_of(self.candidates, closed_before(self.echoes.hull, self._far))
         best = candidate.best
         mesh, doubtful = without_necks(
             candidate.meshes[best],

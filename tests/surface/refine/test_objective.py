@@ -126,6 +126,17 @@ def test_the_body_itself_has_no_misfit_and_a_smaller_one_has(box):
     assert 0.5 < onsets.misfit(vertices_of(smaller)) < 2.5
 
 
+def test_onsets_may_all_come_late_but_not_early(box):
+    onsets = OnsetRanges(heard(box), RESOLUTION, seed=0)
+    off = 2.0 * SCALE * RESOLUTION
+    larger, smaller = (box.copy().apply_scale(1 + side * off / 0.03) for side in (1, -1))
+    before = onsets.misfit(vertices_of(larger))
+    assert onsets.misfit(vertices_of(larger), late=2 * off) < 0.3 * before
+    assert onsets.misfit(vertices_of(larger), late=0.1 * off) > 0.8 * before
+    early = onsets.misfit(vertices_of(smaller))
+    assert onsets.misfit(vertices_of(smaller), late=2 * off) == early
+
+
 def test_ridges_of_a_hull_are_those_of_tangent_planes():
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.02)
     few, many = (OnsetRanges(heard(ball, count=count), RESOLUTION, seed=0) for count in (50, 200))
