@@ -267,8 +267,8 @@ class OnsetRanges:
         """Return the mean Huber loss of the least range; no unit; 0 without onsets.
 
         Args:
-            vertices ((V, 3), m): Of the surface.
-            late (m): The onsets may all come late by as much, or less.
+            vertices ((V, 3), m): Places on the surface.
+            late (m): Range by which all onsets may come late, at most.
         """
         if not len(self):
             return 0.0
