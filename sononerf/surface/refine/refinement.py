@@ -211,6 +211,8 @@ class Refinement:
             self.candidates, self._at = after_first_stage(self.candidates), 0
             for one in self.candidates:
                 if math.isnan(one.objectives[0]):
+                    # Planes may have begun from the fuller surface; they compete with levels.
+                    one.meshes[0] = self.starts[one.start]
                     one.objectives[0] = self._compared(one.start)
             self._later = None
         self.stage += 1

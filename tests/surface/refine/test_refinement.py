@@ -500,6 +500,22 @@ def test_flat_parts_move_as_planes_and_go_on_alone_where_they_are_right(box, box
     assert np.degrees(angles[-20:]).min() > 80.0
 
 
+@pytest.mark.thorough
+def test_planes_that_begin_from_the_fuller_surface_compete_with_levels(box, box_echoes, optics):
+    fine = box.subdivide_to_size(0.6 * optics.wavelength)
+    fuller = trimesh.smoothing.filter_laplacian(fine.copy(), iterations=2)
+    levels = trimesh.smoothing.filter_laplacian(fine.copy().apply_scale(0.9), iterations=3)
+    starts = {"levels": levels, "fuller": fuller}
+    work = Refinement(starts, box_echoes, optics, simulate=unasked, seed=0, stages=SHORT)
+    begun = work.candidate
+    np.testing.assert_array_equal(begun.meshes[0].vertices, fuller.vertices)
+    while work.stage == 0:
+        work.advance()
+    assert (begun.way, begun.start) == ("planes", "levels")
+    np.testing.assert_array_equal(begun.meshes[0].vertices, levels.vertices)
+    assert begun.objectives[0] == work.compared["levels"]
+
+
 def test_a_ball_has_no_flat_parts(bumpy, echoes, optics):
     work = Refinement({"levels": bumpy}, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
     assert work.candidate.way == "blurred"
