@@ -7,19 +7,9 @@ import trimesh
 
 from sononerf.surface.refine.patches import motions, on_patches, patches_of
 from sononerf.surface.refine.planes import flat_parts
-from tests.surface.refine.test_planes import LEAST, TOLERANCE, turned_box, worn_down
+from tests.surface.refine.test_planes import LEAST, TOLERANCE
 
 FAR = 5e-3
-
-
-@pytest.fixture(scope="module")
-def box():
-    return turned_box()
-
-
-@pytest.fixture(scope="module")
-def worn(box):
-    return worn_down(box)
 
 
 def put(mesh, part, patches, far=FAR):
@@ -34,14 +24,14 @@ def flat(worn):
     return put(worn, part, patches), part, patches
 
 
-def test_a_worn_box_has_its_corners_again(box, worn, flat):
+def test_a_worn_box_has_its_corners_again(turned_box, worn, flat):
     found, _, _ = flat
-    corners = np.asarray(box.vertices)[:, None]
+    corners = np.asarray(turned_box.vertices)[:, None]
     away = np.linalg.norm(corners - np.asarray(found.vertices), axis=2).min(axis=1)
     before = np.linalg.norm(corners - np.asarray(worn.vertices), axis=2).min(axis=1)
     assert away.max() < 0.4e-3 < before.min()
     assert found.is_watertight
-    assert found.volume == pytest.approx(box.volume, rel=0.02)
+    assert found.volume == pytest.approx(turned_box.volume, rel=0.02)
 
 
 def test_no_vertex_of_an_edge_goes_farther_than_it_may(worn, flat):

@@ -2,50 +2,21 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import trimesh
 
 from sononerf.surface.refine.planes import flat_parts, planes_of
-from sononerf.surface.refine.remesh import remesh
 
-SIDES = (0.06, 0.04, 0.03)
-EDGE = 1.5e-3
 TOLERANCE = 1e-3
 LEAST = 5e-5
 
 
-def turned_box():
-    found = trimesh.creation.box(SIDES)
-    turn = trimesh.transformations.euler_matrix(0.3, 0.8, 1.9)
-    return found.apply_transform(turn)
-
-
-def worn_down(box):
-    """Return a box with rounded edges, and waves of half a millimetre on its faces."""
-    found = remesh(box.subdivide_to_size(2e-3), EDGE, 1.5e-3)
-    places = np.asarray(found.vertices)
-    wave = 4e-4 * np.sin(places @ np.array([250.0, 120.0, 90.0]))
-    moved = places + wave[:, None] * np.asarray(found.vertex_normals)
-    return trimesh.Trimesh(moved, found.faces, process=False)
-
-
-@pytest.fixture(scope="module")
-def box():
-    return turned_box()
-
-
-@pytest.fixture(scope="module")
-def worn(box):
-    return worn_down(box)
-
-
-def test_a_worn_box_has_its_six_faces(box, worn):
+def test_a_worn_box_has_its_six_faces(turned_box, worn):
     part = flat_parts(worn, TOLERANCE, LEAST)
     normal, offset = planes_of(worn, part, TOLERANCE)
     assert len(normal) == 6
-    alike = normal @ np.asarray(box.facets_normal).T
+    alike = normal @ np.asarray(turned_box.facets_normal).T
     assert np.degrees(np.arccos(alike.max(axis=1))).max() < 1.0
-    wanted = np.asarray(box.facets_origin) * np.asarray(box.facets_normal)
+    wanted = np.asarray(turned_box.facets_origin) * np.asarray(turned_box.facets_normal)
     assert np.allclose(offset, wanted.sum(axis=1)[alike.argmax(axis=1)], atol=2e-4)
 
 
