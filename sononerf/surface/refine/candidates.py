@@ -188,22 +188,30 @@ def number_of_steps(starts: Iterable[StartMethod], stages: tuple[Stage, ...] = S
     return len(plans) * stages[0].steps + further * sum(stage.steps for stage in stages[1:])
 
 
-def after_first_stage(candidates: list[Candidate]) -> list[Candidate]:
+def after_first_stage(
+    candidates: list[Candidate], misfit: Callable[[trimesh.Trimesh], float]
+) -> list[Candidate]:
     """Return the candidates that go on after the first stage, the best one first.
 
-    Of planes and the best of the others the better one goes on, in doubt both. A sheet that is
-    about as good as the best one goes on alone. Else each start goes on in its better way,
-    ``levels`` and ``fuller`` as one, but none that is clearly worse.
+    A sheet that is about as good as the best one goes on alone. Of planes and the best of the
+    others the better one goes on, in doubt both; only their errors count, because free surfaces
+    follow the onsets and planes do not. Else each start goes on in its better way, ``levels`` and
+    ``fuller`` as one, but none that is clearly worse.
+
+    Args:
+        candidates: Planes are the first one.
+        misfit: Part of a surface's objective that the onsets have, dB.
     """
-    if candidates[0].way == "planes" and len(candidates) > 1:
-        pair = [candidates[0], after_first_stage(candidates[1:])[0]]
-        first, second = sorted(pair, key=lambda one: one.objectives[-1])
-        clear = TOLERATED * first.objectives[-1] < second.objectives[-1]
-        return [first] if clear else [first, second]
     good = TOLERATED * min(one.objectives[-1] for one in candidates)
     sheets = [one for one in candidates if one.way == "sheet"]
     if any(one.objectives[-1] <= good for one in sheets):
         return sheets
+    if candidates[0].way == "planes" and len(candidates) > 1:
+        pair = [candidates[0], after_first_stage(candidates[1:], misfit)[0]]
+        errors = [one.objectives[-1] - misfit(one.meshes[-1]) for one in pair]
+        first, second = np.argsort(errors, kind="stable")
+        clear = TOLERATED * errors[first] < errors[second]
+        return [pair[first]] if clear else [pair[first], pair[second]]
     left = [one for one in candidates if one.way != "sheet"] or sheets
     network = [one for one in left if one.start in LEVELS]
     others = [one for one in left if one.start not in LEVELS]

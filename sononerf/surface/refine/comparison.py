@@ -51,6 +51,15 @@ class Comparison:
         self.poses = echoes.validation[chosen.astype(np.int64)]
 
     def objective(self, mesh: trimesh.Trimesh, level: Level, *, smooth: bool) -> float:
+        """Return the error of a surface and the misfit of its onsets, dB; as :meth:`error`."""
+        return self.error(mesh, level, smooth=smooth) + self.misfit(mesh)
+
+    def misfit(self, mesh: trimesh.Trimesh) -> float:
+        """Return the part of the objective that the onsets have, dB."""
+        vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
+        return ONSETS * self.onsets.misfit(vertices, LATE * self.optics.head.resolution)
+
+    def error(self, mesh: trimesh.Trimesh, level: Level, *, smooth: bool) -> float:
         """Return the error of a surface on the validation poses, dB; infinite if all are silent.
 
         Args:
@@ -74,9 +83,7 @@ class Comparison:
         # Without an absolute level each surface gets one gain first.
         common = 1.0 if self.echoes.calibrated else _common_gain(heard, rendered)
         errors = [_difference(a, common * b) for a, b in zip(heard, rendered, strict=True)]
-        vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64))
-        misfit = self.onsets.misfit(vertices, LATE * self.optics.head.resolution)
-        return float(np.average(errors, weights=weights)) + ONSETS * misfit
+        return float(np.average(errors, weights=weights))
 
 
 def _common_gain(heard: list[Singles], rendered: list[Singles]) -> float:

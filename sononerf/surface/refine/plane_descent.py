@@ -71,19 +71,22 @@ def flattest(
     """Return the surface that explains the echoes best with its flat parts on planes.
 
     Args:
-        meshes: Surfaces, m; open ones take no part.
+        meshes: Surfaces, m, the usual one first; open ones take no part.
         error: Error of a surface, dB.
         optics: The head.
 
     Returns:
-        surface: None where it explains them better as it is.
+        surface: None where the usual one explains them better as it is.
     """
-    closed = [mesh for mesh in meshes if mesh.is_watertight]
-    errors = [error(flattened(mesh, optics.wavelength)[0]) for mesh in closed]
-    if not errors:
+
+    def on_planes(mesh: trimesh.Trimesh) -> float:
+        return error(flattened(mesh, optics.wavelength)[0])
+
+    first, *others = [mesh for mesh in meshes if mesh.is_watertight] or [None]
+    if first is None or (least := on_planes(first)) >= error(first):
         return None
-    best = int(np.argmin(errors))
-    return closed[best] if errors[best] < error(closed[best]) else None
+    errors = [least, *(on_planes(mesh) for mesh in others)]
+    return [first, *others][int(np.argmin(errors))]
 
 
 class PlaneDescent:

@@ -208,7 +208,8 @@ class Refinement:
             self._at += 1
             return
         if self.stage == 0:
-            self.candidates, self._at = after_first_stage(self.candidates), 0
+            self.candidates = after_first_stage(self.candidates, self.comparison.misfit)
+            self._at = 0
             for one in self.candidates:
                 if math.isnan(one.objectives[0]):
                     # Planes may have begun from the fuller surface; they compete with levels.
@@ -234,7 +235,7 @@ class Refinement:
             found.update({name: self._compared(name) for name in names})
         network = [self.starts[name] for name in LEVELS if name in self.starts]
         with_planes = [] if self.optics.plane else network
-        flat = flattest(with_planes, self._objective, self.optics)
+        flat = flattest(with_planes, self._error, self.optics)
         for start, way in planned(found, flat=flat is not None):
             mesh = flat if way == "planes" and flat is not None else self.starts[start]
             begun = Candidate(way, start, self._new_level(), [mesh], [found[start]], self._far)
@@ -265,6 +266,10 @@ class Refinement:
         except SonoNerfError as error:
             self._note(f"{name} cannot be compared and counts as the worst: {error}")
             return math.inf
+
+    def _error(self, mesh: trimesh.Trimesh) -> float:
+        """Return the error of a surface without its onsets, dB."""
+        return self._objective(mesh) - self.comparison.misfit(mesh)
 
     def _note(self, fault: str) -> None:
         """Record a fault, and warn of it once."""

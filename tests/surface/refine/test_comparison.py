@@ -49,6 +49,9 @@ def test_onsets_count_beside_the_echoes(echoes, optics, level, silent):
     without = Comparison(echoes, optics, silent, seed=0).objective(mesh, level, smooth=True)
     beside = Comparison(echoes, optics, onsets, seed=0).objective(mesh, level, smooth=True)
     assert beside > without + 3.0
+    compared = Comparison(echoes, optics, onsets, seed=0)
+    assert compared.error(mesh, level, smooth=True) == without
+    assert compared.misfit(mesh) == pytest.approx(beside - without)
 
 
 def test_training_poses_take_no_part(echoes, optics, level, silent):

@@ -419,33 +419,39 @@ def test_the_better_surface_of_the_network_goes_on_as_levels(bumpy, errors, way,
         after = bumpy.copy()
         after.metadata["of"] = start
         candidates.append(Candidate(way_of, start, None, [starts[start], after], [9.0, error]))
-    (found,) = after_first_stage(candidates)
+    (found,) = after_first_stage(candidates, lambda mesh: 0.0)
     assert (found.start, found.way) == ("levels", way)
     assert found.meshes[1].metadata["of"] == kept
     assert found.meshes[0] is starts["levels"]  # what is kept where no refined one is better
 
 
 @pytest.mark.parametrize(
-    ("planes", "other", "ways"),
+    ("planes", "other", "sheet", "ways"),
     [
-        (3.0, 4.0, ["planes"]),
-        (3.8, 4.0, ["planes", "sharp"]),
-        (4.0, 3.8, ["sharp", "planes"]),
-        (4.0, 3.0, ["sharp"]),
+        (5.0, 4.0, 9.0, ["planes"]),
+        (5.8, 4.0, 9.0, ["planes", "sharp"]),
+        (6.0, 3.8, 9.0, ["sharp", "planes"]),
+        (6.0, 3.0, 9.0, ["sharp"]),
+        (5.0, 4.0, 4.5, ["sheet"]),
+        (5.0, 4.0, 4.7, ["planes"]),
     ],
 )
-def test_of_planes_and_the_best_of_the_others_the_better_one_goes_on_in_doubt_both(
-    bumpy, planes, other, ways
+def test_planes_are_compared_by_echoes_alone_and_in_doubt_both_go_on(
+    bumpy, planes, other, sheet, ways
 ):
     def candidate(way, start, objective):
-        return Candidate(way, start, None, [bumpy, bumpy.copy()], [9.0, objective])
+        after = bumpy.copy()
+        after.metadata["way"] = way
+        return Candidate(way, start, None, [bumpy, after], [9.0, objective])
 
     found = after_first_stage(
         [
             candidate("planes", "levels", planes),
             candidate("sharp", "levels", other),
-            candidate("blurred", "open", 5.0),
-        ]
+            candidate("blurred", "open", 5.5),
+            candidate("sheet", "sheet", sheet),
+        ],
+        lambda mesh: 2.0 if mesh.metadata["way"] == "planes" else 0.0,
     )
     assert [one.way for one in found] == ways
 
