@@ -22,8 +22,9 @@ if TYPE_CHECKING:
     from sononerf.field.renderer import Renderer
     from sononerf.geometry.poses import Poses
     from sononerf.head.head import Head
+    from sononerf.run.compare import compare
     from sononerf.run.import_recordings import read_recordings
-    from sononerf.run.run import Run, compare, open_run
+    from sononerf.run.run import Run, open_run
     from sononerf.scene.material import Material
     from sononerf.scene.scene import Scene
     from sononerf.simulation.ensemble import simulate
@@ -75,7 +76,7 @@ _HOMES = {
     "Run": "run.run",
     "Scene": "scene.scene",
     "Surface": "surface.surface",
-    "compare": "run.run",
+    "compare": "run.compare",
     "evaluate": "evaluation.numbers",
     "fit": "field.fitting",
     "next_poses": "surface.next_poses",

@@ -61,15 +61,6 @@ class StoppedError(SonoNerfError):
 
 
 def expect(value: object, kind: type, name: str) -> None:
-    """Refuse a value of another kind.
-
-    Args:
-        value: The given value.
-        kind: The expected kind.
-        name: Name of the argument, for the message.
-
-    Raises:
-        InputError: If it is of another kind.
-    """
+    """Refuse a value of another kind."""
     if not isinstance(value, kind):
         raise InputError(f"{name} is a {type(value).__name__}, expected a {kind.__name__}")

@@ -11,9 +11,6 @@ from pathlib import Path
 
 from sononerf.errors import ResourceError
 
-DRIVERS = (Path("/dev/nvidiactl"), Path("/dev/kfd"))
-"""Device files of GPUs whose drivers reserve more data than there is memory."""
-
 
 def available_cores() -> int:
     """Return the number of cores that this process may use."""
@@ -45,16 +42,7 @@ def available_memory() -> int | None:
 
 
 def require_memory(needed: float, what: str, remedy: str) -> None:
-    """Refuse work that needs more memory than is free, before it begins.
-
-    Args:
-        needed: Bytes.
-        what: The work, for the message.
-        remedy: Advice to the user.
-
-    Raises:
-        ResourceError: With the memory needed and the memory free.
-    """
+    """Refuse work that needs more memory than is free, before it begins."""
     free = available_memory()
     if free is not None and needed > free:
         raise ResourceError(
@@ -64,17 +52,7 @@ def require_memory(needed: float, what: str, remedy: str) -> None:
 
 
 def require_disk(needed: float, folder: Path, what: str, remedy: str) -> None:
-    """Refuse files that need more space than the disk has free, before they are written.
-
-    Args:
-        needed: Bytes.
-        folder: Their folder; it need not exist.
-        what: The files, for the message.
-        remedy: Advice to the user.
-
-    Raises:
-        ResourceError: With the space needed and the space free.
-    """
+    """Refuse files that need more space than the disk has free, before they are written."""
     there = next(place for place in (folder, *folder.absolute().parents) if place.exists())
     free = shutil.disk_usage(there).free
     if needed > free:
@@ -90,37 +68,8 @@ def gigabytes(count: float) -> str:
 
 
 @contextmanager
-def memory_limited() -> Iterator[None]:
-    """Let an allocation that exceeds the free memory fail with one line.
-
-    Without the limit Linux grants every allocation and kills the process once its memory is used.
-    The limit holds for the rest of the process. Other systems, and machines with a GPU, have none.
-
-    Raises:
-        ResourceError: In place of the errors of NumPy and torch.
-    """
-    free = available_memory()
-    status = Path("/proc/self/status")
-    if free is not None and status.is_file() and not any(path.exists() for path in DRIVERS):
-        import resource
-
-        lines = status.read_text(encoding="ascii").splitlines()
-        used = sum(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmData:"))
-        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-        wanted = used + free
-        if hard == resource.RLIM_INFINITY or wanted < hard:
-            resource.setrlimit(resource.RLIMIT_DATA, (wanted, hard))
-    with memory_faults():
-        yield
-
-
-@contextmanager
 def memory_faults() -> Iterator[None]:
-    """Turn the errors that NumPy and torch raise where memory is short into one of ours.
-
-    Raises:
-        ResourceError: In their place.
-    """
+    """Turn the errors that NumPy and torch raise where memory is short into one of ours."""
     free = available_memory()
     try:
         yield

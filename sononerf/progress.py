@@ -74,9 +74,6 @@ class Task:
 class Progress:
     """Shows tasks one after the other.
 
-    Args:
-        quiet: Show nothing, as inside libraries and tests.
-
     Attributes:
         silenced: If True, every new Progress is quiet; ``--quiet`` of the command line sets it.
     """

@@ -15,11 +15,7 @@ is imported at first use."""
 
 
 class Picture:
-    """A picture, which shows itself in a notebook.
-
-    Args:
-        data: A PNG file.
-    """
+    """A picture, which shows itself in a notebook."""
 
     def __init__(self, data: bytes) -> None:
         self.data = data

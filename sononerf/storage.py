@@ -15,17 +15,16 @@ import re
 import shutil
 import stat
 import threading
-import zlib
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, BinaryIO
 
 from sononerf.errors import InputError, NumericalError, StorageError
 
+LOCK = ".lock"
+"""Name of the file by which a folder is locked; it stays there."""
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<pid>\d+)(?:-\d+)?\.tmp", re.DOTALL)
-_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOSYS, errno.EMLINK)
-_watchers: list[Callable[[Path, Path | None], None]] = []
 WAYS_OUT = {
     errno.ELOOP: "is a link; put the file itself in its place",
     errno.ENOSPC: "the disk is full; free space, then give the same command again",
@@ -87,53 +86,18 @@ def _make_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder and its parents, durably; nothing happens where it is there already.
-
-    Raises:
-        StorageError: If it cannot be created.
-    """
+    """Create a folder and its parents, durably; nothing happens where it is there already."""
     try:
         _make_folder(folder)
     except OSError as error:
         raise storage_error("cannot create the folder", folder, error) from error
 
 
-def _keep(path: Path, previous: Path) -> None:
-    if not path.exists():
-        return
-    aside = temporary_beside(previous)
-    aside.unlink(missing_ok=True)
-    try:
-        os.link(path, aside)  # a link, so that `path` is never away
-    except OSError as error:
-        if error.errno not in _NO_LINKS:
-            raise
-        # Away for an instant, yet never lost.
-        os.replace(path, previous)  # noqa: PTH105
-        return
-    try:
-        os.replace(aside, previous)  # noqa: PTH105
-    finally:
-        # A rename leaves both names where both were one file already.
-        aside.unlink(missing_ok=True)
-
-
-def commit(
-    path: Path, writer: Callable[[BinaryIO], object], *, previous: Path | None = None
-) -> None:
+def commit(path: Path, writer: Callable[[BinaryIO], object]) -> None:
     """Write a file so that its old or its new content is complete, even after a crash.
 
     The content goes to a temporary file beside the target, is flushed and fsynced, takes the
     target's name, and the folder is fsynced. Missing folders are created.
-
-    Args:
-        path: The target.
-        writer: Writes the content to the binary file it is given.
-        previous: A name in the same folder under which the replaced content is kept.
-
-    Raises:
-        StorageError: If the file cannot be written; the old one is then untouched, the temporary
-            one gone.
     """
     temporary = temporary_beside(path)
     try:
@@ -143,10 +107,6 @@ def commit(
                 writer(file)
                 file.flush()
                 os.fsync(file.fileno())
-            for watcher in tuple(_watchers):
-                watcher(path, temporary)
-            if previous is not None:
-                _keep(path, previous)
             os.replace(temporary, path)  # noqa: PTH105
             sync_folder(path.parent)
         except BaseException:
@@ -157,63 +117,9 @@ def commit(
         raise storage_error("cannot be written", path, error) from error
 
 
-@contextmanager
-def watched(watcher: Callable[[Path, Path | None], None]) -> Iterator[None]:
-    """Call a function for every file, in any thread, before the file has its name.
-
-    Args:
-        watcher: Called with the target and, where it is written, the temporary file that holds its
-            content; where it is removed, None. Its exceptions stop the change.
-    """
-    _watchers.append(watcher)
-    try:
-        yield
-    finally:
-        _watchers.remove(watcher)
-
-
 def commit_bytes(path: Path, data: bytes | memoryview) -> None:
     """Commit bytes; see :func:`commit`."""
     commit(path, lambda file: file.write(data))
-
-
-def commit_folder(folder: Path, files: Mapping[str, str]) -> None:
-    """Write a new folder of text files, all of them or none.
-
-    They are written into a temporary folder beside the target, which then takes its name.
-
-    Args:
-        folder: The target; not there yet, or empty.
-        files: Content by name.
-
-    Raises:
-        StorageError: If the folder cannot be written, or is not empty; nothing is left behind then.
-    """
-    folder = folder.absolute()
-    current = temporary_beside(folder)
-    try:
-        missing = _missing_folders(folder.parent)
-        try:
-            _make_folder(folder.parent)
-            shutil.rmtree(current, ignore_errors=True)  # of a process that had our number
-            os.mkdir(current)  # noqa: PTH102 - see `_make_folder`
-            for name, text in files.items():
-                with open(current / name, "wb") as file:  # noqa: PTH123
-                    file.write(text.encode())
-                    file.flush()
-                    os.fsync(file.fileno())
-            sync_folder(current)
-            os.replace(current, folder)  # noqa: PTH105
-            current = folder
-            sync_folder(folder.parent)
-        except BaseException:
-            shutil.rmtree(current, ignore_errors=True)
-            for new in missing:
-                with suppress(OSError):
-                    new.rmdir()
-            raise
-    except OSError as error:
-        raise storage_error("cannot be written", folder, error) from error
 
 
 def commit_text(path: Path, text: str) -> None:
@@ -244,12 +150,7 @@ def to_json(data: Any, *, indent: int | None = None, sort_keys: bool = False) ->
 
 
 def commit_json(path: Path, data: Any) -> None:
-    """Commit plain data as JSON; see :func:`commit`.
-
-    Raises:
-        NumericalError: If a number is NaN or infinite; the old file is then untouched.
-        StorageError: If the file cannot be written.
-    """
+    """Commit plain data as JSON; see :func:`commit`."""
     try:
         text = to_json(data, indent=2)
     except ValueError as error:
@@ -258,11 +159,7 @@ def commit_json(path: Path, data: Any) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file.
-
-    Raises:
-        InputError: If it is missing, unreadable, or no JSON.
-    """
+    """Read a JSON file."""
     try:
         return json.loads(path.read_bytes().decode())
     except FileNotFoundError:
@@ -276,11 +173,7 @@ def read_json(path: Path) -> Any:
 def append_line(path: Path, text: str) -> None:
     """Append one line of text to a file, durably; the file is created if it does not exist.
 
-    A line that a crash tore is ended first, so that it does not absorb the next one. Readers
-    recognise torn lines by checksums.
-
-    Raises:
-        StorageError: If it cannot be written.
+    A line that a crash tore is ended first, so that it does not absorb the next one.
     """
     try:
         is_new = not path.exists()
@@ -300,50 +193,9 @@ def append_line(path: Path, text: str) -> None:
         raise storage_error("cannot be appended to", path, error) from error
 
 
-def append_record(path: Path, record: Mapping[str, Any]) -> None:
-    """Append plain data to a journal as one line of JSON with a checksum; see `append_line`."""
-    body = to_json(record, sort_keys=True)
-    # The checksum covers the text before it, so that a torn or damaged line is no record.
-    append_line(path, f"{body[:-1]},{_checksum_field(body)}}}")
-
-
-def read_records(path: Path) -> list[dict[str, Any]]:
-    """Read the records of a journal; torn and damaged lines are ignored.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
-    try:
-        lines = path.read_bytes().split(b"\n")
-    except FileNotFoundError:
-        return []
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    records = []
-    for line in lines:
-        with suppress(ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            record = json.loads(line.decode())
-            del record["crc32"]
-            body = to_json(record)
-            if line.decode() == f"{body[:-1]},{_checksum_field(body)}}}":
-                records.append(record)
-    return records
-
-
-def _checksum_field(body: str) -> str:
-    return f'"crc32":{zlib.crc32(body.encode())}'
-
-
 def remove_file(path: Path) -> None:
-    """Remove a file, durably; a missing file is no error.
-
-    Raises:
-        StorageError: If it cannot be removed.
-    """
+    """Remove a file, durably; a missing file is no error."""
     try:
-        if path.exists():
-            for watcher in tuple(_watchers):
-                watcher(path, None)
         path.unlink()
         sync_folder(path.parent)
     except FileNotFoundError:
@@ -381,14 +233,7 @@ def clean_leftovers(folder: Path) -> None:
 
 
 def probe_writable(folder: Path) -> list[Path]:
-    """Create a folder and prove that files can be written there, before anything expensive.
-
-    Returns:
-        created: The folders that were not there, innermost first; see :func:`remove_if_empty`.
-
-    Raises:
-        StorageError: If it cannot be created or written; nothing is left behind then.
-    """
+    """Create a folder and prove that files can be written there, before anything expensive."""
     created = _missing_folders(folder)
     probe = folder / ".probe"
     try:
@@ -406,9 +251,11 @@ def probe_writable(folder: Path) -> list[Path]:
 
 
 def remove_if_empty(folders: list[Path]) -> None:
-    """Remove folders that nothing came into, in the order given."""
+    """Remove folders that nothing but a lock came into, in the order given."""
     for folder in folders:
         with suppress(OSError):  # something did
+            if [path.name for path in folder.iterdir()] == [LOCK]:
+                (folder / LOCK).unlink()
             folder.rmdir()
 
 

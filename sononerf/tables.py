@@ -16,12 +16,7 @@ MOST_BYTES = 200_000_000
 
 
 def read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Return the header of a table, and line number and cells of each row, as many as the header.
-
-    Raises:
-        InputError: If it cannot be read, holds no rows, a column stands twice, or a row has another
-            length.
-    """
+    """Return the header of a table, and line number and cells of each row."""
     try:
         require_regular(path)
         if path.stat().st_size > MOST_BYTES:
@@ -50,11 +45,7 @@ def read_rows(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 
 def number_in(path: Path, line: int, name: str, cell: str) -> float:
-    """Return the number in a cell.
-
-    Raises:
-        InputError: If it is no finite number, naming file, line and column.
-    """
+    """Return the number in a cell."""
     try:
         number = float(cell)
     except ValueError:

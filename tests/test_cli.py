@@ -24,7 +24,6 @@ import pytest
 import torch
 import trimesh
 import typer
-import yaml
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
@@ -35,6 +34,7 @@ from sononerf.evaluation import baseline
 from sononerf.evaluation import geometry as geometry_module
 from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.run import fit as fit_module
+from sononerf.settings.loading import read_yaml
 from tests.small_views import draw_small
 
 pytestmark = pytest.mark.thorough
@@ -42,7 +42,7 @@ pytestmark = pytest.mark.thorough
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 SMOKE = str(CONFIGS / "smoke.yaml")
 COMMANDS = (
-    "scenes new-scene new-field new-renderer simulate import fit predict next reconstruct evaluate "
+    "scenes new-plugin simulate import fit predict next reconstruct evaluate "
     "export calibrate compare report table doctor view".split()
 )
 SHORT = [  # of the smoke settings, so that a fit takes a second
@@ -93,6 +93,7 @@ def tree(folder):
     return {
         str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None
         for path in sorted(folder.rglob("*"))
+        if path.name != ".lock"
     }
 
 
@@ -147,8 +148,8 @@ def test_every_promised_file_is_there(smoke):
     }
     assert promised <= found
     assert any(name.startswith("tensorboard/smoke/events") for name in found)
-    hidden = [name for name in found if Path(name).name.startswith(".")]
-    assert hidden == []  # no lock, nothing half-written
+    hidden = {name for name in found if Path(name).name.startswith(".")}
+    assert hidden <= {".lock"}  # nothing half-written
     assert (smoke.home / "pictures" / "scene.png").is_file()
 
 
@@ -169,7 +170,7 @@ def test_every_file_can_be_read(smoke):
         assert arrays["predicted"].shape == arrays["measured"].shape
         assert len(arrays["predicted"]) == 3
     assert safetensors.torch.load_file(smoke.run / "model.safetensors")
-    settings = yaml.safe_load((smoke.run / "config.yaml").read_text())
+    settings = read_yaml(smoke.run / "config.yaml")
     assert settings["fit"]["steps_per_epoch"] == 40
     assert settings["fit"]["seed"] == 0  # the defaults are there too
 
@@ -223,7 +224,7 @@ def test_it_learns(smoke):
     tags = events.Tags()
     assert {"spectrogram/validation_pose_0", "projections"} <= set(tags["images"])
     assert "mesh/field_VERTEX" in tags["tensors"]
-    assert {"Chamfer_mm/field", "final/Chamfer_mm"} <= set(tags["scalars"])
+    assert "final/Chamfer_mm" in tags["scalars"]
     metrics = json.loads((smoke.run / "metrics.json").read_text())
     prediction = metrics["prediction"]
     assert prediction["mae_db"] < 0.75 * prediction["mean_predictor_mae_db"]
@@ -417,7 +418,7 @@ def test_scenes_are_listed_for_people_and_for_programs():
 
 def test_a_new_scene_is_written_and_what_to_do_next_is_said(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    text = done("new-scene", "tin-drum")
+    text = done("new-plugin", "scene", "tin-drum")
     assert text.err.splitlines() == [
         *(f"wrote tin-drum/{name}" for name in ("pyproject.toml", "tin_drum.py")),
         "wrote tin-drum/test_tin_drum.py",
@@ -426,13 +427,13 @@ def test_a_new_scene_is_written_and_what_to_do_next_is_said(tmp_path, monkeypatc
         "  python -m pytest tin-drum",
         "  sononerf fit scene.name=tin_drum",
     ]
-    assert "field.kind=net" in done("new-field", "net").err
-    assert "renderer.kind=ears" in done("new-renderer", "ears").err
-    assert "--output" in refused(2, "new-scene", "tin-drum")
-    assert "sphere" in refused(2, "new-scene", "sphere", "--output", "other")
+    assert "field.kind=net" in done("new-plugin", "field", "net").err
+    assert "renderer.kind=ears" in done("new-plugin", "renderer", "ears").err
+    assert "--output" in refused(2, "new-plugin", "scene", "tin-drum")
+    assert "sphere" in refused(2, "new-plugin", "scene", "sphere", "--output", "other")
     assert not Path("other").exists()
     assert "a part of the path is a file" in refused(
-        4, "new-scene", "tin", "--output", "tin-drum/pyproject.toml/bar"
+        4, "new-plugin", "scene", "tin", "--output", "tin-drum/pyproject.toml/bar"
     )
 
 
@@ -486,7 +487,7 @@ def test_wrong_settings_and_options(clean, arguments, words):
     [
         (None, ["mine.yaml", "no such settings file"]),
         ("scene: [", ["mine.yaml:1"]),
-        ("scene:\n  name: sphere\nscene:\n  name: ua\n", ["mine.yaml:3", "stands twice"]),
+        ("scene:\n  name: sphere\nscene:\n  name: ua\n", ["mine.yaml:3", "duplicate key"]),
         ("- a\n", ["mine.yaml", "holds list"]),
         ("", ["mine.yaml", "scene: missing"]),
         ("scene: {name: sphere}\nfit: {epochs: !!python/name:os.system x}\n", ["mine.yaml:2"]),
@@ -606,7 +607,7 @@ def test_a_folder_that_is_no_run(clean):
 def test_a_folder_in_use(clean):
     with locks.lock(Path("run")):
         message = refused(7, "fit", SMOKE, "--output", "run")
-        assert f"in use by process {os.getpid()}" in message
+        assert "in use by another process" in message
         assert "in use" in refused(7, "fit", SMOKE, "--output", "run", "--overwrite")
     assert [path for path in tree(clean) if path != "run"] == []
 
@@ -809,11 +810,11 @@ def test_nothing_and_nonsense_are_wrong_usage():
 
 
 def test_quiet_leaves_results_and_errors(clean):
-    assert done("--quiet", "new-scene", "my_bar").err == ""
+    assert done("--quiet", "new-plugin", "scene", "my_bar").err == ""
     assert (clean / "my_bar").is_dir()
     assert done("--quiet", "--version").out.startswith("sononerf ")
-    assert "my_bar" in refused(2, "--quiet", "new-scene", "my_bar")
-    assert "wrote" in done("new-scene", "my_bat").err
+    assert "my_bar" in refused(2, "--quiet", "new-plugin", "scene", "my_bar")
+    assert "wrote" in done("new-plugin", "scene", "my_bat").err
 
 
 # Signals.
@@ -919,7 +920,7 @@ def test_sigterm_stops_a_fit_in_time_and_the_same_command_goes_on(clean, fit_alo
     assert 10 <= stopped < 200
     for noise in ("Traceback", "LeafSpec", "\x1b"):
         assert noise not in err
-    assert not (clean / "run" / ".lock").exists()
+    assert not locks.is_held(clean / "run")
 
     steps = []
 

@@ -13,9 +13,13 @@ import pytest
 import sononerf as sn
 from sononerf import testing
 from sononerf.field.fitting import quiet_lightning
-from sononerf.run.new_plugin import FIELD, RENDERER
+from sononerf.run.new_plugin import TEMPLATES
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "extending.md").read_text()
+FIELD, RENDERER = (
+    (TEMPLATES / kind / f"my_{kind}.py").read_text(encoding="utf-8")
+    for kind in ("field", "renderer")
+)
 BLOCKS = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 
 

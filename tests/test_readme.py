@@ -11,7 +11,7 @@ import pytest
 import typer
 
 from sononerf.cli.entry import app
-from sononerf.run import new_plugin as new_plugin_module
+from sononerf.run.new_plugin import new_plugin
 from sononerf.settings.loading import load_settings
 from sononerf.settings.plugins import SCENES as GROUP
 from sononerf.settings.plugins import check_options, load, registered
@@ -105,10 +105,8 @@ def test_the_code_of_the_guides_runs(code):
     assert names["magnitude"].shape == (2, len(names["simulator"].head.range), 47)
 
 
-def test_the_guide_shows_the_scene_that_is_written(tmp_path, monkeypatch):
-    # Whoever follows the guide here has that scene installed, and tests all the same.
-    monkeypatch.setattr(new_plugin_module, "_check_name", lambda *_: None)
-    project, module, _ = new_plugin_module.new_plugin("scene", "round-bar", tmp_path / "round-bar")
+def test_the_guide_shows_the_scene_that_is_written(tmp_path):
+    project, module, _ = new_plugin("scene", "round-bar", tmp_path / "round-bar")
     assert blocks("toml", SCENES) == [project.read_text(encoding="utf-8")]
     assert blocks("python", SCENES) == [module.read_text(encoding="utf-8")]
 

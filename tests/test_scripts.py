@@ -109,6 +109,7 @@ def test_a_prediction_traces_echoes_off_the_surface_it_is_given(made, monkeypatc
 def test_a_mesh_of_ones_own_is_a_surface(made):
     scene, echoes, model, _ = made
     mine = sn.Surface(scene.mesh)
+    assert mine.method == "given"
     with pytest.raises(InputError, match="does not know the echoes"):
         sn.predict(model, mine, echoes.poses("test"), progress=QUIET)
     with pytest.raises(InputError, match="mesh is a list"):

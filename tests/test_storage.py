@@ -57,14 +57,6 @@ def test_commit_writes_and_replaces_and_leaves_nothing_else(tmp_path):
     assert names(path.parent) == ["file"]
 
 
-def test_commit_keeps_the_replaced_content_where_asked(tmp_path):
-    path, previous = tmp_path / "file", tmp_path / "file.previous"
-    for content in (b"1", b"2", b"3"):
-        storage.commit(path, lambda file, data=content: file.write(data), previous=previous)
-    assert (path.read_bytes(), previous.read_bytes()) == (b"3", b"2")
-    assert names(tmp_path) == ["file", "file.previous"]
-
-
 def test_commit_is_durable_before_it_is_visible(tmp_path, monkeypatch):
     order = []
     real_fsync, real_replace = os.fsync, os.replace
@@ -96,29 +88,24 @@ def test_new_folders_are_durable_too(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("lasting", [False, True])
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EACCES, errno.EROFS])
-@pytest.mark.parametrize("kept", [False, True])
-def test_a_fault_at_any_call_leaves_old_or_new_and_is_told(
-    tmp_path, monkeypatch, code, lasting, kept
-):
+def test_a_fault_at_any_call_leaves_old_or_new_and_is_told(tmp_path, monkeypatch, code, lasting):
     path = tmp_path / "file"
-    previous = tmp_path / "file.previous" if kept else None
     for number in range(1, 20):
         storage.commit_bytes(path, b"old")
         with failing(monkeypatch, number, code, lasting=lasting) as write:
             message = None
             try:
-                storage.commit(path, lambda file, w=write: w(file, b"new"), previous=previous)
+                storage.commit(path, lambda file, w=write: w(file, b"new"))
             except StorageError as error:
                 message = str(error)
         assert path.read_bytes() in (b"old", b"new")
-        assert set(names(tmp_path)) <= {"file", "file.previous"}
+        assert names(tmp_path) == ["file"]
         if message is None:
             break
         assert str(path) in message
         assert "\n" not in message
     assert path.read_bytes() == b"new"
-    # open, write, fsync, [link, replace,] replace, fsync; then nothing is left to fail
-    assert number == (8 if kept else 6)
+    assert number == 6  # open, write, fsync, replace, fsync; then nothing is left to fail
 
 
 def test_a_file_size_limit_is_a_storage_error_and_keeps_the_old_file(tmp_path):
@@ -158,35 +145,6 @@ def test_threads_that_commit_one_name_do_not_mix_their_bytes(tmp_path):
     for thread in threads:
         thread.join()
     assert path.read_bytes() in (b"a" * 100, b"b" * 100)
-
-
-def test_a_folder_is_committed_whole(tmp_path):
-    files = {"a": "1\n", "b": "é"}
-    storage.commit_folder(tmp_path / "new" / "folder", files)
-    (tmp_path / "empty").mkdir()
-    storage.commit_folder(tmp_path / "empty", files)
-    for folder in (tmp_path / "new" / "folder", tmp_path / "empty"):
-        assert {path.name: path.read_text("utf-8") for path in folder.iterdir()} == files
-    assert names(tmp_path) == ["empty", "new"]
-    assert names(tmp_path / "new") == ["folder"]
-
-
-def test_a_folder_that_fails_at_any_call_leaves_nothing(tmp_path, monkeypatch):
-    for number in range(1, 11):  # two folders, two files with their syncs, rename, two folders
-        with failing(monkeypatch, number, errno.ENOSPC, lasting=True):
-            with pytest.raises(StorageError, match="folder: cannot be written: the disk is full"):
-                storage.commit_folder(tmp_path / "new" / "folder", {"a": "1", "b": "2"})
-        assert names(tmp_path) == []
-    with failing(monkeypatch, 11, errno.ENOSPC, lasting=True):
-        storage.commit_folder(tmp_path / "new" / "folder", {"a": "1", "b": "2"})
-
-
-def test_a_folder_that_is_not_empty_stays_as_it_is(tmp_path):
-    (tmp_path / "mine").write_text("x")
-    with pytest.raises(StorageError):
-        storage.commit_folder(tmp_path, {"a": "1"})
-    assert names(tmp_path) == ["mine"]
-    assert not list(tmp_path.parent.glob(f".{tmp_path.name}.*"))
 
 
 def test_json_converts_numpy_and_refuses_nan(tmp_path):
@@ -334,38 +292,6 @@ def test_all_of_a_file_is_there_when_it_is_synced(tmp_path, monkeypatch):
     assert sizes[2:] == [5, "folder"]
     storage.append_line(tmp_path / "journal", "more")
     assert sizes[4:] == [10]
-    storage.commit_folder(tmp_path / "folder", {"part": "text"})
-    assert sizes[5:] == [4, "folder", "folder"]
-
-
-def test_the_same_file_under_two_names_leaves_no_third(tmp_path):
-    storage.commit_bytes(tmp_path / "file", b"old")
-    (tmp_path / "previous").hardlink_to(tmp_path / "file")
-    previous = tmp_path / "previous"
-    storage.commit(tmp_path / "file", lambda file: file.write(b"new"), previous=previous)
-    assert names(tmp_path) == ["file", "previous"]
-    assert previous.read_bytes() == b"old"
-    # A process that died had our number.
-    storage.temporary_beside(previous).write_bytes(b"half")
-    storage.commit(tmp_path / "file", lambda file: file.write(b"last"), previous=previous)
-    assert previous.read_bytes() == b"new"
-
-
-def test_a_journal_that_cannot_be_read_is_refused_and_none_is_empty(tmp_path):
-    with pytest.raises(InputError, match="cannot be read"):
-        storage.read_records(tmp_path)
-    assert storage.read_records(tmp_path / "none") == []
-
-
-def test_torn_and_changed_records_are_none(tmp_path):
-    path = tmp_path / "journal"
-    for number in range(4):
-        storage.append_record(path, {"number": number, "text": "ü"})
-    lines = path.read_bytes().split(b"\n")
-    lines[1] = lines[1].replace(b'"number":1', b'"number":7')
-    lines[2] = lines[2][:-4]
-    path.write_bytes(b"\n".join([*lines[:4], b"[1]", b'{"number": 9}', b"\xff"]))
-    assert [record["number"] for record in storage.read_records(path)] == [0, 3]
 
 
 OPEN = Path("/proc/self/fd")
@@ -395,9 +321,3 @@ def test_a_file_in_place_of_a_folder_is_refused(tmp_path):
     (tmp_path / "taken").write_text("x")
     with pytest.raises(StorageError, match="taken"):
         storage.make_folder(tmp_path / "taken")
-
-
-def test_records_have_the_same_bytes_whatever_the_order_of_their_keys(tmp_path):
-    storage.append_record(tmp_path / "a", {"b": 1, "a": 2})
-    storage.append_record(tmp_path / "b", {"a": 2, "b": 1})
-    assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()

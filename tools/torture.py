@@ -7,10 +7,8 @@
 ``kill-simulate``, ``kill-fit``: `simulate`, and `fit` with all that follows it, killed at random
 moments and at random writes; what the same command then makes equals an uninterrupted run.
 ``disk``: each call that writes fails once; exit code 4, and old files are as they were.
-``fuzz``: damaged files for all readers. ``flips``: single bits of what sononerf wrote.
 ``attacks``: files and folders of strangers; no code, no connection, nothing written outside.
 ``mistakes``: wrong units, conventions and sizes; refused, or warned with the cause.
-``mutants``: deliberate faults in the code, which the tests must see.
 
 The seed is drawn where it is not given, and printed: the same seed gives the same trials. The exit
 code is 1 where there was a fault. Files that caused one are kept in ``--output``.
@@ -27,21 +25,16 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))  # the parts of this command, and the package of this checkout
 
 from tools.tortures.attacks import attacks  # noqa: E402
-from tools.tortures.fuzz import flips, fuzz  # noqa: E402
 from tools.tortures.harness import Report  # noqa: E402
 from tools.tortures.interrupted import disk, kill_fit, kill_simulate  # noqa: E402
 from tools.tortures.mistakes import mistakes  # noqa: E402
-from tools.tortures.mutants import mutants  # noqa: E402
 
 SERIES = {
     "kill-simulate": (kill_simulate, 500),
     "kill-fit": (kill_fit, 500),
     "disk": (disk, 0),
     "attacks": (attacks, 0),
-    "fuzz": (fuzz, 50_000),
-    "flips": (flips, 1000),
     "mistakes": (mistakes, 0),
-    "mutants": (mutants, 200),
 }
 """Each series, and how many trials it has where no number is given."""
 

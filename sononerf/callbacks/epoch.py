@@ -20,11 +20,7 @@ from sononerf.progress import Task
 
 
 class ProgressCallback(lightning.Callback):
-    """Moves a bar with every step.
-
-    Args:
-        task: One count per step.
-    """
+    """Moves a bar with every step."""
 
     def __init__(self, task: Task) -> None:
         self.task = task
@@ -57,12 +53,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class CheckpointCallback(lightning.Callback):
-    """Keeps ``checkpoints/last.ckpt``; the fit resumes at its step.
-
-    Args:
-        folder: The run.
-        seconds: Longest time between two checkpoints.
-    """
+    """Keeps ``checkpoints/last.ckpt``; the fit resumes at its step."""
 
     def __init__(self, folder: Path, seconds: float) -> None:
         self.path = folder / "checkpoints" / "last.ckpt"

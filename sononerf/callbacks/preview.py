@@ -9,13 +9,10 @@ import lightning
 import numpy as np
 import torch
 import trimesh
-from torch.utils.tensorboard import SummaryWriter
 
 from sononerf import storage
-from sononerf.callbacks.tensorboard import Shown, add_mesh
+from sononerf.callbacks.tensorboard import add_mesh, writer_of
 from sononerf.errors import NumericalError
-from sononerf.evaluation.metrics import chamfer_distance
-from sononerf.evaluation.solid import Solid
 from sononerf.field.field import Field
 from sononerf.field.module import EchoModule, decibels
 from sononerf.field.range_slices import WholePoses
@@ -33,12 +30,6 @@ from sononerf.surface.start.volume import Volume, automatic_level, isosurface
 
 class PreviewCallback(lightning.Callback):
     """Writes ``epochs/0001/``: a coarse mesh, three projections and the numbers so far.
-
-    Args:
-        folder: The run.
-        every_epochs: Number of epochs between two previews.
-        voxels: Along the region's longest side.
-        directions: Spherical lattice for fields without lobes.
 
     Attributes:
         volume, mesh: Last read-out; None if there was no surface.
@@ -83,51 +74,19 @@ class PreviewCallback(lightning.Callback):
             data = png_from_pixels(mip_image(projection))
             storage.commit_bytes(target / f"mip_{axis}.png", data)
         storage.commit_json(target / "metrics.json", numbers)
-
-
-SAMPLES = 4000
-"""Samples of each surface for the Chamfer distance of a preview: right to some percent."""
-
-
-class SurfaceImages(Shown):
-    """Shows the preview: projections with axes, the mesh, and its distance from the truth.
-
-    Args:
-        preview: Callback with the read-out; it must run before.
-        truth: The true surface, m; None where it is not known.
-    """
-
-    def __init__(self, preview: PreviewCallback, truth: trimesh.Trimesh | None = None) -> None:
-        super().__init__()
-        self.preview, self._truth = preview, truth
-        self._solid: Solid | None = None
-
-    def draw(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        writer: SummaryWriter,
-    ) -> None:
-        """Show the last preview."""
-        del pl_module
-        volume, mesh, step = self.preview.volume, self.preview.mesh, trainer.global_step
-        if volume is not None and volume.values.max() > 0:
-            writer.add_image("projections", mips_image(volume), step, dataformats="HWC")
-        if mesh is None:
-            return
-        add_mesh(writer, "mesh/field", mesh, step)
-        if self._truth is not None:
-            self._solid = self._solid or Solid(self._truth)
-            distance = chamfer_distance(mesh, self._solid, samples=SAMPLES)
-            writer.add_scalar("Chamfer_mm/field", 1e3 * distance, step)
+        if writer := writer_of(trainer):
+            writer.add_image(
+                "projections", mips_image(self.volume), trainer.global_step, dataformats="HWC"
+            )
+            add_mesh(writer, "mesh/field", self.mesh, trainer.global_step)
 
 
 POSES = 3
 """Validation poses that are shown, evenly chosen; always the same ones."""
 
 
-class SpectrogramImages(Shown):
-    """Shows validation poses: measured, predicted by the field, and the difference.
+class SpectrogramImages(lightning.Callback):
+    """Shows validation poses: measured, and predicted by the field.
 
     Args:
         poses: The validation poses.
@@ -137,29 +96,30 @@ class SpectrogramImages(Shown):
     def __init__(
         self, poses: WholePoses, range_m: torch.Tensor, frequency_hz: torch.Tensor
     ) -> None:
-        super().__init__()
         self.poses = poses
         self.range_m = range_m.double().numpy()
         self.frequency_hz = frequency_hz.double().numpy()
 
-    def draw(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        writer: SummaryWriter,
+    def on_train_epoch_end(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
     ) -> None:
         """Render the poses and show them."""
-        if not isinstance(pl_module, EchoModule):
+        writer = writer_of(trainer)
+        if writer is None or not isinstance(pl_module, EchoModule):
             return
+        was_training = pl_module.training
+        pl_module.eval()
         chosen = np.linspace(0, len(self.poses) - 1, min(POSES, len(self.poses))).astype(int)
         for number in chosen.tolist():
             batch = trainer.strategy.batch_to_device(self.poses[number])
-            measured, predicted = (
-                decibels(part, pl_module.reference)[0].cpu().numpy()
-                for part in (batch.spectrum, pl_module(batch))
-            )
+            with torch.inference_mode():
+                measured, predicted = (
+                    decibels(part, pl_module.reference)[0].cpu().numpy()
+                    for part in (batch.spectrum, pl_module(batch))
+                )
             shown = sounding_slice(np.stack([measured, predicted]), self.range_m)
             levels = {"measured": measured[:, shown], "predicted": predicted[:, shown]}
             picture = quick_image(levels, self.range_m[shown], self.frequency_hz)
             name = f"spectrogram/validation_pose_{number}"
             writer.add_image(name, picture, trainer.global_step, dataformats="HWC")
+        pl_module.train(was_training)

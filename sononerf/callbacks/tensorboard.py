@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -27,25 +26,10 @@ SCALARS = {
     "val/mae_db_active": "validation_error_dB/active_cells",
 }
 """Name in TensorBoard, with its unit, of each scalar that the module logs."""
-FLOORS = {
-    "noise_floor_mae_db": "validation_error_dB/noise_floor_all_cells",
-    "noise_floor_mae_db_active": "validation_error_dB/noise_floor_active_cells",
-}
-"""Name in TensorBoard of each noise floor."""
-LAYOUT = {
-    "validation error beside the noise floor, dB": {
-        cells: [
-            "Multiline",
-            [f"validation_error_dB/{cells}", f"validation_error_dB/noise_floor_{cells}"],
-        ]
-        for cells in ("all_cells", "active_cells")
-    }
-}
 TRIANGLES = 10_000
 """Largest number of triangles of a mesh in TensorBoard, 0.2 MB; larger meshes are decimated."""
-SHARE, FIRST = 0.02, 10.0
-"""Largest fraction of the fit's time that each kind of picture may take, and the time of the first
-picture after the start, s. With these a fit of 40 s takes 1.4 s longer."""
+PICTURES = 5
+"""Epochs between two pictures; those of the last epoch are always drawn."""
 
 
 def event_folder(run: Path) -> Path:
@@ -56,23 +40,14 @@ def event_folder(run: Path) -> Path:
 
 
 class RunLogger(TensorBoardLogger):
-    """Logs a fit under the run's own name, with units.
+    """Logs a fit under the run's own name, with units."""
 
-    Args:
-        run: The run's folder.
-        floors: Noise floors of the echoes, dB, by the names of ``FLOORS``; where known.
-    """
-
-    def __init__(self, run: Path, floors: Mapping[str, float | None] | None = None) -> None:
-        folder = event_folder(run)
-        super().__init__(run, name=FOLDER, version=folder.name, default_hp_metric=False)
-        self.floors = {FLOORS[key]: value for key, value in (floors or {}).items() if value}
+    def __init__(self, run: Path) -> None:
+        super().__init__(run, name=FOLDER, version=event_folder(run).name, default_hp_metric=False)
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log scalars under their names with units; Lightning's count of epochs is left out."""
         named = {SCALARS.get(key, key): value for key, value in metrics.items() if key != "epoch"}
-        if "val/mae_db" in metrics:
-            named |= self.floors
         super().log_metrics(named, step)
 
     def log_hyperparams(self, *given: Any, **more: Any) -> None:
@@ -80,81 +55,13 @@ class RunLogger(TensorBoardLogger):
         del given, more
 
 
-class Shown(lightning.Callback):
-    """Draws pictures for TensorBoard after an epoch, and limits the time that this takes."""
-
-    def __init__(self) -> None:
-        self.next_at = 0.0  # of the monotonic clock, s
-
-    def on_train_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
-        """Draw nothing in the first seconds, when there is little to see."""
-        del trainer, pl_module
-        self.next_at = time.monotonic() + FIRST
-
-    def on_train_epoch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
-        """Draw, unless drawing would take more than its share; the last epoch is always drawn."""
-        logger = trainer.logger
-        if not trainer.is_global_zero or not isinstance(logger, TensorBoardLogger):
-            return
-        started = time.monotonic()
-        total = trainer.estimated_stepping_batches
-        if started < self.next_at and trainer.global_step < total:
-            return
-        was_training = pl_module.training
-        pl_module.eval()
-        try:
-            with torch.inference_mode():
-                self.draw(trainer, pl_module, logger.experiment)
-        finally:
-            pl_module.train(was_training)
-        now = time.monotonic()
-        self.next_at = now + (now - started) / SHARE
-
-    def draw(
-        self,
-        trainer: lightning.Trainer,
-        pl_module: lightning.LightningModule,
-        writer: SummaryWriter,
-    ) -> None:
-        """Draw one epoch; subclasses implement it."""
-        raise NotImplementedError
-
-
-class Pace(lightning.Callback):
-    """Logs how many steps per second an epoch took, and how the charts are laid out."""
-
-    def __init__(self) -> None:
-        self._began = (0, 0.0)
-
-    def on_train_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
-        """Write the layout: which curves share a chart."""
-        del pl_module
-        if trainer.is_global_zero and isinstance(trainer.logger, TensorBoardLogger):
-            trainer.logger.experiment.add_custom_scalars(LAYOUT)
-
-    def on_train_epoch_start(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
-        """Start the clock of an epoch."""
-        del pl_module
-        self._began = (trainer.global_step, time.monotonic())
-
-    def on_train_epoch_end(
-        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule
-    ) -> None:
-        """Log the mean over the epoch, its validation included."""
-        del pl_module
-        step, since = self._began
-        seconds = time.monotonic() - since
-        if trainer.logger is not None and seconds > 0 and trainer.global_step > step:
-            pace = (trainer.global_step - step) / seconds
-            trainer.logger.log_metrics({"training/steps_per_second": pace}, trainer.global_step)
+def writer_of(trainer: lightning.Trainer) -> SummaryWriter | None:
+    """Return the writer of a fit's pictures; None in most epochs, and without TensorBoard."""
+    logger, epoch = trainer.logger, trainer.current_epoch + 1
+    last = trainer.global_step >= trainer.estimated_stepping_batches
+    if not trainer.is_global_zero or not isinstance(logger, TensorBoardLogger):
+        return None
+    return logger.experiment if last or epoch % PICTURES == 0 else None
 
 
 def add_mesh(writer: SummaryWriter, name: str, mesh: trimesh.Trimesh, step: int) -> None:
@@ -179,13 +86,7 @@ def writing(run: Path) -> Iterator[SummaryWriter]:
 
 
 def log_results(run: Path, settings: Mapping[str, Any], metrics: Mapping[str, Any]) -> None:
-    """Write settings with final numbers, so that TensorBoard's table compares runs.
-
-    Args:
-        run: The run's folder.
-        settings: By dotted key; lists and values of None are left out.
-        metrics: ``metrics.json``.
-    """
+    """Write settings with final numbers, so that TensorBoard's table compares runs."""
     prediction, geometry = metrics.get("prediction") or {}, metrics.get("geometry") or {}
     fscore = geometry.get("fscore") or {}
     results = {
@@ -207,14 +108,7 @@ def _scaled(value: float | None, factor: float) -> float | None:
 
 
 def serve(run: Path) -> str:
-    """Serve TensorBoard for a run on 127.0.0.1 until this process ends.
-
-    Returns:
-        url: Its address.
-
-    Raises:
-        ResourceError: If it cannot be started.
-    """
+    """Serve TensorBoard for a run on 127.0.0.1 until this process ends."""
     from tensorboard import program
 
     board = program.TensorBoard()

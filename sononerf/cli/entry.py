@@ -15,7 +15,7 @@ from sononerf import __version__
 from sononerf.cli import experiments, files
 from sononerf.cli.options import app, say
 from sononerf.errors import SettingsError, SonoNerfError
-from sononerf.memory import memory_limited
+from sononerf.memory import memory_faults
 from sononerf.progress import Progress
 from sononerf.storage import WAYS_OUT, commit_text, storage_error
 
@@ -48,7 +48,7 @@ def _root(
 
 def run() -> int:
     """Run the given command and return its exit code; its exceptions pass through."""
-    with memory_limited():
+    with memory_faults():
         return app(prog_name="sononerf", standalone_mode=False) or 0
 
 

@@ -43,7 +43,7 @@ def _begin(settings: Settings, workers: int | None) -> None:
     if sys.stderr.isatty():  # elsewhere an error message stays the only line
         say(f"echoes of {settings.data.store or (settings.scene and settings.scene.name)}")
     if settings.data.store is None and settings.poses.count >= MANY and workers != 1:
-        from sononerf.simulation.processes import begin
+        from sononerf.executor import begin
 
         begin()
 
@@ -60,13 +60,6 @@ def simulate(
     ] = None,
     scheduler: Annotated[
         str | None, typer.Option(help="Address of a Dask scheduler to use instead.")
-    ] = None,
-    shard: Annotated[
-        str | None,
-        typer.Option(
-            help="I/N: every N-th pose from the I-th on, for batch systems; the same command "
-            "without it joins the shards."
-        ),
     ] = None,
     preview: Annotated[
         Path | None, typer.Option(help="Draw the scene with its poses into this folder.")
@@ -85,10 +78,7 @@ def simulate(
     from sononerf.run.build import results_folder
     from sononerf.run.scenes import draw_ensemble
     from sononerf.run.simulate import simulate as run
-    from sononerf.simulation.shards import Shard
 
-    if shard is not None and (preview is not None or waveforms is not None):
-        raise SettingsError("--shard takes no --preview and no --waveforms; give these without it")
     if workers is not None and scheduler is not None:
         raise SettingsError("--workers and --scheduler exclude each other; give one")
     # A folder that cannot be written is reported before minutes of simulation.
@@ -96,7 +86,6 @@ def simulate(
         store = run(
             settings,
             output=output,
-            shard=None if shard is None else Shard.of(shard),
             workers=workers,
             scheduler=scheduler,
             progress=Progress(),
@@ -343,37 +332,20 @@ def evaluate(
         FrameName | None,
         typer.Option(help="Of the truth's file: auto, world or original; auto by default."),
     ] = None,
-    verify: Annotated[
-        bool,
-        typer.Option(
-            "--verify",
-            help="Write nothing: check that all files are as they were written, and compute all "
-            "numbers again from field, echoes and surface.",
-        ),
-    ] = False,
     as_json: Json = False,
 ) -> None:
     """Compare a run's mesh with the true surface, and show all its numbers."""
     from sononerf.progress import Progress
     from sononerf.run.evaluate import evaluate as evaluate_run
-    from sononerf.run.verify import TrueSurface
-    from sononerf.run.verify import verify as verify_run
 
-    true: TrueSurface = {
-        "truth": truth,
-        "registration": registration,
-        "unit": unit,
-        "frame": frame,
-    }
-    progress = Progress(quiet=as_json)
-    if verify:
-        checked = verify_run(run, progress=progress, **true)
-        if as_json:
-            print_json(checked)
-        else:
-            say("all {files} files are as written; all {numbers} numbers hold".format(**checked))
-        return
-    metrics = evaluate_run(run, progress=progress, **true)
+    metrics = evaluate_run(
+        run,
+        truth=truth,
+        registration=registration,
+        unit=unit,
+        frame=frame,
+        progress=Progress(quiet=as_json),
+    )
     if as_json:
         print_json(metrics)
     else:

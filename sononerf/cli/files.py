@@ -94,44 +94,24 @@ def scenes(
         typer.echo(line)
 
 
+PluginKind = Literal["scene", "field", "renderer"]
 NewFolder = Annotated[
     Path | None, typer.Option(help="A new folder; NAME in the working directory by default.")
 ]
 
 
 @app.command()
-def new_scene(
-    name: Annotated[str, typer.Argument(help="Of the scene, such as my_bar.")],
+def new_plugin(
+    kind: Annotated[PluginKind, typer.Argument(help="scene, field or renderer.")],
+    name: Annotated[str, typer.Argument(help="Of the plugin, such as my_bar.")],
     output: NewFolder = None,
 ) -> None:
-    """Write a scene of one's own to start from: a plugin of two files, and its test."""
-    _new("scene", name, output)
-
-
-@app.command()
-def new_field(
-    name: Annotated[str, typer.Argument(help="Of the field, such as my_net.")],
-    output: NewFolder = None,
-) -> None:
-    """Write a field of one's own to start from: a plugin of two files, and its test."""
-    _new("field", name, output)
-
-
-@app.command()
-def new_renderer(
-    name: Annotated[str, typer.Argument(help="Of the renderer, such as my_ears.")],
-    output: NewFolder = None,
-) -> None:
-    """Write a renderer of one's own to start from: a plugin of two files, and its test."""
-    _new("renderer", name, output)
-
-
-def _new(kind: Literal["scene", "field", "renderer"], name: str, output: Path | None) -> None:
+    """Write a scene, field or renderer of one's own to start from: two files, and their test."""
     import shlex
 
-    from sononerf.run.new_plugin import new_plugin
+    from sononerf.run.new_plugin import new_plugin as write
 
-    written = new_plugin(kind, name, output)
+    written = write(kind, name, output)
     for path in written:
         say(f"wrote {path}")
     folder, module = shlex.quote(str(written[0].parent)), written[1].stem
@@ -206,11 +186,11 @@ def import_(
 @app.command()
 def export(
     source: Annotated[Path, typer.Argument(help="A store, or the folder of a run.")],
-    output: Annotated[Path, typer.Argument(help="File: .mat, .h5, .nc, .csv, .ply, .stl or .glb.")],
+    output: Annotated[Path, typer.Argument(help="File: .mat, .h5, .ply, .stl or .glb.")],
     what: Annotated[
         Exported,
         typer.Option(
-            help="auto: echoes of a store; of a run, points for .csv and else the prediction."
+            help="auto: echoes of a store; of a run the mesh or the prediction, as FILE says."
         ),
     ] = "auto",
     frame: InFrame = "auto",

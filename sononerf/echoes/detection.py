@@ -65,9 +65,6 @@ noise even the rounding of a simulator would be detected."""
 def threshold_factor(looks: float) -> float:
     """Return the threshold over the quantile of noise power.
 
-    Args:
-        looks: Number of independent values in each average of power.
-
     Examples:
         >>> round(threshold_factor(1.0))  # ln(1e-6) / ln(0.9)
         131
@@ -89,7 +86,6 @@ def threshold_levels(power: Floats, looks: float) -> Levels:
     Args:
         power (..., R): Power averaged over frequency: of all poses and ears that are compared, over
             range.
-        looks: Number of independent values in each average.
     """
     factor = threshold_factor(looks)
     noise = factor * np.quantile(power, RANK, axis=-1, keepdims=True)
@@ -149,10 +145,8 @@ def onsets(
 
     Args:
         power (N, R): Power over range.
-        levels: Levels that an echo exceeds.
         window ((W,) float or callable): Power of a point echo over range, its own range in the
             middle; or what gives it for a row and the slice of its echo's greatest power.
-        fineness: Spacing of its values in slices.
         start (N,): First slice that may hold an echo; the first of all where None.
 
     Returns:
@@ -239,8 +233,6 @@ def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = No
     """Detect the echoes of a sealed ensemble's analysed poses.
 
     Args:
-        store: The ensemble.
-        echo: Echo of one point after the analysis.
         nearest ((P, E), m): Least range of a possible echo; earlier sound is clutter. All ranges
             count where None.
     """

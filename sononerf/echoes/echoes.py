@@ -202,7 +202,6 @@ class Echoes(Shown):
             attach(self.head, path)
             for index in written.missing():
                 written.write_pose(index, mine.read_pose(index))
-            written.seal()
 
     def within(self, box: ArrayLike) -> Echoes:
         """Return the same echoes of a body that lies within a box.
@@ -369,11 +368,7 @@ class Echoes(Shown):
 
 
 def complete_store(path: Path) -> EnsembleStore:
-    """Open a store of which nothing is missing.
-
-    Raises:
-        InputError: If a pose is missing, or the store is not finished.
-    """
+    """Open a store of which nothing is missing."""
     store = EnsembleStore.open(path)
     missing = store.missing()
     if missing or "reference" not in store.attributes:
@@ -383,11 +378,7 @@ def complete_store(path: Path) -> EnsembleStore:
 
 
 def stated_head(store: EnsembleStore) -> dict[str, dict[str, Any]]:
-    """Return the sections of settings that describe the head of a store, plain data.
-
-    Raises:
-        InputError: If the store does not state all of them.
-    """
+    """Return the sections of settings that describe the head of a store, plain data."""
     known = store.attributes.get("settings")
     if isinstance(known, dict):
         known = {"support": {}, **known}  # older stores know of no support

@@ -196,7 +196,6 @@ def _behind(
         emitters, receivers ((P, 3), (P, E, 3), m): Emitters and receivers of the poses.
         first ((P, E), m): Ranges.
         axes (P, 3): Looking directions of the poses.
-        within: Cosine of the angle to the axis beyond which an onset rules nothing out.
     """
     found = np.full((len(points), *first.shape), np.inf)
     for n in range(len(points)):
@@ -227,10 +226,7 @@ def _possible(
 
     Args:
         cells ((N, 3), m): Their middles.
-        emitters, receivers, first, axes, within: As in :func:`_behind`.
         wanted (P, E): Mask of the wanted onsets.
-        few: Number of onsets that may rule a cell out, or
-        share: this fraction of those at whose range it lies.
         reach (m): Half diagonal of a cell.
     """
     found = np.zeros(len(cells), np.bool_)
@@ -283,7 +279,6 @@ def weighted(hull: EchoHull, resolution: float, within: Floats | None = None) ->
     left for the fine cells.
 
     Args:
-        hull: Places that the onsets leave.
         resolution (m): Range resolution.
         within ((2, 3), m): Box that holds the body; found from the onsets where None.
     """

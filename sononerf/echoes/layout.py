@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: MIT
-"""Layout of a store on disk: zarr v3 arrays, their attributes, and a manifest of finished poses."""
+"""Layout of a store on disk: zarr v3 arrays and their attributes."""
 
 from __future__ import annotations
 
-import hashlib
 import json
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -95,12 +92,7 @@ def _create(
 
 
 def checked_axes(**given: ArrayLike) -> dict[str, NDArray[Any]]:
-    """Return axes in the types that are stored, by the names of :data:`AXES`.
-
-    Raises:
-        InputError: If shapes do not fit one another, or a split is unknown.
-        NumericalError: If a value is NaN or infinite.
-    """
+    """Return axes in the types that are stored, by the names of :data:`AXES`."""
     axes: dict[str, NDArray[Any]] = {}
     for name, (dtype, dims, sizes) in AXES.items():
         raw = np.asarray(given[name], dtype=np.float64)
@@ -118,13 +110,7 @@ def checked_axes(**given: ArrayLike) -> dict[str, NDArray[Any]]:
 
 
 def create_arrays(root: Path, axes: dict[str, NDArray[Any]], receivers: int) -> None:
-    """Write the axes whole and declare the spectrogram, all before the group that shows them.
-
-    Args:
-        root: The ensemble's folder.
-        axes: By the names of :data:`AXES`.
-        receivers: Number E of receivers, from 1 on.
-    """
+    """Write the axes whole and declare the spectrogram, all before the group that shows them."""
     for name, values in axes.items():
         dtype, dimensions, _ = AXES[name]
         array = _create(
@@ -183,16 +169,8 @@ def _open_array(
 def read_axes(root: Path, group: Any) -> tuple[dict[str, NDArray[Any]], Any]:
     """Check every array against the layout of :func:`create_arrays`, and read the axes.
 
-    Args:
-        root: The ensemble's folder.
-        group: Its opened group.
-
     Returns:
-        axes: By the names of :data:`AXES`.
         spectrogram: (P, E, R, F) float32, not read.
-
-    Raises:
-        InputError: If one is missing, damaged, or does not fit the others.
     """
     axes = {}
     for name, (dtype, dims, sizes) in AXES.items():
@@ -222,15 +200,11 @@ def read_axes(root: Path, group: Any) -> tuple[dict[str, NDArray[Any]], Any]:
 
 FORMAT = "sononerf-ensemble"
 SCHEMA_VERSION = 1
-_RESERVED = ("checksum", "format", "schema_version")
+_RESERVED = ("format", "schema_version")
 
 
 def plain_attributes(path: Path, attributes: dict[str, Any]) -> dict[str, Any]:
-    """Return attributes as JSON would give them back, sorted, so that bytes know no order.
-
-    Raises:
-        NumericalError: If a value is NaN or infinite.
-    """
+    """Return attributes as JSON would give them back, sorted, so that bytes know no order."""
     plain = {key: value for key, value in attributes.items() if key not in _RESERVED}
     try:
         result: dict[str, Any] = json.loads(storage.to_json(plain, sort_keys=True))
@@ -239,24 +213,15 @@ def plain_attributes(path: Path, attributes: dict[str, Any]) -> dict[str, Any]:
     return result
 
 
-def _checksum(plain: dict[str, Any]) -> str:
-    return hashlib.sha256(storage.to_json(plain, sort_keys=True).encode()).hexdigest()
-
-
 def write_group(path: Path, plain: dict[str, Any]) -> None:
     """Write the group's own file; zarr's update would keep the order of the calls in its bytes."""
-    own = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "checksum": _checksum(plain)}
+    own = {"format": FORMAT, "schema_version": SCHEMA_VERSION}
     group = {"zarr_format": 3, "node_type": "group", "attributes": {**own, **plain}}
     storage.commit_json(path / "zarr.json", group)
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
-    """Return a store's attributes, checked, without the format's own names.
-
-    Raises:
-        InputError: If the store is not an ensemble of sononerf, or its attributes are damaged.
-        IncompatibleError: If another version of the format wrote it.
-    """
+    """Return a store's attributes without the format's own names."""
     group = storage.read_json(path / "zarr.json")
     try:
         kind = (group["node_type"], group["zarr_format"])
@@ -271,91 +236,4 @@ def read_attributes(path: Path) -> dict[str, Any]:
             f"{path}: schema_version {version!r}, this sononerf reads {SCHEMA_VERSION}; "
             "install the sononerf that wrote it"
         )
-    plain = {key: value for key, value in stored.items() if key not in _RESERVED}
-    if _checksum(plain) != stored.get("checksum"):
-        raise InputError(f"{path}: attributes damaged (checksum); {ANEW}")
-    return plain
-
-
-MANIFEST_VERSION = 1
-
-
-@dataclass(frozen=True)
-class PoseRecord:
-    """Evidence that a pose is complete: the size of its file and the SHA-256 of its content."""
-
-    size: int
-    sha256: str
-
-    def plain(self) -> dict[str, Any]:
-        """Return the record as plain data."""
-        return {"sha256": self.sha256, "size": self.size}
-
-
-def _record(data: dict[str, Any]) -> PoseRecord:
-    return PoseRecord(int(data["size"]), str(data["sha256"]))
-
-
-class Manifest:
-    """The record of finished poses, ``manifest.json`` overlaid by ``manifest.jsonl``.
-
-    Args:
-        folder: The ensemble's folder.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / "manifest.json"
-        self.journal = folder / "manifest.jsonl"
-
-    def add(self, pose: int, record: PoseRecord) -> None:
-        """Append a finished pose to the journal, durably."""
-        storage.append_record(self.journal, {"pose": pose, **record.plain()})
-
-    def read(self) -> dict[int, PoseRecord]:
-        """Return the finished poses in order."""
-        records = self._read_sealed() if self.path.exists() else {}
-        records.update(self._read_journal())
-        return dict(sorted(records.items()))
-
-    def _read_sealed(self) -> dict[int, PoseRecord]:
-        data = storage.read_json(self.path)
-        try:
-            version = data["schema_version"]
-            if version != MANIFEST_VERSION:
-                raise IncompatibleError(
-                    f"{self.path}: schema_version {version!r}, this sononerf reads "
-                    f"{MANIFEST_VERSION}; install the sononerf that wrote it"
-                )
-            records = {int(pose): _record(entry) for pose, entry in data["poses"].items()}
-            if data["checksum"] == _digest(records):
-                return records
-        except (KeyError, TypeError, ValueError, AttributeError):
-            pass
-        raise InputError(
-            f"{self.path}: damaged; remove it and simulate again, or fetch the ensemble again"
-        )
-
-    def _read_journal(self) -> dict[int, PoseRecord]:
-        records = {}
-        for data in storage.read_records(self.journal):
-            with suppress(ValueError, KeyError, TypeError):
-                records[int(data["pose"])] = _record(data)
-        return records
-
-    @property
-    def is_sealed(self) -> bool:
-        """Whether all records are in ``manifest.json``."""
-        return self.path.is_file() and not self.journal.exists()
-
-    def seal(self) -> None:
-        """Compact the journal into ``manifest.json``, whose bytes know no order of writing."""
-        records = self.read()
-        poses = {str(pose): record.plain() for pose, record in records.items()}
-        data = {"schema_version": MANIFEST_VERSION, "checksum": _digest(records), "poses": poses}
-        storage.commit_json(self.path, data)
-        storage.remove_file(self.journal)
-
-
-def _digest(records: dict[int, PoseRecord]) -> str:
-    plain = {str(pose): record.plain() for pose, record in sorted(records.items())}
-    return hashlib.sha256(storage.to_json(plain, sort_keys=True).encode()).hexdigest()
+    return {key: value for key, value in stored.items() if key not in _RESERVED}

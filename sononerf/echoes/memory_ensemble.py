@@ -77,28 +77,15 @@ class Ensemble(ABC):
 
     @abstractmethod
     def read_pose(self, index: int) -> Singles:
-        """Return one pose's magnitude, (E, R, F), linear.
-
-        Raises:
-            InputError: If the pose is missing or damaged.
-        """
+        """Return one pose's magnitude, (E, R, F), linear."""
 
     @abstractmethod
     def write_pose(self, index: int, spectrogram: ArrayLike) -> None:
-        """Store one pose's linear magnitude, (E, R, F).
-
-        Raises:
-            InputError: If there is no such pose, or the shape is another.
-            NumericalError: If a value is NaN or infinite.
-        """
+        """Store one pose's linear magnitude, (E, R, F)."""
 
     @abstractmethod
     def missing(self) -> list[int]:
         """Return the numbers of the poses that are not there."""
-
-    @abstractmethod
-    def seal(self) -> None:
-        """Mark the ensemble as complete."""
 
     def _checked(self, index: int, spectrogram: ArrayLike) -> Singles:
         """Return a spectrogram in the type that is kept; refuse one that does not fit."""
@@ -143,12 +130,6 @@ class MemoryEnsemble(Ensemble):
         split (P,): 0 train, 1 validation, 2 test.
         range ((R,), m): One-way distances of the slices.
         frequency ((F,), Hz): Frequencies of the bins.
-        receivers: Number E of receivers.
-        attributes: Plain data.
-
-    Raises:
-        InputError: If shapes do not fit one another.
-        NumericalError: If an axis or an attribute is NaN or infinite.
     """
 
     def __init__(
@@ -194,9 +175,6 @@ class MemoryEnsemble(Ensemble):
         """Return the numbers of the poses that are not there."""
         return [index for index in np.arange(len(self)).tolist() if index not in self._heard]
 
-    def seal(self) -> None:
-        """Do nothing: a complete ensemble in memory needs no mark."""
-
 
 def seal(
     ensemble: Ensemble,
@@ -205,16 +183,10 @@ def seal(
     silent: str,
     noise: Floats | None = None,
 ) -> None:
-    """Fix the reported decibels and the noise floor of a complete ensemble, and seal it.
+    """Fix the reported decibels and the noise floor of a complete ensemble, which seals it.
 
     Args:
-        ensemble: No pose is missing.
-        again: Second spectrogram of a test pose, (E, R, F), by the pose's number.
-        silent: Message if no training pose heard anything.
         noise ((E, F) or None): Its root mean square, where it is known.
-
-    Raises:
-        NumericalError: If no training pose heard anything.
     """
     loudest = max(float(ensemble.read_pose(int(i)).max()) for i in ensemble.indices("train"))
     if loudest <= 0.0:
@@ -230,4 +202,3 @@ def seal(
     if noise is not None:
         ensemble.update_attributes(noise=noise.tolist())
     ensemble.update_attributes(reference=reference, **floor)
-    ensemble.seal()

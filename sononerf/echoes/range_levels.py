@@ -64,7 +64,6 @@ class RangeLevels:
 
         Args:
             spectrograms (P of (E, R, F)): Linear magnitudes.
-            poses, emitters, receivers, resolution: As the attributes.
             first, spacing (m): Range of the first slice, and distance between slices.
         """
         step = max(1, round(resolution / spacing / PER_RESOLUTION))
@@ -83,12 +82,7 @@ class RangeLevels:
         )
 
     def with_images(self, plane: Plane, count: int) -> RangeLevels:
-        """Return the levels at the poses, and the same at their images in a support.
-
-        Args:
-            plane: The support.
-            count: Number of poses with onsets; their images follow them.
-        """
+        """Return the levels at the poses, and the same at their images in a support."""
         return replace(
             self,
             poses=np.concatenate([self.poses, count + self.poses]),

@@ -29,15 +29,7 @@ CELLS = 100
 
 
 def noise_rms(store: Ensemble, head: Head) -> Floats | None:
-    """Return the root mean square of the noise, (E, F) linear magnitude.
-
-    Args:
-        store: Its training poses are read.
-        head: The head that heard them.
-
-    Returns:
-        noise: None where the first slices hold echoes already.
-    """
+    """Return the root mean square of the noise, (E, F) linear magnitude."""
     onsets = find_onsets(store, head.point_echo)
     quiet = (
         store.range[None, None] < onsets.first[..., None] - BEFORE * head.resolution
@@ -62,7 +54,6 @@ def heard_again(magnitude: NDArray[np.floating], noise: Floats, seed: int) -> Si
     Args:
         magnitude (E, R, F): Its spectrogram.
         noise (E, F): Root mean square.
-        seed: The same seed gives the same noise.
     """
     rng = np.random.default_rng(seed)
     parts = rng.standard_normal((2, *magnitude.shape)) * (noise[:, None] / math.sqrt(2.0))
@@ -81,14 +72,7 @@ def seal_recorded(
     echoes.
 
     Args:
-        store: No pose is missing.
-        head: The head that heard them.
-        poses: Poses of the store.
         split (P,): Use of each pose: 0 training, 1 validation, 2 test.
-        silent: Message if no training pose heard anything.
-
-    Raises:
-        NumericalError: If no training pose heard anything.
     """
     pairs = repeats(poses, split)
     again = {index: store.read_pose(other) for index, other in pairs.items()}

@@ -42,14 +42,8 @@ class EchoRegion:
     """Evidence of the poses about places.
 
     Args:
-        heard: Power, detected echoes and onsets.
-        hull: Places that the onsets of the same poses leave.
-        ears: Gains of emitter and ears.
         rotations (P, 3, 3): Head to world.
         resolution (m): Range resolution.
-
-    Raises:
-        NumericalError: If no pose heard anything, or no more than noise gives.
     """
 
     def __init__(
@@ -127,9 +121,6 @@ class EchoRegion:
         """Return the box around all that explains the echoes, (2, 3) m, with a margin.
 
         The margin is two range resolutions.
-
-        Raises:
-            NumericalError: If the echoes of no two poses meet anywhere.
         """
         # The box of a flight along a line or on one side: as far ahead as it hears, and to the
         # sides.
@@ -224,7 +215,6 @@ def echo_extent(power: Floats, axis: Floats, looks: float, margin: float) -> tup
     Args:
         power (P, E, R): Power averaged over frequency.
         axis ((R,), m): Ranges of the slices.
-        looks: Number of independent values in each average of power.
         margin (m): Added on both sides.
 
     Returns:

@@ -33,13 +33,8 @@ def split_of(poses: Poses, split: ArrayLike | None, *, where: str = "split") -> 
     """Return what each pose is for, (P,): 0 train, 1 validation, 2 test.
 
     Args:
-        poses: P of them.
         split (P,): Names (``"train"``, ``"val"``, ``"test"``) or numbers; drawn at random with seed
             0 where None, see :func:`draw_split`.
-        where: Its name in messages.
-
-    Raises:
-        InputError: If a name or a number is unknown, the length is another, or none trains.
     """
     if split is None:
         return draw_split(poses, where="poses")
@@ -68,17 +63,11 @@ def draw_split(
     """Draw at random what each pose is for; repeated pings of one pose stay together.
 
     Args:
-        poses: P of them.
         validation, heldout: Numbers of poses; a twentieth and a tenth where None, at most 10 and
             20.
-        seed: Seed of the draw.
-        where: The table, for messages.
 
     Returns:
         split ((P,) int8): 0 train, 1 validation, 2 test.
-
-    Raises:
-        InputError: If none is left to train on.
     """
     groups = pose_groups(poses)
     count = int(groups.max(initial=-1)) + 1

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,8 +16,6 @@ from sononerf.echoes.layout import (
     AXES,
     SPECTROGRAM,
     DurableStore,
-    Manifest,
-    PoseRecord,
     checked_axes,
     chunk_path,
     create_arrays,
@@ -34,17 +31,8 @@ from sononerf.errors import IncompatibleError, InputError
 class EnsembleStore(Ensemble):
     """An ensemble in a zarr v3 group, one chunk per pose; open it with :meth:`open`.
 
-    A pose is committed in two durable steps: its chunk, then its line in the manifest. If a process
-    is killed between them, the pose counts as missing. The same input gives the same bytes in any
-    order of the poses.
-
-    Args:
-        path: The ensemble's folder.
-        mode: Reading, or adding poses too.
-
-    Raises:
-        InputError: If there is no store, or it is damaged.
-        IncompatibleError: If another version of the format wrote it.
+    A pose is there when its chunk is there; zarr checks the chunk's CRC-32C. The same input gives
+    the same bytes in any order of the poses.
     """
 
     def __init__(self, path: Path, *, mode: Literal["r", "r+"] = "r") -> None:
@@ -59,8 +47,6 @@ class EnsembleStore(Ensemble):
         except Exception as error:  # the error of damaged metadata depends on the parser
             raise InputError(f"{path}: damaged ({type(error).__name__}: {error})") from error
         self._axes, self._spectrogram = read_axes(path, group)
-        self._manifest = Manifest(path)
-        self._records = self._manifest.read()
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _reopen, (self.path, self.mode)
@@ -88,20 +74,11 @@ class EnsembleStore(Ensemble):
         The group's own file comes last, so that an unfinished store is not taken for one.
 
         Args:
-            path: A folder that is a store, is empty, or is not there.
             poses_positions ((P, 3), m): Head positions, world frame.
             poses_rotations (P, 3, 3): Head to world.
             split (P,): 0 train, 1 validation, 2 test.
             range ((R,), m): One-way distances of the slices.
             frequency ((F,), Hz): Frequencies of the bins.
-            attributes: Plain data; ``echo_hash`` tells ensembles apart.
-            receivers: Number E of receivers.
-
-        Raises:
-            IncompatibleError: If the folder holds another ensemble.
-            InputError: If shapes do not fit one another, or the folder holds something else.
-            NumericalError: If an axis or an attribute is NaN or infinite.
-            StorageError: If it cannot be written.
         """
         axes = checked_axes(
             position=poses_positions,
@@ -148,34 +125,16 @@ class EnsembleStore(Ensemble):
         """Commit one pose.
 
         Args:
-            index: Number of the pose.
             spectrogram ((E, R, F) float32): Linear magnitude.
-
-        Raises:
-            InputError: If there is no such pose, or the shape is another.
-            NumericalError: If a value is NaN or infinite.
-            StorageError: If it cannot be written; the pose then counts as missing.
         """
         self._refuse_reading()
-        values = self._checked(index, spectrogram)
-        self._spectrogram[index] = values
-        size = self._chunk(index).stat().st_size
-        record = PoseRecord(size, _sha256(values))
-        self._manifest.add(index, record)
-        self._records[index] = record
+        self._spectrogram[index] = self._checked(index, spectrogram)
 
     def read_pose(self, index: int) -> Singles:
-        """Return one pose's magnitude, (E, R, F), verified.
-
-        Raises:
-            InputError: If the pose is missing or damaged.
-        """
+        """Return one pose's magnitude, (E, R, F), verified."""
         self._refuse_unknown(index)
-        if index not in self._records:  # another process may have added it since
-            self._records = self._manifest.read()
-        record = self._records.get(index)
         way_out = "give the same simulate or import command again"
-        if record is None or not self._chunk(index).is_file():
+        if not self._chunk(index).is_file():
             raise InputError(f"{self.path}: pose {index} is missing; {way_out}")
         try:
             values = np.array(self._spectrogram[index], dtype=np.float32, order="C")
@@ -183,8 +142,6 @@ class EnsembleStore(Ensemble):
             raise InputError(
                 f"{self.path}: pose {index} is damaged ({error}); {way_out}"
             ) from error
-        if _sha256(values) != record.sha256:
-            raise InputError(f"{self.path}: pose {index} is damaged (SHA-256); {way_out}")
         fault = fault_of(values)
         if fault:
             raise InputError(
@@ -193,20 +150,19 @@ class EnsembleStore(Ensemble):
         return values
 
     def missing(self) -> list[int]:
-        """Return the poses without a file, or whose file has another size than recorded."""
-        self._records = self._manifest.read()
-        return [index for index in np.arange(len(self)).tolist() if not self._is_there(index)]
+        """Return the poses without a file."""
+        return [index for index in range(len(self)) if not self._chunk(index).is_file()]
 
     @property
     def is_sealed(self) -> bool:
         """True if no pose is missing and the results over all poses are stored."""
-        return "reference" in self._attributes and self._manifest.is_sealed and not self.missing()
+        return "reference" in self._attributes and not self.missing()
 
     def damaged(self) -> list[int]:
         """Read all poses that are there; return those that are damaged."""
         found = []
-        for index in np.arange(len(self)).tolist():
-            if self._is_there(index):
+        for index in range(len(self)):
+            if self._chunk(index).is_file():
                 try:
                     self.read_pose(index)
                 except InputError:
@@ -214,43 +170,13 @@ class EnsembleStore(Ensemble):
         return found
 
     def remove_damaged(self) -> None:
-        """Remove the files of damaged poses, which then count as missing.
-
-        Raises:
-            StorageError: If one cannot be removed.
-        """
+        """Remove the files of damaged poses, which then count as missing."""
         self._refuse_reading()
         for index in self.damaged():
             storage.remove_file(self._chunk(index))
 
-    def check(self) -> list[str]:
-        """Read everything and return the faults, one line each."""
-        try:
-            fresh = EnsembleStore(self.path)
-        except (InputError, IncompatibleError) as error:
-            return [str(error)]
-        faults = []
-        for index in np.arange(len(fresh)).tolist():
-            try:
-                fresh.read_pose(index)
-            except InputError as error:
-                faults.append(str(error))
-        return faults
-
-    def seal(self) -> None:
-        """Compact the journal of finished poses into ``manifest.json``."""
-        self._refuse_reading()
-        self._manifest.seal()
-
     def _chunk(self, index: int) -> Path:
         return chunk_path(self.path, SPECTROGRAM, (index, 0, 0, 0))
-
-    def _is_there(self, index: int) -> bool:
-        record = self._records.get(index)
-        try:
-            return record is not None and self._chunk(index).stat().st_size == record.size
-        except OSError:
-            return False
 
     def _refuse_reading(self) -> None:
         if self.mode == "r":
@@ -259,10 +185,6 @@ class EnsembleStore(Ensemble):
 
 def _reopen(path: Path, mode: Literal["r", "r+"]) -> EnsembleStore:
     return EnsembleStore(path, mode=mode)
-
-
-def _sha256(values: Singles) -> str:
-    return hashlib.sha256(values.astype("<f4", copy=False).tobytes()).hexdigest()
 
 
 def _refuse_foreign(path: Path) -> None:

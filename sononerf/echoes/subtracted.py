@@ -20,14 +20,6 @@ class SubtractedStore(EnsembleStore):
 
     There is no phase, so power is subtracted cell by cell. A cell in which the surroundings alone
     have more power becomes silent.
-
-    Args:
-        path: Store of target and surroundings.
-        background: Store of the surroundings alone.
-
-    Raises:
-        InputError: If there is no such store, one is damaged, or a pose is missing.
-        IncompatibleError: If poses, ranges or frequencies differ.
     """
 
     def __init__(self, path: Path, background: Path) -> None:

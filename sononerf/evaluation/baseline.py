@@ -47,18 +47,8 @@ def backprojection(
     Args:
         spectrograms (iterable of (E, R, F) float): Linear magnitude, one per pose in order; read
             one at a time.
-        poses: P of them.
-        head: The head that heard the spectrograms.
         lower, upper ((3,), m): The box.
         spacing (m): Voxel size.
-
-    Returns:
-        volume: Mean energy per voxel; what lies outside the recorded ranges adds nothing.
-
-    Raises:
-        ValueError: If there is not one spectrogram of the head's shape for each pose.
-        NumericalError: If a spectrogram is not finite.
-        ResourceError: If the grid does not fit in memory.
     """
     emitters, receivers = head.places(poses.positions, poses.rotations)
     axis = head.range
@@ -94,17 +84,7 @@ def coherent_backprojection(
     Args:
         waveforms (iterable of (E, S) float): Recordings from the start of the emission on, one per
             pose in order; read one at a time.
-        poses, lower, upper: As in :func:`backprojection`.
-        head: Whose call was emitted.
         spacing (m): Voxel size; a quarter of the shortest wavelength shows all there is.
-
-    Returns:
-        volume: Magnitude of the mean compressed pressure per voxel.
-
-    Raises:
-        ValueError: If shapes do not fit.
-        NumericalError: If a recording is not finite.
-        ResourceError: If the grid would not fit in memory.
     """
     emitted = head.waveform
     finer = _oversampling(emitted)
@@ -150,10 +130,6 @@ def range_profiles(
         spectrograms (iterable of (E, R, F) float): Linear magnitude, one per pose; read one at a
             time.
         shape (P, E, R): The expected shape.
-
-    Raises:
-        ValueError: If there are more, fewer or other ones.
-        NumericalError: If one is not finite.
     """
     poses, ears, slices = shape
     count = 0
@@ -233,17 +209,6 @@ def best_level_surface(
     A baseline has no rule for its level. To its advantage it gets the best of twelve levels, by the
     F-score at 5 mm against the true surface. Never use this function on the result under
     evaluation.
-
-    Args:
-        volume: Greater values are inside.
-        truth: The true surface.
-
-    Returns:
-        mesh: The best surface.
-        level: Its level.
-
-    Raises:
-        NumericalError: If no level gives a surface.
     """
     true = truth if isinstance(truth, Solid) else Solid(truth)
     target, _ = true.samples(LEVEL_SAMPLES, 0)
@@ -302,16 +267,6 @@ def voxel_fit(
         spectrograms, poses, head, lower, upper, spacing: As of
             :func:`sononerf.evaluation.baseline.backprojection`; the emitter is near the ears
             against the ranges.
-        passes: Number of passes over all poses.
-
-    Returns:
-        volume: Power per voxel, as heard at one metre; zero where no recorded range reaches.
-
-    Raises:
-        ValueError: If there is not one spectrogram of the head's shape for each pose, or there is
-            no pass.
-        NumericalError: If a spectrogram is not finite.
-        ResourceError: If the grid would not fit in memory.
 
     References:
         .. [1] L. B. Lucy, "An iterative technique for the rectification of observed distributions",
@@ -401,7 +356,6 @@ def _sorted(
         power (X, Y, Z): Powers of the voxels.
         x_out, y_out, z_out, x_back, y_back, z_back (m²): See :func:`_squares`.
         first, step (m): Range of the first bin, and from one to the next.
-        bins: Their number.
     """
     total = np.zeros(bins)
     for i in range(power.shape[0]):
@@ -439,10 +393,7 @@ def volume_of(store: Ensemble, name: str, numbers: Ints, *given: Any) -> Volume:
     """Return the volume of a baseline; a function that other processes can import.
 
     Args:
-        store: Store of the spectrograms.
-        name: Name in ``BASELINES``.
         numbers (P,): Numbers of the poses.
-        given: Further arguments of the baseline.
     """
     heard = (store.read_pose(int(number)) for number in numbers)
     return BASELINES[name](heard, *given)

@@ -64,11 +64,7 @@ def compare(first: Volume, second: Volume) -> Comparison:
 
 
 def added_part(mesh: trimesh.Trimesh, without: trimesh.Trimesh) -> trimesh.Trimesh | None:
-    """Return the parts of a true surface that another one lacks; None if there are none.
-
-    Args:
-        mesh, without: Metres, one world frame; equal parts are equal triangle for triangle.
-    """
+    """Return the parts of a true surface that another one lacks; None if there are none."""
     if not len(without.faces):
         return mesh
     distance, _ = cKDTree(without.triangles_center).query(mesh.triangles_center)

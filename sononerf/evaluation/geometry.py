@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import itertools
-import threading
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,9 +18,9 @@ from sononerf.errors import InputError, NumericalError
 from sononerf.evaluation.baseline import best_level_surface, volume_of
 from sononerf.evaluation.metrics import geometry_metrics, target_metrics
 from sononerf.evaluation.solid import Solid
+from sononerf.executor import computed
 from sononerf.geometry.poses import Poses
 from sononerf.scene.scene import Scene
-from sononerf.simulation.pool import computed
 from sononerf.surface.start.volume import Volume
 
 MANY = 64
@@ -74,15 +73,6 @@ def register(
     Each point of either surface is drawn to the nearest one of the other, so that a part of one
     surface is not laid over a whole. The iteration starts as the surfaces lie and from all proper
     alignments of their principal axes; the best result counts. A mirror image is never taken.
-
-    Args:
-        found: Reconstruction, m.
-        truth: True surface, any unit if ``kind`` is ``similarity``.
-        kind: No motion; rotation and translation; and one scale.
-        seed: Seed of the samples. The same seed gives the same motion.
-
-    Returns:
-        registration: Identity for ``none``.
 
     References:
         .. [1] P. J. Besl and N. D. McKay, "A method for registration of 3-D shapes", IEEE PAMI
@@ -162,14 +152,8 @@ def check_truth(found: trimesh.Trimesh, true: trimesh.Trimesh, kind: Kind, name:
     """Refuse a true surface that is of another size, or elsewhere, before any work.
 
     Args:
-        found: Reconstruction, m.
-        true: True surface, m.
         kind: Motion that will lay the reconstruction over it: a similarity has any size, and a
             motion any place.
-        name: Name of the true surface, for the message.
-
-    Raises:
-        InputError: If the sizes differ by more than ``MOST_TIMES``, or the two boxes do not meet.
     """
     sizes = [float(np.linalg.norm(mesh.extents)) for mesh in (found, true)]
     times = max(sizes) / max(min(sizes), 1e-12)
@@ -207,13 +191,7 @@ BASELINE_SAMPLES = 20_000
 
 
 class Truth:
-    """A true surface, laid over a reconstruction.
-
-    Args:
-        true: The true surface, m.
-        mesh: The reconstruction, m.
-        kind: Motion that lays the reconstruction over the truth; baselines are moved alike.
-    """
+    """A true surface, laid over a reconstruction."""
 
     def __init__(self, true: trimesh.Trimesh, mesh: trimesh.Trimesh, kind: Kind) -> None:
         self.surface = Solid(true)
@@ -252,19 +230,11 @@ class Truth:
         return {**found, "level": level}
 
 
-def baseline_volume(
-    name: str, echoes: Echoes, lower: Floats, upper: Floats, stop: threading.Event
-) -> Volume:
+def baseline_volume(name: str, echoes: Echoes, lower: Floats, upper: Floats) -> Volume:
     """Compute a baseline: backprojection or a voxel fit of the training poses.
 
     Args:
-        name: Name in ``BASELINES``.
-        echoes: Measured spectrograms; they are read one after the other.
         lower, upper ((3,), m): Corners of the region.
-        stop: Ends it early when set.
-
-    Raises:
-        CancelledError: If it was ended early.
     """
     train = echoes.store.indices("train")
     spacing = float((upper - lower).max()) / BASELINE_VOXELS
@@ -272,6 +242,6 @@ def baseline_volume(
     task = name, train, poses, echoes.head, lower, upper, spacing
     if len(train) < MANY:
         return volume_of(echoes.store, *task)
-    ((_, volume),) = computed(volume_of, echoes.store, {0: task}, 1, what="baseline", stop=stop)
+    ((_, volume),) = computed(volume_of, echoes.store, {0: task}, 1, what="baseline")
     assert isinstance(volume, Volume)
     return volume

@@ -46,16 +46,16 @@ def learn_interval(
     error = np.abs(measured - predicted)
     active = (measured >= active_db) | (predicted >= active_db)
     level, count = level_class(predicted), predicted.shape[-1]
-    half = np.zeros((CLASSES, count))
-    for one in range(CLASSES):
+    half = np.full((CLASSES, count), RANGE_DB)  # nothing is known
+    known = [one for one in range(CLASSES) if (active & (level == one)).any()]
+    for one in known:
         some = active & (level == one)
-        if not some.any():  # as uncertain as the next lower level
-            half[one] = half[one - 1] if one else 0.0
-            continue
         usual = _quantile(error[some])
         for band in np.array_split(np.arange(count), min(BANDS, count)):
             found = error[..., band][some[..., band]]
             half[one, band] = usual if len(found) < FEWEST else _quantile(found)
+    for one in range(CLASSES) if known else ():  # others are as uncertain as the next lower one
+        half[one] = half[max((other for other in known if other <= one), default=known[0])]
     return half
 
 
@@ -92,9 +92,6 @@ def covered(
         measured_db, predicted_db ((P, E, R, F), dB): Levels.
         half_db ((P, E, R, F), dB): Half the width of the interval.
         active_db (dB): As in :func:`learn_interval`.
-
-    Returns:
-        fraction: 0 to 1; None where no cell is active.
     """
     measured, predicted = (np.asarray(a, dtype=np.float64) for a in (measured_db, predicted_db))
     active = (measured >= active_db) | (predicted >= active_db)

@@ -38,10 +38,6 @@ def geometry_metrics(
     samples of the one surface to the triangles of the other.
 
     Args:
-        reconstructed: Metres, world frame.
-        truth: Likewise; pass a Solid if several meshes are compared with it.
-        samples: Points drawn from each surface.
-        seed: The same seed gives the same numbers.
         thresholds (tuple of float, m): Distances at which the F-score is taken.
 
     Returns:
@@ -62,10 +58,6 @@ def geometry_metrics(
                 of the other surface, both ways.
             ``components``, ``components_true``
                 Connected parts with more than 1 % of the largest one's area.
-
-    Raises:
-        ValueError: If ``samples`` is not positive.
-        NumericalError: If a mesh is empty or not finite.
     """
     if samples < 1:
         raise ValueError(f"samples: {samples}, expected 1 or more")
@@ -87,16 +79,6 @@ def geometry_metrics(
     }
 
 
-def chamfer_distance(
-    reconstructed: trimesh.Trimesh, truth: Solid, *, samples: int, seed: int = 0
-) -> float:
-    """Return the mean of the two mean distances, m, alone; see :func:`geometry_metrics`."""
-    points, _ = sample_surface(reconstructed, samples, seed + 1)
-    to_truth = truth.nearest.distance(points)
-    to_found = Nearest(reconstructed).distance(truth.samples(samples, seed)[0])
-    return float(to_truth.mean() + to_found.mean()) / 2
-
-
 def target_metrics(
     reconstructed: trimesh.Trimesh,
     target: trimesh.Trimesh,
@@ -112,9 +94,6 @@ def target_metrics(
     surroundings; else as :func:`geometry_metrics`.
 
     Args:
-        reconstructed, target, background: Metres, world frame.
-        samples: Points drawn from each surface.
-        seed: The same seed gives the same numbers.
         thresholds (tuple of float, m): Distances at which the F-score is taken.
 
     Returns:
@@ -123,10 +102,6 @@ def target_metrics(
                 The part of the reconstructed surface that counts.
             ``chamfer_m``, ``fscore``
                 None and 0 where no part of it does.
-
-    Raises:
-        ValueError: If ``samples`` is not positive.
-        NumericalError: If a mesh is empty or not finite.
     """
     if samples < 1:
         raise ValueError(f"samples: {samples}, expected 1 or more")

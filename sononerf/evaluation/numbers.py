@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import threading
 from typing import Any
 
 import numpy as np
@@ -97,7 +96,7 @@ def evaluate(
         numbers["baseline"] = {}
         with progress.task("baselines", len(BASELINES)) as task:
             for name in BASELINES:
-                volume = baseline_volume(name, echoes, lower, upper, threading.Event())
+                volume = baseline_volume(name, echoes, lower, upper)
                 numbers["baseline"][name] = laid.of_volume(volume)
                 task.advance()
     return numbers
@@ -106,16 +105,9 @@ def evaluate(
 def compare_prediction(prediction: Prediction, echoes: Echoes) -> Evaluation:
     """Compare a prediction with the measurement of its poses.
 
-    Args:
-        prediction: Prediction of poses of the echoes.
-        echoes: The measured echoes.
-
     Returns:
         evaluation: ``mae_db``, ``rendered_mae_db`` and others, beside ``mean_predictor_mae_db`` and
             ``noise_floor_mae_db``, see :func:`sononerf.evaluation.prediction.prediction_metrics`.
-
-    Raises:
-        InputError: If a pose is not among those of the echoes.
     """
     numbers = echoes.numbers_of(prediction.poses)
     measured = np.stack([echoes.spectrogram(int(number)) for number in numbers])

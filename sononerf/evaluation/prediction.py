@@ -143,11 +143,7 @@ def predict(
 
 
 def check_hearing(model: EchoModule, poses: Poses) -> None:
-    """Refuse poses that can hear nothing of the region.
-
-    Raises:
-        InputError: If there is one.
-    """
+    """Refuse poses that can hear nothing of the region."""
     lower, upper = _corners(model)
     ranges = model.renderer.range.cpu().double().numpy()
     below, above = lower - poses.positions, poses.positions - upper
@@ -262,10 +258,6 @@ def prediction_metrics(
             frequency, mean over the rest), ``psnr_db`` and ``ssim`` (range 60 dB), ``pearson``.
             None where a figure does not exist: nothing active, a perfect match's PSNR, pictures too
             small for SSIM, no variation.
-
-    Raises:
-        ValueError: If the shapes do not fit.
-        NumericalError: If a value is not finite.
     """
     measured, predicted = same_shape(measured_db, predicted_db)
     mean = np.asarray(mean_db, dtype=np.float64)

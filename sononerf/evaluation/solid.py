@@ -33,7 +33,6 @@ class Solid:
     """The union of the closed bodies of a mesh, and its open sheets.
 
     Args:
-        mesh: Metres. Closed bodies, which may overlap or be inside out, and open sheets.
         fill_cavities: Whether closed cavities count as filled, as for a true surface: no sound
             reaches them.
 
@@ -137,17 +136,9 @@ class Solid:
 def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[Floats, NDArray[np.intp]]:
     """Draw points uniformly by area.
 
-    Args:
-        mesh: Metres.
-        count: Number of points.
-        seed: The same seed draws the same points.
-
     Returns:
         points ((count, 3), m): On the surface.
         face (count,): The triangles that they lie on.
-
-    Raises:
-        NumericalError: If the mesh has no area.
     """
     if not mesh.area > 0:
         raise NumericalError("the mesh has no area to draw points from")
@@ -205,11 +196,7 @@ SLACK = 1e-9
 
 
 class Nearest:
-    """Distances to one mesh, whose search structures are built once and when first needed.
-
-    Args:
-        mesh: Any mesh with a triangle; it is not to be changed afterwards.
-    """
+    """Distances to one mesh, whose search structures are built once and when first needed."""
 
     def __init__(self, mesh: trimesh.Trimesh) -> None:
         self.mesh = mesh

@@ -76,21 +76,9 @@ def learn_traced(
     The gain per ear and frequency comes from training poses, the weight per frequency from one
     regression on the validation poses. Held-out poses take no part.
 
-    Args:
-        model: The fitted model.
-        echoes: The measured echoes.
-        mesh: The surface, m.
-        simulation: Simulation of the surface's echoes; engine and number of rays are replaced.
-        seed: Seed of the rays.
-        accelerator: Device that renders the field.
-        progress: Display of progress.
-
     Returns:
         traced: Weight zero where there are no validation poses, or nothing can be traced off the
             surface; ``fault`` then says why.
-
-    Raises:
-        ResourceError: If there is too little memory for it now.
     """
     reference, head, store = model.reference, echoes.head, echoes.store
     training, validation = store.indices("train"), store.indices("val")
@@ -128,11 +116,6 @@ def for_single_poses(traced: Traced, head: Head, simulation: SimulationSettings)
     """Return a surface whose simulator answers poses that come one by one in tenths of a second.
 
     The first one takes seconds, and 400 MB are kept for three spheres.
-
-    Args:
-        traced: The surface.
-        head: The head.
-        simulation: Simulation of the surface's echoes; engine and number of rays are replaced.
     """
     if not traced.weight.any():
         return traced

@@ -34,10 +34,6 @@ class EpochSampler(DistributedSampler[int]):
     A batch is a function of its number, so a fit that resumes in the middle of an epoch gets the
     remaining batches. Each device gets its share of each batch from the
     stream: as a ``DistributedSampler`` this one is not replaced by Lightning.
-
-    Args:
-        steps: Steps of an epoch.
-        done: Returns how many steps were done, in all epochs.
     """
 
     def __init__(self, steps: int, done: Callable[[], int]) -> None:

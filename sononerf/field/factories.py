@@ -25,11 +25,7 @@ RendererFactory = Callable[..., Renderer]
 
 
 def box_of(region: ArrayLike | Tensor) -> Tensor:
-    """Return a region (2, 3), m, in single precision.
-
-    Raises:
-        SettingsError: If it is no box.
-    """
+    """Return a region (2, 3), m, in single precision."""
     given = region if isinstance(region, Tensor) else torch.as_tensor(np.array(region, np.float64))
     box = given.detach().to(torch.float32)
     if box.shape != (2, 3) or not bool((box[0] < box[1]).all()):
@@ -49,14 +45,7 @@ def make_field(
     """Return the field of a name, of a factory, or the field itself.
 
     Args:
-        field: Name of a plugin, factory, or field.
         region ((2, 3), m): Lower and upper corner.
-        head: Its frequencies are those of the field.
-        options: Keyword arguments of the factory.
-
-    Raises:
-        SettingsError: If the name or an option is not allowed, or the head is missing.
-        InputError: If the plugin cannot be loaded, or makes something else.
     """
     return _made(field, Field, plugins.FIELDS, region, head, options)
 
@@ -70,13 +59,7 @@ def make_renderer(
     """Return the renderer of a name, of a factory, or the renderer itself.
 
     Args:
-        renderer: Name of a plugin, factory, or renderer.
         region ((2, 3), m): Lower and upper corner.
-        head: The head that heard the echoes.
-        options: Keyword arguments of the factory.
-
-    Raises:
-        SettingsError, InputError: As :func:`make_field`.
     """
     return _made(renderer, Renderer, plugins.RENDERERS, region, head, options)
 

@@ -48,11 +48,7 @@ def has_accelerator() -> bool:
 
 
 def require_accelerator(accelerator: str) -> None:
-    """Refuse an accelerator that this machine does not have.
-
-    Raises:
-        ResourceError: If ``gpu`` was asked for and there is none.
-    """
+    """Refuse an accelerator that this machine does not have."""
     if accelerator == "gpu" and not has_accelerator():
         raise ResourceError("no GPU that torch can use; take --accelerator cpu, or auto")
 
@@ -96,6 +92,8 @@ def fit(
         ResourceError: If ``gpu`` is asked for and there is none.
     """
     require_accelerator(accelerator)
+    if accelerator == "auto" and not torch.cuda.is_available():
+        accelerator = "cpu"  # Apple's GPU has no double precision, which fields need
     if model is None:
         model = EchoModule.for_echoes(echoes, options=options)
     elif options is not None:

@@ -47,18 +47,14 @@ class FourierField(Field):
     Args:
         region ((2, 3), m): Lower and upper corner of the box, world frame.
         frequency ((F,), Hz): Frequencies of the answer.
-        inputs: Inputs of the network, which select one of two.
-        octaves: Number of sines per input, half an octave apart.
         direction_octaves: Number of sines per component of the direction, of
             ``inputs="direction"``; as many as for the position where None. Many of them let
             directions that were never heard from be anything.
-        width: Width of the hidden layers.
         scale (1/m): Factor of positions before the embedding.
         spacing (m): Spacing of places that resolves the field; a hundredth of the region's longest
             side where None, for the network itself has none.
         precision: Type in which layers multiply; parameters, sums and result are float32 in any
             case.
-        rate: Initial learning rate of Adam where the settings name none.
 
     References:
         .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, section 2.

@@ -114,17 +114,12 @@ class GridField(LobeField):
         region ((2, 3), m): Lower and upper corner of the box, world frame.
         frequency ((F,), Hz): Frequencies of the answer.
         spacing (m): Vertex spacing of the finest level; found from ``vertices`` where None.
-        vertices: Largest number of vertices of the finest level where ``spacing`` is None.
         finest, coarsest (m): Bounds of the spacing that is found.
-        levels: Number of grids, each twice as coarse as the one before.
         rank: Number of spectra that places add by coefficients of their own; at most one less than
             there are frequencies.
         correction: Width of the hidden layers of a network that corrects what places answer; 0 for
             none. Only :meth:`select` and :meth:`echo` hear it: which places are audible, and their
             energy and axis, go by the lobe alone.
-
-    Raises:
-        SettingsError: If ``finest`` lies above ``coarsest`` where they are needed.
     """
 
     origin: Tensor

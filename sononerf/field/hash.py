@@ -51,14 +51,8 @@ class HashField(LobeField):
         region ((2, 3), m): Lower and upper corner of the box, world frame.
         frequency ((F,), Hz): Frequencies of the answer.
         finest (m): Vertex spacing of the finest level.
-        growth: Ratio of the spacing of a level to that of the next finer one.
-        levels: Number of levels.
-        features: Numbers per vertex and level.
-        log2_entries: A level has at most two to the power of this many entries.
-        width: Width of the hidden layers.
         rank: Number of spectra that places add by coefficients of their own; at most one less than
             there are frequencies.
-        released: The part of the fit after which all levels take part.
 
     References:
         .. [1] T. Müller, A. Evans, C. Schied, A. Keller, "Instant neural graphics primitives with a
@@ -133,7 +127,6 @@ class HashField(LobeField):
         Args:
             positions ((N, 3), m): Places, world frame; those outside the lattice are moved to its
                 faces.
-            level: Counted from the coarsest.
 
         Returns:
             entries (8, N): Rows of the table.

@@ -28,11 +28,7 @@ CALM = 0.1
 
 
 class CalmLayer(nn.Linear):
-    """A layer that moves calmly: with steps as large as a vertex takes, a whole field may die.
-
-    Args:
-        start, end: Numbers in and out.
-    """
+    """A layer that moves calmly: with steps as large as a vertex takes, a whole field may die."""
 
     def __init__(self, start: int, end: int) -> None:
         super().__init__(start, end)

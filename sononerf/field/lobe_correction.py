@@ -55,8 +55,6 @@ class Correction(nn.Module):
     Args:
         region ((2, 3), m): Lower and upper corner of the box, world frame.
         spacing (m): Spacing of the field that is corrected.
-        width: Width of the two hidden layers.
-        count: Number of frequencies.
     """
 
     origin: Tensor

@@ -42,11 +42,8 @@ class ProfileRenderer(Renderer):
 
     Args:
         region ((2, 3), m): Lower and upper corner of the box that holds the field.
-        head: The head that heard the spectra.
-        oversampling: Bins of the profile per range slice.
         points: Largest number of places that a step evaluates; more are drawn by their running
             energy.
-        uniform: Share of the drawn places that are drawn uniformly.
         start: Largest number of places of the first lattice. It is as often twice as coarse as the
             field as that takes, and is refined around what is alive.
         prune_every: Steps between two looks at which places are alive, and whether the lattice is

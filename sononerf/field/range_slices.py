@@ -37,12 +37,7 @@ def seed_of(*parts: int) -> int:
 
 
 class PoseReader:
-    """Spectrograms of a store, kept in memory up to a bound, the oldest given up first.
-
-    Args:
-        store: Store of the spectra.
-        memory_bytes: Largest number of bytes that are kept.
-    """
+    """Spectrograms of a store, kept in memory up to a bound, the oldest given up first."""
 
     def __init__(self, store: Ensemble, memory_bytes: int) -> None:
         self.store = store
@@ -67,21 +62,9 @@ class SliceStream(Dataset[RangeSlices]):
     """The training batches; item k is batch k, in any process and in any order.
 
     Args:
-        store: A sealed ensemble.
-        split: Split whose poses are used.
-        whole_poses: Batches of whole poses, or of single slices of any poses.
-        batch: Poses or slices per batch, over all devices together.
-        batch_frequencies: Number of frequencies of a batch; all where None.
-        seed: Turns the order.
-        memory_bytes: Largest part of the ensemble that is kept in memory, bytes.
         share (int, int): Index of this device, and number of devices that divide each batch.
         silent_share: Fraction of the silent slices that is used, drawn once by the seed; single
             slices alone.
-        silent_below: Magnitude that no cell of a silent slice reaches.
-
-    Raises:
-        SettingsError: If a batch is smaller than the number of devices.
-        ValueError: If whole poses are to go without their silence.
     """
 
     def __init__(
@@ -180,8 +163,6 @@ class WholePoses(Dataset[RangeSlices]):
     Args:
         positions ((P, 3), m): Places of the head.
         rotations (P, 3, 3): Head to world.
-        ranges, frequencies: Lengths of the axes.
-        reader: Reader of measured spectra; none are returned without it.
         numbers ((P,) int or None): Numbers of the poses in the store; counted from 0 where None.
     """
 

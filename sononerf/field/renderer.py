@@ -269,12 +269,9 @@ class ShellRenderer(Renderer):
 
     Args:
         region ((2, 3), m): Lower and upper corner of the box that holds the field.
-        head: The head that heard the spectra.
-        directions: Number of directions over the forward hemisphere.
         direction: Input of the field: the direction from each place to the head, or, as the
             published code does, the sensor's own look direction (reversed) for all places of a
             call.
-        call_spectrum: Whether each frequency has a gain of its own.
 
     References:
         .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, equation 17.

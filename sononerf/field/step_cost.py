@@ -38,10 +38,6 @@ def step_cost(module: EchoModule, data: EchoDataModule) -> StepCost:
     """Measure one item of a batch, and scale it to the whole batch.
 
     The module's random numbers, parameters and buffers stay as they are; a copy is used.
-
-    Args:
-        module: On the CPU.
-        data: Streams the batches.
     """
     batch = data.stream()[0]
     part = RangeSlices(

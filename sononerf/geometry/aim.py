@@ -20,7 +20,6 @@ def off_axis(poses: Poses, centre: Floats) -> Floats:
     """Return the angles (P,) between where heads look and where a body is, rad.
 
     Args:
-        poses: P of them.
         centre ((3,), m): Centre of the body.
     """
     to_body = centre - poses.positions
@@ -33,7 +32,6 @@ def aim_fault(poses: Poses, centre: Floats) -> str:
     """Return a line if poses look away from a body, and its likely cause; empty otherwise.
 
     Args:
-        poses: P of them.
         centre ((3,), m): Centre of the body.
     """
     if not len(poses):

@@ -24,9 +24,6 @@ PATCHES = (64, 128)  # of a cap, over its area and around its axis
 def fibonacci_sphere(count: int) -> Floats:
     """Return unit vectors on a spiral from +z to -z, each standing for the same solid angle.
 
-    Args:
-        count: Number of directions, one or more.
-
     Returns:
         directions (D, 3): Unit vectors.
 
@@ -43,7 +40,6 @@ def fibonacci_cap(
     """Return unit vectors on a spiral that fills the cap around an axis; equal areas, stratified.
 
     Args:
-        count: Number of directions, one or more.
         axis (3,): The cap's middle; any length but zero.
         half_angle (rad): From the axis to the cap's rim, 0 to pi.
         offset ((2,), 1): Two numbers in [0, 1): the first shifts every direction within its ring's
@@ -61,9 +57,6 @@ def usual_gap(count: int) -> float:
 
     The radius is the angle from the middle of the gap to the nearest direction. Caps of this
     radius around all directions have log(count) times the area of the sphere.
-
-    Args:
-        count: Number of directions, one or more.
     """
     return math.acos(max(1.0 - 2.0 * math.log(count) / count, -1.0)) if count > 1 else math.pi
 
@@ -275,10 +268,6 @@ def spread_points(mesh: trimesh.Trimesh, count: int) -> tuple[Floats, Floats]:
     """Choose points of a surface, each as far as possible from those before it [1]_.
 
     So any first ones of them are spread evenly over the surface, whatever its triangles.
-
-    Args:
-        mesh: The surface.
-        count: Number of points, N.
 
     Returns:
         points ((N, 3), m): On the triangles.

@@ -41,10 +41,6 @@ class Frame:
         Args:
             attributes: ``to_original`` (4, 4), ``head_to_original`` (3, 3) and ``origin``; each
                 may be missing.
-            name: ``auto`` is the original frame of recordings, and the world's of simulations.
-
-        Raises:
-            InputError: If the matrices are no similarity.
         """
         recorded = attributes.get("origin") == "recorded"
         if name == "world" or (name == "auto" and not recorded):

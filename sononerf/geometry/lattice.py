@@ -77,12 +77,8 @@ def level_surface(
 
     Args:
         grid (X, Y, Z): Values; none on the level itself, where triangles have no area.
-        level: Value on the surface.
         origin ((3,), m): Centre of the first voxel.
         spacing (m): Between centres.
-
-    Returns:
-        mesh: Positive volume if it is closed.
     """
     vertices, faces, _, _ = marching_cubes(
         grid.astype(np.float32), level, gradient_direction="ascent", allow_degenerate=False

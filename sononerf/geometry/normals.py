@@ -25,7 +25,6 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease: float = CREASE) -> Floats:
     Max [1]_: exact wherever a vertex and its neighbours lie on one sphere.
 
     Args:
-        mesh: With shared vertices.
         crease (rad): Triangles that meet at a greater angle do not share a normal.
 
     Returns:
@@ -57,7 +56,6 @@ def total_curvature(mesh: trimesh.Trimesh, normals: Floats) -> Floats:
     give that map, as in Rusinkiewicz [1]_. Edges are no part of it.
 
     Args:
-        mesh: With shared vertices.
         normals (T, 3, 3): From :func:`corner_normals`.
 
     Returns:
@@ -130,7 +128,6 @@ def enclosing_balls(corners: Floats, label: Ints, count: int) -> tuple[Floats, F
     Args:
         corners ((T, 3, 3), m): Corners of the triangles.
         label (T,): Index of each triangle's body.
-        count: Largest number of balls, one or more.
 
     Returns:
         centres ((B, 3), m): Centres of the balls.

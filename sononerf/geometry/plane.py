@@ -69,12 +69,8 @@ class Plane:
         stands on the plane and its image are then one closed body.
 
         Returns:
-            mesh: Those and their images, one after the other.
             kept (T,): True for faces of the mesh that are kept; None if it reaches below the plane
                 and was cut.
-
-        Raises:
-            InputError: If nothing of the mesh is above the plane.
         """
         heights = self.height(np.asarray(mesh.vertices))
         least = ON_PLANE * float(np.ptp(np.asarray(mesh.vertices), axis=0).max())

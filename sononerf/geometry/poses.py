@@ -219,9 +219,6 @@ def look_at(positions: ArrayLike, target: ArrayLike) -> Floats:
 
     Returns:
         rotations (..., 3, 3): Head to world, roll 0; straight up or down, yaw is 0.
-
-    Raises:
-        ValueError: If a position is the target.
     """
     forward = np.asarray(target, np.float64) - np.asarray(positions, np.float64)
     length = np.linalg.norm(forward, axis=-1)

@@ -230,9 +230,6 @@ def _sight(
 class RayCaster:
     """Rays against one mesh. It cannot be pickled; send the mesh instead.
 
-    Args:
-        mesh: At least one triangle.
-
     Attributes:
         face_normals (T, 3): Unit normals of the flat triangles; of one without area, zero.
         curvature ((T,), 1/m): Total curvature of the smooth surface.
@@ -276,9 +273,6 @@ class RayCaster:
         Args:
             origins ((N, 3), m): Origins of the rays.
             directions (N, 3): Unit vectors.
-
-        Returns:
-            hits: Points and distances in double precision, from the triangles' planes.
         """
         found = self._engine.first(self._scaled(origins), directions)
         one = len(origins) > 1 and origins.strides[0] == 0

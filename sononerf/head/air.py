@@ -75,11 +75,6 @@ def air_absorption(
     Returns:
         absorption ((...,), dB/m): Same shape as ``frequency``; zero or more.
 
-    Raises:
-        ValueError: If temperature or humidity lies outside the stated range, or ``frequency /
-            pressure`` outside 4e-4 to 10 Hz/Pa (about 40 Hz to 1 MHz at sea level), where the
-            standard states no accuracy.
-
     References:
         .. [1] ISO 9613-1:1993, equations (3) to (5), (B.1) to (B.3).
 

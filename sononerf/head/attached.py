@@ -27,16 +27,7 @@ class NamesFiles(Protocol):
 
 
 def attach(head: NamesFiles, folder: Path) -> None:
-    """Copy the files that a head names into a folder, if they are not there yet.
-
-    Args:
-        head: Head of the run or the store.
-        folder: Folder of the run or the store.
-
-    Raises:
-        InputError: If a file cannot be read.
-        StorageError: If a copy cannot be written.
-    """
+    """Copy the files that a head names into a folder, if they are not there yet."""
     for section in FILE_SECTIONS:
         file = getattr(head, section).file
         if file is None or (copy := _copy_of(file, section, folder)).is_file():

@@ -39,7 +39,6 @@ def call_waveform(settings: CallSettings, sampling_rate: float) -> Floats:
     so that a hyperbolic sweep's period runs straight, and it bears Doppler shifts [1]_.
 
     Args:
-        settings: The call.
         sampling_rate (Hz): Sampling rate of the waveform.
 
     Returns:
@@ -89,7 +88,6 @@ def covered(settings: CallSettings, frequency: ArrayLike) -> Bools:
     """Return which frequencies the call emits.
 
     Args:
-        settings: The call.
         frequency ((F,), Hz): Frequencies of the result.
 
     Returns:
@@ -111,7 +109,6 @@ def has_ghosts(settings: CallSettings, frequency: ArrayLike) -> bool:
     and has to be expected of a file.
 
     Args:
-        settings: The call.
         frequency ((F,), Hz): Frequencies of the rows.
     """
     f = np.asarray(frequency, dtype=np.float64)
@@ -160,7 +157,6 @@ def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> Floats:
     :math:`T (1/f - 1/f_0) / (1/f_1 - 1/f_0)` in a hyperbolic one.
 
     Args:
-        settings: The call.
         frequency ((F,), Hz): Above zero.
 
     Returns:
@@ -191,7 +187,6 @@ def sweep_rate(settings: CallSettings, frequency: ArrayLike) -> Floats:
     hyperbolic one.
 
     Args:
-        settings: The call.
         frequency ((F,), Hz): Above zero.
 
     Returns:
@@ -254,15 +249,11 @@ def matched_filter(recordings: ArrayLike, call: ArrayLike, *, oversampling: int 
     Args:
         recordings (..., S): Pressure from the start of the emission on.
         call (N,): Waveform, at the same sampling rate.
-        oversampling: Samples of the result per sample of the recordings.
 
     Returns:
         compressed ((..., S * oversampling) complex128): Analytic signal. An echo that is ``g``
             times the call has the magnitude ``g`` at its delay; the magnitude is the envelope, the
             real part the filter's output.
-
-    Raises:
-        ValueError: If the call is silent or has several dimensions, or the oversampling is below 1.
 
     Examples:
         >>> call = np.sin(np.arange(60.0) ** 2 / 60.0)
@@ -310,9 +301,6 @@ def inverse_filter(recordings: ArrayLike, call: ArrayLike) -> Floats:
     Returns:
         compressed (..., S): An echo that is ``g`` times the call has the spectrum ``g`` within the
             call's band. The last N - 1 samples lack the echoes after the end of the recording.
-
-    Raises:
-        ValueError: If the call is silent or has several dimensions.
     """
     heard, waveform = (np.asarray(each, dtype=np.float64) for each in (recordings, call))
     if waveform.ndim != 1 or not np.any(waveform):

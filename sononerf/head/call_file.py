@@ -99,18 +99,7 @@ class CallFile:
 
 
 def load_call(path: Path) -> CallFile:
-    """Read a call.
-
-    Args:
-        path: WAV of one channel.
-
-    Returns:
-        call: The same object for as long as the file does not change.
-
-    Raises:
-        InputError: If the file is missing, no WAV, truncated, of several channels, silent, not
-            finite, or too long.
-    """
+    """Read a call."""
     try:
         status = path.stat()
     except OSError as error:

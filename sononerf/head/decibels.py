@@ -29,13 +29,9 @@ def compress(magnitude: ArrayLike, reference: float) -> Floats:
 
     Args:
         magnitude (...,): Linear, zero or more.
-        reference: Same unit; silence is 0 dB, a magnitude of the reference 6 dB.
 
     Returns:
         level_db ((...,), dB): Zero or more.
-
-    Raises:
-        ValueError: If the reference is not above zero.
     """
     if not reference > 0.0:
         raise ValueError(f"reference is {reference}, expected above 0")
@@ -51,7 +47,6 @@ def active_level(noise: ArrayLike | None, reference: float) -> float | Floats:
     Args:
         noise ((E, F) or None): Root mean square of the magnitude of noise; None where none is
             known.
-        reference: Magnitude that decibels refer to.
     """
     if noise is None:
         return ACTIVE_DB
@@ -113,7 +108,6 @@ def mae_db(
 
     Args:
         a, b ((P, ...), dB): Spectrograms.
-        active: Whether only those cells count that reach ``active_db`` in either.
         active_db (dB): Level from which a cell is active; one number, or one that is broadcast to a
             spectrogram.
 

@@ -70,8 +70,6 @@ def ear(directions: Floats, side: float, settings: EarSettings, frequency: Float
 
     Args:
         directions (L, A, 3): Unit vectors, head frame; elevation is that of the row.
-        side: 1 for an ear that looks to the left, -1 to the right, 0 straight ahead.
-        settings: Axis, width and depth of the notch.
         frequency ((F,), Hz): Above zero.
 
     Returns:
@@ -138,11 +136,7 @@ class Ears:
         return len(self.ears) == 1 or self.ears.strides[0] == 0
 
     def cone(self, least: float) -> float:
-        """Return the cosine to the head's axis down to which every direction has a gain.
-
-        Args:
-            least: Gain of beam and receivers that suffices, as a fraction of the greatest.
-        """
+        """Return the cosine to the head's axis down to which every direction has a gain."""
         gain = (self.beam * self.ears.max(axis=0)).max(axis=0).astype(np.float64)
         deaf = self.directions[..., 0][gain < least * gain.max()]
         return float(deaf.max()) if len(deaf) else -1.0
@@ -164,9 +158,6 @@ def ear_tables(settings: EarSettings, frequency: ArrayLike) -> Ears:
             highest measured frequency they are those at it; outside the measured directions they
             fade to zero over 10 degrees.
         frequency ((F,), Hz): Ascending.
-
-    Returns:
-        ears: On a grid of 2 degrees.
     """
     f = np.asarray(frequency, dtype=np.float64)
     measured = _measured(settings)
@@ -270,13 +261,7 @@ def analysed_ears(
 
     so that beside a notch an echo seems to come from millimetres nearer or farther.
 
-    Args:
-        settings: Places, axes, widths.
-        call: An impulse or a sweep.
-        analysis: Window, transform and frequencies.
-
     Returns:
-        ears: At the analysis' frequencies.
         lag ((E, F, L, A) float32 or None, s): Delay of an echo at each ear, beam
             included; None for an impulse.
     """
@@ -331,7 +316,6 @@ def beam_gain(ears: Ears, directions_head: Floats) -> Singles:
     """Gain of the emission towards directions, bilinear between the table's nodes.
 
     Args:
-        ears: Tables.
         directions_head (N, 3): Unit vectors away from the emitter, head frame.
 
     Returns:
@@ -344,8 +328,6 @@ def ear_gain(ears: Ears, ear: int, directions_head: Floats) -> Singles:
     """Gain of one ear for sound from directions, bilinear between the table's nodes.
 
     Args:
-        ears: Tables.
-        ear: Its number.
         directions_head (N, 3): Unit vectors from the ear to the origin of the sound, head frame.
 
     Returns:
@@ -377,7 +359,6 @@ def _bilinear(
     Args:
         values (D, F): All azimuths of the first elevation, and so on.
         directions (N, 3): Unit vectors.
-        elevation, azimuth: Axes of the grid: the first node (rad), nodes per radian, their number.
     """
     width, frequencies = azimuth[2], values.shape[1]
     gain = np.zeros((len(directions), frequencies), np.float32)

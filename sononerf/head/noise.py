@@ -35,9 +35,6 @@ def target_gain(target_strength_db: float, distance: float) -> float:
             against the wavelength [1]_.
         distance (m): From emitter and ear to the target.
 
-    Returns:
-        gain: Spherical spreading both ways.
-
     References:
         .. [1] R. J. Urick, Principles of Underwater Sound, 3rd edition, 1983, table 9.1.
 
@@ -53,8 +50,6 @@ def loudest_power(echo: Floats, analysis: SpectrogramSettings, samples: int) -> 
 
     Args:
         echo (E, S): Waveforms.
-        analysis: Sampling rate and band.
-        samples: Length of a stretch.
 
     Returns:
         power (E,): Square of the echo's unit.
@@ -73,7 +68,6 @@ def noise_level(settings: NoiseSettings, power: Floats, analysis: SpectrogramSet
     """Set each ear's noise: the standard deviation of its samples.
 
     Args:
-        settings: The ratio, which must be set.
         power (E,): Power of the reference echo, from :func:`loudest_power`.
         analysis: Sampling rate and band: of white noise's power, the band holds its share of all
             frequencies up to half the sampling rate.
@@ -92,8 +86,6 @@ def draw_noise(level: Floats, samples: int, *, seed: int) -> Floats:
 
     Args:
         level (E,): Standard deviations.
-        samples: Per ear.
-        seed: Seed of the pose; what else is drawn from it is independent of the noise.
 
     Returns:
         noise (E, samples): Unit of ``level``.

@@ -47,8 +47,6 @@ def row_duration(call: CallSettings, analysis: SpectrogramSettings, frequency: A
     a Gaussian filter and a linear sweep that gives exactly this.
 
     Args:
-        call: The emitted call.
-        analysis: Window and sampling rate.
         frequency ((F,), Hz): Frequencies of the rows.
 
     Returns:
@@ -65,10 +63,6 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
     A short window is wide in frequency, so a slow sweep stays in it for long; a long window is long
     itself. The result minimises the root mean square of :func:`row_duration` over the analysed
     frequencies that the call covers.
-
-    Args:
-        call: The emitted call.
-        analysis: Sampling rate and frequencies.
 
     Returns:
         window: Samples. For an impulse, for which shorter is always better, it is the set window;
@@ -99,10 +93,6 @@ def _heard(call: CallSettings, analysis: SpectrogramSettings) -> Floats:
 
 def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> Floats:
     """Point echo in each row of the dechirped spectrogram, as a window over the received time.
-
-    Args:
-        call: The emitted call.
-        analysis: Filters and frequencies.
 
     Returns:
         window (F, W): One value per sample; the point's own range is in the middle, where it is 1.
@@ -160,12 +150,7 @@ def _cropped(row: Floats, call: CallSettings, analysis: SpectrogramSettings) -> 
 
 
 def warn_of_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
-    """Log one line for each way in which call and analysis do not suit one another.
-
-    Args:
-        call: The emitted call.
-        analysis: Window and band.
-    """
+    """Log one line for each way in which call and analysis do not suit one another."""
     warn_of_band(call, analysis)
     best = best_window(call, analysis)
     if analysis.kind == "stft" and not 1.0 / FAR <= best / analysis.window <= FAR:

@@ -140,7 +140,6 @@ def row_widths(settings: SpectrogramSettings, frequency: ArrayLike) -> tuple[Flo
     """Duration of a row's envelope and bandwidth of its transform, each at half of its height.
 
     Args:
-        settings: The analysis.
         frequency ((F,), Hz): Frequencies of the rows.
 
     Returns:
@@ -157,11 +156,7 @@ def row_widths(settings: SpectrogramSettings, frequency: ArrayLike) -> tuple[Flo
 
 @lru_cache(maxsize=16)  # all readers of rows share the arrays; nobody may write to them
 def row_filters(settings: SpectrogramSettings) -> RowFilters:
-    """Return the filters of an analysis.
-
-    Args:
-        settings: The analysis.
-    """
+    """Return the filters of an analysis."""
     return _gammatone(settings) if settings.kind == "gammatone" else _hamming(settings)
 
 

@@ -23,9 +23,6 @@ def frequency_axis(settings: SpectrogramSettings) -> Floats:
     Of the kind ``stft`` the FFT's bins nearest to the two ends, and all between,
     ``sampling_rate / fft`` apart; of ``gammatone`` equal ratios from one end to the other.
 
-    Args:
-        settings: The analysis.
-
     Returns:
         frequency ((F,), Hz): Ascending.
 
@@ -41,7 +38,6 @@ def range_axis(settings: SpectrogramSettings, speed_of_sound: float) -> Floats:
     """Ranges of the analysis frames, ``c t / 2`` with t at the centre of the frame's envelopes.
 
     Args:
-        settings: The analysis; frames start every ``hop`` samples from the emission on.
         speed_of_sound (m/s): Speed of the medium.
 
     Returns:
@@ -77,12 +73,8 @@ def echo_samples(
     """Number of samples from the emission on that the last analysis frame needs.
 
     Args:
-        settings: The analysis.
         speed_of_sound (m/s): Speed of the medium.
         longest_delay (s): The greatest by which a frequency's row is advanced; 0 for an impulse.
-
-    Returns:
-        samples: At the sampling rate of the settings.
     """
     last = _frames(settings, speed_of_sound)[1]
     reach = row_filters(settings).reach
@@ -108,16 +100,12 @@ def spectrogram(
 
     Args:
         echo (E, S): Pressure from the emission on, at the sampling rate of the settings.
-        settings: The analysis.
         speed_of_sound (m/s): Speed of the medium.
         delay ((F,), s): Emission time of each frequency, zero or more; all at once where it is left
             out.
 
     Returns:
         magnitude (E, R, F): Linear.
-
-    Raises:
-        ValueError: If the echo ends before the last frame, or a delay is negative.
 
     References:
         .. [1] W. Jansen and J. Steckel, SonoNERFs, Biomimetics 9(6):321, 2024, equation (16).
@@ -202,10 +190,6 @@ def smearing(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
     filter's transform about its own time. A sweep's frequencies enter the filter one after the
     other; by Parseval's theorem a row hears the mean power, each frequency weighted with the
     squares of the filter's transform and of the call's spectrum.
-
-    Args:
-        call: The emitted call.
-        analysis: Filters and frequencies.
     """
     return (_of_gammatones if analysis.kind == "gammatone" else _of_a_window)(call, analysis)
 

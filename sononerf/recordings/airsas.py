@@ -38,11 +38,7 @@ ACROSS = np.pi / 2  # yaw of a head that looks to positive y, rad
 
 
 def read_airsas(path: Path, settings: ImportSettings) -> Recording:
-    """Read the format ``airsas``; see the module.
-
-    Raises:
-        InputError: If it is damaged, or has another layout.
-    """
+    """Read the format ``airsas``; see the module."""
     if settings.sampling_rate is None:
         raise InputError(
             f"{path}: the format does not say its sampling rate; set import.sampling_rate"

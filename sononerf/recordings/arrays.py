@@ -40,11 +40,7 @@ WHOLE = {"position": PLACE, "euler": EULER}
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """Read all arrays of an ``.npz``, or of the root of an HDF5 file.
-
-    Raises:
-        InputError: If it is missing, damaged, of another kind than its name says, or holds objects.
-    """
+    """Read all arrays of an ``.npz``, or of the root of an HDF5 file."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     stamp = path.stat()
@@ -79,11 +75,7 @@ def _read(path: Path, *stamp: int) -> dict[str, NDArray[Any]]:
 def waveform_of(
     path: Path, arrays: dict[str, NDArray[Any]], settings: ImportSettings
 ) -> tuple[float, NDArray[Any]]:
-    """Return the sampling rate (Hz) and the unchanged array ``waveform``.
-
-    Raises:
-        InputError: If either is missing.
-    """
+    """Return the sampling rate (Hz) and the unchanged array ``waveform``."""
     if "waveform" not in arrays:
         listed = ", ".join(sorted(arrays)) or "nothing"
         raise InputError(f"{path}: holds no array waveform; it holds {listed}")
@@ -98,11 +90,7 @@ def waveform_of(
 
 
 def read_numpy(path: Path, settings: ImportSettings) -> Recording:
-    """Read the format ``numpy``; see the module.
-
-    Raises:
-        InputError: If arrays are missing, unknown, or do not fit one another.
-    """
+    """Read the format ``numpy``; see the module."""
     arrays = read_arrays(path)
     rate, waveform = waveform_of(path, arrays, settings)
     if waveform.ndim == 2:

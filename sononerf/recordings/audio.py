@@ -29,15 +29,9 @@ SUFFIXES = (*WAV, *OTHERS)
 def read_audio(path: Path) -> tuple[float, NDArray[Any]]:
     """Read a sound file.
 
-    Args:
-        path: File of a kind in :data:`SUFFIXES`; a WAV is mapped, not loaded, where it can be.
-
     Returns:
         sampling_rate (Hz): As the file says.
         samples (E, S): Integers reach from one end of their type to the other.
-
-    Raises:
-        InputError: If it is missing, truncated, empty, or of another kind than its name says.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -121,9 +115,6 @@ def wav_bytes(waveform: ArrayLike, sampling_rate: float) -> bytes:
     Args:
         waveform (E, S): One channel per receiver.
         sampling_rate (Hz): A whole number.
-
-    Raises:
-        ValueError: If the sampling rate is no whole number; a WAV file cannot hold it.
     """
     if sampling_rate != round(sampling_rate):
         raise ValueError(f"a WAV file cannot hold a sampling rate of {sampling_rate} Hz")
@@ -136,8 +127,6 @@ def pose_table(poses: Poses, files: Sequence[str], split: NDArray[np.int8]) -> s
     """Return the table that the format ``recordings`` reads.
 
     Args:
-        poses: P of them.
-        files: The recording of each.
         split ((P,) int8): 0 train, 1 validation, 2 test.
     """
     words = {number: word for word, number in SPLITS.items()}

@@ -48,7 +48,6 @@ def channels_of(power: Floats, looks: float) -> list[Channel]:
 
     Args:
         power (P, E, R): Averaged over frequency.
-        looks: Number of independent values in each average of power.
     """
     heard = (power > threshold_levels(power, looks).total).any(axis=-1).sum(axis=0)
     loud = np.median(power.max(axis=-1), axis=0)
@@ -82,15 +81,7 @@ def faults_of_channels(channels: list[Channel]) -> list[str]:
 
 
 def check_channels(recording: Recording, channels: Channels | None) -> None:
-    """Refuse a channel that is silent, or equal to another one, in all pings that are looked at.
-
-    Args:
-        recording: All pings.
-        channels: Channels that become receivers; all where None.
-
-    Raises:
-        InputError: Naming the channels.
-    """
+    """Refuse a channel that is silent, or equal to another one, in all pings that are looked at."""
     asked = np.linspace(0, len(recording) - 1, min(LOOKED_AT, len(recording))).round().astype(int)
     contents = []
     for ping in np.unique(asked).tolist():

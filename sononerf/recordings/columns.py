@@ -85,11 +85,7 @@ class Columns:
         )
 
     def split(self) -> NDArray[np.int8] | None:
-        """Return the use of each pose, (P,): 0 training, 1 validation, 2 test; None if not stated.
-
-        Raises:
-            InputError: If a word is none of these three.
-        """
+        """Return the use of each pose, (P,): 0 training, 1 validation, 2 test; None if unknown."""
         words = self.texts.get("split")
         if words is None:
             return None
@@ -113,15 +109,8 @@ def columns_of(
     """Bring named columns into SI units.
 
     Args:
-        where: The table, for messages.
         given (dict of (P,) float): Columns by name, with or without a unit in it.
-        settings: Units of those without.
-        texts: Columns of words.
         rotation (P, 3, 3): Rotation matrices, if there are any.
-
-    Raises:
-        InputError: If a name is unknown or stands twice, a unit is missing, or a value is not
-            finite.
     """
     values: dict[str, Floats] = {}
     units: dict[str, str] = {}
@@ -171,15 +160,7 @@ def _parted(where: str, full: str) -> tuple[str, str | None]:
 
 
 def read_table(path: Path, settings: ImportSettings) -> Columns:
-    """Read a CSV table of poses with one header line.
-
-    Args:
-        path: UTF-8; separated by commas, semicolons or tabulators.
-        settings: Units of columns that do not say theirs.
-
-    Raises:
-        InputError: If it cannot be read or anything in it is wrong, naming file, line and column.
-    """
+    """Read a CSV table of poses with one header line."""
     header, rows = read_rows(path)
     numbers: dict[str, list[float]] = {name: [] for name in header if name not in TEXTS}
     texts: dict[str, list[str]] = {name: [] for name in header if name in TEXTS}

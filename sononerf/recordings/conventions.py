@@ -37,12 +37,7 @@ digits."""
 
 
 def frame_matrices(settings: ImportSettings) -> tuple[Floats, Floats]:
-    """Return the matrices (3, 3) that take the world's and the head's axes to ours.
-
-    Raises:
-        SettingsError: If an own frame's matrix is not orthogonal, or one is left-handed and the
-            other not.
-    """
+    """Return the matrices (3, 3) that take the world's and the head's axes to ours."""
     if settings.frame == "own":
         world = np.asarray(settings.axes, dtype=np.float64)
         head = world if settings.head_axes is None else np.asarray(settings.head_axes, np.float64)
@@ -80,16 +75,7 @@ def original_frame(columns: Columns, settings: ImportSettings) -> dict[str, Any]
 
 
 def to_poses(columns: Columns, settings: ImportSettings) -> Poses:
-    """Return the poses of a table in our frame.
-
-    Args:
-        columns: Places and orientations, or a turntable's angles and heights.
-        settings: Frame, turntable, and the point that poses look at if there are no orientations.
-
-    Raises:
-        InputError: If columns are missing or contradict one another.
-        SettingsError: If the frame has no valid matrices.
-    """
+    """Return the poses of a table in our frame."""
     if settings.turntable is not None:
         return _turntable_of(columns, settings.turntable)
     if not columns.has(*PLACE):
@@ -202,9 +188,6 @@ def turntable_poses(angle: Floats, height: Floats, *, radius: float, clockwise: 
         radius (m): From the axis to the sensor.
         clockwise: Whether growing angles turn the object clockwise, seen from above. The sensor
             then goes about the object counter-clockwise.
-
-    Returns:
-        poses: At angle 0 on the x axis; they look at the axis, level.
     """
     turn = np.asarray(angle) * (1.0 if clockwise else -1.0)
     level = np.asarray(height, dtype=np.float64)

@@ -27,11 +27,7 @@ SUFFIXES = (*audio.SUFFIXES, *arrays.SUFFIXES)
 
 
 def read_sound(path: Path, settings: ImportSettings) -> tuple[float, NDArray[Any]]:
-    """Read one file of any kind: its sampling rate (Hz) and samples (E, S).
-
-    Raises:
-        InputError: If it is missing, damaged, or of a kind that is not known.
-    """
+    """Read one file of any kind: its sampling rate (Hz) and samples (E, S)."""
     suffix = path.suffix.lower()
     if suffix in audio.SUFFIXES:
         rate, samples = audio.read_audio(path)
@@ -50,16 +46,7 @@ def read_sound(path: Path, settings: ImportSettings) -> tuple[float, NDArray[Any
 
 
 def read_folder(source: Path, settings: ImportSettings, apart: Collection[Path] = ()) -> Recording:
-    """Read the format ``recordings``.
-
-    Args:
-        source: The folder, or the table of poses in it.
-        settings: Path of the table, and its units.
-        apart: Further files of the folder that hold no pings, such as the call's.
-
-    Raises:
-        InputError: If files or poses are missing, or files differ in rate or channels.
-    """
+    """Read the format ``recordings``."""
     table = source if source.is_file() else source / settings.poses
     if not table.is_file():
         raise InputError(f"{table}: no table of poses; write one line per ping")

@@ -63,11 +63,6 @@ def calibrate(
 
     Args:
         echo (E, S): Its echo at the receivers, from the emission on.
-        reference: The target.
-        head: Gains, places, air, call and analysis; its range limits do not matter.
-
-    Raises:
-        InputError: If the recording ends before the target, or nothing is heard of it.
 
     References:
         .. [1] R. J. Urick, Principles of Underwater Sound, 3rd edition, 1983, table 9.1.
@@ -174,20 +169,11 @@ def found_ranges(
     """Find range limits that are left out from the echoes.
 
     Args:
-        head: Air, receivers, call and analysis.
-        cutter: Cuts the pings.
-        recording: All pings.
         given: Keys of the analysis that are set; limits that are not among them follow from the
             echoes.
-        progress: Display of progress.
 
     Returns:
-        limits: ``range_min`` and ``range_max``, m.
         power (P, E, R): Powers of some pings over all ranges, averaged over frequency.
-
-    Raises:
-        InputError: If the recordings are too short, or begin too late, for limits that are set.
-        ResourceError: If there is too little memory for so long a range.
     """
     analysis, speed = head.analysis, head.speed_of_sound
     rate = analysis.sampling_rate
@@ -257,18 +243,7 @@ def calibrated(
     head: Head,
     folder: Path,
 ) -> tuple[Cutter, dict[str, Any]]:
-    """Return the cutter of pings, with all corrections, and the applied calibration.
-
-    Args:
-        recording: All pings.
-        wanted: Settings to apply.
-        head: Gains, places, air, call and analysis.
-        folder: Folder of background and reference.
-
-    Returns:
-        cutter: Cuts and calibrates pings.
-        applied: Plain data.
-    """
+    """Return the cutter of pings, with all corrections, and the applied calibration."""
     speed, rate = head.speed_of_sound, recording.sampling_rate
     applied: dict[str, Any] = {
         "scale": wanted.scale,

@@ -63,14 +63,8 @@ def find_lag(
     """Return the lag of pings behind their poses, rows, and its standard deviation.
 
     Args:
-        poses: Poses of all pings, in the order of recording.
         first ((N, E), m): Ranges of the first echoes of some pings; not finite without an echo.
         heard (N,): Rows of these pings.
-        consistency: Consistency of the head.
-        shown: Called once per lag that is tried.
-
-    Returns:
-        lag, deviation: Rows.
     """
     misfits = []
     for lag in LAGS.tolist():

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from sononerf.array_types import Floats
 from sononerf.errors import InputError
-from sononerf.input_files import require_sound_matlab
 from sononerf.recordings import matlab as hdf5
 
 NUMERIC = {"double", "single", "logical", "char"} | {
@@ -28,17 +27,9 @@ PLAIN = "save it again with numbers, structs and cells alone"
 def read_mat(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
     """Read variables of a MATLAB file.
 
-    Args:
-        path: The file.
-        wanted: Names of variables; those that are not there are left out.
-
     Returns:
         variables: Structs as dicts, cells and arrays of structs as lists, numbers as arrays in
             MATLAB's shape, text as str.
-
-    Raises:
-        InputError: If the file is missing, damaged or no MATLAB file, or a variable holds objects,
-            functions or tables.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -53,7 +44,6 @@ def read_mat(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
             }
     if not start.startswith(b"MATLAB 5.0 MAT-file"):
         raise InputError(f"{path}: no MATLAB file of version 5 or 7.3, whatever its name says")
-    require_sound_matlab(path)
     try:
         found = scipy.io.loadmat(path, variable_names=list(wanted), struct_as_record=True)
     except (NotImplementedError, MemoryError) as error:
@@ -146,11 +136,7 @@ def as_list(value: Any) -> list[Any]:
 
 
 def vector(path: Path, where: dict[str, Any], name: str, size: int) -> Floats:
-    """Return a field of some numbers, (size,).
-
-    Raises:
-        InputError: If it is missing, of another size, or not finite.
-    """
+    """Return a field of some numbers, (size,)."""
     found = where.get(name) if isinstance(where, dict) else None
     values = np.asarray(found if isinstance(found, np.ndarray) else [], dtype=np.float64)
     values = values.reshape(-1)
@@ -165,12 +151,7 @@ MOST_TIMES = 2000
 
 @contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """Open an HDF5 file for reading.
-
-    Raises:
-        InputError: If it is missing, truncated, or no HDF5 file; also for faults that reading
-            finds.
-    """
+    """Open an HDF5 file for reading."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     try:
@@ -182,11 +163,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 
 def child(group: Any, name: str) -> Any:
-    """Return a group's member; None if there is none.
-
-    Raises:
-        InputError: If it is a link.
-    """
+    """Return a group's member; None if there is none."""
     link = group.get(name, getlink=True)
     if link is None:
         return None
@@ -196,12 +173,7 @@ def child(group: Any, name: str) -> Any:
 
 
 def dataset(group: Any, name: str) -> Any:
-    """Return a dataset of numbers of its own file, not read; None if there is none.
-
-    Raises:
-        InputError: If it is no dataset of numbers, lies in another file, or is larger than it can
-            be.
-    """
+    """Return a dataset of numbers of its own file, not read; None if there is none."""
     node = group
     for part in name.strip("/").split("/"):
         if not isinstance(node, h5py.Group):

@@ -36,9 +36,6 @@ def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -
 
     Args:
         samples (E, S): As they are on disk.
-        emission: Time of the call's emission, in samples from the first one on; need not be whole.
-        count: Number of samples, N.
-        first: Index of the first sample, from the emission on.
 
     Returns:
         echo: (E, N).
@@ -62,11 +59,7 @@ def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -
 
 
 def mix(samples: NDArray[Any], channels: Channels | None) -> NDArray[Any]:
-    """Return the chosen channels (E, S); those that stand together are averaged.
-
-    Raises:
-        InputError: If there is no such channel.
-    """
+    """Return the chosen channels (E, S); those that stand together are averaged."""
     if channels is None:
         return samples
     groups = [(one,) if isinstance(one, int) else one for one in channels]
@@ -123,13 +116,7 @@ class Cutter:
         return round(seconds * self.recording.sampling_rate, 6)
 
     def echo(self, index: int, count: int, *, first: int = 0) -> Floats:
-        """Return the calibrated samples of a ping, (E, N).
-
-        Args:
-            index: Number of the ping.
-            count: Number of samples, N.
-            first: The first of them, counted from the emission.
-        """
+        """Return the calibrated samples of a ping, (E, N)."""
         whole = count + self._tail
         raw = cut(self.recording.read(index), self._emission(index), whole, first=first)
         if self.background is not None:
@@ -144,12 +131,7 @@ class Cutter:
         return 0 if self.call is None else len(self.call) - 1
 
     def clipped(self, index: int, first: int, last: int) -> Clipping:
-        """Return how a ping's loudest samples look, from one sample after the emission to another.
-
-        Args:
-            index: Number of the ping.
-            first, last: Counted from the emission.
-        """
+        """Return how a ping's loudest samples look, between two samples after the emission."""
         samples = self.recording.read(index)
         begin = round(self._emission(index))
         part = np.asarray(samples[:, max(begin + first, 0) : max(begin + last, 0)])
@@ -212,16 +194,7 @@ def clipped_pings(found: list[Clipping]) -> Bools:
 
 
 def check_numbers(recording: Recording, cutter: Cutter, last: int) -> None:
-    """Refuse pings that hold NaN, or whose times lie outside the recording.
-
-    Args:
-        recording: All pings.
-        cutter: Cuts them.
-        last: Samples after the emission that are needed; 0 where that is not known yet.
-
-    Raises:
-        InputError: Naming the first one and how many there are.
-    """
+    """Refuse pings that hold NaN, or whose times lie outside the recording."""
 
     def refuse(bad: list[int], what: str) -> None:
         if bad:

@@ -89,15 +89,7 @@ class Verdict:
 
 
 def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]:
-    """Return the poses of a table under conventions that are easily mixed up with the stated one.
-
-    Args:
-        columns: The table as read.
-        settings: As stated.
-
-    Returns:
-        poses: By name; those that do not differ from the stated ones are left out.
-    """
+    """Return the poses of a table under conventions that are easily mixed up."""
     stated = to_poses(columns, settings)
     found: dict[str, Poses] = {}
     if settings.turntable is not None:
@@ -137,12 +129,7 @@ def shifted(columns: Columns, pings: Ints, settings: ImportSettings) -> dict[str
     """Return the poses of pings if each ping belongs to the next or to the previous row.
 
     Args:
-        columns: The whole table.
         pings (P,): Rows of the pings that are checked.
-        settings: As stated.
-
-    Returns:
-        poses: By name. The first or the last ping of the table keeps its row.
     """
     last = len(columns) - 1
     return {
@@ -195,8 +182,6 @@ def check_poses(
 
     Args:
         first ((P, E), m): Ranges of the first echoes; not finite without an echo.
-        stated: The poses as they were read.
-        others: The same poses under other conventions, by name.
         emitter ((3,), m): Head frame.
         receivers ((E, 3), m): Head frame.
         resolution (m): Range resolution; onsets are known to a tenth of it.

@@ -33,11 +33,7 @@ SONONERF_RATE, SONONERF_SPEED = 1e6, 343.0  # Hz, m/s: of its first script
 
 
 def read_sononerf_matlab(path: Path, settings: ImportSettings) -> Recording:
-    """Read the format ``sononerf-matlab``; see the module.
-
-    Raises:
-        InputError: If it is damaged, or has another layout.
-    """
+    """Read the format ``sononerf-matlab``; see the module."""
     stored = read_mat(path, ("dataStorageMatrix",)).get("dataStorageMatrix")
     if stored is None:
         raise InputError(f"{path}: holds no dataStorageMatrix; is it of the format sonotracelab?")
@@ -54,11 +50,7 @@ def read_sononerf_matlab(path: Path, settings: ImportSettings) -> Recording:
 
 
 def read_sonotracelab(path: Path, settings: ImportSettings) -> Recording:
-    """Read the format ``sonotracelab``; see the module.
-
-    Raises:
-        InputError: If it is damaged, or has another layout.
-    """
+    """Read the format ``sonotracelab``; see the module."""
     names = ("structSensor", "structSimulationResult", "structSimulationParameters")
     found = read_mat(path, names)
     missing = [name for name in names[:2] if name not in found]

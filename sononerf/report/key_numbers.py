@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 Rows = list[tuple[str, ...]]
+BASELINES = ("backprojection", "voxels")
+"""Names of the baselines in ``metrics.json``."""
 NONE = "-"
 """Text for a number that does not apply or is not known yet."""
 
@@ -29,11 +31,7 @@ class KeyNumber:
     form: str = ".2f"
 
     def text(self, metrics: Mapping[str, Any]) -> str:
-        """Return the number of a run as text.
-
-        Raises:
-            TypeError, ValueError: If the value is not a number.
-        """
+        """Return the number of a run as text."""
         value: Any = metrics
         for part in self.key.split("/"):
             value = (value or {}).get(part)
@@ -68,24 +66,34 @@ COST = (
 )
 
 
-def limits(columns: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the thresholds of all F-scores in these geometries, m, as text."""
-    known = {limit for column in columns for limit in column.get("fscore") or {}}
-    return sorted(known, key=float)
-
-
-def shape_rows(columns: Sequence[Mapping[str, Any]]) -> Rows:
-    """Return label and one text per geometry: F-scores first, then the other numbers."""
-    rows: Rows = []
-    for limit in limits(columns):
-        number = KeyNumber(f"F-score at {1e3 * float(limit):g} mm", f"fscore/{limit}")
-        rows.append((number.label, *(number.text(column) for column in columns)))
-    return rows + [(n.label, *(n.text(column) for column in columns)) for n in SHAPE]
-
-
 def run_rows(runs: Sequence[Mapping[str, Any]]) -> Rows:
     """Return label and one text per run's metrics; rows that no run has are left out."""
-    rows = [(n.label, *(n.text(run) for run in runs)) for n in PREDICTION]
-    rows += shape_rows([run.get("geometry") or {} for run in runs])
-    rows += [(n.label, *(n.text(run) for run in runs)) for n in COST]
+    numbers = [*PREDICTION, *_shapes(runs, "geometry", "")]
+    target = {limit for run in runs for limit in _scores(run, "geometry/target")}
+    numbers += [_fscore(limit, "geometry/target", "target alone: ") for limit in _sorted(target)]
+    for baseline in BASELINES:
+        numbers += _shapes(runs, f"baseline/{baseline}", f"{baseline}: ")
+    rows = [(n.label, *(n.text(run) for run in runs)) for n in [*numbers, *COST]]
     return [row for row in rows if set(row[1:]) != {NONE}]
+
+
+def _shapes(runs: Sequence[Mapping[str, Any]], key: str, prefix: str) -> list[KeyNumber]:
+    """Return the numbers of a surface: F-scores first, then the others."""
+    limits = _sorted({limit for run in runs for limit in _scores(run, key)})
+    others = [replace(n, label=prefix + n.label, key=f"{key}/{n.key}") for n in SHAPE]
+    return [*(_fscore(limit, key, prefix) for limit in limits), *others]
+
+
+def _scores(run: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    found: Any = run
+    for part in [*key.split("/"), "fscore"]:
+        found = (found or {}).get(part)
+    return found or {}
+
+
+def _sorted(limits: set[str]) -> list[str]:
+    return sorted(limits, key=float)
+
+
+def _fscore(limit: str, key: str, prefix: str) -> KeyNumber:
+    return KeyNumber(f"{prefix}F-score at {1e3 * float(limit):g} mm", f"{key}/fscore/{limit}")

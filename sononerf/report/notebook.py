@@ -52,7 +52,6 @@ def png_of(thing: object, **options: Any) -> bytes | None:
     Args:
         thing: A scene or a surface, whose mesh is drawn; or echoes or a prediction, of which one
             spectrogram is drawn.
-        options: ``pose``, its number; of echoes also ``prediction``, which is drawn beside.
     """
     del thing, options
     return None

@@ -49,9 +49,6 @@ show();
 class Page:
     """A page; each method adds a part at its end.
 
-    Args:
-        title: Its first heading.
-
     Attributes:
         parts: HTML, one part after the other.
     """
@@ -92,11 +89,7 @@ class Page:
         self.parts.append(f'<div class="side">{figures}</div>')
 
     def view(self, meshes: Mapping[str, trimesh.Trimesh]) -> None:
-        """Add a 3D view of coloured meshes that turns by mouse and touch; once per page.
-
-        Args:
-            meshes: By the name that the reader chooses; the first one is shown at first.
-        """
+        """Add a 3D view of coloured meshes that turns by mouse and touch; once per page."""
         from trimesh.exchange.gltf import export_glb
         from trimesh.viewer.notebook import scene_to_html
 

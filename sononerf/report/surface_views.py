@@ -37,10 +37,8 @@ class SurfaceViews:
     """Pictures and coloured meshes of a surface.
 
     Args:
-        mesh: The reconstruction, m.
         confidence ((V,) int32 or None): Number of poses that heard each vertex.
         error ((V,) float32 or None, m): Error of each vertex, known without the truth.
-        truth: The true surface in the frame of the reconstruction, m; None where it is not known.
         limit (m): Error and distance of the strongest colour.
     """
 

@@ -50,15 +50,7 @@ Predict = Callable[[Poses], Prediction]
 
 
 class Viewer:
-    """A page in the browser, served to this machine alone until it is closed.
-
-    Args:
-        title: Title of the page.
-        port: Port of the page; the next free one if it is taken.
-
-    Raises:
-        ResourceError: If the extra ``view`` is not installed.
-    """
+    """A page in the browser, served to this machine alone until it is closed."""
 
     def __init__(self, title: str, *, port: int = 8080) -> None:
         try:
@@ -232,12 +224,7 @@ class Viewer:
     # Model.
 
     def show_model(self, model: EchoModule, predict: Predict | None = None) -> None:
-        """Show a head that can be dragged, and the spectrogram that it would hear.
-
-        Args:
-            model: Fitted.
-            predict: Predicts with traced echoes too, for poses that are clicked.
-        """
+        """Show a head that can be dragged, and the spectrogram that it would hear."""
         self._model, self._predict = model, predict
         with self.server.gui.add_folder("Free head"):
             self._live_text = self.server.gui.add_markdown("Drag the head in the scene.")

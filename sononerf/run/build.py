@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import trimesh
@@ -27,23 +27,15 @@ from sononerf.settings.loading import faults_of, validate_settings
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
 from sononerf.simulation.simulator import Simulator
 
+if TYPE_CHECKING:
+    from sononerf.run.run import Run
+
 OWN_KEYS = ("spectrogram.dynamic_range_db",)
 """Keys of these sections that an experiment may choose: they do not describe the echoes."""
 
 
 def with_store(settings: Settings) -> Settings:
-    """Complete the settings from the store, if the echoes come from one.
-
-    Args:
-        settings: The user's settings. A missing key takes the store's value.
-
-    Returns:
-        settings: With air, ears, call and analysis of the store.
-
-    Raises:
-        IncompatibleError: If the settings contradict the store.
-        InputError: If there is no such store, or it does not say how it was recorded.
-    """
+    """Complete the settings from the store, if the echoes come from one."""
     if settings.scene is not None or settings.data.store is None:
         return settings
     path = settings.data.store
@@ -77,11 +69,7 @@ def with_attached(settings: Settings, folder: Path) -> Settings:
 
 
 def head_of(settings: Settings) -> Head:
-    """Return the head that settings describe.
-
-    Raises:
-        InputError, SettingsError: As :class:`sononerf.head.head.Head`.
-    """
+    """Return the head that settings describe."""
     return Head(
         ears=settings.ears,
         call=settings.call,
@@ -98,13 +86,7 @@ def module_for(
     """Return an unfitted module that settings describe.
 
     Args:
-        settings: Field, renderer and fit.
-        head: The head that heard the echoes.
         region ((2, 3), m): Lower and upper corner; of a small box where None.
-        reference: Magnitude m0 of the reported decibels.
-
-    Raises:
-        SettingsError, InputError: As :class:`sononerf.field.module.EchoModule`.
     """
     with faults_of(settings.source):
         return EchoModule(
@@ -126,12 +108,7 @@ def simulator_of(scene: Scene, settings: Settings) -> Simulator:
 
 @contextmanager
 def results_folder(folder: Path) -> Iterator[None]:
-    """Make a folder for results; remove it afterwards if it is empty.
-
-    Raises:
-        InputError: If it is a run's own, in which results would lie among its files.
-        StorageError: If it cannot be created or written.
-    """
+    """Make a folder for results; remove it afterwards if it is empty."""
     if any((folder / name).exists() for name in ("config.yaml", "model.json")):
         raise InputError(f"{folder}: is the folder of a run; give --output a folder of its own")
     created = storage.probe_writable(folder)
@@ -139,6 +116,15 @@ def results_folder(folder: Path) -> Iterator[None]:
         yield
     finally:
         storage.remove_if_empty(created)
+
+
+@contextmanager
+def locked(runs: Iterable[Run], output: Path) -> Iterator[None]:
+    """Hold those runs whose folder a file goes into; see :meth:`Run.locked`."""
+    with ExitStack() as stack:
+        for run in runs:
+            stack.enter_context(run.locked(output))
+        yield
 
 
 logger = logging.getLogger("sononerf")
@@ -165,15 +151,7 @@ def true_scene(settings: Settings) -> Scene | None:
 def true_mesh(
     settings: Settings, stated: Mapping[str, Any] | None = None
 ) -> trimesh.Trimesh | None:
-    """Return ``evaluation.truth``, or else the scene's own surface; None where neither is known.
-
-    Args:
-        settings: Settings of the experiment.
-        stated: Attributes of the store, or provenance of the run, that state the frame of the file.
-
-    Raises:
-        InputError: If the file of ``evaluation.truth`` is no mesh.
-    """
+    """Return ``evaluation.truth``, or else the scene's own surface; None where neither is known."""
     if settings.evaluation.truth is not None:
         chosen = settings.evaluation
         frame = Frame.of(stated or {}, chosen.frame)
@@ -183,15 +161,7 @@ def true_mesh(
 
 
 def read_truth(path: Path, unit: Unit = "m") -> trimesh.Trimesh:
-    """Read a true surface from a file; return it in metres.
-
-    Args:
-        path: PLY, STL, OBJ, OFF or GLB.
-        unit: Unit of its numbers.
-
-    Raises:
-        InputError: If it is missing, of another kind, damaged, empty or not finite.
-    """
+    """Read a true surface from a file; return it in metres."""
     if path.suffix.lower() not in KINDS:
         raise InputError(f"{path}: evaluation.truth: expected one of {', '.join(KINDS)}")
     if not path.is_file():

@@ -25,7 +25,7 @@ from sononerf.progress import Progress
 from sononerf.recordings.lag import LAGS, find_lag, is_path, later
 from sononerf.recordings.pose_check import Consistency
 from sononerf.run.corrected_store import DECIBELS, write_corrected
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run
 from sononerf.run.trial_fits import fitted_error, least_error
 from sononerf.settings.schema import SpectrogramSettings
 from sononerf.surface.refine.optics import Optics
@@ -83,11 +83,7 @@ class Calibrated:
 
 
 def kinds_of(names: Sequence[str]) -> tuple[Kind, ...]:
-    """Return the kinds of errors by name.
-
-    Raises:
-        SettingsError: If a name is unknown, or there is none.
-    """
+    """Return the kinds of errors by name."""
     unknown = [name for name in names if name not in KINDS]
     if unknown or not names:
         found = f"unknown error {unknown[0]!r}" if unknown else "no error is given"
@@ -122,7 +118,7 @@ def calibrate(
         raise SettingsError(
             f"{source}: a store; {wanted[0]} is found by a surface: fit first, and name the run"
         )
-    opened = RunFolder.of(source)
+    opened = Run.of(source)
     echoes, mesh = opened.echoes, opened.mesh()
     if "radius" in wanted and not _is_turntable(echoes.positions):
         raise SettingsError(
@@ -158,7 +154,7 @@ def _without_lag(
     """Write a store whose poses are those of their pings; see :func:`calibrate`."""
     if set(kinds) != {LAG}:
         raise SettingsError(f"{LAG} is found before a surface is known: calibrate it alone")
-    echoes = Echoes.open(source) if _is_store(source) else RunFolder.of(source).echoes
+    echoes = Echoes.open(source) if _is_store(source) else Run.of(source).echoes
     store, head = echoes.store, echoes.head
     poses, onsets = Poses(store.positions, store.rotations), echoes.onsets
     if not is_path(poses):
@@ -193,9 +189,9 @@ def _is_turntable(positions: Floats) -> bool:
     return bool(np.ptp(distance) < ON_CYLINDER * distance.mean())
 
 
-def _by_trials(opened: RunFolder, kind: str, output: Path, progress: Progress) -> Calibrated:
+def _by_trials(opened: Run, kind: str, output: Path, progress: Progress) -> Calibrated:
     """Find the radius or the support's height by fits at several; see :func:`calibrate`."""
-    echoes, settings = opened.echoes, opened.fitted.settings
+    echoes, settings = opened.echoes, opened.settings
     folder, step = output.with_name(f"{output.name}-trials"), echoes.head.resolution
     nothing = Calibration.none(len(echoes.head.receivers), len(echoes.store))
 
@@ -276,13 +272,7 @@ def dependent_cells(analysis: SpectrogramSettings) -> float:
 def describe(
     head: Head, store: Ensemble, mesh: trimesh.Trimesh, estimate: Estimate, kinds: Sequence[str]
 ) -> tuple[list[str], list[str]]:
-    """Return results and undetermined errors, one line each.
-
-    Args:
-        head, store, mesh: Head, store and mesh of the run.
-        estimate: The estimated errors.
-        kinds: Kinds of errors that were sought.
-    """
+    """Return results and undetermined errors, one line each."""
     found, deviation, error = estimate.calibration, estimate.deviation, estimate.error_db
     away = store.positions[store.indices("train")] - mesh.centroid
     distance = np.linalg.norm(away, axis=1)

@@ -6,25 +6,29 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 import trimesh
 
 from sononerf import storage
 from sononerf.array_types import Floats
+from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.splits import TRAIN
-from sononerf.errors import IncompatibleError, SettingsError
+from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.evaluation.baseline import backprojection
 from sononerf.evaluation.difference import Comparison, added_part
 from sononerf.evaluation.difference import compare as compare_volumes
+from sononerf.evaluation.numbers import Evaluation, compare_prediction
+from sononerf.evaluation.prediction import Prediction
 from sononerf.field.fitting import render_poses
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.report.pictures.mip_picture import difference_pngs, overlay_png
 from sononerf.run.build import results_folder, true_mesh
-from sononerf.run.fitted import Fitted, all_poses
-from sononerf.run.run_folder import RunFolder, differing_keys
+from sononerf.run.provenance import differing_keys
+from sononerf.run.run import Run
 from sononerf.surface.start.volume import Volume, vti_bytes
 
 logger = logging.getLogger("sononerf")
@@ -56,7 +60,7 @@ def compare_runs(
     millimetres apart.
 
     Args:
-        first, second: Fitted runs; the difference is the first without the second.
+        first, second: Run runs; the difference is the first without the second.
         output: Folder of the results; ``FIRST/compare-<name of SECOND>`` where None.
         accelerator: Device to render on.
         progress: Display of progress.
@@ -73,19 +77,19 @@ def compare_runs(
         NumericalError: If both are silent.
     """
     progress = progress or Progress(quiet=True)
-    run = RunFolder(first)
-    other = RunFolder(second)
-    runs = [run.fitted, other.fitted]
+    run = Run(first)
+    other = Run(second)
+    _ = run.model, other.model  # a folder that is no run is refused at once
     if first.resolve() == second.resolve():
         raise SettingsError(
             f"{first} and {second} are the same run; give as the second a run without what is "
             "looked for"
         )
-    _check_alike(*runs)
+    _check_alike(run, other)
     folder = output or first / f"compare-{second.resolve().name}"
     with run.locked(folder), results_folder(folder):
-        found = compare_runs_of(*runs, accelerator=accelerator, progress=progress)
-        surfaces = [true_mesh(each.fitted.settings, each.provenance) for each in (run, other)]
+        found = compare_runs_of(run, other, accelerator=accelerator, progress=progress)
+        surfaces = [true_mesh(each.settings, each.provenance) for each in (run, other)]
         truth = _added(*surfaces)
         names = first.resolve().name, second.resolve().name
         for name in ("first", "second", "difference"):
@@ -114,21 +118,15 @@ def compare_runs(
 
 
 def compare_runs_of(
-    first: Fitted, second: Fitted, *, accelerator: str = "auto", progress: Progress | None = None
+    first: Run, second: Run, *, accelerator: str = "auto", progress: Progress | None = None
 ) -> Comparison:
-    """Compare the echoes of two fitted fields; see :func:`compare_runs`, whose errors it raises.
-
-    Args:
-        first, second: The difference is the first without the second.
-        accelerator: Device to render on.
-        progress: Display of progress; on stderr where None.
-    """
+    """Compare the echoes of two fitted fields; see :func:`compare_runs`, whose errors it raises."""
     progress = progress or Progress()
     runs = [first, second]
     _check_alike(first, second)
-    corners = np.array([one.module.field.region.cpu().double().numpy() for one in runs])
+    corners = np.array([one.model.field.region.cpu().double().numpy() for one in runs])
     box = corners[:, 0].min(axis=0), corners[:, 1].max(axis=0)
-    reference = max(one.module.reference for one in runs)
+    reference = max(one.model.reference for one in runs)
     poses = _common_poses(runs)
     one, other = (_heard(each, poses, reference, *box, accelerator, progress) for each in runs)
     found = compare_volumes(one, other)
@@ -142,7 +140,7 @@ def compare_runs_of(
     return replace(found, poses=len(poses))
 
 
-def _check_alike(first: Fitted, second: Fitted) -> None:
+def _check_alike(first: Run, second: Run) -> None:
     differing = [
         key
         for key in differing_keys(first.settings, second.settings)
@@ -153,11 +151,11 @@ def _check_alike(first: Fitted, second: Fitted) -> None:
         raise IncompatibleError(f"the two runs hear differently ({keys}); fit both alike")
 
 
-def _common_poses(runs: list[Fitted]) -> Poses:
+def _common_poses(runs: list[Run]) -> Poses:
     """Return the poses that either run was trained on, each once, evenly thinned out."""
     table = []
     for run in runs:
-        poses, split = all_poses(run)
+        poses, split = run.all_poses()
         rows = np.concatenate([poses.positions, poses.rotations.reshape(-1, 9)], axis=1)
         table.append(rows[split == TRAIN])
     _, index = np.unique(np.concatenate(table).round(9), axis=0, return_index=True)
@@ -167,7 +165,7 @@ def _common_poses(runs: list[Fitted]) -> Poses:
 
 
 def _heard(
-    run: Fitted,
+    run: Run,
     poses: Poses,
     reference: float,
     lower: Floats,
@@ -176,7 +174,7 @@ def _heard(
     progress: Progress,
 ) -> Volume:
     """Return the mean level that is heard from each place's range."""
-    rendered = render_poses(run.module, poses, accelerator=accelerator, progress=progress)
+    rendered = render_poses(run.model, poses, accelerator=accelerator, progress=progress)
     # Delay-and-sum adds squares; the square of this is the level.
     roots = (np.sqrt(compress(spectrogram, reference)) for spectrogram in rendered)
     return backprojection(
@@ -193,3 +191,36 @@ def _added(first: trimesh.Trimesh | None, second: trimesh.Trimesh | None) -> Flo
         return None
     weights = added.area_faces
     return np.asarray(weights @ added.triangles_center / weights.sum(), dtype=np.float64)
+
+
+@overload
+def compare(first: Prediction, second: Echoes) -> Evaluation: ...
+
+
+@overload
+def compare(first: Run, second: Run) -> Comparison: ...
+
+
+def compare(first: Prediction | Run, second: Echoes | Run) -> Evaluation | Comparison:
+    """Compare a prediction with echoes, or two runs with each other.
+
+    Args:
+        first: A prediction of poses of the echoes; or a run with the target.
+        second: The measured echoes; or a run without the target.
+
+    Returns:
+        found: For a prediction its errors, ``mae_db`` and others; of runs what the first sends back
+            and the second does not.
+
+    Raises:
+        InputError: If a pose is not among those of the echoes, or the two do not go together.
+        IncompatibleError: If two runs hear differently.
+    """
+    if isinstance(first, Prediction) and isinstance(second, Echoes):
+        return compare_prediction(first, second)
+    if isinstance(first, Run) and isinstance(second, Run):
+        return compare_runs_of(first, second)
+    raise InputError(
+        f"found {type(first).__name__} and {type(second).__name__}, expected a Prediction and "
+        "Echoes, or two runs"
+    )

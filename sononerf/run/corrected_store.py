@@ -31,14 +31,7 @@ DECIBELS = 20.0 / math.log(10.0)
 def write_corrected(
     echoes: Echoes, output: Path, found: Calibration, progress: Progress
 ) -> EnsembleStore:
-    """Write echoes without the errors of their recording; an interrupted call resumes.
-
-    Args:
-        echoes: With the errors. The support of their head is the right one already.
-        output: The corrected store.
-        found: The errors.
-        progress: Display of progress.
-    """
+    """Write echoes without the errors of their recording; an interrupted call resumes."""
     store, head = echoes.store, changed_head(echoes.head, beam_radius=found.beam_radius)
     sections = head.plain()
     speed = head.speed_of_sound * math.exp(found.speed_of_sound)

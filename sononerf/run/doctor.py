@@ -68,11 +68,7 @@ class Finding:
 
 
 def examine(folder: Path | None = None) -> list[Finding]:
-    """Run all checks.
-
-    Args:
-        folder: Folder of future runs; the working directory where None.
-    """
+    """Run all checks."""
     looks: tuple[Callable[[], Finding], ...] = (
         _python,
         _cpu,

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
@@ -18,7 +17,7 @@ from sononerf.geometry.frame import FrameName
 from sononerf.progress import Progress
 from sononerf.run.build import Unit, read_truth, true_scene
 from sononerf.run.reconstruct import reconstruct
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run
 from sononerf.scene.scene import Scene
 from sononerf.surface.start.volume import Volume
 
@@ -29,30 +28,26 @@ class EvaluationWork:
     The baselines need no surface: they begin at once.
 
     Args:
-        run: A fitted run.
         truth: File of the true surface; ``evaluation.truth`` of the run's settings where None, or
             else the surface of its scene.
         registration: Motion that lays the reconstruction over the truth;
             ``evaluation.registration`` where None.
-        unit: Unit of the numbers in the file; ``evaluation.unit`` where None.
-        frame: Frame of the file; ``evaluation.frame`` where None.
     """
 
     def __init__(
         self,
-        run: RunFolder,
+        run: Run,
         truth: Path | None = None,
         registration: Kind | None = None,
         unit: Unit | None = None,
         frame: FrameName | None = None,
     ) -> None:
-        settings = run.fitted.settings
+        settings = run.settings
         self._run = run
         self._file = truth or settings.evaluation.truth
         self._kind: Kind = registration or settings.evaluation.registration
         self._unit: Unit = unit or settings.evaluation.unit
         self._frame = run.frame(frame or settings.evaluation.frame)
-        self._stop = threading.Event()
         with suppress(InputError):  # raised again by the part that needs the echoes
             _ = run.echoes  # loaded once, before other threads ask for them
         self._pool = ThreadPoolExecutor(len(BASELINES))
@@ -64,7 +59,6 @@ class EvaluationWork:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._stop.set()
         self._pool.shutdown(cancel_futures=True)
 
     def begin(self) -> None:
@@ -88,14 +82,14 @@ class EvaluationWork:
         """Return the scene, where that gives the true surface, and the surface."""
         if self._file:
             return None, self._frame.to_world(read_truth(self._file, self._unit))
-        scene = true_scene(self._run.fitted.settings)
+        scene = true_scene(self._run.settings)
         return scene, None if scene is None else scene.mesh
 
     def _volume(self, name: str) -> Volume | None:
         if self._true.result()[1] is None:
             return None
-        lower, upper = (c.double().numpy() for c in self._run.fitted.module.field.region)
-        return baseline_volume(name, self._run.echoes, lower, upper, self._stop)
+        lower, upper = (c.double().numpy() for c in self._run.model.field.region)
+        return baseline_volume(name, self._run.echoes, lower, upper)
 
     def _laid(self) -> Truth | None:
         true = self._true.result()[1]
@@ -119,7 +113,7 @@ class EvaluationWork:
 
 
 def evaluate(
-    run: Path | RunFolder,
+    run: Path | Run,
     *,
     truth: Path | None = None,
     registration: Kind | None = None,
@@ -145,8 +139,8 @@ def evaluate(
         InputError: If the run is none, or the true surface cannot be read.
     """
     progress = progress or Progress(quiet=True)
-    run = RunFolder.of(run)
-    _ = run.fitted  # a folder that is no run is refused before it is locked
+    run = Run.of(run)
+    _ = run.model  # a folder that is no run is refused before it is locked
     with run.locked():
         if begun is None:
             with EvaluationWork(run, truth, registration, unit, frame) as work:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Echoes, predictions, volumes and surface points as files of MATLAB, HDF5, NetCDF and others."""
+"""Echoes, predictions, volumes and surface points as files of MATLAB and HDF5, and meshes."""
 
 from __future__ import annotations
 
@@ -17,20 +17,19 @@ import scipy.io
 from numpy.typing import NDArray
 
 from sononerf import __version__, storage
-from sononerf.checksums import require_recorded
 from sononerf.echoes.echoes import complete_store
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
 from sononerf.geometry.frame import Frame, FrameName
-from sononerf.geometry.poses import Poses
-from sononerf.run.run_folder import RunFolder, locked
+from sononerf.run.build import locked
+from sononerf.run.run import Run
 from sononerf.surface.mesh_files import MeshFormat, confidence_of, error_of, mesh_bytes
 from sononerf.surface.start.volume import Volume
 
-FileType = Literal["mat", "h5", "nc"]
+FileType = Literal["mat", "h5"]
 
-LARGEST = {"mat": 2**31 - 1, "nc": 2**31 - 4}
-"""Largest array, bytes, in MATLAB's format of version 5 and in NetCDF's of version 3."""
+LARGEST = 2**31 - 1
+"""Largest array in MATLAB's format of version 5, bytes."""
 HEAD = "MATLAB 5.0 MAT-file, written by sononerf"
 """Header without the usual date: the same arrays give the same bytes."""
 
@@ -59,26 +58,17 @@ def file_bytes(
     """Return arrays as the bytes of a file; the same arrays give the same bytes.
 
     MATLAB's file (version 5) has one variable per array and the structs ``units``, ``axes`` and
-    ``attributes``. HDF5 has one dataset per array, with dimension scales. NetCDF (version 3, 64-bit
-    offsets) has one variable per array.
-
-    Args:
-        file_type: Kind of file.
-        arrays: By their names in the file.
-        attributes: Attributes of the whole file.
-
-    Raises:
-        ResourceError: If an array is too large for the kind of file.
+    ``attributes``. HDF5 has one dataset per array, with dimension scales.
     """
-    most = LARGEST.get(file_type)
+    if file_type == "h5":
+        return _hdf5(arrays, attributes)
     for name, array in arrays.items():
-        if most is not None and array.values.nbytes > most:
+        if array.values.nbytes > LARGEST:
             raise ResourceError(
-                f"{name}: {array.values.nbytes / 1e9:.1f} GB, and a .{file_type} file holds "
-                f"at most {most / 1e9:.1f} GB in one array; choose a .h5 file"
+                f"{name}: {array.values.nbytes / 1e9:.1f} GB, and a .mat file holds at most "
+                f"{LARGEST / 1e9:.1f} GB in one array; choose a .h5 file"
             )
-    writers = {"mat": _matlab, "h5": _hdf5, "nc": _netcdf}
-    return writers[file_type](arrays, attributes)
+    return _matlab(arrays, attributes)
 
 
 def _matlab(arrays: Mapping[str, Named], attributes: Mapping[str, str]) -> bytes:
@@ -109,52 +99,30 @@ def _hdf5(arrays: Mapping[str, Named], attributes: Mapping[str, str]) -> bytes:
     return buffer.getvalue()
 
 
-def _netcdf(arrays: Mapping[str, Named], attributes: Mapping[str, str]) -> bytes:
-    buffer = io.BytesIO()
-    with scipy.io.netcdf_file(buffer, "w", version=2) as file:
-        for key, text in attributes.items():
-            setattr(file, key, text)
-        for array in arrays.values():
-            for axis, size in zip(array.axes, array.values.shape, strict=True):
-                if axis not in file.dimensions:
-                    file.createDimension(axis, size)
-        for name, array in arrays.items():
-            values = array.values
-            if values.dtype.kind in "iub" and values.dtype.itemsize > 1:
-                values = values.astype(np.int32)  # the format has no longer integers
-            made = file.createVariable(name, values.dtype, array.axes)
-            made[...] = values
-            if array.units:
-                made.units = array.units
-            made.long_name = array.meaning
-        file.flush()
-        return buffer.getvalue()
-
-
 What = Literal["auto", "echoes", "prediction", "volume", "points", "mesh"]
 
-ARRAYS: dict[str, FileType] = {".mat": "mat", ".h5": "h5", ".hdf5": "h5", ".nc": "nc"}
+ARRAYS: dict[str, FileType] = {".mat": "mat", ".h5": "h5", ".hdf5": "h5"}
 MESHES: dict[str, MeshFormat] = {".ply": "ply", ".stl": "stl", ".glb": "glb"}
 
 
 def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName = "auto") -> Path:
     """Write a part of a store or a run as a file of another format, which its suffix names.
 
-    =========== =================================== ==========================================
-    what        formats                             content
-    =========== =================================== ==========================================
-    echoes      ``.mat .h5 .nc``, ``.csv``          spectrograms, poses, axes; poses alone
-    prediction  ``.mat .h5 .nc``                    predicted and measured spectrograms
-    volume      ``.mat .h5 .nc``                    summed reflectivity on a grid
-    points      ``.csv``, ``.mat .h5 .nc``          vertices, normals, poses that heard them
-    mesh        ``.ply .stl .glb``                  the surface
-    =========== =================================== ==========================================
+    =========== =================== ==========================================
+    what        formats             content
+    =========== =================== ==========================================
+    echoes      ``.mat .h5``        spectrograms, poses, axes
+    prediction  ``.mat .h5``        predicted and measured spectrograms
+    volume      ``.mat .h5``        summed reflectivity on a grid
+    points      ``.mat .h5``        vertices, normals, poses that heard them
+    mesh        ``.ply .stl .glb``  the surface
+    =========== =================== ==========================================
 
     Args:
         source: A store, or the folder of a run.
         output: The file.
-        what: Part to export. ``auto``: echoes of a store; of a run the mesh or the points, as the
-            suffix says, else the prediction.
+        what: Part to export. ``auto``: echoes of a store; of a run the mesh, where the suffix says
+            so, else the prediction.
         frame: Frame of places and directions; the original one of recordings for ``auto``.
 
     Returns:
@@ -167,12 +135,12 @@ def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName 
         StorageError: If the file cannot be written.
     """
     suffix = output.suffix.lower()
-    if suffix not in (*ARRAYS, *MESHES, ".csv"):
-        listed = ", ".join([*ARRAYS, *MESHES, ".csv"])
+    if suffix not in (*ARRAYS, *MESHES):
+        listed = ", ".join([*ARRAYS, *MESHES])
         raise SettingsError(f"{output}: expected a suffix of {listed}")
     is_store = (source / "zarr.json").is_file()
     if what == "auto" and not is_store:
-        what = "mesh" if suffix in MESHES else "points" if suffix == ".csv" else "prediction"
+        what = "mesh" if suffix in MESHES else "prediction"
     elif what == "auto":
         what = "echoes"
     if is_store != (what == "echoes"):
@@ -186,7 +154,7 @@ def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName 
             f"{output}: a mesh is written as {', '.join(MESHES)}, and nothing else is; choose "
             "another suffix, or another --what"
         )
-    run = RunFolder(source)
+    run = Run(source)
     stated = EnsembleStore.open(source).attributes if is_store else run.provenance
     with locked([] if is_store else [run], output):
         storage.commit_bytes(output, _content(source, suffix, what, Frame.of(stated, frame)))
@@ -196,11 +164,9 @@ def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName 
 def _content(source: Path, suffix: str, what: What, frame: Frame) -> bytes:
     """Return the bytes of the file that :func:`export` writes."""
     if suffix in MESHES:
-        mesh = RunFolder(source).mesh()
+        mesh = Run(source).mesh()
         known = {"confidence": confidence_of(mesh), "error": error_of(mesh)}
         return mesh_bytes(frame.mesh(mesh), MESHES[suffix], **known)
-    if suffix == ".csv":
-        return _csv(source, what, frame).encode()
     parts = {"echoes": _echoes, "prediction": _prediction, "volume": _volume, "points": _points}
     arrays, attributes = parts[what](source, frame)
     plain = {"software": f"sononerf {__version__}", "frame": frame.name, **attributes}
@@ -208,18 +174,6 @@ def _content(source: Path, suffix: str, what: What, frame: Frame) -> bytes:
 
 
 Part = tuple[dict[str, Named], dict[str, str]]
-
-
-def _csv(source: Path, what: What, frame: Frame) -> str:
-    if what == "echoes":
-        store = EnsembleStore.open(source)
-        return frame.table(Poses(store.positions, store.rotations))
-    if what != "points":
-        raise SettingsError(f"{what}: a .csv file holds poses or points; choose .mat, .h5 or .nc")
-    arrays, _ = _points(source, frame)
-    columns = [arrays["position"].values, arrays["normal"].values, arrays["poses"].values[:, None]]
-    rows = (",".join(f"{value:.9g}" for value in row) for row in np.hstack(columns))
-    return "\n".join(["x,y,z,nx,ny,nz,poses", *rows]) + "\n"
 
 
 def _axes(range_m: NDArray[Any], frequency: NDArray[Any]) -> dict[str, Named]:
@@ -279,11 +233,7 @@ def _prediction(source: Path, frame: Frame) -> Part:
 
 
 def read_volume(source: Path) -> Volume:
-    """Return the volume of a run's reconstruction.
-
-    Raises:
-        InputError: If there is none, or it is damaged.
-    """
+    """Return the volume of a run's reconstruction."""
     file = _reconstructed(source, "volume.vti")
     try:
         with warnings.catch_warnings(action="ignore"):  # VTK's own words on a damaged file
@@ -325,7 +275,7 @@ def _volume(source: Path, frame: Frame) -> Part:
 
 
 def _points(source: Path, frame: Frame) -> Part:
-    mesh = RunFolder(source).mesh()
+    mesh = Run(source).mesh()
     heard = confidence_of(mesh)
     if heard is None:
         heard = np.zeros(len(mesh.vertices), np.int32)
@@ -346,5 +296,4 @@ def _reconstructed(source: Path, name: str) -> Path:
     file = source / "reconstruction" / name
     if not file.is_file():
         raise InputError(f"{file}: missing; make it with `sononerf reconstruct {source}`")
-    require_recorded(source, file, "reconstruct again")
     return file

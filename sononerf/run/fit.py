@@ -7,7 +7,6 @@ import logging
 import resource
 import sys
 import time
-from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,18 +14,17 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 
 from sononerf import locks, storage
 from sononerf.callbacks.epoch import CheckpointCallback, ProgressCallback
-from sononerf.callbacks.preview import PreviewCallback, SpectrogramImages, SurfaceImages
-from sononerf.callbacks.tensorboard import FLOORS, Pace, RunLogger, log_results
+from sononerf.callbacks.preview import PreviewCallback, SpectrogramImages
+from sononerf.callbacks.tensorboard import RunLogger, log_results
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import InputError, NumericalError, ResourceError, StoppedError
+from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.evaluation.traced import Traced, learn_traced
-from sononerf.field.checkpoint_io import previous_of, save_weights
+from sononerf.field.checkpoint_io import save_weights
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import fit as fit_field
 from sononerf.field.fitting import has_accelerator, require_accelerator
@@ -34,12 +32,13 @@ from sononerf.field.module import EchoModule
 from sononerf.field.step_cost import StepCost, step_cost
 from sononerf.memory import gigabytes, require_memory
 from sononerf.progress import Progress, duration
-from sononerf.run.build import head_of, module_for, true_mesh, with_store
+from sononerf.run.build import head_of, module_for, with_store
 from sononerf.run.evaluate import EvaluationWork, evaluate
 from sononerf.run.fit_warnings import fit_warnings
 from sononerf.run.predict import predict
+from sononerf.run.provenance import flat, stated_frame
 from sononerf.run.reconstruct import reconstruct
-from sononerf.run.run_folder import RunFolder, flat, stated_frame
+from sononerf.run.run import Run
 from sononerf.run.simulate import (
     background_path,
     open_ensemble,
@@ -53,7 +52,7 @@ logger = logging.getLogger("sononerf")
 
 
 def finish(
-    run: Path | RunFolder, *, accelerator: str = "auto", progress: Progress | None = None
+    run: Path | Run, *, accelerator: str = "auto", progress: Progress | None = None
 ) -> dict[str, Any]:
     """Reconstruct, find the weight of the surface's echoes, predict held-out poses, evaluate.
 
@@ -69,7 +68,7 @@ def finish(
         NumericalError: If the field has no surface; its predictions are written all the same.
     """
     progress = progress or Progress(quiet=True)
-    run = RunFolder.of(run)
+    run = Run.of(run)
     shown: dict[str, Any] = {"accelerator": accelerator, "progress": progress}
     no_surface: NumericalError | None = None
     with run.locked(), ExitStack() as stack:
@@ -91,19 +90,19 @@ def finish(
             raise no_surface
         if not run.is_done("evaluation"):
             evaluate(run, begun=evaluation, progress=progress)
-            log_results(run.path, flat(run.fitted.settings.plain()), run.read_metrics())
+            log_results(run.path, flat(run.settings.plain()), run.read_metrics())
     return run.read_metrics()
 
 
-def _learn_traced(run: RunFolder, accelerator: str, progress: Progress) -> None:
-    settings, mesh = run.fitted.settings, run.mesh()
+def _learn_traced(run: Run, accelerator: str, progress: Progress) -> None:
+    settings, mesh = run.settings, run.mesh()
     run.begin("traced")
     if settings.prediction.traced == "off":
-        traced = Traced.none(mesh, run.fitted.head)
+        traced = Traced.none(mesh, run.head)
     else:
         try:
             traced = learn_traced(
-                run.fitted.module,
+                run.model,
                 run.echoes,
                 mesh,
                 settings.simulation,
@@ -131,11 +130,7 @@ def follows() -> bool:
 
 
 def _wait_for_store(settings: Settings, folder: Path) -> EnsembleStore:
-    """Open the ensemble once the first process has sealed it.
-
-    Raises:
-        ResourceError: If no process has held the run's folder for ``PATIENCE_SECONDS``.
-    """
+    """Open the ensemble once the first process has sealed it."""
     path = store_path(settings, None, None)
     background = background_path(settings)
     last_held = time.monotonic()
@@ -167,7 +162,7 @@ def fit(
     workers: int | None = None,
     finishes: bool = False,
     progress: Progress | None = None,
-) -> RunFolder:
+) -> Run:
     """Simulate where needed, or open the store of ``data.store``; fit, and keep the fitted field.
 
     The same call resumes an interrupted one; a finished run is left as it is. If ``fit.epochs`` is
@@ -192,7 +187,7 @@ def fit(
             saved.
     """
     progress = progress or Progress(quiet=True)
-    run = RunFolder(path)
+    run = Run(path)
     require_accelerator(accelerator)
     settings = with_store(settings)
     head = head_of(settings)
@@ -210,6 +205,8 @@ def fit(
         aside = run.move_aside()
         if aside:
             progress.say(f"moved the old run to {aside}")
+    if path.is_dir() and not run.config.is_file():
+        run.refuse_foreign()  # before a lock is left there
     created = storage.probe_writable(path)
     try:
         with run.locked():
@@ -286,7 +283,7 @@ def _prepared(
 
 def _fit(
     settings: Settings,
-    run: RunFolder,
+    run: Run,
     work: _Work,
     hardware: dict[str, Any],
     progress: Progress,
@@ -294,7 +291,7 @@ def _fit(
     echoes, module, data = work.echoes, work.module, work.data
     renderer = module.renderer
     keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
-    resumed = _can_resume(run)
+    resumed = run.checkpoint.is_file()
     if not resumed and not follows():
         run.clear_previews()
     preview = PreviewCallback(
@@ -303,7 +300,6 @@ def _fit(
         voxels=settings.preview.voxels,
         directions=settings.reconstruction.directions,
     )
-    attributes = echoes.store.attributes
     with progress.task("fitting", work.steps) as task, keeper.watching():
         fit_field(
             echoes,
@@ -311,13 +307,11 @@ def _fit(
             data,
             callbacks=[
                 ProgressCallback(task),
-                Pace(),
                 preview,
-                SurfaceImages(preview, _truth(settings, attributes)),
                 SpectrogramImages(data.whole("val"), renderer.range, renderer.frequency),
                 keeper,
             ],
-            logger=RunLogger(run.path, {key: attributes.get(key) for key in FLOORS}),
+            logger=RunLogger(run.path),
             folder=run.path,
             checkpoint=run.checkpoint if resumed else None,
             **hardware,
@@ -336,11 +330,7 @@ def _fit(
 def _announce(
     cost: StepCost, echoes: Echoes, settings: Settings, steps: int, progress: Progress
 ) -> None:
-    """Show the cost of the fit, and refuse it if it needs more memory than there is.
-
-    Raises:
-        ResourceError: With the memory needed and the memory free.
-    """
+    """Show the cost of the fit, and refuse it if it needs more memory than there is."""
     store = echoes.store
     each = 4 * store.receivers * len(store.range) * len(store.frequency)
     kept = min(len(store) * each, settings.data.memory_bytes)
@@ -356,24 +346,7 @@ def _announce(
     )
 
 
-def _truth(settings: Settings, attributes: Mapping[str, Any]) -> trimesh.Trimesh | None:
-    """Return the true surface for previews; None where it is unknown or has to be registered."""
-    if settings.evaluation.registration != "none":
-        return None
-    try:
-        return true_mesh(settings, attributes)
-    except InputError as error:
-        logger.warning("%s", error)
-        return None
-
-
-def _can_resume(run: RunFolder) -> bool:
-    return run.checkpoint.is_file() or previous_of(run.checkpoint).is_file()
-
-
-def _keep(
-    settings: Settings, run: RunFolder, echoes: Echoes, module: EchoModule, seconds: float
-) -> None:
+def _keep(settings: Settings, run: Run, echoes: Echoes, module: EchoModule, seconds: float) -> None:
     """Write the fitted field and its cost."""
     hull = echoes.hull
     state = {f"field.{k}": v for k, v in module.field.state_dict().items()}

@@ -32,9 +32,7 @@ def fit_warnings(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:
     """Return warnings about a fit, one line each.
 
     Args:
-        echoes: Echoes of the fit.
         region ((2, 3), m): Lower and upper corner.
-        is_set: True if the region was set, not found from the echoes.
     """
     training = echoes.poses("train")
     found = [_repeated(training)]

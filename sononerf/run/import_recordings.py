@@ -124,16 +124,7 @@ def read_recordings(
 def import_understood(
     known: Understood, output: Path, *, progress: Progress | None = None
 ) -> tuple[EnsembleStore, Verdict]:
-    """Write the store, and report the check of the poses by first echoes.
-
-    Args:
-        known: The interpretation of recordings and settings.
-        output: The store.
-        progress: Display of progress.
-
-    Raises:
-        NumericalError, StorageError, IncompatibleError: As :func:`read_recordings`.
-    """
+    """Write the store, and report the check of the poses by first echoes."""
     progress = progress or Progress(quiet=True)
     wanted = echo_hash(known)
     if (output / "zarr.json").is_file():
@@ -141,7 +132,6 @@ def import_understood(
         if store.attributes.get("echo_hash") != wanted:
             raise IncompatibleError(f"{output}: holds other echoes; choose another --output")
         if store.is_sealed and not store.damaged():
-            locks.remove_dead(output)
             return store, verdict(known, store)
     warn_of_call(known.settings.call, known.settings.spectrogram)
     poses = known.poses[known.pings]
@@ -212,12 +202,7 @@ def verdict(known: Understood, store: EnsembleStore) -> Verdict:
 
 
 def check_before(known: Understood, *, progress: Progress | None = None) -> Verdict:
-    """Return the verdict on the poses without making a store.
-
-    Raises:
-        NumericalError: If no pose hears anything.
-        StorageError: If the folder of temporary files cannot be written.
-    """
+    """Return the verdict on the poses without making a store."""
     train = np.flatnonzero(known.split == 0)
     chosen = train[np.linspace(0, len(train) - 1, min(MOST, len(train))).round().astype(int)]
     part = replace(known, pings=known.pings[chosen], split=known.split[chosen])
@@ -298,11 +283,7 @@ def _kinds(units: dict[str, str]) -> dict[str, str]:
 
 
 def draw(known: Understood, folder: Path) -> Path:
-    """Draw poses, and waveforms and spectrograms of the first pings, into a folder.
-
-    Raises:
-        StorageError: If it cannot be written.
-    """
+    """Draw poses, and waveforms and spectrograms of the first pings, into a folder."""
     head = known.head
     pings = [int(ping) for ping in known.pings[:SHOWN]]
     picture = pings_png(

@@ -8,8 +8,7 @@ from pathlib import Path
 from sononerf import storage
 from sononerf.errors import InputError
 from sononerf.run.predict import read_poses
-from sononerf.run.run import open_run
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run, open_run
 from sononerf.surface.next_poses import Within, next_poses
 
 
@@ -18,22 +17,11 @@ def propose(
 ) -> Path:
     """Write the poses that would reduce the error of a run's surface most, the best first.
 
-    Args:
-        run: A fitted run whose surface was refined.
-        count: Number of poses.
-        candidates: Poses to choose among; see :func:`~sononerf.run.predict.read_poses`.
-        within: Places to choose among without candidates.
-        output: Table of poses; ``RUN/next.csv`` where None.
-
     Returns:
         file: The table in the frame of the world; ``predict --frame world`` reads it for
             recordings too.
-
-    Raises:
-        InputError: If the run has no errors, the candidates cannot be read or hear nothing, or the
-            output is a folder.
     """
-    opened, folder = open_run(run), RunFolder(run)
+    opened, folder = open_run(run), Run(run)
     file = output or folder.path / "next.csv"
     if file.is_dir():
         raise InputError(f"{file}: is a folder; give --output the name of a file")

@@ -35,24 +35,19 @@ from sononerf.recordings.columns import read_table
 from sononerf.recordings.conventions import to_poses
 from sononerf.report.pictures.spectrogram_picture import spectrogram_picture
 from sononerf.run.build import results_folder
-from sononerf.run.fitted import NAME as TRACED_NAME
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run
+from sononerf.run.traced_file import NAME as TRACED_NAME
 from sononerf.settings.import_schema import read_import_settings
 
 logger = logging.getLogger("sononerf")
 
 
-def read_poses(run: RunFolder, path: Path, frame: FrameName = "auto") -> Poses:
+def read_poses(run: Run, path: Path, frame: FrameName = "auto") -> Poses:
     """Read a table of poses.
 
     Args:
-        run: Run with the frame of the table.
         path: In the world's frame with the header ``x,y,z,yaw,pitch,roll`` (m, degrees); in the
             original one of recordings with the columns, units and conventions of their import.
-        frame: ``auto``: the original one of recordings that have one.
-
-    Raises:
-        InputError: If the table cannot be read or is invalid.
     """
     stated = run.provenance.get("poses_as")
     recorded = run.provenance.get("origin") == "recorded"
@@ -67,7 +62,7 @@ DRAWN = 3
 
 
 def predict(
-    run: Path | RunFolder,
+    run: Path | Run,
     *,
     split: Split = "test",
     poses_csv: Path | None = None,
@@ -98,17 +93,17 @@ def predict(
             the folder is a run's.
     """
     progress = progress or Progress(quiet=True)
-    run = RunFolder.of(run)
+    run = Run.of(run)
     own = read_poses(run, poses_csv, frame) if poses_csv else None
-    fitted = run.fitted
+    model, settings = run.model, run.settings
     kind = "" if own is None and split == "test" else f"-{'poses' if own is not None else split}"
     folder = output or run.path / f"prediction{kind}"
     if own is not None:
         poses, numbers = own, np.arange(len(own))
         with _named(poses_csv):
-            check_hearing(fitted.module, poses)
-        fault = aim_fault(poses, fitted.module.field.region.double().numpy().mean(axis=0))
-        if fault and fitted.settings.ears.is_directional:
+            check_hearing(model, poses)
+        fault = aim_fault(poses, model.field.region.double().numpy().mean(axis=0))
+        if fault and settings.ears.is_directional:
             logger.warning("%s: %s", poses_csv, fault)
     else:
         poses, numbers = run.echoes.poses(split), run.echoes.store.indices(split)
@@ -120,10 +115,10 @@ def predict(
         traced = _traced(run)
         with results_folder(folder):
             found = predict_poses(
-                fitted.module,
+                model,
                 traced,
                 poses,
-                options=fitted.settings.simulation,
+                options=settings.simulation,
                 accelerator=accelerator,
                 progress=progress,
             )
@@ -162,7 +157,7 @@ def _named(file: Path | None) -> Iterator[None]:
         raise InputError(f"{file}: {error}") from None
 
 
-def _traced(run: RunFolder) -> Traced | None:
+def _traced(run: Run) -> Traced | None:
     """Return the surface that echoes are traced off; warn where the run has lost its own."""
     traced = run.traced()
     known = (run.read_metrics().get("prediction") or {}).get("traced_weight", 0)

@@ -4,9 +4,11 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import logging
 import math
 import time
+from collections.abc import Iterator, MutableMapping
 from pathlib import Path
 from typing import Literal
 
@@ -16,21 +18,20 @@ import trimesh
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from sononerf import storage
+from sononerf import __version__, storage
 from sononerf.callbacks.tensorboard import add_mesh, writing
-from sononerf.errors import IncompatibleError, InputError, SettingsError
+from sononerf.errors import InputError, SettingsError
 from sononerf.field.checkpoint_io import model_checksum
 from sononerf.geometry.frame import Frame
 from sononerf.progress import Progress
 from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png, side_by_side_png
 from sononerf.report.pictures.mip_picture import mip_pictures
 from sononerf.run.build import results_folder, true_mesh
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run
 from sononerf.surface import reconstruction
 from sononerf.surface.mesh_files import mesh_bytes
 from sononerf.surface.reconstruction import refine, starts_of
-from sononerf.surface.refine import descent as stages
-from sononerf.surface.refine.refinement import STATE_VERSION, Refinement
+from sononerf.surface.refine import descent
 from sononerf.surface.refine.surface_error import error_from_twice
 from sononerf.surface.start.read_out import Method
 from sononerf.surface.start.volume import vti_bytes
@@ -38,47 +39,64 @@ from sononerf.surface.surface import FORMATS, Surface
 
 logger = logging.getLogger("sononerf")
 
-STATE = Path("checkpoints") / "surface.safetensors"
-"""Where the state of an interrupted refinement is kept, in the run's folder."""
+STAGES = Path("checkpoints") / "surface"
+"""Where the stages of an unfinished refinement are kept, in the run's folder."""
+
+
+class SavedStages(MutableMapping[str, dict[str, Tensor]]):
+    """Stages of a refinement, one file each."""
+
+    def __init__(self, folder: Path, belongs: str) -> None:
+        self.folder, self._belongs = folder, {"of": belongs}
+        for key in self:
+            if self._metadata(key) != self._belongs:
+                del self[key]
+
+    def _file(self, key: str) -> Path:
+        return self.folder / f"{key}.safetensors"
+
+    def _metadata(self, key: str) -> dict[str, str] | None:
+        try:
+            with safe_open(str(self._file(key)), "pt") as opened:
+                return dict(opened.metadata() or {})
+        except (SafetensorError, OSError):
+            return None
+
+    def __getitem__(self, key: str) -> dict[str, Tensor]:
+        if not self._file(key).is_file():
+            raise KeyError(key)
+        return safetensors.torch.load_file(self._file(key))
+
+    def __setitem__(self, key: str, stage: dict[str, Tensor]) -> None:
+        own = {name: part.cpu().clone().contiguous() for name, part in stage.items()}
+        data = safetensors.torch.save(own, metadata=self._belongs)
+        storage.commit_bytes(self._file(key), data)
+
+    def __delitem__(self, key: str) -> None:
+        storage.remove_file(self._file(key))
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(sorted(file.stem for file in self.folder.glob("*.safetensors")))
+
+    def __len__(self) -> int:
+        return len(list(iter(self)))
 
 
 def refine_surface(
-    run: RunFolder, surface: Surface, *, accelerator: str = "auto", progress: Progress
+    run: Run, surface: Surface, *, accelerator: str = "auto", progress: Progress
 ) -> Surface:
-    """Refine the surface of a run, or resume an interrupted refinement.
+    """Refine the surface of a run; stages that an interrupted refinement finished are kept."""
+    settings = run.settings
+    places = b"".join(mesh.vertices.tobytes() for mesh in starts_of(surface).values())
+    state = f"{model_checksum(run.path)} {__version__} {descent.STAGES}".encode()
+    saved = SavedStages(run.path / STAGES, hashlib.sha256(places + state).hexdigest())
+    numbers = itertools.count(1)
 
-    Args:
-        run: Keeps the state until the refinement is done.
-        surface: Read out of its field.
-        accelerator: Device to compute on.
-        progress: Display of progress.
-
-    Raises:
-        InputError, IncompatibleError: If the run's echoes are not there, or are others.
-        ResourceError: If ``gpu`` was asked for and there is none.
-    """
-    settings = run.fitted.settings
-    starts = starts_of(surface)
-    digest = hashlib.sha256(b"".join(mesh.vertices.tobytes() for mesh in starts.values()))
-    belongs = {**_version(), "of": f"{model_checksum(run.path)} {digest.hexdigest()}"}
-    file = run.path / STATE
-    saved = time.monotonic()
-    shown = 0
-
-    def after_step(work: Refinement, mismatch: float) -> None:
-        nonlocal saved, shown
-        del mismatch
-        if work.newest is not None and len(work.history) > shown:
-            shown = len(work.history)
-            with writing(run.path) as writer:
-                add_mesh(writer, "mesh/refinement_stages", work.newest, shown)
-                error = work.history[-1]["objective_db"]
-                writer.add_scalar("refinement/validation_error_dB", error, shown)
-        if time.monotonic() - saved > settings.fit.checkpoint_seconds and not work.done:
-            tensors = {name: p.cpu().clone().contiguous() for name, p in work.state().items()}
-            data = safetensors.torch.save(tensors, metadata=belongs)
-            storage.commit_bytes(file, data)
-            saved = time.monotonic()
+    def after_stage(mesh: trimesh.Trimesh, error_db: float) -> None:
+        number = next(numbers)
+        with writing(run.path) as writer:
+            add_mesh(writer, "mesh/refinement_stages", mesh, number)
+            writer.add_scalar("refinement/validation_error_dB", error_db, number)
 
     refined = refine(
         surface,
@@ -86,57 +104,16 @@ def refine_surface(
         options=settings.simulation,
         seed=settings.fit.seed,
         accelerator=accelerator,
-        state=_saved_state(run, file, belongs),
-        after_step=after_step,
+        saved=saved,
+        after_stage=after_stage,
         progress=progress,
     )
-    storage.remove_file(file)
+    saved.clear()
     return refined
 
 
-def check_state(run: RunFolder) -> None:
-    """Refuse the state of a refinement that went through other stages than those of this version.
-
-    Raises:
-        IncompatibleError: If such a state is in the run.
-    """
-    file = run.path / STATE
-    found = _metadata(file)
-    if found is not None and any(found.get(key) != value for key, value in _version().items()):
-        raise IncompatibleError(
-            f"{file}: the refinement was interrupted in another version of sononerf; finish it "
-            "with that version, or remove this file to refine from the beginning"
-        )
-
-
-def _version() -> dict[str, str]:
-    return {"version": str(STATE_VERSION), "stages": repr(stages.STAGES)}
-
-
-def _metadata(file: Path) -> dict[str, str] | None:
-    """Return the description of a saved state; None if it is missing or damaged."""
-    try:
-        with safe_open(str(file), "pt") as opened:
-            return opened.metadata() or {}
-    except (SafetensorError, OSError):
-        return None  # without a state the refinement starts from the beginning
-
-
-def _saved_state(run: RunFolder, file: Path, belongs: dict[str, str]) -> dict[str, Tensor] | None:
-    """Return the state of an interrupted refinement of the same starts, or None."""
-    if _metadata(file) != belongs:
-        return None
-    try:
-        run.require_recorded(file, "the refinement starts from the beginning")
-    except InputError as error:
-        logger.warning("%s", error)
-        return None
-    with safe_open(str(file), "pt") as opened:
-        return {name: opened.get_tensor(name) for name in opened.keys()}
-
-
 def reconstruct(
-    run: Path | RunFolder,
+    run: Path | Run,
     *,
     spacing: float | None = None,
     level: float | Literal["auto"] | None = None,
@@ -165,12 +142,11 @@ def reconstruct(
 
     Raises:
         NumericalError: If the field has no surface.
-        IncompatibleError: If another version interrupted a refinement of this run.
     """
     progress = progress or Progress(quiet=True)
-    run = RunFolder.of(run)
+    run = Run.of(run)
     started = time.monotonic()
-    options = run.fitted.settings.reconstruction
+    options = run.settings.reconstruction
     folder = output or run.reconstruction
     own = folder.resolve() == run.reconstruction.resolve()
     # Arguments of the caller replace both settings.
@@ -191,13 +167,9 @@ def reconstruct(
     )
     with run.locked(None if refines else folder), results_folder(folder):
         truth = _truth(run)
-        if refines:
-            check_state(run)
         # The start levels needs the echoes; all others do with the free space.
-        heard = run.echoes if refines or method == "levels" else run.fitted.hull
-        surface = reconstruction.reconstruct(
-            run.fitted.module, heard, options=chosen, progress=progress
-        )
+        heard = run.echoes if refines or method == "levels" else run.hull
+        surface = reconstruction.reconstruct(run.model, heard, options=chosen, progress=progress)
         if refines:
             surface = refine_surface(run, surface, accelerator=accelerator, progress=progress)
         if own:
@@ -210,7 +182,7 @@ def reconstruct(
     return folder
 
 
-def _has_echoes(run: RunFolder, progress: Progress) -> bool:
+def _has_echoes(run: Run, progress: Progress) -> bool:
     """Return whether the run's echoes are there to refine against; say so where they are not."""
     try:
         return run.echoes is not None
@@ -219,10 +191,10 @@ def _has_echoes(run: RunFolder, progress: Progress) -> bool:
         return False
 
 
-def _truth(run: RunFolder) -> trimesh.Trimesh | None:
+def _truth(run: Run) -> trimesh.Trimesh | None:
     """Return the true surface, for the view; None, with a warning, where it cannot be read."""
     try:
-        return true_mesh(run.fitted.settings, run.provenance)
+        return true_mesh(run.settings, run.provenance)
     except InputError as error:
         logger.warning("the view shows no true surface: %s", error)
         return None

@@ -15,8 +15,10 @@ from sononerf.report.page import Page
 from sononerf.report.pictures.curve_picture import curves_picture
 from sononerf.report.pictures.mip_picture import mip_pictures
 from sononerf.report.pictures.spectrogram_picture import spectrogram_picture
+from sononerf.run.build import locked
 from sononerf.run.export import read_volume
-from sononerf.run.run_folder import RunFolder, differing_keys, flat, locked
+from sononerf.run.provenance import differing_keys, flat
+from sononerf.run.run import Run
 from sononerf.run.run_page import curves_of, damage_named, page_of, read_predictions
 from sononerf.settings.schema import Settings
 
@@ -55,7 +57,7 @@ def report(
         .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, figures 4 to 8.
     """
     progress = progress or Progress(quiet=True)
-    runs = [RunFolder(path) for path in paths]
+    runs = [Run(path) for path in paths]
     settings = [run.open() for run in runs]
     target = output or (paths[0] / PAGE if len(paths) == 1 else Path(PAGE))
     if target.suffix.lower() != ".html":
@@ -73,7 +75,7 @@ def report(
     return target
 
 
-def _vector_figures(run: RunFolder, kind: Literal["svg", "pdf"]) -> dict[str, bytes]:
+def _vector_figures(run: Run, kind: Literal["svg", "pdf"]) -> dict[str, bytes]:
     """Return the figures of a run that are drawn by lines and letters, by name."""
     found = {}
     curves, floors = curves_of(run)
@@ -97,20 +99,20 @@ def _vector_figures(run: RunFolder, kind: Literal["svg", "pdf"]) -> dict[str, by
     return found
 
 
-def names_of(runs: Sequence[RunFolder]) -> list[str]:
+def names_of(runs: Sequence[Run]) -> list[str]:
     """Return the names of runs: of their folders, or of the paths where two share one."""
     names = [run.path.resolve().name for run in runs]
     return names if len(set(names)) == len(names) else [str(run.path) for run in runs]
 
 
-def _comparing(runs: list[RunFolder], settings: list[Settings]) -> Page:
+def _comparing(runs: list[Run], settings: list[Settings]) -> Page:
     names = names_of(runs)
     page = Page(" · ".join(names))
     page.say(f"{len(runs)} runs beside one another.")
     page.heading("Numbers")
     found = []
     for run in runs:
-        with damage_named(run.metrics):
+        with damage_named(run.metrics_file):
             found.append(run.read_metrics())
             run_rows(found[-1:])
     page.table([("", *names), *run_rows(found)])

@@ -1,68 +1,146 @@
 # SPDX-License-Identifier: MIT
-"""A run that is on disk, opened from Python; and two things of a kind compared."""
+"""A run: an experiment in a folder, its settings, its stages, and what they left.
+
+Settings go in; echoes, a field, a surface, predictions and numbers come out, in this order::
+
+    simulate     settings          -> echoes       data/<scene>-<hash>/
+    fit          echoes            -> field        model.safetensors, model.json
+    reconstruct  field, echoes     -> surface      reconstruction/
+    predict      field, surface    -> prediction   prediction/
+    evaluate     all of these      -> numbers      metrics.json
+
+Each stage reads what those before it left and writes its own file last: it is done when that file
+is there. A stage that was killed is done again; a fit goes on from its checkpoint, a refinement
+from its last stage. The formulas are in ``docs/method.md``.
+"""
 
 from __future__ import annotations
 
 import html
+import shutil
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import overload
+from typing import Any, Literal
 
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from sononerf import locks, storage
 from sononerf.echoes.echoes import Echoes
-from sononerf.errors import InputError
-from sononerf.evaluation.difference import Comparison
-from sononerf.evaluation.numbers import Evaluation, compare_prediction
+from sononerf.echoes.free_space import EchoHull
+from sononerf.errors import IncompatibleError, InputError
+from sononerf.evaluation.numbers import Evaluation
 from sononerf.evaluation.prediction import Prediction, predict
 from sononerf.evaluation.traced import Traced, for_single_poses
+from sononerf.field.checkpoint_io import DESCRIPTION_NAME
 from sononerf.field.module import EchoModule
+from sononerf.geometry.frame import Frame, FrameName
 from sononerf.geometry.poses import Poses
+from sononerf.head.attached import attach
 from sononerf.head.head import Head
 from sononerf.progress import Progress
-from sononerf.run.compare import compare_runs_of
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.model_files import Model, read_model
+from sononerf.run.provenance import differing_keys, versions
+from sononerf.run.simulate import default_store, open_ensemble
+from sononerf.run.traced_file import load_traced, same_mesh, save_traced
+from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
 from sononerf.settings.schema import Settings
 from sononerf.shown import Shown
+from sononerf.simulation.simulator import ensemble_poses
 from sononerf.surface.mesh_files import confidence_of, error_of
 from sononerf.surface.surface import Surface
 
+METRICS_SCHEMA = 1
+Stage = Literal["fit", "surface", "traced", "prediction", "evaluation"]
+STAGES: tuple[Stage, ...] = ("fit", "surface", "traced", "prediction", "evaluation")
+"""Stages of a run, in order: the fit; the reconstruction; gain and weight of echoes traced off it;
+the prediction of held-out poses; the comparison with the true surface and the baselines."""
+
 
 class Run(Shown):
-    """A fitted run, opened for reading with :func:`open_run`; each part is loaded at first use.
+    """A run on disk; each of its parts is loaded at first use.
 
     Args:
         path: Its folder.
-
-    Raises:
-        InputError: If there is no fitted run, or it is damaged.
-        IncompatibleError: If it needs another version.
     """
 
     def __init__(self, path: Path | str) -> None:
-        self._folder = RunFolder(Path(path))
-        self._fitted = self._folder.fitted
+        self.path = Path(path)
+        self.config = self.path / "config.yaml"
+        self.metrics_file = self.path / "metrics.json"
+        self.checkpoint = self.path / "checkpoints" / "last.ckpt"
+        self.reconstruction = self.path / "reconstruction"
+        self._locks = 0
+        self._kept: Traced | None = None
 
-    @property
-    def path(self) -> Path:
-        """Folder of the run."""
-        return self._folder.path
+    def __repr__(self) -> str:
+        return f"Run({str(self.path)!r})"
 
-    @property
-    def settings(self) -> Settings:
-        """Settings of the experiment."""
-        return self._fitted.settings
+    def _repr_html_(self) -> str:
+        return f"<b>{html.escape(repr(self))}</b>{self.metrics._repr_html_()}"
+
+    @classmethod
+    def of(cls, run: Path | Run) -> Run:
+        """Return the run of a path, or the same run."""
+        return run if isinstance(run, Run) else cls(run)
+
+    @contextmanager
+    def locked(self, output: Path | None = None) -> Iterator[None]:
+        """Hold the run against other processes; within one process it can be held repeatedly."""
+        elsewhere = output is not None and not output.resolve().is_relative_to(self.path.resolve())
+        if self._locks or elsewhere:
+            yield
+            return
+        with locks.lock(self.path):
+            self._locks += 1
+            try:
+                yield
+            finally:
+                self._locks -= 1
+
+    # What its stages left.
+
+    @cached_property
+    def _model(self) -> Model:
+        return read_model(self.path)
 
     @property
     def model(self) -> EchoModule:
-        """Field and renderer, fitted."""
-        return self._fitted.module
+        """Field and renderer, fitted.
+
+        Raises:
+            InputError: If there are none, or they are damaged.
+            IncompatibleError: If they need another version.
+        """
+        return self._model.module
+
+    @property
+    def hull(self) -> EchoHull:
+        """Free space in front of the onsets of the training poses."""
+        return self._model.hull
+
+    @property
+    def settings(self) -> Settings:
+        """Settings of the fitted experiment."""
+        return self._model.settings
+
+    @property
+    def echo_hash(self) -> str:
+        """Hash of the echoes that were fitted."""
+        return self._model.echo_hash
 
     @property
     def head(self) -> Head:
         """Head that heard the echoes."""
-        return self._fitted.head
+        assert self.model.head is not None  # it was made with one
+        return self.model.head
 
-    @property
+    @cached_property
     def echoes(self) -> Echoes:
         """Echoes that were fitted.
 
@@ -70,7 +148,76 @@ class Run(Shown):
             InputError: If the store is not where the settings say.
             IncompatibleError: If other echoes lie there.
         """
-        return self._folder.echoes
+        settings, wanted = self.settings, self.echo_hash
+        stated = settings.data.store or default_store(settings, wanted)
+        # A fit that was started elsewhere: above its run the store lies as it did from there.
+        places = [stated, *(folder / stated for folder in self.path.absolute().parents)]
+        stores = [open_ensemble(settings, one) for one in places if (one / "zarr.json").is_file()]
+        if not stores:
+            again = (
+                "import the recordings again"
+                if settings.scene is None
+                else "make it again with `sononerf simulate RUN/config.yaml`"
+            )
+            raise InputError(
+                f"{stated}: the ensemble of this run is not there; {again}, or predict poses of "
+                "your own with --poses"
+            )
+        for store in stores:
+            if store.attributes.get("echo_hash") == wanted:
+                return Echoes(store, self.head, self.hull)
+        raise IncompatibleError(f"{stores[0].path}: holds other echoes than those of this run")
+
+    def all_poses(self) -> tuple[Poses, NDArray[np.int8]]:
+        """Return all poses and the use of each (P,): 0 train, 1 val, 2 test."""
+        if self.settings.scene is not None:
+            return ensemble_poses(self.settings.poses)
+        store = self.echoes.store
+        return Poses(store.positions, store.rotations), store.split
+
+    @property
+    def has_heldout(self) -> bool:
+        """Whether poses were held out of the fit."""
+        settings = self.settings
+        if settings.scene is not None:
+            return settings.poses.heldout > 0
+        return len(self.echoes.store.indices("test")) > 0
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """Versions, machine and sources of the run; empty if the file is missing."""
+        file = self.path / "provenance.json"
+        found = storage.read_json(file) if file.is_file() else {}
+        return found if isinstance(found, dict) else {}
+
+    def frame(self, name: FrameName = "auto") -> Frame:
+        """Return the frame of that name; see :meth:`sononerf.geometry.frame.Frame.of`."""
+        return Frame.of(self.provenance, name)
+
+    def mesh(self) -> trimesh.Trimesh:
+        """Read the reconstructed surface."""
+        file = self.reconstruction / "mesh.ply"
+        if not file.is_file():
+            raise InputError(
+                f"{file}: there is no surface; make one with `sononerf reconstruct {self.path}`"
+            )
+        try:
+            mesh = trimesh.load_mesh(file, file_type="ply")
+        except Exception as error:  # the error of a damaged file depends on trimesh's reader
+            raise InputError(f"{file}: damaged ({error}); reconstruct again") from error
+        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+            raise InputError(f"{file}: holds no surface; reconstruct again")
+        return mesh
+
+    @property
+    def read_out(self) -> dict[str, Any]:
+        """Settings with which the reconstructed surface was read out."""
+        file = self.reconstruction / "read_out.json"
+        again = f"reconstruct again with `sononerf reconstruct {self.path}`"
+        found = storage.read_json(file)
+        if not isinstance(found, dict):
+            raise InputError(f"{file}: damaged; {again}")
+        return found
 
     @cached_property
     def surface(self) -> Surface:
@@ -79,12 +226,12 @@ class Run(Shown):
         Raises:
             InputError: If there is none, or it is damaged.
         """
-        mesh = self._folder.mesh()
+        mesh = self.mesh()
         try:
-            echoes: Echoes | None = self._folder.echoes
+            echoes: Echoes | None = self.echoes
         except InputError:
             echoes = None
-        known = self._folder.read_out
+        known = self.read_out
         surface = Surface(
             mesh,
             method=known["method"],
@@ -104,14 +251,34 @@ class Run(Shown):
     @property
     def metrics(self) -> Evaluation:
         """Content of ``metrics.json``: prediction, geometry, baseline, cost."""
-        return Evaluation(self._folder.read_metrics())
+        return Evaluation(self.read_metrics())
 
     @cached_property
     def _traced(self) -> Traced | None:
-        traced = self._folder.traced()
+        traced = self.traced()
         if traced is None:
             return None
         return for_single_poses(traced, self.head, self.settings.simulation)
+
+    def traced(self) -> Traced | None:
+        """Return the surface that echoes are traced off, and their weight; None without them."""
+        found, kept = load_traced(self.path), self._kept
+        if found is None or kept is None or not same_mesh(found.mesh, kept.mesh):
+            return found
+        return replace(found, simulator=kept.simulator)
+
+    def keep_traced(self, traced: Traced) -> None:
+        """Write the traced surface, with its gain and weight."""
+        save_traced(self.path, traced)
+        self._kept = traced
+
+    def _traces_its_mesh(self) -> bool:
+        """Return whether the traced surface is that of the reconstruction."""
+        try:
+            traced, mesh = self.traced(), self.mesh()
+        except InputError:
+            return False
+        return traced is not None and same_mesh(traced.mesh, mesh)
 
     def predict(
         self,
@@ -142,46 +309,142 @@ class Run(Shown):
             progress=progress,
         )
 
-    def __repr__(self) -> str:
-        return f"Run({str(self.path)!r})"
+    # Which stages are done.
 
-    def _repr_html_(self) -> str:
-        return f"<b>{html.escape(repr(self))}</b>{self.metrics._repr_html_()}"
+    def is_done(self, stage: Stage) -> bool:
+        """Return whether a stage came to its end, with the results of the stages before it."""
+        if stage == "fit":
+            return (self.path / DESCRIPTION_NAME).is_file()
+        if stage == "surface":
+            # The description is written after all else.
+            names = ("mesh.ply", "read_out.json")
+            return all((self.reconstruction / name).is_file() for name in names)
+        if stage == "traced":
+            return self._traces_its_mesh()
+        found = self.read_metrics().keys()
+        if stage == "prediction":
+            return "prediction" in found or not self.has_heldout
+        return {"geometry", "baseline"} <= found
+
+    @property
+    def is_finished(self) -> bool:
+        """True if all stages are complete."""
+        return all(self.is_done(stage) for stage in STAGES)
+
+    def begin(self, stage: Literal["surface", "traced"]) -> None:
+        """Mark a stage as not done, and the evaluation or prediction that depends on it."""
+        if stage == "surface":
+            storage.remove_file(self.reconstruction / "read_out.json")
+            self.drop_metrics("geometry")
+        else:
+            self.drop_metrics("prediction")
+
+    def open(self) -> Settings:
+        """Return the settings of a run that is there."""
+        if not self.config.is_file():
+            raise InputError(f"{self.path}: no run (no config.yaml); make one with `sononerf fit`")
+        return validate_settings(read_yaml(self.config), str(self.config))
+
+    def check(self, settings: Settings) -> None:
+        """Make sure that the folder is free, or holds a run of the same settings."""
+        if self.config.is_file():
+            different = differing_keys(self.open(), settings)
+            if different:
+                raise IncompatibleError(
+                    f"{self.path}: holds a run of other settings ({', '.join(different[:5])}"
+                    f"{', ...' if len(different) > 5 else ''}); choose another --output, or "
+                    "--overwrite to move it aside"
+                )
+            return
+        self.refuse_foreign()
+
+    def prolong(self, settings: Settings) -> None:
+        """Take over a larger number of epochs, if nothing else differs."""
+        if not self.config.is_file():
+            return
+        old = self.open()
+        if differing_keys(old, settings) == ["fit.epochs"] and settings.fit.epochs > old.fit.epochs:
+            storage.remove_file(self.path / DESCRIPTION_NAME)
+            self.begin("surface")
+            self.begin("traced")
+            storage.commit_text(self.config, dump_yaml(settings))
+
+    def refuse_foreign(self) -> None:
+        """Refuse a folder that holds something else."""
+        foreign = [p.name for p in self.path.iterdir() if p.name[0] != "."]
+        if foreign:
+            raise InputError(
+                f"{self.path}: holds {sorted(foreign)[0]!r} and is no run; choose another --output"
+            )
+
+    def begin_fit(self, settings: Settings) -> None:
+        """Write the settings of a new run, or make sure that an old one has the same."""
+        self.check(settings)
+        if not self.config.is_file():
+            attach(settings, self.path)
+            storage.commit_text(self.config, dump_yaml(settings))
+
+    def move_aside(self) -> Path | None:
+        """Rename the folder so that a new run can take its place; nothing is deleted."""
+        if not self.path.exists():
+            return None
+        path = self.path.resolve()
+        number = 1
+        while (aside := path.with_name(f"{path.name}.old-{number}")).exists():
+            number += 1
+        if not self.config.is_file():
+            self.refuse_foreign()
+        with locks.lock(path):
+            try:
+                path.rename(aside)
+            except OSError as error:
+                raise storage.storage_error("cannot be moved aside", path, error) from error
+        return aside
+
+    def read_metrics(self) -> dict[str, Any]:
+        """Return the present content of ``metrics.json``."""
+        if not self.metrics_file.is_file():
+            return {"schema": METRICS_SCHEMA}
+        metrics = storage.read_json(self.metrics_file)
+        if not isinstance(metrics, dict):
+            raise InputError(f"{self.metrics_file}: holds no metrics; remove it and evaluate again")
+        return metrics
+
+    def write_metrics(
+        self, section: str, values: dict[str, Any] | None, *, merge: bool = False
+    ) -> None:
+        """Replace one section of ``metrics.json``; the others are left as they are."""
+        with self.locked():
+            metrics = self.read_metrics()
+            if merge:
+                values = {**(metrics.get(section) or {}), **(values or {})}
+            metrics |= {"schema": METRICS_SCHEMA, section: values}
+            storage.commit_json(self.metrics_file, metrics)
+
+    def drop_metrics(self, section: str) -> None:
+        """Take one section out of ``metrics.json``, where it is there."""
+        with self.locked():
+            metrics = self.read_metrics()
+            if section in metrics:
+                del metrics[section]
+                storage.commit_json(self.metrics_file, metrics)
+
+    def write_provenance(self, **facts: Any) -> None:
+        """Record versions and sources of the run, without names of people, machines or folders."""
+        storage.commit_json(self.path / "provenance.json", {**versions(), **facts})
+
+    def clear_previews(self) -> None:
+        """Remove the previews of a fit that starts anew."""
+        shutil.rmtree(self.path / "epochs", ignore_errors=True)
 
 
 def open_run(path: Path | str) -> Run:
-    """Open a fitted run; see :class:`Run`."""
-    return Run(path)
-
-
-@overload
-def compare(first: Prediction, second: Echoes) -> Evaluation: ...
-
-
-@overload
-def compare(first: Run, second: Run) -> Comparison: ...
-
-
-def compare(first: Prediction | Run, second: Echoes | Run) -> Evaluation | Comparison:
-    """Compare a prediction with echoes, or two runs with each other.
-
-    Args:
-        first: A prediction of poses of the echoes; or a run with the target.
-        second: The measured echoes; or a run without the target.
-
-    Returns:
-        found: For a prediction its errors, ``mae_db`` and others; of runs what the first sends back
-            and the second does not.
+    """Open a fitted run; see :class:`Run`.
 
     Raises:
-        InputError: If a pose is not among those of the echoes, or the two do not go together.
-        IncompatibleError: If two runs hear differently.
+        InputError: If there is no fitted run, or it is damaged.
+        IncompatibleError: If it needs another version.
     """
-    if isinstance(first, Prediction) and isinstance(second, Echoes):
-        return compare_prediction(first, second)
-    if isinstance(first, Run) and isinstance(second, Run):
-        return compare_runs_of(first._fitted, second._fitted)
-    raise InputError(
-        f"found {type(first).__name__} and {type(second).__name__}, expected a Prediction and "
-        "Echoes, or two runs"
-    )
+    run = Run(path)
+    _ = run.model
+    return run

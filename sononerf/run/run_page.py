@@ -21,15 +21,15 @@ from sononerf.errors import InputError, NumericalError, SonoNerfError
 from sononerf.evaluation.prediction import evenly, ranked
 from sononerf.head.decibels import compress, mae_db
 from sononerf.progress import Progress
-from sononerf.report.key_numbers import COST, NONE, KeyNumber, shape_rows
+from sononerf.report.key_numbers import NONE, run_rows
 from sononerf.report.page import Page
 from sononerf.report.pictures.curve_picture import curves_picture
 from sononerf.report.pictures.mesh_picture import mesh_png
 from sononerf.report.pictures.scene_picture import scene_png
 from sononerf.report.surface_views import SurfaceViews
 from sononerf.run.build import true_mesh
-from sononerf.run.fitted import Fitted, all_poses
-from sononerf.run.run_folder import RunFolder, flat
+from sononerf.run.provenance import flat
+from sononerf.run.run import Run
 from sononerf.settings.loading import dump_yaml
 from sononerf.settings.schema import Settings
 from sononerf.surface.mesh_files import confidence_of, error_of
@@ -50,10 +50,10 @@ def damage_named(file: Path) -> Iterator[None]:
         ) from None
 
 
-def page_of(run: RunFolder, settings: Settings, paper: bool, progress: Progress) -> Page:
+def page_of(run: Run, settings: Settings, paper: bool, progress: Progress) -> Page:
     """Return the page of a run; see :func:`sononerf.run.report_runs.report`."""
     page = Page(run.path.resolve().name)
-    with damage_named(run.metrics):
+    with damage_named(run.metrics_file):
         _made(page, run, settings)
         _numbers(page, run)
     _curves(page, run)
@@ -62,14 +62,14 @@ def page_of(run: RunFolder, settings: Settings, paper: bool, progress: Progress)
         if run.has_heldout:
             _predictions(page, run.path)
         if paper:
-            _figures(page, run.path, run.fitted, progress)
+            _figures(page, run, progress)
     page.heading("Settings")
     page.code(dump_yaml(settings).rstrip())
     _provenance(page, run.path)
     return page
 
 
-def _made(page: Page, run: RunFolder, settings: Settings) -> None:
+def _made(page: Page, run: Run, settings: Settings) -> None:
     cost = run.read_metrics().get("cost") or {}
     echoes = (
         f"Recorded echoes of `{settings.data.store}`"
@@ -91,18 +91,6 @@ def _made(page: Page, run: RunFolder, settings: Settings) -> None:
         )
 
 
-HELD_OUT = (
-    ("all cells", "mae_db", "mean_predictor_mae_db", "noise_floor_mae_db", "rendered_mae_db"),
-    (
-        "active cells",
-        "mae_db_active",
-        "mean_predictor_mae_db_active",
-        "noise_floor_mae_db_active",
-        "rendered_mae_db_active",
-    ),
-)
-
-
 FLOOR_OF = {
     None: "the same echoes simulated with other rays",
     "repeated poses": "between poses that were recorded twice",
@@ -110,28 +98,21 @@ FLOOR_OF = {
 }
 
 
-def _numbers(page: Page, run: RunFolder) -> None:
+def _numbers(page: Page, run: Run) -> None:
     metrics = run.read_metrics()
     prediction, geometry = metrics.get("prediction") or {}, metrics.get("geometry") or {}
     page.heading("Numbers")
     if not run.is_done("fit"):
         page.say("None yet.")
         return
+    page.table([("", "this run"), *run_rows([metrics])])
     if prediction:
-        heads = ("held-out error, dB", "this run", "field alone", "mean spectrogram", "noise floor")
-        page.table(
-            [heads]
-            + [
-                (name, *(KeyNumber("", key).text(prediction) for key in (ours, alone, mean, floor)))
-                for name, ours, mean, floor, alone in HELD_OUT
-            ]
-        )
         page.say(
-            f"Mean over {prediction.get('poses')} poses that were never trained on, in decibels "
-            "above 60 dB below the loudest training echo. Active cells: measured or predicted is "
-            "3 dB or more, and above the noise of recordings. Field alone: without the "
-            "echoes that are traced off the run's own mesh. "
-            "Mean spectrogram: what the mean of the training poses predicts for every pose."
+            f"Held-out error: mean over {prediction.get('poses')} poses that were never trained "
+            "on, in decibels above 60 dB below the loudest training echo. Active cells: measured "
+            "or predicted is 3 dB or more, and above the noise of recordings. Field alone: without "
+            "the echoes that are traced off the run's own mesh. Mean spectrogram: what the mean of "
+            "the training poses predicts for every pose."
             + (
                 ""
                 if prediction.get("noise_floor_mae_db") is None
@@ -142,27 +123,13 @@ def _numbers(page: Page, run: RunFolder) -> None:
         page.say(f"No numbers of held-out poses yet: {_command('predict', run.path)}.")
     else:
         page.say("No pose was held out (`poses.heldout: 0`), so nothing is predicted.")
-    if not geometry:
+    if geometry:
+        page.say("The baselines are given the best of several levels, chosen with the truth.")
+    else:
         page.say(
             f"No geometry yet: {_command('evaluate', run.path)}; it needs the true mesh, and that "
             "the field has a surface."
         )
-    else:
-        baseline = metrics.get("baseline") or {}
-        columns = [geometry, *((baseline.get(name) or {}) for name in ("backprojection", "voxels"))]
-        page.table(
-            [("geometry", "this run", "backprojection", "voxel fit"), *_known(shape_rows(columns))]
-        )
-        target = (geometry.get("target") or {}).get("fscore") or {}
-        if target:
-            alone = (f"{score:.2f} at {1e3 * float(limit):g} mm" for limit, score in target.items())
-            page.say(f"F-score of the target alone, without its background: {', '.join(alone)}.")
-        page.say("The baselines are given the best of several levels, chosen with the truth.")
-    page.table([("cost", "this run"), *_known([(n.label, n.text(metrics)) for n in COST])])
-
-
-def _known(rows: list[tuple[str, ...]]) -> list[tuple[str, ...]]:
-    return [row for row in rows if set(row[1:]) != {NONE}]
 
 
 CURVES = {"all cells": "val/mae_db", "active cells": "val/mae_db_active"}
@@ -171,7 +138,7 @@ CURVES = {"all cells": "val/mae_db", "active cells": "val/mae_db_active"}
 Curves = dict[str, tuple[list[float], list[float]]]
 
 
-def curves_of(run: RunFolder) -> tuple[Curves, dict[str, float]]:
+def curves_of(run: Run) -> tuple[Curves, dict[str, float]]:
     """Return the errors on validation poses, as the previews kept them, and the noise floors."""
     curves: Curves = {name: ([], []) for name in CURVES}
     for file in sorted(run.path.glob("epochs/*/metrics.json")):
@@ -194,7 +161,7 @@ def curves_of(run: RunFolder) -> tuple[Curves, dict[str, float]]:
     )
 
 
-def _curves(page: Page, run: RunFolder) -> None:
+def _curves(page: Page, run: Run) -> None:
     curves, floors = curves_of(run)
     if curves:
         page.heading("Learning curves")
@@ -202,7 +169,7 @@ def _curves(page: Page, run: RunFolder) -> None:
         page.pictures({"The field alone on validation poses.": picture})
 
 
-def _surface(page: Page, run: RunFolder, settings: Settings) -> None:
+def _surface(page: Page, run: Run, settings: Settings) -> None:
     page.heading("Surface")
     source, command = run.reconstruction, _command("reconstruct", run.path)
     if not run.is_done("surface"):
@@ -220,7 +187,7 @@ def _surface(page: Page, run: RunFolder, settings: Settings) -> None:
         confidence_of(mesh),
         error_of(mesh),
         _truth_beside(page, run, settings),
-        run.fitted.head.resolution / 2,
+        run.head.resolution / 2,
     )
     page.view(views.meshes())
     _candidates(page, run)
@@ -236,7 +203,7 @@ def _surface(page: Page, run: RunFolder, settings: Settings) -> None:
     page.pictures(found)
 
 
-def _candidates(page: Page, run: RunFolder) -> None:
+def _candidates(page: Page, run: Run) -> None:
     """Show the starts of the refinement with their errors on validation poses."""
     with damage_named(run.reconstruction / "read_out.json"):
         found = run.read_out.get("candidates") or []
@@ -253,14 +220,14 @@ def _candidates(page: Page, run: RunFolder) -> None:
         page.say(f"Errors on validation poses. Another start is refined by {taken}.")
 
 
-def _truth_beside(page: Page, run: RunFolder, settings: Settings) -> trimesh.Trimesh | None:
+def _truth_beside(page: Page, run: Run, settings: Settings) -> trimesh.Trimesh | None:
     """Return the true surface in the frame of the reconstruction; None where it is not known."""
     try:
         true = true_mesh(settings, run.provenance)
     except SonoNerfError as error:
         page.say(f"The true surface is not shown: {error}.")
         return None
-    with damage_named(run.metrics):
+    with damage_named(run.metrics_file):
         geometry = run.read_metrics().get("geometry") or {}
         motion = (geometry.get("registration") or {}).get("matrix")
         if true is not None and motion is not None:
@@ -289,11 +256,7 @@ class _Predicted:
 
 
 def read_predictions(path: Path) -> _Predicted | None:
-    """Return the prediction of a run for its held-out poses; None before it exists.
-
-    Raises:
-        InputError: If the file is damaged.
-    """
+    """Return the prediction of a run for its held-out poses; None before it exists."""
     file = path / "prediction" / "spectrograms.npz"
     if not file.is_file():
         return None
@@ -345,35 +308,35 @@ def _provenance(page: Page, path: Path) -> None:
         page.table([("what", "value"), *rows])
 
 
-def _figures(page: Page, path: Path, fitted: Fitted, progress: Progress) -> None:
+def _figures(page: Page, run: Run, progress: Progress) -> None:
     page.heading("As in the paper")
     page.heading("Scene and poses (figures 4 to 6)", 3)
-    mesh = true_mesh(fitted.settings, RunFolder(path).provenance)
+    mesh = true_mesh(run.settings, run.provenance)
     if mesh is None:
         page.say("The true surface is not known here: no scene or `evaluation.truth` can be read.")
     else:
-        poses, split = all_poses(fitted)
+        poses, split = run.all_poses()
         looks = poses.rotations[:, :, 0]
         page.pictures({"The scene.": scene_png(mesh, poses.positions, looks, split=split)})
     # Read before the long work, for they may be damaged.
-    compared = list(_comparisons(path))
+    compared = list(_comparisons(run.path))
     page.heading("Iso-surface of the summed reflectivity (figures 4 to 6)", 3)
-    _isosurface(page, fitted, progress)
+    _isosurface(page, run, progress)
     page.heading("What was heard here and not there (figures 7 and 8)", 3)
     if not compared:
-        page.say(f"Not compared with another run yet: {_command('compare', path, ' OTHER')}.")
+        page.say(f"Not compared with another run yet: {_command('compare', run.path, ' OTHER')}.")
     for said, pictures in compared:
         page.say(said)
         page.pictures(pictures)
 
 
-def _isosurface(page: Page, fitted: Fitted, progress: Progress) -> None:
-    options = fitted.settings.reconstruction
+def _isosurface(page: Page, run: Run, progress: Progress) -> None:
+    options = run.settings.reconstruction
     level = options.level
     try:
         with progress.task("reading out", 1000) as task, torch.inference_mode():
             mesh, volume, found = read_isosurface(
-                fitted.module.field,
+                run.model.field,
                 spacing=options.spacing,
                 level=level,
                 directions=options.directions,

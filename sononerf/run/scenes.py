@@ -86,10 +86,6 @@ def describe_scene(name: str) -> dict[str, Any]:
     Returns:
         scene: ``name``, ``description`` (the docstring without its Returns and Raises), and
             ``options``, as :func:`sononerf.settings.plugins.describe_options` has them.
-
-    Raises:
-        SettingsError: If there is no such scene.
-        InputError: If it is broken.
     """
     with _quietly():
         factory = plugins.load(plugins.SCENES, name)
@@ -143,18 +139,7 @@ def _quietly() -> Iterator[None]:
 
 
 def draw_scenes(folder: Path) -> tuple[list[Path], list[str]]:
-    """Draw every scene that needs no options.
-
-    Args:
-        folder: Folder of the pictures, ``NAME.png`` each.
-
-    Returns:
-        written: The pictures.
-        skipped: Each other scene, and why it is not drawn.
-
-    Raises:
-        StorageError: If the folder cannot be written, before anything is drawn.
-    """
+    """Draw every scene that needs no options."""
     storage.probe_writable(folder)
     written, skipped = [], []
     for plugin in list_scenes():
@@ -178,17 +163,6 @@ def draw_ensemble(settings: Settings, store: Ensemble, folder: Path) -> list[Pat
     """Draw a scene with the poses of its ensemble, and the echo of the first test pose.
 
     Without test poses, the first pose is drawn.
-
-    Args:
-        settings: Settings of the ensemble.
-        store: Complete.
-        folder: Folder of the pictures.
-
-    Returns:
-        written: ``scene.png`` and ``pose_0000.png``, numbered as in the store.
-
-    Raises:
-        StorageError: If a picture cannot be written.
     """
     with _quietly():  # who simulated it has been warned
         scene = scene_of(settings)

@@ -5,8 +5,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import yaml
-
 from sononerf import storage
 from sononerf.echoes.echoes import Echoes, complete_store
 from sononerf.echoes.store import EnsembleStore
@@ -17,10 +15,10 @@ from sononerf.recordings.audio import pose_table, wav_bytes
 from sononerf.run.build import head_of, simulator_of
 from sononerf.run.understand import OWN_SETTINGS
 from sononerf.scene.scene import Scene, load_scene
+from sononerf.settings.loading import to_yaml
 from sononerf.settings.schema import HEAD_SECTIONS, Settings
 from sononerf.simulation import ensemble
 from sononerf.simulation.accuracy import settle_rays
-from sononerf.simulation.shards import Shard
 from sononerf.simulation.simulator import ensemble_poses, pose_seed
 
 
@@ -31,12 +29,7 @@ def echo_hash(settings: Settings, scene: Scene) -> str:
 
 
 def scene_of(settings: Settings) -> Scene:
-    """Return the scene that settings name.
-
-    Raises:
-        SettingsError: If they name none: their echoes come from a store.
-        InputError: If the scene is unknown or broken.
-    """
+    """Return the scene that settings name."""
     if settings.scene is None:
         raise SettingsError("scene: missing; set scene.name to simulate echoes")
     return load_scene(settings.scene.name, settings.scene.options, source=settings.source)
@@ -57,11 +50,7 @@ def default_store(settings: Settings, echoes: str) -> Path:
 
 
 def background_path(settings: Settings) -> Path | None:
-    """Return the path of the ensemble of the surroundings alone; None if none is subtracted.
-
-    Raises:
-        SettingsError: If the scene's own are asked for, and it marks none.
-    """
+    """Return the path of the ensemble of the surroundings alone; None if none is subtracted."""
     chosen = settings.data.background
     return _own_background(settings)[0] if chosen == "scene" else chosen
 
@@ -110,28 +99,22 @@ def simulate(
     *,
     scene: Scene | None = None,
     output: Path | None = None,
-    shard: Shard | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> EnsembleStore:
     """Simulate the missing poses of an ensemble, and seal it.
 
-    Shards are stores beside the ensemble's, each with some of its poses. They can be simulated on
-    different machines at once. The same call without a shard takes the poses from there, simulates
-    missing ones, and seals the store.
-
     Args:
         settings: The experiment.
         scene: Another one than the settings'.
         output: The store; ``data/<scene>-<hash>`` where None.
-        shard: Number of the shard and of all shards; the whole ensemble where None.
         workers: Processes; as many as there are cores, at most 8, where None.
         scheduler: Address of a Dask scheduler to use instead.
         progress: Display of progress.
 
     Returns:
-        store: Complete, or the shard; opened for reading.
+        store: Complete, opened for reading.
 
     Raises:
         InputError: If scene or poses are no good.
@@ -151,7 +134,6 @@ def simulate(
         output=store_path(settings, scene, output),
         options=settings.simulation,
         about={"scene": plain["scene"], "settings": {"poses": plain["poses"]}},
-        shard=shard,
         workers=workers,
         scheduler=scheduler,
         progress=progress or Progress(quiet=True),
@@ -172,20 +154,6 @@ def write_waveforms(
     The folder is what ``sononerf import recordings`` reads: a WAV file per pose (32-bit floats),
     ``poses.csv``, and ``import.yaml`` with air, ears, call and analysis. Poses, echoes and noise
     are those of :func:`sononerf.run.simulate.simulate`.
-
-    Args:
-        settings: The experiment; its scene is needed.
-        folder: Empty, or not there.
-        scene: Another one than the settings'.
-        progress: Display of progress.
-
-    Returns:
-        written: Table, settings, and the first WAV file.
-
-    Raises:
-        SettingsError: If there is no scene, or a WAV file cannot hold the sampling rate.
-        InputError: If the folder is not empty.
-        StorageError: If it cannot be written.
     """
     progress = progress or Progress(quiet=True)
     if scene is None:
@@ -215,7 +183,7 @@ def write_waveforms(
     plain = settings.plain()
     told = {name: plain[name] for name in HEAD_SECTIONS}
     told["import"] = {"source": f"simulated, scene {settings.scene.name}" if settings.scene else ""}
-    storage.commit_text(folder / OWN_SETTINGS, str(yaml.safe_dump(told, sort_keys=False)))
+    storage.commit_text(folder / OWN_SETTINGS, to_yaml(told))
     # The table comes last: without it the folder cannot be imported.
     storage.commit_text(folder / "poses.csv", pose_table(poses, names, split))
     return [folder / "poses.csv", folder / OWN_SETTINGS, folder / names[0]]

@@ -11,8 +11,10 @@ from pathlib import Path
 from sononerf import storage
 from sononerf.errors import InputError
 from sononerf.report.key_numbers import run_rows
+from sononerf.run.build import locked
+from sononerf.run.provenance import flat
 from sononerf.run.report_runs import names_of
-from sononerf.run.run_folder import RunFolder, flat, locked
+from sononerf.run.run import Run
 
 
 def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
@@ -26,7 +28,7 @@ def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
         InputError: If one is no run, or its numbers are damaged.
         StorageError: If the CSV file cannot be written.
     """
-    runs = [RunFolder(path) for path in paths]
+    runs = [Run(path) for path in paths]
     found = []
     for run in runs:
         run.open()
@@ -35,7 +37,7 @@ def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
             run_rows(found[-1:])
         except (TypeError, ValueError, AttributeError) as error:
             raise InputError(
-                f"{run.metrics}: damaged ({error}); remove it and evaluate again"
+                f"{run.metrics_file}: damaged ({error}); remove it and evaluate again"
             ) from None
     names = names_of(runs)
     rows = [("", *names), *run_rows(found)]

@@ -33,12 +33,6 @@ def least_error(error_at: Callable[[int], float]) -> tuple[float, float]:
     Args:
         error_at: Error at a whole number of steps from the stated value; infinite where there is no
             surface. It is evaluated at -1, 0 and 1 and then on the side that is better.
-
-    Returns:
-        at, deviation: Steps. The deviation is infinite where the least error is at an end.
-
-    Raises:
-        NumericalError: If there is no surface at any value.
     """
     errors = {step: error_at(step) for step in (0, -1, 1)}
     while True:
@@ -57,17 +51,7 @@ def least_error(error_at: Callable[[int], float]) -> tuple[float, float]:
 
 
 def fitted_error(settings: Settings, store: Path, run: Path, progress: Progress) -> float:
-    """Return the error of a store's refined surface on its validation poses, dB.
-
-    Args:
-        settings: Settings of a run, whose field, fit and reconstruction are taken.
-        store: The store to fit.
-        run: Folder of the fit.
-        progress: Display of progress.
-
-    Returns:
-        error: Infinite where there is no surface.
-    """
+    """Return the error of a store's refined surface on its validation poses, dB."""
     plain = {name: part for name, part in settings.plain().items() if name not in OF_SOURCE}
     plain["reconstruction"]["refine"] = True
     plain["data"] = {"store": str(store)}

@@ -95,18 +95,8 @@ def understand(
     """Read recordings and settings, and complete each by the other.
 
     Args:
-        form: A name of :data:`READERS`.
-        source: File or folder.
-        output: The store to be.
         settings_file: Sections ``import``, ``air``, ``ears``, ``call``, ``spectrogram``;
             ``import.yaml`` beside the recordings where None, if it is there.
-        overrides: ``KEY=VALUE``.
-        progress: Display of progress.
-
-    Raises:
-        SettingsError: If a key or value is not allowed, or settings and recordings contradict one
-            another.
-        InputError: If recordings or poses are no good.
     """
     if form not in READERS:
         raise SettingsError(f"unknown format {form!r}; known: {', '.join(READERS)}")

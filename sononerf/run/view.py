@@ -15,8 +15,7 @@ from sononerf.report.surface_views import SurfaceViews
 from sononerf.report.viewer import Viewer
 from sononerf.run.build import true_mesh
 from sononerf.run.export import read_volume
-from sononerf.run.run import open_run
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run, open_run
 from sononerf.run.simulate import store_path
 from sononerf.surface.mesh_files import confidence_of, error_of
 
@@ -25,19 +24,10 @@ WAIT = 2.0
 
 
 class View:
-    """A viewer of one folder; :meth:`refresh` shows new files.
-
-    Args:
-        path: A run, finished or not, or a store.
-        port: Port of the page; the next free one if it is taken.
-
-    Raises:
-        InputError: If it is neither.
-        ResourceError: If the extra ``view`` is not installed.
-    """
+    """A viewer of one folder; :meth:`refresh` shows new files."""
 
     def __init__(self, path: Path, *, port: int = 8080) -> None:
-        self.run = RunFolder(path)
+        self.run = Run(path)
         is_run = self.run.config.is_file()
         if not is_run and not (path / "zarr.json").is_file():
             raise InputError(f"{path}: neither a run nor a store; give the folder of one")
@@ -96,7 +86,7 @@ class View:
         except InputError as error:
             self._say(str(error))
             truth = None
-        limit = self.run.fitted.head.resolution / 2
+        limit = self.run.head.resolution / 2
         views = SurfaceViews(mesh, confidence_of(mesh), error_of(mesh), truth, limit)
         self.viewer.show_surface(views)
         if (self.run.reconstruction / "volume.vti").is_file():

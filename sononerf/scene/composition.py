@@ -53,16 +53,8 @@ def compose(parts: Sequence[Part], *, may_cross: bool = False) -> Scene:
     """Put scenes together into one.
 
     Args:
-        parts: At least one; their triangles follow one another in this order.
         may_cross: Whether it is meant that parts cut through one another. Otherwise it is warned
             of.
-
-    Returns:
-        scene: Materials that are alike share a number; one that all parts have stands alone.
-
-    Raises:
-        SettingsError: If there are no parts or nothing but background, or a position, rotation or
-            scale is none.
     """
     if not parts:
         raise SettingsError("parts: found none; give at least one")
@@ -163,9 +155,6 @@ def surfaces_cross(one: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:
 
     Where triangles meet, an edge of one of them passes through the other; so all edges of each
     surface are tried against the other one.
-
-    Args:
-        one, other: Metres, world frame.
 
     Returns:
         cross: False also where one lies wholly inside the other. Surfaces that touch may be taken

@@ -112,11 +112,7 @@ def roughened(material: Material, height: float) -> Material:
     :math:`e^{-2 (k \sigma)^2}` of the pressure in step.
 
     Args:
-        material: The smooth one.
         height (m): Standard deviation of the height.
-
-    Returns:
-        material: At nodes from 20 to 150 kHz; reflection is weakened alike.
 
     References:
         .. [1] P. Beckmann and A. Spizzichino, "The Scattering of Electromagnetic Waves from Rough

@@ -176,11 +176,7 @@ class Scene(Shown):
 
 
 def check_surface(mesh: trimesh.Trimesh) -> None:
-    """Refuse a mesh that is not a surface of a sensible size in metres.
-
-    Raises:
-        InputError, SurfaceSizeError: As :class:`Scene` says.
-    """
+    """Refuse a mesh that is not a surface of a sensible size in metres."""
     faces, vertices = np.asarray(mesh.faces), np.asarray(mesh.vertices)
     if len(faces) == 0:
         raise InputError("the mesh has no triangles; give a surface")
@@ -226,21 +222,7 @@ def list_scenes() -> list[plugins.Plugin]:
 def load_scene(
     name: str, options: Mapping[str, Any] | None = None, *, source: str | None = None
 ) -> Scene:
-    """Build a scene by its name.
-
-    Args:
-        name: Name of an entry point of the group ``sononerf.scenes``.
-        options: Keyword arguments of its factory.
-        source: Name of the settings' source, for messages.
-
-    Returns:
-        scene: Checked.
-
-    Raises:
-        SettingsError: If the name is unknown or claimed twice, an option is not allowed, or options
-            make a surface that is far too large or too small.
-        InputError: If the plugin cannot be imported, fails, or returns no scene.
-    """
+    """Build a scene by its name."""
     with faults_of(source):
         factory = plugins.load(plugins.SCENES, name)
         plugin = next(plugin for plugin in list_scenes() if plugin.name == name)

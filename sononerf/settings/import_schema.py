@@ -100,15 +100,7 @@ class ImportSettings(Section):
 
 
 def read_import_settings(data: Mapping[str, Any], where: str) -> ImportSettings:
-    """Check the section ``import`` of a settings file.
-
-    Args:
-        data: The section as plain data.
-        where: The file, for messages.
-
-    Raises:
-        SettingsError: One line for each fault.
-    """
+    """Check the section ``import`` of a settings file."""
     if not isinstance(data, Mapping):
         raise SettingsError(f"{where}: import: holds {data!r}, expected `key: value` lines")
     try:

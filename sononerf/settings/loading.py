@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import difflib
 import importlib.resources
+import io
 import json
 import re
 import typing
@@ -13,69 +14,31 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
 from pydantic import BaseModel, ValidationError
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+from ruamel.yaml.events import AliasEvent
 
 from sononerf.errors import SettingsError
 from sononerf.input_files import require_regular
 from sononerf.settings.schema import Settings
 
 MAX_SETTINGS_BYTES = 1_000_000
-MAX_SETTINGS_DEPTH = 50
 SectionT = TypeVar("SectionT", bound=BaseModel)
 PLUGIN_NAMES = (("scene", "name"), ("field", "kind"), ("renderer", "kind"))
 """Keys whose value determines the options beside them."""
 
 
-class _StrictLoader(yaml.SafeLoader):
-    """YAML that refuses duplicate keys and reads ``3e-3`` as the number it is."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        seen: set[Any] = set()
-        for key_node, _ in node.value:
-            key = self.construct_object(key_node, deep=True)
-            if not isinstance(key, str):
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} is no text", key_node.start_mark
-                )
-            if key in seen:
-                raise yaml.constructor.ConstructorError(
-                    None, None, f"the key {key!r} stands twice", key_node.start_mark
-                )
-            seen.add(key)
-        return super().construct_mapping(node, deep=deep)
-
-
-# YAML 1.1 reads 3e-3 as text, 010 as eight, 12:30 as 750 and `on` as true; YAML 1.2's core
-# schema does not.
-_StrictLoader.yaml_implicit_resolvers = {}
-for _tag, _pattern, _first in (
-    ("null", r"^(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
-    ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", list("tTfF")),
-    ("int", r"^[-+]?(?:0|[1-9][0-9]*)$", list("-+0123456789")),
-    (
-        "float",
-        r"^[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$",
-        list("-+0123456789."),
-    ),
-):
-    _StrictLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
-
-
 def _parse_yaml(text: str, where: str) -> Any:
-    depth = 0
+    """Return the plain data of a YAML 1.2 text; duplicate keys and aliases are errors."""
+    parser = YAML(typ="safe", pure=True)
     try:
-        for event in yaml.parse(text, Loader=_StrictLoader):
-            if isinstance(event, yaml.AliasEvent):
-                raise SettingsError(f"{where}: YAML aliases are not accepted; write the value out")
-            if isinstance(event, yaml.CollectionStartEvent):
-                depth += 1
-                if depth > MAX_SETTINGS_DEPTH:
-                    raise SettingsError(f"{where}: nested deeper than {MAX_SETTINGS_DEPTH} levels")
-            elif isinstance(event, yaml.CollectionEndEvent):
-                depth -= 1
-        return yaml.load(text, Loader=_StrictLoader)
-    except yaml.YAMLError as error:
+        if any(isinstance(event, AliasEvent) for event in parser.parse(text)):
+            raise SettingsError(f"{where}: YAML aliases are not accepted; write the value out")
+        return parser.load(text)
+    except RecursionError:
+        raise SettingsError(f"{where}: nested too deeply") from None
+    except (YAMLError, ValueError) as error:
         mark = getattr(error, "problem_mark", None)
         place = f"{where}:{mark.line + 1}:{mark.column + 1}" if mark else where
         problem = getattr(error, "problem", None) or "is no YAML"
@@ -83,11 +46,7 @@ def _parse_yaml(text: str, where: str) -> Any:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Read one settings file as plain data.
-
-    Raises:
-        SettingsError: If the file is missing, not UTF-8, too large, or no YAML mapping.
-    """
+    """Read one settings file as plain data."""
     try:
         require_regular(path)
         if path.stat().st_size > MAX_SETTINGS_BYTES:
@@ -112,11 +71,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 
 def apply_override(data: dict[str, Any], assignment: str) -> None:
-    """Set one dotted ``KEY=VALUE`` in ``data``, in place.
-
-    Raises:
-        SettingsError: If the text is no assignment or runs through a value that is no section.
-    """
+    """Set one dotted ``KEY=VALUE`` in ``data``, in place."""
     key, equals, value = assignment.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
@@ -133,11 +88,7 @@ def apply_override(data: dict[str, Any], assignment: str) -> None:
 
 
 def assignments(sections: Mapping[str, Any]) -> list[str]:
-    """Return sections of settings, a dictionary of dictionaries, as ``KEY=VALUE`` assignments.
-
-    Raises:
-        SettingsError: If a section is no dictionary, or a value is no plain data.
-    """
+    """Return sections of settings, a dictionary of dictionaries, as ``KEY=VALUE`` assignments."""
     found = []
     for section, keys in sections.items():
         if not isinstance(keys, Mapping):
@@ -164,11 +115,7 @@ def _drop_options_of_another(data: dict[str, Any], assignment: str) -> None:
 
 
 def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
-    """Check plain data against the settings.
-
-    Raises:
-        SettingsError: One line per fault, naming ``source``, the dotted key and what is allowed.
-    """
+    """Check plain data against the settings."""
     try:
         settings = Settings.model_validate(dict(data))
     except ValidationError as error:
@@ -181,16 +128,7 @@ def validate_settings(data: Mapping[str, Any], source: str) -> Settings:
 def checked_section(
     model: type[SectionT], given: SectionT | Mapping[str, Any], where: str
 ) -> SectionT:
-    """Return a section of the settings from plain data; one that is checked already stays.
-
-    Args:
-        model: The section.
-        given: Its keys and values.
-        where: Name of the section, for messages.
-
-    Raises:
-        SettingsError: One line per fault.
-    """
+    """Return a section of the settings from plain data; one that is checked already stays."""
     if isinstance(given, model):
         return given
     if not isinstance(given, Mapping):
@@ -232,10 +170,6 @@ def load_settings(config: Path, overrides: Iterable[str] = ()) -> Settings:
     Args:
         config: A file; the name of a shipped one, such as ``three_spheres``; or an assignment,
             which is laid over the defaults.
-        overrides: Further assignments.
-
-    Raises:
-        SettingsError: As :func:`read_yaml` and :func:`validate_settings` say.
     """
     overrides = list(overrides)
     if is_assignment(config):
@@ -258,7 +192,16 @@ def is_assignment(config: Path) -> bool:
 
 def dump_yaml(settings: Settings) -> str:
     """Return the settings, whole, as YAML text that :func:`load_settings` reads back."""
-    return str(yaml.safe_dump(settings.plain(), sort_keys=False, allow_unicode=True))
+    return to_yaml(settings.plain())
+
+
+def to_yaml(data: dict[str, Any]) -> str:
+    """Return plain data as YAML text."""
+    text = io.StringIO()
+    dumper: Any = YAML(typ="safe", pure=True)
+    dumper.default_flow_style, dumper.sort_base_mapping_type_on_output = False, False
+    dumper.dump(data, text)
+    return text.getvalue()
 
 
 def _model_at(model: type[BaseModel], path: Iterable[str | int]) -> type[BaseModel] | None:
@@ -322,16 +265,7 @@ def describe_faults(
 def refuse_truths(
     given: Mapping[str, Any], taken: BaseModel, *, source: str | None = None, prefix: str = ""
 ) -> None:
-    """Refuse yes and no where a number is meant; pydantic takes them for 1 and 0.
-
-    Args:
-        given: The settings as they were given.
-        taken: The settings after pydantic's validation.
-        source, prefix: Name of the source, and dotted key of the whole, for messages.
-
-    Raises:
-        SettingsError: One line for each.
-    """
+    """Refuse yes and no where a number is meant; pydantic takes them for 1 and 0."""
     head = "" if source is None else f"{source}: "
     keys = [".".join([*([prefix] if prefix else []), *key]) for key in _truths(given, taken)]
     if keys:

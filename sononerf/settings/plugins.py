@@ -51,12 +51,7 @@ def registered(group: str) -> list[Plugin]:
 
 
 def load(group: str, name: str) -> Callable[..., Any]:
-    """Import one plugin by its name.
-
-    Raises:
-        SettingsError: If the name is unknown, or two distributions claim it.
-        InputError: If the plugin cannot be imported, or is no factory.
-    """
+    """Import one plugin by its name."""
     kind = group.rpartition(".")[2].removesuffix("s")
     plugins = registered(group)
     claims = [plugin for plugin in plugins if plugin.name == name]
@@ -84,18 +79,7 @@ def load(group: str, name: str) -> Callable[..., Any]:
 
 
 def call(owner: str, factory: Callable[..., Any], *given: Any, **options: Any) -> Any:
-    """Call a plugin's factory.
-
-    Args:
-        owner: Name of the plugin, for the message.
-        factory: It.
-        given, options: Its arguments.
-
-    Raises:
-        SonoNerfError: As the factory raises it.
-        ResourceError: If there is not enough memory.
-        InputError: If the factory raises anything else.
-    """
+    """Call a plugin's factory."""
     try:
         with memory_faults():
             return factory(*given, **options)
@@ -109,21 +93,7 @@ def call(owner: str, factory: Callable[..., Any], *given: Any, **options: Any) -
 def check_options(
     factory: Callable[..., Any], options: Mapping[str, Any], *, where: str, given: int = 0
 ) -> dict[str, Any]:
-    """Check options against a factory's keyword arguments and fill in its defaults.
-
-    Args:
-        factory: Its annotated keyword arguments are what may be set.
-        options: Options of the settings.
-        where: Dotted key of the options, for messages.
-        given: Number of leading arguments that the caller passes.
-
-    Returns:
-        options: Every argument with its value, converted to its annotation.
-
-    Raises:
-        SettingsError: If a key is unknown, missing, or its value is not allowed.
-        InputError: If the factory's annotations cannot be read.
-    """
+    """Check options against a factory's keyword arguments and fill in its defaults."""
     model = _options_model(factory, where, given)
     try:
         checked = model.model_validate(dict(options))
@@ -135,10 +105,6 @@ def check_options(
 
 def describe_options(factory: Callable[..., Any], *, given: int = 0) -> list[dict[str, Any]]:
     """Return the options of a factory: its keyword arguments.
-
-    Args:
-        factory: Its annotated keyword arguments are what may be set.
-        given: Number of leading arguments that the caller passes.
 
     Returns:
         rows: ``name``; ``default``, plain data, or None if there is none; ``needed``, where it

@@ -204,11 +204,7 @@ class SpectrogramSettings(Section):
 
 
 def check_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
-    """Refuse a sweep that the sampling rate cannot hold, or of which nothing is analysed.
-
-    Raises:
-        ValueError: If it is one.
-    """
+    """Refuse a sweep that the sampling rate cannot hold, or of which nothing is analysed."""
     bands, half = call.bands, analysis.sampling_rate / 2
     for number, (_, high) in bands.items():
         if high > half:

@@ -48,16 +48,6 @@ def settle_rays(
     The difference between two seeds is measured at a few poses, as the noise floor is: the mean
     over active cells of reported decibels. Call :meth:`Simulator.prepare` first; its results are
     used.
-
-    Args:
-        simulator: Its engine gets the number.
-        poses: Those of the ensemble.
-        options: A number of rays, or the accuracy to be reached.
-        progress: Shows the trials and the number.
-        workers: See :func:`sononerf.simulation.workers.simulated`.
-
-    Returns:
-        rays: Per pose; None if the engine traces none.
     """
     tracer = tracer_of(simulator.engine)
     if tracer is None:
@@ -81,7 +71,7 @@ def settle_rays(
         factor = (error / options.accuracy_db) ** (1.0 / CONVERGENCE)
         tracer.rays = min(MOST, _rounded(tracer.rays * float(np.clip(factor, *STEP))))
     progress.say(
-        f"echoes: {MOST} rays per pose, the most that are chosen; they are less accurate than "
+        f"echoes: {MOST} rays per pose, the most that are chosen; fewer were less accurate than "
         f"simulation.accuracy_db ({options.accuracy_db:g} dB); simulation.rays=NUMBER takes more"
     )
     return tracer.rays

@@ -121,9 +121,6 @@ window of 32 us nothing is heard more than 10 mm before the nearest point."""
 class Arrival:
     """The shortest ways from an emitter over the surface of a scene to an ear.
 
-    Args:
-        scene: The ensonified scene.
-
     Attributes:
         radius (m): Radius of a sphere around the scene.
     """

@@ -123,7 +123,6 @@ def wedge_directivity(
         open_angle ((N,), rad): :math:`\theta_w`, of the air around the edge.
         to_source, to_receiver ((N, 3), m): From the point.
         fade ((F,), 1/m): Decay over the detour from the mirror's path.
-        xp: ``numpy``; or ``torch``, for tensors with gradients.
 
     Returns:
         directivity (N, F): Finite everywhere.
@@ -174,11 +173,6 @@ class Diffraction:
 
     where emitter and ear both see it, with the material's strength :math:`D`; on an edge
     :math:`dM` is the length alone and :math:`D` is multiplied by the directivity of a rigid wedge.
-
-    Args:
-        scene: Mesh and materials.
-        caster: Caster of the mesh.
-        reflections: The materials at the nodes.
     """
 
     def __init__(
@@ -214,14 +208,8 @@ class Diffraction:
         """Return the sound of edges and curved places at the ears of a pose.
 
         Args:
-            hearing: Head and air.
             position ((3,), m): Place of the head.
             rotation (3, 3): Head to world.
-            points: Number of points, spaced evenly over all edges that diffract.
-            offset: In [0, 1), shifts them.
-
-        Returns:
-            sound: For :meth:`Hearing.echo` with the synthesis' ``hats``.
         """
         sound = hearing.silence()
         share = self._end[-1] / points

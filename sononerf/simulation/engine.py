@@ -17,10 +17,6 @@ from sononerf.simulation.reflection import Reflection, reflection
 class Engine:
     """Base of engines: the sound of a scene at the ears of a pose.
 
-    Args:
-        scene: The ensonified scene.
-        hearing: Head and air.
-
     Attributes:
         reflections: The scene's materials at the nodes of the synthesis.
         note: Note to the user about the simulation of this scene; may be empty.
@@ -76,7 +72,6 @@ class Engine:
         Args:
             positions ((P, 3), m): Places of the head, world frame.
             rotations (P, 3, 3): Head to world.
-            progress: Takes the numbers of parts that are done and of all parts.
         """
 
     def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
@@ -85,7 +80,6 @@ class Engine:
         Args:
             position ((3,), m): Place of the head, world frame.
             rotation (3, 3): Head to world.
-            seed: Seed of all random numbers.
 
         Returns:
             echo (E, S): From the emission to the end of the last analysis frame.

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -34,7 +34,6 @@ from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.accuracy import MOST, settle_rays
 from sononerf.simulation.pose_faults import check_aim, check_poses, check_reach, deaf
-from sononerf.simulation.shards import Shard, take_shards
 from sononerf.simulation.simulator import VERSION, Simulator, pose_seed
 from sononerf.simulation.workers import SeedOf, simulated
 
@@ -54,17 +53,13 @@ def simulate(
     output: Path | str | None = None,
     options: SimulationSettings | Mapping[str, Any] | None = None,
     about: Mapping[str, Any] | None = None,
-    shard: Shard | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> Echoes:
     """Simulate the echoes of a scene that a head hears at poses.
 
-    The same call resumes an interrupted ensemble on disk, and opens a complete one. Shards are
-    stores beside the ensemble's, each with some of its poses. Different machines can simulate them
-    at once. The same call without a shard takes the poses from there, simulates missing ones, and
-    seals the store.
+    The same call resumes an interrupted ensemble on disk, and opens a complete one.
 
     Args:
         scene: The ensonified scene.
@@ -77,14 +72,12 @@ def simulate(
         options: Engine, accuracy and seed: keys of the section ``simulation`` of the settings, such
             as ``{"accuracy_db": 0.4, "bounces": 1, "seed": 1}``.
         about: Further attributes of the ensemble, plain data.
-        shard: Number of the shard and of all shards; the whole ensemble where None. It needs
-            ``output``.
         workers: Processes; as many as there are cores, at most 8, where None.
         scheduler: Address of a Dask scheduler to use instead.
         progress: Display of progress; on stderr where None.
 
     Returns:
-        echoes: Complete, or the shard.
+        echoes: Complete.
 
     Raises:
         InputError: If a pose is inside the scene, the poses are too few to split, or an argument
@@ -103,9 +96,6 @@ def simulate(
     purposes = split_of(poses, split)
     wanted = echo_hash(scene, poses, purposes, head, settings)
     path = None if output is None else Path(output)
-    whole = path
-    if shard is not None and path is not None:
-        path = shard.path(path)
     if path is not None and (finished := _finished(path, wanted)) is not None:
         return Echoes(finished, head)
     warn_of_call(head.call, head.analysis)
@@ -123,9 +113,8 @@ def simulate(
     if path is not None:
         storage.remove_if_empty(storage.probe_writable(path))
         cells = len(poses) * len(head.receivers) * len(head.range) * len(head.frequency)
-        share = 1 if shard is None else shard.count
         require_disk(
-            LEAST_BYTES * cells / share,
+            LEAST_BYTES * cells,
             path,
             f"{path}: the echoes of {len(poses):,} poses",
             "lower poses.count, or choose another disk with --output",
@@ -139,7 +128,6 @@ def simulate(
         "attributes": _attributes(wanted, scene, head, settings, about or {}),
         "receivers": len(head.receivers),
     }
-    only = None if shard is None else range(shard.number - 1, len(poses), shard.count)
     how: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "progress": progress}
     if path is None:
         kept = MemoryEnsemble(positions=poses.positions, rotations=poses.rotations, **given)
@@ -151,9 +139,7 @@ def simulate(
         )
         store.remove_damaged()
         attach(head, path)
-        if shard is None and whole is not None:
-            take_shards(store, whole)
-        _fill(store, simulator, poses, settings, only=only, **how)
+        _fill(store, simulator, poses, settings, **how)
     return Echoes(EnsembleStore.open(path), head)
 
 
@@ -169,7 +155,6 @@ def _finished(path: Path, wanted: str) -> EnsembleStore | None:
         )
     if not store.is_sealed or store.damaged():
         return None
-    locks.remove_dead(path)
     return store
 
 
@@ -263,17 +248,16 @@ def _fill(
     poses: Poses,
     options: SimulationSettings,
     *,
-    only: Collection[int] | None = None,
     workers: int | None,
     scheduler: str | None,
     progress: Progress,
 ) -> None:
-    """Simulate the missing poses of a store, and seal it unless ``only`` names some poses.
+    """Simulate the missing poses of a store, and seal it.
 
     The test poses are simulated twice, with other rays, which gives the noise floor.
     """
-    missing = [index for index in store.missing() if only is None or index in only]
-    test = store.indices("test")[: options.noise_floor_poses if only is None else 0]
+    missing = store.missing()
+    test = store.indices("test")[: options.noise_floor_poses]
     again: dict[int, Singles] = {}
     wanted = [*missing, *test]
     simulator.prepare(poses.positions[wanted], poses.rotations[wanted], progress)
@@ -308,8 +292,6 @@ def _fill(
             workers=workers,
             scheduler=scheduler,
         )
-    if only is not None:
-        return
     analysis = simulator.head.analysis
     silent = deaf(analysis.range_min, analysis.range_max)
     seal(store, {int(i): again[int(i)] for i in test}, silent=silent)
@@ -330,14 +312,8 @@ def simulate_ensemble(
     The result of a pose depends on its seed alone, not on workers or order.
 
     Args:
-        simulator: Scene and head.
-        poses: All poses of the ensemble.
-        indices: Indices of those to simulate.
-        write: Takes an index and its spectrogram (E, R, F); called here, one at a time.
-        seed_of: Gives the seed of a pose by its index.
         workers: Processes on this machine; one means this process. Where None, as many as there are
             cores, at most 8, if they save time.
-        scheduler: Address of a Dask scheduler whose workers are used instead.
     """
     wanted = [int(index) for index in indices]
     results = simulated(simulator, poses, wanted, seed_of, workers=workers, scheduler=scheduler)
@@ -358,11 +334,8 @@ def spectrograms(
     """Return the spectrograms of poses (P, E, R, F), linear magnitude, with the same rays for each.
 
     Args:
-        simulator: Scene and head.
         positions ((P, 3), m): Places of the head, world frame.
         rotations (P, 3, 3): Head to world.
-        seed: Seed of the rays.
-        done: Called after each pose.
     """
     found: dict[int, Singles] = {}
 

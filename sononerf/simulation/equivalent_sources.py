@@ -85,12 +85,6 @@ class Sources(Solved):
     solved for; :func:`hybrid` leaves both to the rays. A smooth body needs a tenth of
     the unknowns of boundary elements, so this engine solves the low band of :class:`Hybrid`.
 
-    Args:
-        scene: The ensonified scene; closed and rigid.
-        hearing: Head and air.
-        most: Sources at the highest frequency. With the area of the surface they say which it is.
-        fall: See :class:`Solved`.
-
     Attributes:
         keeps: Whether the factorised equations are kept. Further poses are then solved for at once,
             in blocks of ``FEW``.

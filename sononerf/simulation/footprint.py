@@ -188,7 +188,6 @@ def onto(rows: Singles, turned: Singles, further: Ints, distance: Floats) -> Sin
     """Return mirrored bundles (N, 12) where they are hit next, see :func:`land`.
 
     Args:
-        rows, turned: From :func:`land`.
         further (N,): Indices of those that hit anything.
         distance ((N,), m): Distance to the hit.
     """

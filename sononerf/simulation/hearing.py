@@ -36,10 +36,6 @@ class Listener(Protocol):
 class Sound:
     """Sound at the ears of one pose, while it is collected.
 
-    Args:
-        synthesis: Time bins.
-        ears: Number of ears, E.
-
     Attributes:
         bins: Bins of each ear.
         heard: True if any echo was added.
@@ -60,10 +56,6 @@ class Sound:
 
 class Hearing:
     """Response of a head to echoes of points.
-
-    Args:
-        head: Emitter, receivers and air.
-        synthesis: Time bins and filters.
 
     Attributes:
         ears: Gains at the nodes of the synthesis.
@@ -132,8 +124,6 @@ class Hearing:
         ear.
 
         Args:
-            sound: The sound to add to.
-            ear: 0 left, 1 right.
             points ((N, 3), m): World frame.
             length ((N,), m): Path from the emitter to the points.
             spread ((N,), m): Standard deviation of the whole path's length over a point's patch.
@@ -163,7 +153,6 @@ class Hearing:
         """Return the pressure at the ears for a call that is one sample of height 1.
 
         Args:
-            sound: The collected sound.
             basis ((K, F) complex128): Filters of the synthesis; its ``basis``, for reflections,
                 where not given.
 

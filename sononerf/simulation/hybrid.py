@@ -29,10 +29,6 @@ class Hybrid(Engine):
     wrong by several decibels. At these frequencies the wave equation of small bodies is cheap.
     Both engines give pressure with level and delay, so they are added. Between the bands the low
     one falls as a raised cosine, and the high one rises.
-
-    Args:
-        low: For low frequencies.
-        high: For high frequencies; its band begins where that of ``low`` ends.
     """
 
     def __init__(self, low: Sources, high: Rays) -> None:
@@ -82,11 +78,7 @@ def hybrid(
     """Return the hybrid engine, or the rays alone if the low band cannot be solved for.
 
     Args:
-        scene: The ensonified scene.
-        hearing: Head and air.
-        sources: Largest number of sources, which bounds the time.
         frequency_min (Hz): The lowest that is analysed.
-        **rays: Arguments of :class:`Rays`.
 
     Returns:
         engine: Rays where a surface is open, not rigid, too large or too thin; its ``note`` says

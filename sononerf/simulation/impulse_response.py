@@ -112,13 +112,6 @@ def plan_synthesis(settings: SpectrogramSettings, samples: int) -> Synthesis:
     smoothly to zero within a third of that frequency. The factor ``j f`` that every
     reflection has is part of the filters: a flat reflection is then a short derivative pulse and
     no long tail.
-
-    Args:
-        settings: The analysis of the echo.
-        samples: Length of the echo, S.
-
-    Returns:
-        synthesis: Time bins, nodes and filters.
     """
     rate = settings.sampling_rate
     top = min(max(HIGHEST, 1.2 * settings.frequency_max), 0.45 * rate)
@@ -187,8 +180,6 @@ def deposit(
     """Lay echoes into time bins, each into the two nearest bins of its two neighbouring levels.
 
     Args:
-        synthesis: The bins.
-        bins: The echoes are added to these, in place.
         delay ((N,), s): From the emission; echoes too late for the last frame are left out.
         spread ((N,), s): Standard deviation of the arrival times of an echo's patch.
         strength (N, F): Per node.
@@ -222,7 +213,6 @@ def _lay(
     Args:
         values (B, F): Values of the bins.
         start (L + 1,): First row of each level.
-        delay, spread, strength: See :func:`deposit`.
         rate (Hz): Rate of the finest bins.
         last (bins): Arrival time from which on echoes are left out.
     """
@@ -268,8 +258,6 @@ def synthesise(
     """Weaken each node's bins by the air, filter them with its part of the spectrum, add up.
 
     Args:
-        synthesis: The filters.
-        bins: From :func:`deposit`.
         air (B, F): From :func:`air_loss`.
         basis ((K, F) complex128): The synthesis' ``basis``, or its ``hats``.
 
@@ -313,9 +301,6 @@ def _filter(
         spectrum (K / part,): Spectrum of the echo.
         half (size // 2 + 1, F): Spectra of the bins.
         basis (K, F): The filters.
-        size: Number of bins.
-        part: One over the part of the record that is filtered.
-        width: Width of these bins, in finest ones.
     """
     finest = OVERSAMPLING * 2.0 * (len(spectrum) - 1)  # bins at the level of the finest
     for k in range(len(spectrum)):

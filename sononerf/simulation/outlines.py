@@ -16,9 +16,6 @@ from sononerf.geometry.normals import CREASE, bodies, corner_normals, weight_gra
 class Outlines:
     """Edges of a mesh that may be part of an obstacle's outline, seen from some place.
 
-    Args:
-        mesh: The scene.
-
     Attributes:
         body (T,): Index of each triangle's connected part.
         closed (T,): True if that part has no rim.
@@ -106,9 +103,6 @@ def _outline(
         bend (T, 2, 3): Difference of the smooth normals there from that at the first corner.
         bodies (T,): Index of each triangle's body.
         least (1/m): Curvature of an edge that bends the other way.
-
-    Returns:
-        outline: As in :meth:`Outlines.seen_from`.
     """
     front = np.zeros(len(normals), np.bool_)
     for i in range(len(normals)):

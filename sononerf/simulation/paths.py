@@ -146,16 +146,11 @@ def trace(
     Both sides of a surface are alike: the side that a ray hits is the outside.
 
     Args:
-        caster: The surface.
         emitter ((3,), m): Origin of all rays.
         directions (N, 3): Unit vectors.
-        bounces: Largest number of hits of a ray.
         solid_angle (sr): Solid angle of each ray.
         beyond: Takes the first hits and all directions (N, 3); returns the hits to use instead, and
             their distance from the emitter (M,), m.
-
-    Yields:
-        bounce: One per bounce, as long as any ray hits.
     """
     origins = np.broadcast_to(emitter, directions.shape)
     hits = caster.first_hit(origins, directions)
@@ -208,18 +203,10 @@ def echo_paths(
     refined where the integrand is not resolved.
 
     Args:
-        caster: The surface.
         emitter ((3,), m): Origin of all rays.
-        cap: First rays, world frame.
-        bounces: Largest number of hits of a ray.
-        extra: At most so many rays come to the first ones.
         judge: Takes hits; returns which of them (H,) can be heard at all, and how much of each (H,)
             may be wrong for the size of its cell, in any unit, zero where it is small enough.
-        beyond: See :func:`trace`.
         index (N,): Index of the first rays, those that may hit anything; all where not given.
-
-    Yields:
-        bounce: Audible hits of cells that are left as they are.
     """
     rays = np.arange(cap.count) if index is None else index
     directions, parts, count = cap.directions(rays), 1, cap.count

@@ -25,14 +25,8 @@ def check_poses(
     """Refuse poses that lie inside the surface, or not above the support.
 
     Args:
-        scene: The ensonified scene.
-        poses: To be checked.
         offsets ((K, 3), m): Further points of the head that must be outside, such as emitter and
             ears; head frame.
-        plane: The support; None if there is none.
-
-    Raises:
-        InputError: If a pose lies there.
     """
     points = np.zeros((1, 3)) if offsets is None else np.vstack([np.zeros((1, 3)), offsets])
     places = poses.positions[:, None] + np.einsum("pij,kj->pki", poses.rotations, points)
@@ -67,13 +61,7 @@ def check_reach(
     """Warn of poses that no echo can reach within the range limits.
 
     Args:
-        scene: The ensonified scene.
-        poses: To be checked.
-        bounces: Largest number of hits.
         range_min, range_max (m): The limits of the spectrograms.
-
-    Raises:
-        NumericalError: If it is so for all poses; the tails of the analysis would pass for echoes.
     """
     lower, upper = np.asarray(scene.mesh.bounds)
     radius = float(np.linalg.norm(upper - lower)) / 2.0
@@ -94,13 +82,7 @@ def check_reach(
 
 
 def check_aim(scene: Scene, poses: Poses, *, is_directional: bool) -> None:
-    """Warn of poses that look away from the scene, and of poses that are all the same.
-
-    Args:
-        scene: The ensonified scene.
-        poses: To be checked.
-        is_directional: Whether it matters which way the head looks.
-    """
+    """Warn of poses that look away from the scene, and of poses that are all the same."""
     fault = aim_fault(poses, np.asarray(scene.mesh.bounds).mean(axis=0))
     if fault and is_directional:
         logger.warning("%s", fault)

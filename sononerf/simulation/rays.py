@@ -62,11 +62,6 @@ class Rays(Engine):
     through it. Shadows of later bounces are sharp.
 
     Args:
-        scene: The ensonified scene.
-        hearing: Head and air.
-        rays: Per pose.
-        bounces: Largest number of hits of a ray.
-        diffraction_points: Per pose, where a material diffracts.
         band (K,): Factor of each frequency of the synthesis; 1 for all where not
             given.
     """

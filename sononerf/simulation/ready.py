@@ -1,7 +1,13 @@
 # SPDX-License-Identifier: MIT
+# ruff: noqa: E402 - numerical libraries read the environment when they are imported
 """Imported by the process that workers are forked from, so that each has all compiled loops."""
 
 from __future__ import annotations
+
+import os
+
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+os.environ.update(dict.fromkeys(THREADS, "1"))  # each worker uses one core
 
 import numpy as np
 import trimesh

@@ -71,8 +71,6 @@ class Shadow:
     What passes is the same over a cell of the surface, and solved for where it is asked for.
 
     Args:
-        outlines: Outlines of the scene.
-        caster: Caster of the scene.
         place ((3,), m): Emitter or ear.
         wavenumber ((F,), 1/m): At the nodes.
         speed_of_sound (m/s): Speed of the air.
@@ -270,10 +268,7 @@ def _lay(
         bodies (N,): Bodies that the points lie on.
         start (N + 1,): Index of each point's first piece in ``reached``.
         reached (R,): Pieces whose sound may reach the points.
-        middles, alongs, behinds, owners, curves: Attributes of the pieces; see :class:`_Pieces`.
-        bins: Number of bins.
         step (m): Width of a bin.
-        cell, longest, waist: Attributes of the shadow.
 
     Returns:
         laid (4, U, bins): The angle swept, and weights of the powers of Pekeris' function.
@@ -368,7 +363,6 @@ def passing(
     Args:
         lit, heard (N,): Rows of each point in the tables, from :meth:`Shadow.passed`.
         lit_table, heard_table (C, F): Transmission from the emitter, and to the ear.
-        is_lit: True if nothing stands between the emitter and any point.
         is_seen (N,): True if nothing stands between a point and the ear.
 
     Returns:

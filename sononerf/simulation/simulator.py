@@ -52,9 +52,6 @@ VERSION = 5  # to be raised when the same settings give other echoes: stores are
 class Simulator:
     """Simulator of what the receivers of a pose hear of a scene.
 
-    Args:
-        engine: Brings the sound to the receivers; its head makes spectrograms of it.
-
     Attributes:
         head: The head.
     """
@@ -68,14 +65,8 @@ class Simulator:
         """Return the simulator of a scene and a head.
 
         Args:
-            scene: The ensonified scene.
             head: The head. Of a scene on its support the part above it is ensonified together
                 with its image: a rigid plane is exactly that.
-            options: The engine and the bounds of its work.
-
-        Raises:
-            InputError: If all of the scene lies below the support.
-            SettingsError: If the engine knows no support.
         """
         hearing, analysis = hearing_of(head), head.analysis
         if head.plane is not None:
@@ -117,14 +108,7 @@ class Simulator:
     def of_surface(
         cls, mesh: trimesh.Trimesh, head: Head, options: SimulationSettings, *, rays: int
     ) -> Simulator:
-        """Return the hybrid engine on a reconstructed surface, without noise.
-
-        Args:
-            mesh: m.
-            head: The head.
-            options: Engine and number of rays are replaced.
-            rays: Per pose.
-        """
+        """Return the hybrid engine on a reconstructed surface, without noise."""
         wanted = options.model_copy(update={"engine": "hybrid", "rays": rays})
         return cls.of(Scene(mesh, warns=False), head.without_noise(), wanted)
 
@@ -144,7 +128,6 @@ class Simulator:
         Args:
             positions ((P, 3), m): Places of the head, world frame.
             rotations (P, 3, 3): Head to world.
-            progress: Display of progress.
         """
         if len(positions) and self.engine.parts:
             with progress.task("solving", self.engine.parts) as task:
@@ -239,16 +222,8 @@ def ensemble_poses(wanted: PoseSettings) -> tuple[Poses, NDArray[np.int8]]:
     Each set draws from a generator of its own, so that the number of one does not move another.
     The poses of a path stay in the order of its table.
 
-    Args:
-        wanted: Arrangement, numbers and seed.
-
     Returns:
-        poses: All of them.
         split ((P,) int8): 0 train, 1 validation, 2 test.
-
-    Raises:
-        InputError: If a table of poses cannot be used.
-        ResourceError: If there is too little memory for so many poses.
     """
     if wanted.path is not None:
         return _path_poses(wanted, wanted.path)

@@ -113,10 +113,7 @@ class Solved(Engine):
     around; for ``three_spheres`` it is more than 80 dB below the greatest pressure.
 
     Args:
-        scene: The ensonified scene.
-        hearing: Head and air.
         frequency_max (Hz): Frequency at which the response has fallen to zero.
-        fall: ``frequency_max`` over the frequency from which on the response falls.
 
     Attributes:
         frequency ((K,), Hz): Those that are solved for.
@@ -171,7 +168,6 @@ class Solved(Engine):
 
         Args:
             wavenumber (1/m): Wavenumber of sound in air; its imaginary part is not positive.
-            poses: Places of emitters and ears, and their gains.
 
         Returns:
             pressure ((P, E) complex128): For an emission of pressure 1 at 1 m where the beam's gain
@@ -192,7 +188,6 @@ class Solved(Engine):
         Args:
             positions ((P, 3), m): Places of the head, world frame.
             rotations (P, 3, 3): Head to world.
-            progress: Takes how many frequencies are done and how many there are.
         """
         finite = np.isfinite(positions).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
         pairs = zip(positions[finite], rotations[finite], strict=True)

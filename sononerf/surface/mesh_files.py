@@ -31,18 +31,8 @@ def mesh_bytes(
     always their normals. STL knows none of them.
 
     Args:
-        mesh: Metres.
-        file_type: Binary PLY, binary STL, or binary glTF.
         confidence (V,): Number of poses that heard the surface around each vertex.
         error ((V,), m): Error of each vertex.
-
-    Returns:
-        data: The file.
-
-    Raises:
-        ValueError: If the format is another one, or there is not one number per vertex, zero or
-            more.
-        NumericalError: If the mesh is empty or a vertex is not finite.
     """
     if file_type not in ("ply", "stl", "glb"):
         raise ValueError(f"file_type: {file_type!r}, expected 'ply', 'stl' or 'glb'")

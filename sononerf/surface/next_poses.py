@@ -103,7 +103,6 @@ def _greedy(
     Args:
         weight, known (B,): Error before a pose is added, and the curvature.
         added (P, B): Curvature that each candidate adds.
-        count: Number of rows.
         ways, heard ((P, 3), (H, 3)): Directions of the candidates, and of the poses so far, from
             the surface. Only candidates with ``SPREAD`` of the greatest gap are chosen.
     """

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 import trimesh
 from lightning import Fabric
-from torch import Tensor
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
@@ -28,7 +27,7 @@ from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.candidates import number_of_steps
 from sononerf.surface.refine.descent import poses_that_hear
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.refinement import Refinement
+from sononerf.surface.refine.refinement import Saved
 from sononerf.surface.refine.refinement import refine as refine_starts
 from sononerf.surface.start.read_out import (
     LEVELS,
@@ -157,8 +156,8 @@ def refine(
     options: SimulationSettings | Mapping[str, Any] | None = None,
     seed: int = 0,
     accelerator: str = "auto",
-    state: dict[str, Tensor] | None = None,
-    after_step: Callable[[Refinement, float], None] | None = None,
+    saved: Saved | None = None,
+    after_stage: Callable[[trimesh.Trimesh, float], None] | None = None,
     progress: Progress | None = None,
 ) -> Surface:
     """Move a surface until physical optics, corrected by the simulator, gives the echoes.
@@ -175,9 +174,9 @@ def refine(
             settings.
         seed: Order of the poses.
         accelerator: Device to compute on: ``auto``, ``cpu`` or ``gpu``.
-        state: State of an interrupted refinement of the same surface and echoes, which resumes, see
-            :meth:`sononerf.surface.refine.refinement.Refinement.state`.
-        after_step: Called after each step with the refinement and the step's mismatch, dB.
+        saved: Stages that are done are kept here. Given again with the same surface and echoes,
+            they are not repeated.
+        after_stage: Called with the surface of a stage and its error on validation poses, dB.
         progress: Display of progress; on stderr where None.
 
     Returns:
@@ -197,10 +196,8 @@ def refine(
     starts = starts_of(surface)
     with progress.task("refining", number_of_steps(starts)) as task, _one_thread():
 
-        def stepped(work: Refinement, mismatch: float) -> None:
-            task.advance(work.drawn - task.done, f"mismatch {mismatch:.2f} dB")
-            if after_step is not None:
-                after_step(work, mismatch)
+        def after_step(steps: int, mismatch: float) -> None:
+            task.advance(steps, f"mismatch {mismatch:.2f} dB")
 
         refined = refine_starts(
             starts,
@@ -208,8 +205,9 @@ def refine(
             optics=_placed(Optics(echoes.head), accelerator),
             simulate=partial(Simulator.of_surface, head=echoes.head, options=simulation, rays=RAYS),
             seed=seed,
-            state=state,
-            after_step=stepped,
+            saved=saved,
+            after_step=after_step,
+            after_stage=after_stage,
         )
     known = math.isfinite(refined.error_db)
     return finished_surface(
@@ -227,12 +225,7 @@ def refine(
 
 
 def starts_of(surface: Surface) -> dict[StartMethod, trimesh.Trimesh]:
-    """Return the start surfaces of a refinement, m, by their method.
-
-    Raises:
-        SettingsError: If the surface is an iso-surface of a field.
-        NumericalError: If no method gives a surface.
-    """
+    """Return the start surfaces of a refinement, m, by their method."""
     if surface.method == "isosurface":
         raise SettingsError(
             "an iso-surface is not refined; reconstruct with the method auto, or give "

@@ -62,7 +62,7 @@ class Surface(Shown):
 
     mesh: trimesh.Trimesh
     volume: Volume | None = None
-    method: Method = "filled"
+    method: Method = "given"
     level: float | None = None
     openness: Openness | None = None
     confidence: NDArray[np.int32] | None = None
@@ -119,13 +119,9 @@ def finished_surface(
     An open surface also ends where the evidence for it ends.
 
     Args:
-        mesh: A start surface or a refined one, m.
-        method: Method of its start.
-        reading: Evidence of the start; without it the mesh stays whole.
         confidence ((V,) int32): Number of poses that heard each vertex; counted in the evidence of
             a field where None.
         error ((V,) float32, m): As in :class:`Surface`.
-        echoes, refined, error_db, faults, candidates: As in :class:`Surface`.
     """
     known: dict[str, Any] = {"echoes": echoes, "reading": reading}
     known |= {"refined": refined, "error_db": error_db, "faults": faults}
@@ -216,10 +212,8 @@ def judge_openness(
     the support counts as seen: no pose hears it, but the support gives its place.
 
     Args:
-        mesh: A closed reconstruction, normals outward, m.
         sources ((P, 3), m): Places of the poses.
         resolution (m): Range resolution of the analysis.
-        plane: The support; None if there is none.
     """
     middles = np.asarray(mesh.triangles_center, dtype=np.float64)
     normals = np.asarray(mesh.face_normals, dtype=np.float64)
@@ -271,10 +265,8 @@ def known_part(
     little out of it as one smooth surface may be.
 
     Args:
-        mesh: m.
         heard ((V,) int32): Number of poses that heard the surface around each vertex, see
             :func:`~sononerf.surface.start.evidence.poses_that_heard`.
-        hull: The onsets.
         resolution (m): Range resolution of the analysis.
 
     Returns:

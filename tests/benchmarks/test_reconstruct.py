@@ -33,11 +33,11 @@ def asked(monkeypatch):
         settings=settings,
         hull="the hull",
         head=SimpleNamespace(resolution=0.005),
-        module=SimpleNamespace(field=field),
+        model=SimpleNamespace(field=field),
     )
     monkeypatch.setattr(module, "read_field", read_field)
     monkeypatch.setattr(module, "start_surfaces", lambda reading, methods: [])
-    monkeypatch.setattr(module, "load_fitted", lambda run: fitted)
+    monkeypatch.setattr(module, "Run", lambda run: fitted)
     monkeypatch.setattr(module.time, "perf_counter", lambda: clock[0])
     return given
 
@@ -63,7 +63,7 @@ def test_the_median_of_five(asked, tmp_path):
 
 def test_a_run_with_a_voxel_size_of_its_own_is_read_by_that(asked, tmp_path, monkeypatch):
     given = {"scene": {"name": "ua"}, "reconstruction": {"spacing": 0.005}}
-    monkeypatch.setattr(module.load_fitted("any"), "settings", validate_settings(given, "test"))
+    monkeypatch.setattr(module.Run("any"), "settings", validate_settings(given, "test"))
     _, found = go(tmp_path)
     assert [row["name"] for row in found["rows"]] == ["a, 5 mm"]
     assert all(options["spacing"] == 0.005 for options in asked)

@@ -83,7 +83,6 @@ def test_echoes_are_those_of_the_unscaled_world(worlds, tmp_path):
     for index, spectrogram in enumerate(heard):
         old.write_pose(index, spectrogram)
     old.update_attributes(reference=0.003, noise_floor_mae_db=0.5)
-    old.seal()
     for _ in range(2):  # one that is complete is left as it is
         scaled_store(tmp_path / "old", tmp_path / "new", large, 3.0)
     # It is taken for the ensemble of the scaled settings: nothing is simulated.

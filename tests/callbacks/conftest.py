@@ -59,7 +59,7 @@ def training(ensemble, tmp_path):
             max_epochs=steps // PER_EPOCH,
             limit_val_batches=1.0 if validation else 0,
             num_sanity_val_steps=sanity,
-            logger=RunLogger(tmp_path, {"noise_floor_mae_db": 0.25}) if logger else False,
+            logger=RunLogger(tmp_path) if logger else False,
             callbacks=list(callbacks),
             plugins=[DurableCheckpointIO()],
             enable_checkpointing=False,

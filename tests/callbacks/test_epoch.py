@@ -58,7 +58,6 @@ def test_after_every_epoch(training, tmp_path):
     assert steps.seen == [4, 8]
     assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == [
         "last.ckpt",
-        "last.ckpt.previous",
     ]
 
 

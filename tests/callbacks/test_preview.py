@@ -7,7 +7,6 @@ import io
 import json
 
 import lightning
-import numpy as np
 import pytest
 import torch
 import trimesh
@@ -15,7 +14,7 @@ from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sononerf.callbacks import preview as preview_module
-from sononerf.callbacks.preview import PreviewCallback, SurfaceImages
+from sononerf.callbacks.preview import PreviewCallback
 from sononerf.errors import NumericalError
 
 
@@ -54,9 +53,7 @@ def loud(module):
 
 def test_mesh_projections_and_numbers(training, tmp_path):
     modes = Modes()
-    preview = previews(tmp_path / "run")
-    truth = trimesh.creation.icosphere(radius=0.02)
-    made = training(preview, SurfaceImages(preview, truth), modes, logger=True)
+    made = training(previews(tmp_path / "run"), modes, logger=True)
     loud(made.module)
     made.train()
     folders = sorted((tmp_path / "run" / "epochs").iterdir())
@@ -79,14 +76,6 @@ def test_mesh_projections_and_numbers(training, tmp_path):
     assert modes.seen == [True] * 8
     events = events_of(tmp_path)
     assert events.Images("projections")[-1].step == 8
-    mesh = trimesh.load_mesh(folders[-1] / "mesh.ply")
-    distance = events.Scalars("Chamfer_mm/field")[-1]
-    assert distance.step == 8
-    # The truth is a sphere about the origin.
-    off = np.abs(
-        np.linalg.norm(trimesh.sample.sample_surface(mesh, 2000, seed=0)[0], axis=1) - 0.02
-    )
-    assert distance.value > 0.3e3 * off.mean()
     assert {"mesh/field_VERTEX", "mesh/field_FACE"} <= set(events.Tags()["tensors"])
 
 

@@ -19,7 +19,6 @@ def store(path, values, *, poses=range(POSES), **changes):
     made = EnsembleStore.create(path, **axes(attributes=attributes, **changes))
     for index in poses:
         made.write_pose(index, values(index))
-    made.seal()
     return path
 
 

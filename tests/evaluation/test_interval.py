@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from sononerf.evaluation.interval import covered, interval_db, learn_interval
+from sononerf.head.decibels import RANGE_DB
 
 
 def drawn(seed, poses=12):
@@ -35,7 +36,14 @@ def test_levels_that_were_never_predicted_are_as_uncertain_as_lower_ones():
     assert (interval_db(np.full((1, 24), 55.0), half) == half[3]).all()
 
 
-def test_silence_has_no_interval():
+def test_lower_levels_that_were_never_predicted_are_as_uncertain_as_higher_ones():
+    measured, predicted = drawn(0)
+    half = learn_interval(measured + 24.0, predicted + 24.0, 3.0)
+    assert (interval_db(np.full((1, 24), 4.0), half) == half[4]).all()
+    assert (half[4] > 0.0).all()
+
+
+def test_where_nothing_was_heard_a_level_is_not_known():
     silent = np.zeros((2, 1, 5, 3))
-    assert not learn_interval(silent, silent, 3.0).any()
+    assert (learn_interval(silent, silent, 3.0) == RANGE_DB).all()
     assert covered(silent, silent, silent, 3.0) is None

@@ -26,7 +26,6 @@ def make(path, split=SPLIT):
     for pose in range(POSES):
         values = np.random.default_rng(pose).random((2, RANGES, FREQUENCIES))
         store.write_pose(pose, values)
-    store.seal()
     return EnsembleStore.open(path)
 
 

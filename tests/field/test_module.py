@@ -456,7 +456,6 @@ def store(tmp_path_factory):
     )
     for index, values in enumerate(heard.numpy()):
         store.write_pose(index, values)
-    store.seal()
     return store
 
 

@@ -33,7 +33,6 @@ def store(tmp_path_factory):
     cells = np.meshgrid(*map(np.arange, (2, RANGES, FREQUENCIES)), indexing="ij")
     for pose in range(POSES):
         store.write_pose(pose, value(pose, *cells))
-    store.seal()
     return store
 
 
@@ -204,7 +203,6 @@ def test_memory_is_bounded_for_any_number_of_receivers(tmp_path):
     )
     for pose in range(4):
         store.write_pose(pose, np.ones((ears, RANGES, FREQUENCIES)))
-    store.seal()
     reader = PoseReader(store, 2 * ears * RANGES * FREQUENCIES * 4)
     first = reader[0]
     assert reader[0] is first

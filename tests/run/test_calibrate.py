@@ -17,7 +17,7 @@ from sononerf.run import calibrate as module
 from sononerf.run.build import with_store
 from sononerf.run.calibrate import calibrate, dependent_cells, describe, kinds_of
 from sononerf.run.corrected_store import moved
-from sononerf.run.fitted import echoes_of, load_fitted
+from sononerf.run.run import Run
 from sononerf.settings.schema import SpectrogramSettings
 from sononerf.surface.refine.recording_errors import Calibration, Estimate
 
@@ -36,12 +36,12 @@ def run(fitted_run, tmp_path, monkeypatch):
 
 
 def test_a_gain_is_taken_off_a_copy(run, tmp_path, tiny_settings):
-    store = echoes_of(load_fitted(run)).store
+    store = Run(run).echoes.store
     loud = tmp_path / "loud"
     shutil.copytree(store.path, loud)
     found = calibrate(run, tmp_path / "corrected", ["gain"])
     made = found.store
-    assert (len(made), made.missing(), made.check()) == (len(store), [], [])
+    assert (len(made), made.missing(), made.damaged()) == (len(store), [], [])
     assert np.abs(found.estimate.calibration.gain).max() < 0.2  # the simulator's level
     factor = np.exp(-found.estimate.calibration.gain)[:, None, None]
     np.testing.assert_allclose(made.read_pose(0), factor * store.read_pose(0), rtol=1e-5)
@@ -58,7 +58,7 @@ def test_a_gain_is_taken_off_a_copy(run, tmp_path, tiny_settings):
 
 def test_the_speed_of_sound_changes_the_ranges(run, tmp_path):
     found = calibrate(run, tmp_path / "corrected", ["speed_of_sound"])
-    store = echoes_of(load_fitted(run)).store
+    store = Run(run).echoes.store
     ratio = found.store.attributes["speed_of_sound"] / store.attributes["speed_of_sound"]
     np.testing.assert_allclose(found.store.range, np.asarray(store.range) * ratio, rtol=1e-6)
     analysis = SpectrogramSettings(**found.store.attributes["settings"]["spectrogram"])
@@ -72,15 +72,15 @@ def test_the_speed_of_sound_changes_the_ranges(run, tmp_path):
 
 def test_poses_are_corrected_but_those_held_out(run, tmp_path):
     found = calibrate(run, tmp_path / "corrected", ["position", "aim"])
-    store = echoes_of(load_fitted(run)).store
+    store = Run(run).echoes.store
     off = np.linalg.norm(found.store.positions - store.positions, axis=1)
     assert (off[store.split == 2] == 0.0).all()
     assert (off[store.split != 2] > 0.0).any()
 
 
 def test_what_is_not_determined_is_said(run):
-    fitted = load_fitted(run)
-    store = echoes_of(fitted).store
+    fitted = Run(run)
+    store = fitted.echoes.store
     kinds = ("gain", "range_offset", "speed_of_sound", "position")
     estimate = Estimate(
         Calibration.none(2, len(store)),
@@ -100,8 +100,8 @@ def test_what_is_not_determined_is_said(run):
 
 
 def test_a_turntable_hardly_tells_a_range_offset(run):
-    fitted = load_fitted(run)
-    store = echoes_of(fitted).store
+    fitted = Run(run)
+    store = fitted.echoes.store
     angle = np.arange(len(store))
     turned = SimpleNamespace(
         indices=store.indices,

@@ -12,15 +12,14 @@ import scipy.io
 import trimesh
 import zarr
 
-from sononerf import checksums, storage
+from sononerf import storage
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
-from sononerf.geometry.poses import Poses
 from sononerf.run import export as export_module
 from sononerf.run.export import Named, export, file_bytes
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run
 
 
 @pytest.fixture(scope="module")
@@ -37,19 +36,16 @@ def test_echoes_of_a_store(echoes, tmp_path):
     assert np.array_equal(found["frequency"].ravel(), store.frequency)
     assert found["split"].ravel().tolist() == store.split.tolist()
     assert "sphere" not in str(found["attributes"]["origin"])
-    poses = Poses.read(export(echoes, tmp_path / "poses.csv"))
-    assert np.allclose(poses.positions, store.positions)
-    assert np.allclose(poses.rotations, store.rotations)
+    assert np.allclose(found["position"], store.positions)
 
 
 def test_a_mesh_is_written_in_each_frame(run, tmp_path):
     """A simulation has no other frame than the world's unless its scene's file has one."""
     facts = storage.read_json(run / "provenance.json")
-    own = RunFolder(run).mesh()
+    own = Run(run).mesh()
     written = trimesh.load(export(run, tmp_path / "a.ply"), process=False)
     np.testing.assert_allclose(written.vertices, own.vertices, atol=1e-7)
     turned = [[0, 1000, 0, 5], [1000, 0, 0, 0], [0, 0, -1000, 0], [0, 0, 0, 1]]
-    (run / checksums.NAME).unlink()  # as of an older version
     storage.commit_json(run / "provenance.json", {**facts, "to_original": turned})
     try:
         there = trimesh.load(export(run, tmp_path / "b.stl", frame="original"))
@@ -84,20 +80,15 @@ def test_prediction_volume_and_points_of_a_run(run, tmp_path):
     with h5py.File(export(run, tmp_path / "prediction.h5")) as file:
         assert file["predicted"].shape == file["measured"].shape
         assert file["predicted"].dims[2].label == "range"
-    with scipy.io.netcdf_file(export(run, tmp_path / "v.nc", what="volume"), mmap=False) as file:
-        assert file.variables["reflectivity"].dimensions == ("x", "y", "z")
-        loudest = np.unravel_index(
-            file.variables["reflectivity"][...].argmax(), file.variables["reflectivity"].shape
-        )
-        place = [
-            float(file.variables[axis][...][k]) for axis, k in zip("xyz", loudest, strict=True)
-        ]
+    with h5py.File(export(run, tmp_path / "v.h5", what="volume")) as file:
+        assert [axis.label for axis in file["reflectivity"].dims] == ["x", "y", "z"]
+        reflectivity = file["reflectivity"][...]
+        loudest = np.unravel_index(reflectivity.argmax(), reflectivity.shape)
+        place = [float(file[axis][k]) for axis, k in zip("xyz", loudest, strict=True)]
     assert np.linalg.norm(place) < 0.04  # the sphere of 20 mm lies at the origin
-    lines = export(run, tmp_path / "points.csv").read_text().splitlines()
-    assert lines[0] == "x,y,z,nx,ny,nz,poses"
-    table = np.loadtxt(io.StringIO("\n".join(lines[1:])), delimiter=",")
-    assert len(table) == len(RunFolder(run).mesh().vertices)
-    assert (table[:, :3] * table[:, 3:6]).sum(axis=1).mean() > 0  # normals look outward
+    points = scipy.io.loadmat(export(run, tmp_path / "points.mat", what="points"))
+    assert len(points["position"]) == len(Run(run).mesh().vertices)
+    assert (points["position"] * points["normal"]).sum(axis=1).mean() > 0  # normals look outward
 
 
 def test_normals_are_in_the_mesh_file(run):
@@ -111,7 +102,6 @@ def test_normals_are_in_the_mesh_file(run):
     [
         ("x.txt", "auto", SettingsError, r"expected a suffix of \.mat"),
         ("x.mat", "echoes", InputError, "is no store"),
-        ("x.csv", "volume", SettingsError, "holds poses or points"),
     ],
 )
 def test_what_does_not_fit_is_refused(run, tmp_path, name, what, error, says):
@@ -156,25 +146,14 @@ def test_hdf5():
         assert file.attrs["origin"] == "simulated"
 
 
-def test_netcdf():
-    data = file_bytes("nc", ARRAYS, {"origin": "simulated"})
-    with scipy.io.netcdf_file(io.BytesIO(data), mmap=False) as file:
-        assert file.variables["level"].dimensions == ("pose", "range")
-        assert np.array_equal(file.variables["level"][...], ARRAYS["level"].values)
-        assert file.variables["level"].units == b"dB"
-        assert file.variables["number"][...].tolist() == [7, 8]
-        assert file.origin == b"simulated"
-
-
-@pytest.mark.parametrize("kind", ["mat", "h5", "nc"])
+@pytest.mark.parametrize("kind", ["mat", "h5"])
 def test_the_same_arrays_give_the_same_bytes(kind, monkeypatch):
     first = file_bytes(kind, ARRAYS, {})
     monkeypatch.setattr("time.asctime", lambda *given: "another day")
     assert file_bytes(kind, ARRAYS, {}) == first
 
 
-@pytest.mark.parametrize("kind", ["mat", "nc"])
-def test_what_is_too_large_for_a_format_is_refused(kind, monkeypatch):
-    monkeypatch.setitem(export_module.LARGEST, kind, 20)
+def test_what_is_too_large_for_a_format_is_refused(monkeypatch):
+    monkeypatch.setattr(export_module, "LARGEST", 20)
     with pytest.raises(ResourceError, match=r"level: .* choose a \.h5 file"):
-        file_bytes(kind, ARRAYS, {})
+        file_bytes("mat", ARRAYS, {})

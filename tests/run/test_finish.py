@@ -18,14 +18,13 @@ from sononerf.evaluation import geometry as geometry_module
 from sononerf.field.checkpoint_io import load_weights, save_weights
 from sononerf.progress import Progress
 from sononerf.run import fit as finish_module
-from sononerf.run import fitted as fitted_module
-from sononerf.run import run_folder as run_module
+from sononerf.run import run as run_module
 from sononerf.run.evaluate import evaluate
 from sononerf.run.fit import finish
-from sononerf.run.fitted import NAME
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
-from sononerf.run.run_folder import STAGES, RunFolder
+from sononerf.run.run import STAGES, Run
+from sononerf.run.traced_file import NAME
 
 SPHERE = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
 
@@ -94,10 +93,10 @@ STEPS = {
 
 
 def test_each_stage_is_done_once_and_in_its_order(run, steps):
-    assert not RunFolder(run).is_finished
+    assert not Run(run).is_finished
     finish(run, accelerator="cpu")
     assert steps == ALL
-    assert RunFolder(run).is_finished
+    assert Run(run).is_finished
     finish(run, accelerator="cpu")
     assert steps == ALL
 
@@ -119,7 +118,7 @@ def test_an_interrupt_repeats_its_own_stage_alone(run, steps, stage):
 
 def test_another_surface_repeats_what_depends_on_it(run, steps):
     finish(run, accelerator="cpu")
-    opened = RunFolder(run)
+    opened = Run(run)
     opened.begin("surface")
     assert [stage for stage in STAGES if opened.is_done(stage)] == ["fit", "traced", "prediction"]
     bumpy = SPHERE.copy().apply_scale(1.01)
@@ -136,7 +135,7 @@ def test_traces_of_another_fit_do_not_count(run, steps):
     finish(run, accelerator="cpu")
     tensors = safetensors.torch.load_file(run / NAME)
     (run / NAME).write_bytes(safetensors.torch.save(tensors, {"model": "of another fit"}))
-    assert not RunFolder(run).is_finished
+    assert not Run(run).is_finished
 
 
 def test_nothing_is_predicted_where_nothing_is_held_out(run, steps):
@@ -145,7 +144,7 @@ def test_nothing_is_predicted_where_nothing_is_held_out(run, steps):
     save_weights(run, state, description)
     finish(run)
     assert steps == ["surface", "traced", "evaluation"]
-    assert RunFolder(run).is_finished
+    assert Run(run).is_finished
 
 
 @pytest.mark.parametrize("stage", ["surface", "traced"])
@@ -161,7 +160,7 @@ def test_a_field_without_a_surface_predicts_before_it_is_told(run, steps, monkey
 
 def test_a_surface_that_cannot_be_traced_is_told_and_no_fault(run, steps, monkeypatch, caplog):
     monkeypatch.undo()
-    opened = RunFolder(run)
+    opened = Run(run)
     opened.reconstruction.mkdir()
     speck = trimesh.creation.icosphere(radius=1e-5)
     (opened.reconstruction / "mesh.ply").write_bytes(speck.export(file_type="ply"))
@@ -179,11 +178,11 @@ def test_too_little_memory_to_trace_is_told_and_tried_again(run, steps, monkeypa
         progress = Heard()
         finish(run, progress=progress)
     assert any("tries again: too little memory" in text for text in progress.said)
-    assert not RunFolder(run).is_finished
+    assert not Run(run).is_finished
     steps.clear()
     finish(run)
     assert steps[0] == "traced"
-    assert RunFolder(run).is_finished
+    assert Run(run).is_finished
 
 
 @pytest.mark.thorough
@@ -193,16 +192,16 @@ def test_one_call_loads_field_and_echoes_once(run, no_projections, monkeypatch):
     monkeypatch.setattr(geometry_module, "BASELINE_VOXELS", 16)
     monkeypatch.setattr(baseline, "LEVEL_SAMPLES", 300)
     loaded = []
-    for name in ("load_fitted", "echoes_of"):
-        real = getattr(fitted_module, name)
+    for name in ("read_model", "default_store"):
+        real = getattr(run_module, name)
         monkeypatch.setattr(
-            run_module, name, lambda given, real=real, name=name: loaded.append(name) or real(given)
+            run_module, name, lambda *given, real=real, n=name: loaded.append(n) or real(*given)
         )
     monkeypatch.setattr(
         finish_module, "learn_traced", lambda f, e, m, s, **o: finish_module.Traced.none(m, f.head)
     )
     finish(run, accelerator="cpu")
-    assert sorted(loaded) == ["echoes_of", "load_fitted"]
+    assert sorted(loaded) == ["read_model"]
 
 
 @pytest.mark.parametrize("command", [reconstruct, predict, evaluate, finish])
@@ -219,19 +218,19 @@ def test_a_run_in_use_is_left_alone(run, command):
         other = threading.Thread(target=elsewhere)
         other.start()
         other.join()
-    assert "in use by process" in str(caught[0])
-    assert sorted(run.rglob("*")) == before
+    assert "in use by another process" in str(caught[0])
+    assert {path for path in run.rglob("*") if path.name != ".lock"} == set(before)
 
 
 def test_the_lock_is_held_until_the_last_number_is_written(run, steps, monkeypatch):
     written = []
-    real = RunFolder.write_metrics
+    real = Run.write_metrics
 
     def watched(self, *given, **options):
         written.append((self.path / ".lock").is_file())
         return real(self, *given, **options)
 
-    monkeypatch.setattr(RunFolder, "write_metrics", watched)
+    monkeypatch.setattr(Run, "write_metrics", watched)
     finish(run, accelerator="cpu")
     assert written
     assert all(written)

@@ -44,7 +44,7 @@ from sononerf.run import fit as fit_module
 from sononerf.run.build import head_of
 from sononerf.run.fit import fit, peak_memory_bytes
 from sononerf.run.reconstruct import reconstruct
-from sononerf.run.run_folder import STAGES, RunFolder
+from sononerf.run.run import STAGES, Run
 from tests.head.directivity.patterns import pair
 
 STEPS, PER_EPOCH = 12, 4
@@ -183,15 +183,6 @@ def test_a_fit_that_was_cut_off_ends_bit_for_bit_alike(
     assert differences(what_a_run_holds(tmp_path / "run"), uninterrupted) == []
 
 
-def test_a_torn_checkpoint_costs_steps_and_no_bits(tiny, tmp_path, interrupt, uninterrupted):
-    interrupt(6, signal.SIGTERM)
-    with pytest.raises(StoppedError):
-        run(tiny(), tmp_path / "run")
-    (tmp_path / "run" / "checkpoints" / "last.ckpt").write_bytes(b"PK")
-    run(tiny(), tmp_path / "run")
-    assert differences(what_a_run_holds(tmp_path / "run"), uninterrupted) == []
-
-
 # Canaries: where something that resuming rests on is taken away, the tests above must see it.
 
 
@@ -279,7 +270,7 @@ def test_more_epochs_go_on_and_the_stages_after_them_are_done_again(tiny, tmp_pa
     path = tmp_path / "run"
     run(tiny(), path)
     before = what_a_run_holds(path)
-    opened = RunFolder(path)
+    opened = Run(path)
     reconstruct(path, accelerator="cpu")
     opened.write_metrics("prediction", {})
     run(tiny(fit={"epochs": 5}), path)
@@ -509,7 +500,7 @@ def test_any_receivers_from_scene_to_surface(tiny_settings, tmp_path, count, dir
     assert (heard.max(axis=(1, 2)) > 0.0).all()
     (tmp_path / "a.sofa").unlink(missing_ok=True)  # the run has a copy
     folder = reconstruct(tmp_path / "run", accelerator="cpu")
-    assert RunFolder(tmp_path / "run").read_metrics()["cost"]["steps"] == 2
+    assert Run(tmp_path / "run").read_metrics()["cost"]["steps"] == 2
     assert len(trimesh.load(folder / "mesh.ply").faces) > 100
 
 

@@ -20,7 +20,7 @@ from sononerf.field.fitting import render_poses
 from sononerf.progress import Progress
 from sononerf.run.build import head_of
 from sononerf.run.fit import fit
-from sononerf.run.fitted import echoes_of, load_fitted
+from sononerf.run.run import Run, open_run
 from sononerf.settings.loading import validate_settings
 
 QUIET = Progress(quiet=True)
@@ -44,14 +44,14 @@ def change(path, **values):
 
 
 def test_what_is_loaded_is_what_was_fitted(run, tiny, echoes):
-    found = load_fitted(run)
+    found = Run(run)
     assert found.settings == tiny()
     attributes = EnsembleStore.open(echoes).attributes
     assert found.echo_hash == attributes["echo_hash"]
-    assert found.module.reference == attributes["reference"]
-    assert not found.module.training
+    assert found.model.reference == attributes["reference"]
+    assert not found.model.training
     state, _ = load_weights(run)
-    for part, prefix in ((found.module.field, "field."), (found.module.renderer, "renderer.")):
+    for part, prefix in ((found.model.field, "field."), (found.model.renderer, "renderer.")):
         own = part.state_dict()
         assert {f"{prefix}{name}" for name in own} == {n for n in state if n.startswith(prefix)}
         for name, tensor in own.items():
@@ -59,7 +59,7 @@ def test_what_is_loaded_is_what_was_fitted(run, tiny, echoes):
 
 
 def test_the_hull_is_of_the_training_poses_alone(run, echoes):
-    hull = load_fitted(run).hull
+    hull = Run(run).hull
     store = EnsembleStore.open(echoes)
     train = store.indices("train")
     assert hull.emitters.dtype == hull.first.dtype == np.float64
@@ -81,7 +81,7 @@ def test_weights_without_what_is_needed_are_told(run, name):
     del state[name]
     save_weights(run, state, description)
     with pytest.raises(InputError, match=rf"incomplete \('{name}'\); repeat the fit") as caught:
-        load_fitted(run)
+        open_run(run)
     assert "\n" not in str(caught.value)
     assert "model.json" not in str(caught.value)  # which is whole
 
@@ -92,7 +92,7 @@ def test_what_is_loaded_knows_what_first_echoes_leave(run, echoes, tiny):
     state, description = load_weights(run)
     state["hull.first"][3, 1] = -torch.inf
     save_weights(run, state, description)
-    loaded = load_fitted(run).hull
+    loaded = Run(run).hull
     assert loaded.within == hull.within
     assert isinstance(loaded.within, float)
     for name in ("emitters", "receivers", "axes"):
@@ -137,7 +137,7 @@ def unknown_key(description):
 def test_a_wrong_description_is_told(run, change, error, message):
     damage(run, change)
     with pytest.raises(error, match=message) as caught:
-        load_fitted(run)
+        open_run(run)
     assert "\n" not in str(caught.value)
 
 
@@ -146,61 +146,61 @@ def test_damaged_or_missing_weights_are_told(run, tmp_path):
     data[-5] ^= 1
     (run / "model.safetensors").write_bytes(data)
     with pytest.raises(InputError, match="damaged"):
-        load_fitted(run)
+        open_run(run)
     with pytest.raises(InputError, match="no fitted run"):
-        load_fitted(tmp_path / "nowhere")
+        open_run(tmp_path / "nowhere")
 
 
 def test_the_ensemble_is_found_where_the_settings_or_its_hash_say(run, echoes, tmp_path):
-    fitted = load_fitted(run)
-    assert echoes_of(fitted).store.path == echoes
+    fitted = Run(run)
+    assert fitted.echoes.store.path == echoes
     section = fitted.settings.data.model_dump()
     plain = {**fitted.settings.plain(), "data": {**section, "store": None}}
     change(run, settings=validate_settings(plain, "plain").plain())
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path)
         with pytest.raises(InputError, match=rf"sphere-{fitted.echo_hash[:8]}\w*: .*is not there"):
-            echoes_of(load_fitted(run))
+            _ = Run(run).echoes
 
 
 def test_an_ensemble_of_other_echoes_is_refused(run):
     change(run, echo_hash="0" * 64)
     with pytest.raises(IncompatibleError, match="holds other echoes"):
-        echoes_of(load_fitted(run))
+        _ = Run(run).echoes
 
 
 def test_rendering_goes_pose_by_pose_and_in_order(run):
-    fitted = load_fitted(run)
-    poses = echoes_of(fitted).poses("train")[[4, 1, 6]]
-    rendered = render_poses(fitted.module, poses, accelerator="cpu", progress=QUIET)
+    fitted = Run(run)
+    poses = fitted.echoes.poses("train")[[4, 1, 6]]
+    rendered = render_poses(fitted.model, poses, accelerator="cpu", progress=QUIET)
     assert rendered.dtype == np.float32
     assert rendered.shape == (3, 2, len(fitted.head.range), len(fitted.head.frequency))
     assert (rendered >= 0).all()
     for row in range(3):
         alone = poses[row]
-        again = render_poses(fitted.module, alone, accelerator="cpu", progress=QUIET)
+        again = render_poses(fitted.model, alone, accelerator="cpu", progress=QUIET)
         np.testing.assert_array_equal(again[0], rendered[row])
     assert np.abs(rendered[0] - rendered[1]).max() > 0
 
 
 def test_rendering_does_not_look_at_what_was_measured(run, monkeypatch):
-    fitted = load_fitted(run)
-    poses = echoes_of(fitted).poses("val")
-    rendered = render_poses(fitted.module, poses, accelerator="cpu", progress=QUIET)
+    fitted = Run(run)
+    poses = fitted.echoes.poses("val")
+    rendered = render_poses(fitted.model, poses, accelerator="cpu", progress=QUIET)
     read = EnsembleStore.read_pose
     monkeypatch.setattr(EnsembleStore, "read_pose", lambda *given: 0 * read(*given))
-    again = echoes_of(fitted).poses("val")
-    deaf = render_poses(fitted.module, again, accelerator="cpu", progress=QUIET)
+    again = fitted.echoes.poses("val")
+    deaf = render_poses(fitted.model, again, accelerator="cpu", progress=QUIET)
     np.testing.assert_array_equal(deaf, rendered)
 
 
 def test_a_gpu_that_is_not_there(run, monkeypatch):
-    fitted = load_fitted(run)
-    poses = echoes_of(fitted).poses("val")
+    fitted = Run(run)
+    poses = fitted.echoes.poses("val")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
     with pytest.raises(ResourceError):
-        render_poses(fitted.module, poses, accelerator="gpu", progress=QUIET)
+        render_poses(fitted.model, poses, accelerator="gpu", progress=QUIET)
 
 
 @pytest.mark.thorough
@@ -218,17 +218,18 @@ def test_what_was_fitted_without_its_background_is_measured_without_it(run, tiny
     )
     for index in range(len(heard)):
         alone.write_pose(index, 0.5 * heard.read_pose(index))
-    alone.seal()
-    fitted = load_fitted(run)
+    fitted = Run(run)
     settings = tiny(data={"background": str(tmp_path / "alone")})
-    store = echoes_of(dataclasses.replace(fitted, settings=settings)).store
+    without = Run(run)
+    without.__dict__["_model"] = dataclasses.replace(fitted._model, settings=settings)
+    store = without.echoes.store
     np.testing.assert_allclose(
         store.read_pose(1), np.sqrt(0.75) * heard.read_pose(1), rtol=1e-5, atol=1e-9
     )
-    assert type(echoes_of(fitted).store) is EnsembleStore
+    assert type(fitted.echoes.store) is EnsembleStore
     path = tmp_path / "fitted"
     fit(settings, path)
-    reference = load_fitted(path).module.reference
+    reference = Run(path).model.reference
     assert reference == pytest.approx(np.sqrt(0.75) * heard.attributes["reference"], rel=1e-5)
     with pytest.raises(IncompatibleError, match=r"data\.background"):
         fit(tiny(), path)
@@ -238,9 +239,22 @@ def test_a_run_finds_its_store_from_another_working_folder(run, echoes, tmp_path
     home, other = tmp_path / "home", tmp_path / "other"
     shutil.copytree(echoes, home / "data" / "store")
     (other / "data" / "store").mkdir(parents=True)  # holds nothing
-    plain = load_fitted(run).settings.plain()
+    plain = Run(run).settings.plain()
     change(run, settings={**plain, "data": {**plain["data"], "store": "data/store"}})
     shutil.copytree(run, home / "runs" / "one")
     monkeypatch.chdir(other)
-    found = echoes_of(load_fitted(Path("../home/runs/one")))
+    found = Run(Path("../home/runs/one")).echoes
+    assert found.store.path.resolve() == home / "data" / "store"
+
+
+def test_a_store_of_other_echoes_does_not_hide_that_of_the_run(run, echoes, tmp_path, monkeypatch):
+    home, other = tmp_path / "home", tmp_path / "other"
+    for place in (home, other):
+        shutil.copytree(echoes, place / "data" / "store")
+    EnsembleStore.open(other / "data" / "store", mode="r+").update_attributes(echo_hash="another")
+    plain = Run(run).settings.plain()
+    change(run, settings={**plain, "data": {**plain["data"], "store": "data/store"}})
+    shutil.copytree(run, home / "runs" / "one")
+    monkeypatch.chdir(other)
+    found = Run(Path("../home/runs/one")).echoes
     assert found.store.path.resolve() == home / "data" / "store"

@@ -44,7 +44,7 @@ def test_a_store_knows_all_that_a_fit_needs(brought):
     store, verdict = brought()
     known = store.attributes
     assert verdict.message == ""
-    assert (len(store), store.receivers, store.missing(), store.check()) == (24, 2, [], [])
+    assert (len(store), store.receivers, store.missing(), store.damaged()) == (24, 2, [], [])
     assert (known["origin"], known["source"], known["licence"]) == ("recorded", "by formula", "CC0")
     assert set(known["settings"]) == {"air", "ears", "call", "spectrogram", "support"}
     assert Echoes.open(store.path).head.plane is None
@@ -120,7 +120,7 @@ def test_the_same_import_mends_a_damaged_pose(brought):
     data = bytearray(chunk.read_bytes())
     data[len(data) // 2] ^= 1
     chunk.write_bytes(data)
-    assert brought()[0].check() == []
+    assert brought()[0].damaged() == []
     assert files(store.path) == whole
 
 

@@ -16,7 +16,7 @@ from sononerf.field.module import EchoModule
 from sononerf.progress import Progress
 from sononerf.run.build import head_of
 from sononerf.run.predict import predict
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run
 
 
 class KilledError(Exception):
@@ -85,13 +85,10 @@ def test_a_killed_fit_ends_with_the_weights_of_one_that_was_not(made, tmp_path, 
 
 
 def test_a_trainers_test_gives_the_numbers_of_a_prediction(run, tmp_path):
-    opened = RunFolder(run)
+    opened = Run(run)
     predict(opened, accelerator="cpu", progress=Progress(quiet=True))
     numbers = opened.read_metrics()["prediction"]
-    fitted = opened.fitted
     data = EchoDataModule(opened.echoes)
-    (found,) = trainer(tmp_path, enable_checkpointing=False).test(
-        fitted.module, data, verbose=False
-    )
+    (found,) = trainer(tmp_path, enable_checkpointing=False).test(opened.model, data, verbose=False)
     assert found["test/mae_db"] == pytest.approx(numbers["rendered_mae_db"], rel=1e-5)
     assert found["test/mae_db_active"] == pytest.approx(numbers["rendered_mae_db_active"], rel=1e-5)

@@ -16,11 +16,10 @@ from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, ResourceError
 from sononerf.head.decibels import compress
 from sononerf.run import predict as predict_module
-from sononerf.run import run_folder as run_module
+from sononerf.run import run as run_module
 from sononerf.run.fit import fit
-from sononerf.run.fitted import load_fitted
 from sononerf.run.predict import predict
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run
 
 CSV = "x,y,z,yaw,pitch,roll\n-0.4,0,0,0,0,0\n0,0,0.4,0,90,0\n"
 AXES = {"range_m", "frequency_hz", "reference", "pose", "position", "rotation"}
@@ -110,7 +109,7 @@ def test_poses_of_ones_own_need_neither_store_nor_scene(run, tmp_path, monkeypat
     def gone(*given):
         raise AssertionError("asked for the ensemble")
 
-    monkeypatch.setattr(run_module, "echoes_of", gone)
+    monkeypatch.setattr(run_module, "open_ensemble", gone)
     (tmp_path / "poses.csv").write_text(CSV)
     folder = predict(run, poses_csv=tmp_path / "poses.csv", accelerator="cpu")
     assert folder == run / "prediction-poses"
@@ -165,7 +164,7 @@ def test_poses_that_can_hear_nothing_of_the_region_are_refused(run, tmp_path, po
 def test_nor_are_those_that_are_too_near_to_hear_any(run, tmp_path):
     csv = tmp_path / "poses.csv"
     csv.write_text(f"{CSV}0,0,0,0,0,0\n")
-    module = load_fitted(run).module
+    module = Run(run).model
     assert module.field.region.norm(dim=1).max() < module.renderer.range[0]
     with pytest.raises(InputError, match="from pose 2"):
         predict(run, poses_csv=csv, accelerator="cpu")
@@ -173,20 +172,18 @@ def test_nor_are_those_that_are_too_near_to_hear_any(run, tmp_path):
 
 def test_poses_within_the_region_are_told(run, tmp_path, no_pictures, caplog):
     csv = tmp_path / "poses.csv"
-    lower, upper = load_fitted(run).module.field.region.double().numpy()
+    lower, upper = Run(run).model.field.region.double().numpy()
     x, y, z = lower + 0.01 * (upper - lower)
     csv.write_text(f"{CSV}{x},{y},{z},0,0,0\n")
-    fitted = load_fitted(run)
-    fitted.module.renderer.range[0] = 0.0
-    within = RunFolder(run)
-    within.fitted = fitted
+    within = Run(run)
+    within.model.renderer.range[0] = 0.0
     predict(within, poses_csv=csv, accelerator="cpu")
     (told,) = caplog.messages
     assert told == "poses 2 lie within the fitted region, where none was trained"
 
 
 def test_a_pose_that_hears_the_regions_far_side_alone_will_do(run, tmp_path, no_pictures):
-    csv, module = tmp_path / "poses.csv", load_fitted(run).module
+    csv, module = tmp_path / "poses.csv", Run(run).model
     lower, upper = module.field.region.double().numpy()
     first = float(module.renderer.range[0])
     csv.write_text(f"{CSV}{upper[0] + first - (upper[0] - lower[0]) / 2},0,0,180,0,0\n")
@@ -196,10 +193,10 @@ def test_a_pose_that_hears_the_regions_far_side_alone_will_do(run, tmp_path, no_
 def test_that_tracing_is_missing_is_told(run, no_pictures, caplog):
     predict(run, accelerator="cpu")
     predict(run, accelerator="cpu")  # nothing was traced
-    RunFolder(run).write_metrics("prediction", None)
+    Run(run).write_metrics("prediction", None)
     predict(run, accelerator="cpu")
     assert caplog.messages == []
-    RunFolder(run).write_metrics("prediction", {"traced_weight": 0.3})
+    Run(run).write_metrics("prediction", {"traced_weight": 0.3})
     predict(run, accelerator="cpu")
     (told,) = caplog.messages
     assert f"{run / 'traced.safetensors'} is missing" in told

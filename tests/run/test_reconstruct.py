@@ -14,8 +14,8 @@ from PIL import Image
 
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.progress import Progress
-from sononerf.run.fitted import load_fitted
 from sononerf.run.reconstruct import reconstruct
+from sononerf.run.run import Run
 from sononerf.surface import reconstruction
 from sononerf.surface import surface as surface_module
 from sononerf.surface.refine import descent, refinement
@@ -129,13 +129,13 @@ def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, mo
 
     def judge(mesh, sources, *, resolution, plane):
         asked.append(sources)
-        assert resolution == load_fitted(run).head.resolution
+        assert resolution == Run(run).head.resolution
         assert plane is None
         return plain(mesh, sources, resolution=resolution)
 
     monkeypatch.setattr(surface_module, "judge_openness", judge)
     folder = reconstruct(run, spacing=0.012)
-    np.testing.assert_allclose(asked[0], load_fitted(run).hull.sources)
+    np.testing.assert_allclose(asked[0], Run(run).hull.sources)
     assert len(asked) == 1
     kind = read_out(folder)["surface"]
     assert kind in ("closed", "sheet", "one-sided")

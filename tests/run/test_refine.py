@@ -5,27 +5,26 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
-import safetensors.torch
 import torch
 import trimesh
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sononerf.checksums import recorded
-from sononerf.errors import IncompatibleError, ResourceError
+from sononerf import storage
+from sononerf.errors import ResourceError
 from sononerf.progress import Progress
 from sononerf.run import reconstruct as reconstruct_module
-from sononerf.run.reconstruct import STATE, reconstruct, refine_surface
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.reconstruct import STAGES, reconstruct, refine_surface
+from sononerf.run.run import Run
 from sononerf.storage import commit_json, read_json
 from sononerf.surface import reconstruction
 from sononerf.surface.refine import comparison as core
 from sononerf.surface.refine import descent as stages
-from sononerf.surface.refine import refinement as refinement_module
 from sononerf.surface.refine.descent import Stage
-from sononerf.surface.refine.refinement import Refinement
+from sononerf.surface.refine.refinement import refine
 from sononerf.surface.surface import Surface
 
 QUIET = Progress(quiet=True)
@@ -53,8 +52,8 @@ class Heard(Progress):
 def run(fitted_run, tmp_path, monkeypatch):
     for where, name in ((core, "RAYS"), (reconstruction, "RAYS")):
         monkeypatch.setattr(where, name, 500)
-    for where in (refinement_module, stages):
-        monkeypatch.setattr(where, "STAGES", SHORT)
+    monkeypatch.setattr(stages, "STAGES", SHORT)
+    monkeypatch.setattr(reconstruction, "refine_starts", partial(refine, stages=SHORT))
     for name in ("mesh_png", "side_by_side_png", "confidence_png"):
         monkeypatch.setattr(reconstruct_module, name, lambda *given: b"")
     path = tmp_path / "run"
@@ -65,12 +64,11 @@ def run(fitted_run, tmp_path, monkeypatch):
 def with_settings(run, section, **values):
     description = json.loads((run / "model.json").read_text())
     description["settings"][section] |= values
-    with recorded(run):
-        commit_json(run / "model.json", description)
+    commit_json(run / "model.json", description)
 
 
 def refined(path, start=BUMPY):
-    return refine_surface(RunFolder(path), Surface(start), accelerator="cpu", progress=QUIET)
+    return refine_surface(Run(path), Surface(start), accelerator="cpu", progress=QUIET)
 
 
 def test_a_run_has_its_refined_surface(run, no_projections):
@@ -102,75 +100,40 @@ def test_without_its_echoes_a_surface_is_not_refined(run, no_projections):
     assert read_json(folder / "read_out.json")["method"] == "filled"
 
 
-@pytest.fixture
-def interrupted(run, monkeypatch):
-    """A run whose refinement was interrupted after four steps."""
-    with_settings(run, "fit", checkpoint_seconds=1e-9)
-    real, steps = Refinement.advance, []
+@pytest.mark.parametrize("what", ["killed", "another start", "damaged"])
+def test_stages_that_are_saved_are_taken_where_they_belong_to_the_same_refinement(run, what):
+    before = refined(run)
+    calls, real = [], storage.commit_bytes
 
-    def stops(self):
-        if len(steps) == 4:
+    def stops(file, data):
+        real(file, data)
+        if file.parent == run / STAGES:
+            calls.append(file)
             raise KeyboardInterrupt
-        steps.append(self.drawn)
-        return real(self)
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Refinement, "advance", stops)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(storage, "commit_bytes", stops)
         with pytest.raises(KeyboardInterrupt):
             refined(run)
-    assert (run / STATE).is_file()
-    return run
-
-
-def test_an_interrupted_refinement_goes_on_to_the_same_surface(interrupted, monkeypatch):
-    real, more = Refinement.advance, []
-    monkeypatch.setattr(Refinement, "advance", lambda self: more.append(self.drawn) or real(self))
-    again = refined(interrupted)
-    assert more == [4, 5, 6, 7, 8]  # the first stage is done twice
-    assert not (interrupted / STATE).exists()
-    whole = refined(interrupted)
-    np.testing.assert_array_equal(again.mesh.vertices, whole.mesh.vertices)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("what", ["another start", "damaged"])
-def test_a_state_that_does_not_fit_is_ignored(interrupted, what):
+    (file,) = (run / STAGES).iterdir()
+    start = BUMPY
     if what == "damaged":
-        (interrupted / STATE).write_bytes(b"nonsense")
-        wanted = BUMPY
-    else:
-        wanted = BUMPY.copy().apply_scale(1.1)
-    found = refined(interrupted, wanted)
-    (interrupted / STATE).unlink(missing_ok=True)
-    np.testing.assert_array_equal(found.mesh.vertices, refined(interrupted, wanted).mesh.vertices)
-
-
-def as_other_version(file):
-    file.write_bytes(safetensors.torch.save(safetensors.torch.load_file(file), {"of": "a start"}))
-
-
-def as_other_stages(file):
-    with safetensors.safe_open(str(file), "pt") as opened:
-        said = {**opened.metadata(), "stages": "()"}
-    file.write_bytes(safetensors.torch.save(safetensors.torch.load_file(file), said))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("change", [as_other_version, as_other_stages])
-def test_a_state_of_another_version_is_refused_before_anything_is_written(
-    interrupted, change, no_projections
-):
-    with_settings(interrupted, "reconstruction", refine=True)
-    change(interrupted / STATE)
-    before = {p: p.read_bytes() for p in interrupted.rglob("*") if p.is_file()}
-    with pytest.raises(IncompatibleError, match=r"surface\.safetensors: .* remove this file"):
-        reconstruct(interrupted, accelerator="cpu", spacing=0.008)
-    assert {p: p.read_bytes() for p in interrupted.rglob("*") if p.is_file()} == before
-    (interrupted / STATE).unlink()
-    assert reconstruct(interrupted, accelerator="cpu", spacing=0.008).is_dir()
+        file.write_bytes(b"nonsense")
+    if what == "another start":
+        start = BUMPY.copy().apply_scale(1.1)
+        before = refined(shutil.copytree(run, run.parent / "other"), start)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            storage, "commit_bytes", lambda file, data: (calls.append(file), real(file, data))
+        )
+        again = refined(run, start)
+    stages_done = [call for call in calls[1:] if call.parent == run / STAGES]
+    assert len(stages_done) == (2 if what == "killed" else 3)
+    assert not list((run / STAGES).iterdir())
+    np.testing.assert_array_equal(again.mesh.vertices, before.mesh.vertices)
 
 
 def test_a_gpu_that_is_not_there_is_refused(run, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ResourceError, match="no GPU"):
-        refine_surface(RunFolder(run), Surface(BUMPY), accelerator="gpu", progress=QUIET)
+        refine_surface(Run(run), Surface(BUMPY), accelerator="gpu", progress=QUIET)

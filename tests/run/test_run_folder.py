@@ -8,7 +8,8 @@ import json
 import pytest
 
 from sononerf.errors import IncompatibleError, InputError, SettingsError
-from sononerf.run.run_folder import RunFolder, differing_keys
+from sononerf.run.provenance import differing_keys
+from sononerf.run.run import Run
 from sononerf.settings.loading import dump_yaml, load_settings
 
 
@@ -16,7 +17,7 @@ from sononerf.settings.loading import dump_yaml, load_settings
 def run(tiny, tmp_path):
     path = tmp_path / "run"
     path.mkdir()
-    run = RunFolder(path)
+    run = Run(path)
     run.begin_fit(tiny())
     return run
 
@@ -56,17 +57,17 @@ def test_the_same_settings_begin_it_again_and_others_do_not(run, tiny):
 
 def test_a_folder_of_something_else_is_refused(tiny, tmp_path):
     (tmp_path / ".hidden").write_text("no matter")
-    RunFolder(tmp_path).check(tiny())
+    Run(tmp_path).check(tiny())
     (tmp_path / "thesis.tex").write_text("mine")
     with pytest.raises(InputError, match=r"holds 'thesis\.tex' and is no run"):
-        RunFolder(tmp_path).begin_fit(tiny())
+        Run(tmp_path).begin_fit(tiny())
     assert not (tmp_path / "config.yaml").exists()
 
 
 def test_no_run(tmp_path):
     with pytest.raises(InputError, match="no run"):
-        RunFolder(tmp_path).open()
-    assert RunFolder(tmp_path / "nowhere").move_aside() is None
+        Run(tmp_path).open()
+    assert Run(tmp_path / "nowhere").move_aside() is None
 
 
 def test_damaged_settings_of_a_run_are_told(run, tiny):
@@ -82,7 +83,7 @@ def test_sections_of_the_metrics_do_not_touch_each_other(run):
     assert run.read_metrics() == {"schema": 1, "cost": {"steps": 1, "fit_s": 2.0}, "geometry": None}
     run.write_metrics("geometry", {"level": 1.0}, merge=True)
     run.write_metrics("cost", {"steps": 3})
-    assert json.loads(run.metrics.read_text()) == {
+    assert json.loads(run.metrics_file.read_text()) == {
         "schema": 1,
         "cost": {"steps": 3},
         "geometry": {"level": 1.0},
@@ -91,16 +92,16 @@ def test_sections_of_the_metrics_do_not_touch_each_other(run):
 
 def test_a_section_that_is_dropped_takes_no_other_with_it(run):
     run.drop_metrics("geometry")
-    assert not run.metrics.exists()
+    assert not run.metrics_file.exists()
     run.write_metrics("geometry", None)
     run.write_metrics("cost", {"steps": 1})
     run.drop_metrics("geometry")
     run.drop_metrics("geometry")
-    assert json.loads(run.metrics.read_text()) == {"schema": 1, "cost": {"steps": 1}}
+    assert json.loads(run.metrics_file.read_text()) == {"schema": 1, "cost": {"steps": 1}}
 
 
 def test_metrics_that_are_none(run):
-    run.metrics.write_text("[1]")
+    run.metrics_file.write_text("[1]")
     with pytest.raises(InputError, match="holds no metrics"):
         run.read_metrics()
 
@@ -109,7 +110,7 @@ def test_moving_aside_keeps_what_was_there(run, tiny):
     (run.path / "epochs").mkdir()
     aside = run.move_aside()
     assert aside.name == "run.old-1"
-    assert RunFolder(aside).open() == tiny()
+    assert Run(aside).open() == tiny()
     assert not run.path.exists()
 
 
@@ -118,8 +119,3 @@ def test_previews_of_an_older_fit_go(run):
     run.clear_previews()
     run.clear_previews()
     assert not (run.path / "epochs").exists()
-
-
-def test_a_run_that_died_before_its_first_file_begins_again(tiny, tmp_path):
-    (tmp_path / "checksums.jsonl").write_text('{"crc32":1}\n')
-    RunFolder(tmp_path).check(tiny())

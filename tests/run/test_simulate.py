@@ -39,7 +39,6 @@ from sononerf.run.simulate import (
 from sononerf.scene.material import LEAF, RIGID
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.simulation import ensemble as simulate_module
-from sononerf.simulation.shards import Shard
 from tests.head.directivity.patterns import pair
 
 
@@ -225,58 +224,8 @@ def test_the_same_command_mends_a_damaged_pose(tiny, echoes, tmp_path):
     data[len(data) // 2] ^= 1
     file.write_bytes(data)
     made = simulate(tiny(), output=tmp_path / "store", workers=1)
-    assert made.check() == []
+    assert made.damaged() == []
     assert content(made) == content(EnsembleStore.open(echoes))
-
-
-def test_shards_that_stop_and_go_on_make_the_same_bytes_as_one_process(
-    tiny, echoes, tmp_path, monkeypatch
-):
-    stopper = Stopper(monkeypatch)
-
-    def stop():
-        raise KeyboardInterrupt
-
-    settings, whole = tiny(), tmp_path / "store"
-    for number in (1, 2, 4):  # the third machine never ran
-        stopper.arm(2, stop)
-        with pytest.raises(KeyboardInterrupt):
-            simulate(settings, output=whole, shard=Shard(number, 4), workers=1)
-        stopper.arm(-1, stop)
-        part = simulate(settings, output=whole, shard=Shard(number, 4), workers=1)
-        there = set(range(len(part))) - set(part.missing())
-        assert there == set(range(number - 1, len(part), 4))
-        assert "reference" not in part.attributes
-    alone = EnsembleStore.open(echoes)
-    assert not whole.exists()
-    assert content(simulate(settings, output=whole, workers=1)) == content(alone)
-
-
-def test_a_shard_that_was_stopped_before_it_had_anything_is_passed_over(
-    tiny, echoes, tmp_path, monkeypatch
-):
-    def stop(*given, **options):
-        raise KeyboardInterrupt
-
-    simulate(tiny(), output=tmp_path / "store", shard=Shard(1, 2))
-    with monkeypatch.context() as patch:
-        patch.setattr(simulate_module, "simulate_ensemble", stop)
-        with pytest.raises(KeyboardInterrupt):
-            simulate(tiny(), output=tmp_path / "store", shard=Shard(2, 2))
-    whole = simulate(tiny(), output=tmp_path / "store")
-    assert content(whole) == content(EnsembleStore.open(echoes))
-
-
-def test_shards_of_other_echoes_are_not_joined(tiny, tmp_path):
-    simulate(tiny(), output=tmp_path / "store", shard=Shard(1, 2))
-    with pytest.raises(IncompatibleError, match=r"store\.shard-1-of-2: is a shard of other echoes"):
-        simulate(tiny(simulation={"rays": 600}), output=tmp_path / "store")
-
-
-@pytest.mark.parametrize("text", ["", "3", "0/4", "5/4", "a/b", "1/0", "-1/2", "1/2/3"])
-def test_what_is_no_shard_is_refused(text):
-    with pytest.raises(SettingsError, match=r"--shard: found .* give I/N"):
-        Shard.of(text)
 
 
 @pytest.mark.slow

@@ -25,11 +25,11 @@ from sononerf.head.decibels import compress
 from sononerf.progress import Progress
 from sononerf.run import fit as finish_module
 from sononerf.run import predict as predict_module
-from sononerf.run import run_folder as run_module
+from sononerf.run import run as run_module
 from sononerf.run.build import head_of, simulator_of
-from sononerf.run.fitted import NAME, echoes_of, load_fitted, load_traced
 from sononerf.run.predict import predict
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run
+from sononerf.run.traced_file import NAME, load_traced
 from sononerf.scene.scene import Scene
 from sononerf.simulation.simulator import Simulator
 
@@ -71,7 +71,7 @@ def run(fitted_run, tmp_path, monkeypatch):
 
 
 def learn(path, progress=QUIET):
-    finish_module._learn_traced(RunFolder(path), "cpu", progress)
+    finish_module._learn_traced(Run(path), "cpu", progress)
     return load_traced(path).weight
 
 
@@ -116,7 +116,9 @@ def never(*given, **options):
 
 def tree(folder):
     return {
-        path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))
+        path: path.read_bytes() if path.is_file() else None
+        for path in sorted(folder.rglob("*"))
+        if path.name != ".lock"
     }
 
 
@@ -130,13 +132,13 @@ def test_echoes_of_the_true_surface_have_a_great_weight(run):
     np.testing.assert_array_equal(found.weight, weight)
     # Both are simulated; 500 rays give a level to some tenths of a decibel.
     np.testing.assert_allclose(found.gain_db, 0, atol=0.5)
-    surface = RunFolder(run).mesh()
+    surface = Run(run).mesh()
     np.testing.assert_array_equal(found.mesh.vertices, surface.vertices)
     np.testing.assert_array_equal(found.mesh.faces, surface.faces)
 
 
 def test_nothing_is_traced_where_the_field_alone_is_right(run, monkeypatch):
-    heard = echoes_of(load_fitted(run))
+    heard = Run(run).echoes
 
     def right(model, poses, **options):
         return np.stack([heard.spectrogram(int(number)) for number in heard.numbers_of(poses)])
@@ -155,14 +157,14 @@ def test_the_regression_has_the_validation_poses_alone(run, monkeypatch):
 
     monkeypatch.setattr(traced_module, "regress_weight", noted)
     assert (learn(run) == 0.4).all()
-    fitted, surface = load_fitted(run), load_traced(run)
+    fitted, surface = Run(run), load_traced(run)
     assert (surface.weight == 0.4).all()
-    heard, reference = echoes_of(fitted), fitted.module.reference
+    heard, reference = fitted.echoes, fitted.model.reference
     store = heard.store
     poses = heard.poses("val")
     measured = [store.read_pose(int(i)) for i in store.indices("val")]
     np.testing.assert_array_equal(given["measured"], compress(measured, reference))
-    rendered = render_poses(fitted.module, poses, accelerator="cpu", progress=QUIET)
+    rendered = render_poses(fitted.model, poses, accelerator="cpu", progress=QUIET)
     np.testing.assert_array_equal(given["rendered"], compress(rendered, reference))
     traced = trace_poses(fitted, surface, poses, progress=QUIET)
     np.testing.assert_allclose(given["traced"], compress(traced, reference), rtol=1e-6, atol=1e-9)
@@ -279,7 +281,7 @@ def test_the_low_band_is_solved_once_for_learning_and_predicting(run):
     description = json.loads((run / "model.json").read_text())
     description["settings"]["simulation"]["sources"] = 300
     (run / "model.json").write_text(json.dumps(description))
-    progress, opened = Counted(), RunFolder(run)
+    progress, opened = Counted(), Run(run)
     finish_module._learn_traced(opened, "cpu", progress)
     solved = progress.solved
     assert solved > 0
@@ -325,7 +327,7 @@ def test_a_surface_that_the_simulator_refuses_is_told_and_not_traced(
     assert not kept.weight.any()
     assert words in kept.fault
     predict(run, accelerator="cpu")
-    assert RunFolder(run).read_metrics()["prediction"]["traced_fault"] == kept.fault
+    assert Run(run).read_metrics()["prediction"]["traced_fault"] == kept.fault
 
 
 def test_a_mesh_that_is_gone_or_damaged_is_an_error(run):
@@ -344,9 +346,9 @@ def test_a_mesh_that_is_gone_or_damaged_is_an_error(run):
 @pytest.fixture
 def traceable(run):
     """A fitted run, what is traced off, and where."""
-    fitted = load_fitted(run)
-    poses = echoes_of(fitted).poses("val")
-    rows = len(fitted.module.renderer.frequency)
+    fitted = Run(run)
+    poses = fitted.echoes.poses("val")
+    rows = len(fitted.model.renderer.frequency)
     return fitted, Traced(SPHERE, np.zeros((2, rows)), np.ones(rows)), poses
 
 
@@ -375,8 +377,9 @@ def test_noise_engine_and_rays_of_the_experiment_are_left_out(traceable, section
     changed = getattr(fitted.settings, section).model_copy(update=values)
     settings = fitted.settings.model_copy(update={section: changed})
     assert settings != fitted.settings
-    other = replace(fitted, settings=settings)
-    other.module.head = head_of(settings)
+    other = Run(fitted.path)
+    other.__dict__["_model"] = replace(fitted._model, settings=settings)
+    other.model.head = head_of(settings)
     some = poses[0]
     np.testing.assert_array_equal(
         trace_poses(other, surface, some, progress=QUIET),
@@ -503,18 +506,18 @@ def arrays_and_numbers(path, **options):
 
 def parts(path, poses):
     """What the field renders and what is traced, as a blend takes them."""
-    fitted = load_fitted(path)
-    rendered = render_poses(fitted.module, poses, accelerator="cpu", progress=QUIET)
+    fitted = Run(path)
+    rendered = render_poses(fitted.model, poses, accelerator="cpu", progress=QUIET)
     traced = trace_poses(fitted, load_traced(path), poses, progress=QUIET)
-    return rendered, traced, fitted.module.reference
+    return rendered, traced, fitted.model.reference
 
 
 @pytest.mark.parametrize("share", [0.3, 1.0])
 def test_a_prediction_is_traced_as_far_as_it_is_believed(run, believe, share):
     believe(run, share)
     arrays, numbers = arrays_and_numbers(run)
-    fitted = load_fitted(run)
-    poses = echoes_of(fitted).poses("test")
+    fitted = Run(run)
+    poses = fitted.echoes.poses("test")
     rendered, traced, reference = parts(run, poses)
     assert arrays["predicted"].dtype == np.float32
     level = mix(compress(rendered, reference), compress(traced, reference), share)
@@ -533,9 +536,9 @@ def test_a_prediction_is_traced_as_far_as_it_is_believed(run, believe, share):
 
 def test_a_prediction_without_belief_is_the_rendering(run, believe):
     never_learned, numbers = arrays_and_numbers(run)
-    fitted = load_fitted(run)
-    poses = echoes_of(fitted).poses("test")
-    rendered = render_poses(fitted.module, poses, accelerator="cpu", progress=QUIET)
+    fitted = Run(run)
+    poses = fitted.echoes.poses("test")
+    rendered = render_poses(fitted.model, poses, accelerator="cpu", progress=QUIET)
     np.testing.assert_array_equal(never_learned["predicted"], rendered)
     believe(run, 0.0)
     with pytest.MonkeyPatch.context() as patch:
@@ -554,11 +557,11 @@ def test_poses_of_ones_own_are_traced_off_the_run_without_store_or_scene(
     believe(run, 1.0)
     (run / "reconstruction" / "mesh.ply").unlink()
     monkeypatch.setattr(EnsembleStore, "read_pose", never)
-    monkeypatch.setattr(run_module, "echoes_of", never)
+    monkeypatch.setattr(run_module, "open_ensemble", never)
     (tmp_path / "poses.csv").write_text(CSV)
     arrays, numbers = arrays_and_numbers(run, poses_csv=tmp_path / "poses.csv")
     assert numbers is None
-    fitted = load_fitted(run)
+    fitted = Run(run)
     simulator = simulator_of(Scene(load_traced(run).mesh), fitted.settings)
     mine = np.stack(
         [
@@ -566,7 +569,7 @@ def test_poses_of_ones_own_are_traced_off_the_run_without_store_or_scene(
             for position, rotation in zip(arrays["position"], arrays["rotation"], strict=True)
         ]
     )
-    reference = fitted.module.reference
+    reference = fitted.model.reference
     # The settings have 500 rays as well; what differs is the gain, some tenths of a decibel.
     np.testing.assert_allclose(
         compress(arrays["predicted"], reference), compress(mine, reference), atol=0.5

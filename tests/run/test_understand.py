@@ -78,7 +78,7 @@ def test_files_of_the_settings_lie_beside_them(recorded, tmp_path):
     (tmp_path / "call.wav").unlink()
     known = with_store(validate_settings({"data": {"store": str(tmp_path / "store")}}, "test"))
     assert known.call.file.parent == tmp_path / "store" / "attached"
-    assert EnsembleStore.open(tmp_path / "store").check() == []
+    assert EnsembleStore.open(tmp_path / "store").damaged() == []
 
 
 def test_clipped_pings_are_left_out_and_counted(recorded):

@@ -19,7 +19,7 @@ import trimesh
 
 from sononerf.errors import InputError
 from sononerf.report.echo_sound import RATE, STRETCH, echo_wav
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run
 from sononerf.run.view import View
 from sononerf.surface.mesh_files import mesh_bytes
 from sononerf.surface.start.volume import Volume, vti_bytes
@@ -79,7 +79,7 @@ def test_a_pose_shows_what_it_measured_and_what_is_predicted(run, shown):
 
 
 def test_a_store_is_shown_without_a_run(run, shown):
-    view = shown(RunFolder(run).echoes.store.path)
+    view = shown(Run(run).echoes.store.path)
     view.viewer.choose(0)
     assert view.viewer._pose_text.content == "Pose 0, training."
 

@@ -56,7 +56,7 @@ def test_the_accuracy_is_reached_and_costs_rays(few, tmp_path):
 
 def test_one_worker_is_this_process_in_trials_too(few, tmp_path, monkeypatch):
     monkeypatch.setattr(workers, "WORTH_RAYS", 0)
-    monkeypatch.setattr(workers, "in_processes", None)
+    monkeypatch.setattr(workers, "computed", None)
     store = simulate(settings(accuracy_db=2.0), output=tmp_path / "store", workers=1)
     assert store.missing() == []
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 import trimesh
 
+from sononerf import executor
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
 from sononerf.geometry.poses import Poses, look_at
 from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
-from sononerf.simulation import workers as workers_module
 from sononerf.simulation.ensemble import simulate_ensemble
 from sononerf.simulation.pose_faults import check_aim, check_poses, check_reach
 from sononerf.simulation.simulator import ensemble_poses, pose_seed
@@ -231,7 +231,7 @@ def test_faults_of_the_writer_are_not_blamed_on_a_pose(small):
 
 
 def test_a_scheduler_that_is_not_there_is_named(small, monkeypatch):
-    monkeypatch.setattr(workers_module, "CONNECT_SECONDS", 1)
+    monkeypatch.setattr(executor, "CONNECT_SECONDS", 1)
     with pytest.raises(ResourceError, match=r"tcp://127\.0\.0\.1:9 cannot be reached"):
         simulate_ensemble(
             *small, [0], lambda *_: None, seed_of=SEED_OF, scheduler="tcp://127.0.0.1:9"

@@ -199,7 +199,7 @@ def test_what_takes_too_much_is_refused_before_it_starts(monkeypatch):
 
 
 def test_an_ensemble_is_prepared_here_and_at_once(caplog, monkeypatch):
-    monkeypatch.setattr(workers_module, "in_processes", None)
+    monkeypatch.setattr(workers_module, "computed", None)
     found, written = glint(), {}
     poses = Poses(np.stack([POSITION, POSITION + 0.1, POSITION + 0.2]), np.stack([POSE[1]] * 3))
     with caplog.at_level(logging.WARNING):

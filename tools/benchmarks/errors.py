@@ -12,7 +12,7 @@ from sononerf import open_run, reconstruct
 from sononerf.array_types import Floats
 from sononerf.evaluation.geometry import signed_error
 from sononerf.run.build import true_mesh
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run
 from sononerf.surface.reconstruction import starts_of
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.surface_error import surface_error
@@ -67,7 +67,7 @@ def _by_ensemble(path: Path, distance: Floats) -> float | None:
     """
     name = path.name.removesuffix("-0")
     members = [path.with_name(f"{name}-{seed}") for seed in MEMBERS]
-    members = [member for member in members if RunFolder(member).config.is_file()]
+    members = [member for member in members if Run(member).config.is_file()]
     if not members:
         return None
     mesh = open_run(path).surface.mesh
@@ -77,7 +77,7 @@ def _by_ensemble(path: Path, distance: Floats) -> float | None:
 
 def off_truth(path: Path) -> Floats:
     """Return the distance (V,), m, of a run's vertices from the true surface."""
-    folder, run = RunFolder(path), open_run(path)
+    folder, run = Run(path), open_run(path)
     truth = true_mesh(run.settings, folder.provenance)
     assert truth is not None, f"{path}: no true surface"
     return np.abs(signed_error(run.surface.mesh, truth))

@@ -20,7 +20,7 @@ import torch
 
 from sononerf import __version__, storage
 from sononerf.errors import SonoNerfError
-from sononerf.run.run_folder import RunFolder
+from sononerf.run.run import Run
 from sononerf.run.simulate import default_store, echo_hash
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import load_settings
@@ -79,7 +79,7 @@ def run_experiment(
         KeyboardInterrupt: If it was stopped.
     """
     chosen = load_settings(config, settings)
-    run = RunFolder(folder)
+    run = Run(folder)
     if run.config.is_file():
         run.check(chosen)
         metrics = run.read_metrics()

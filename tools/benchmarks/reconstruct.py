@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 
 from sononerf import storage
-from sononerf.run.fitted import load_fitted
+from sononerf.run.run import Run
 from sononerf.surface.start.read_out import StartMethod, read_field, start_surfaces
 from tools.benchmarks.experiment import Row, aligned, ending, keep, ratios
 
@@ -27,8 +27,8 @@ def reconstruct(arguments: argparse.Namespace) -> str:
             storage.read_json(arguments.compare)
         rows: list[Row] = []
         for run in arguments.runs:
-            fitted = load_fitted(run)
-            own = fitted.settings.reconstruction.spacing or fitted.module.field.resolution / 2
+            fitted = Run(run)
+            own = fitted.settings.reconstruction.spacing or fitted.model.field.resolution / 2
             for spacing in arguments.spacings or [own]:
                 rows.append(_timed(run, spacing))
                 print(f"{rows[-1]['name']}: done", file=sys.stderr, flush=True)
@@ -38,7 +38,7 @@ def reconstruct(arguments: argparse.Namespace) -> str:
 
 
 def _timed(run: Path, spacing: float) -> Row:
-    fitted = load_fitted(run)
+    fitted = Run(run)
     options = fitted.settings.reconstruction
     method: StartMethod = "filled" if options.method in ("auto", "isosurface") else options.method
     seconds = []
@@ -46,7 +46,7 @@ def _timed(run: Path, spacing: float) -> Row:
         began = time.perf_counter()
         with torch.inference_mode():
             reading = read_field(
-                fitted.module.field,
+                fitted.model.field,
                 fitted.hull,
                 resolution=fitted.head.resolution,
                 spacing=spacing,

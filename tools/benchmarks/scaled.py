@@ -85,4 +85,3 @@ def scaled_store(source: Path, target: Path, settings: Settings, factor: float) 
     )
     for index in new.missing():
         new.write_pose(index, old.read_pose(index) / factor)
-    new.seal()

@@ -24,9 +24,9 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
+from tools.tortures.samples import samples
 
 from tools.tortures.harness import FIT, SIMULATE, Report, contents, give, prepared
-from tools.tortures.samples import samples
 
 CANARY = "canary"
 SHELL = f"touch {CANARY}"
@@ -50,7 +50,7 @@ URLS = (
 NAMES = ("os:system", "../x", "os.system", "sononerf.cli", "a b", "$(touch canary)", "__import__")
 LINKS = (
     *(".lock", "metrics.json", "model.json", "model.safetensors", "provenance.json", "config.yaml"),
-    *("checksums.jsonl", "report.html", "traced.safetensors", "checkpoints", "tensorboard"),
+    *("report.html", "traced.safetensors", "checkpoints", "tensorboard"),
     *("epochs", "reconstruction", "prediction", "reconstruction/mesh.ply"),
     *("prediction/spectrograms.npz", "checkpoints/last.ckpt", "epochs/0001"),
 )
@@ -120,10 +120,8 @@ def _checkpoints() -> Iterator[Attack]:
 
             def build(folder: Path, bomb: Any = bomb, new: bool = zipped) -> Any:
                 shutil.copytree(folder / "run", folder / "victim")
-                for file in ("model.json", "checksums.jsonl"):
-                    (folder / "victim" / file).unlink()
+                (folder / "victim" / "model.json").unlink()
                 file = folder / "victim" / "checkpoints" / "last.ckpt"
-                file.with_name("last.ckpt.previous").unlink(missing_ok=True)
                 content = {"state_dict": {}, "global_step": 1, "hyper_parameters": bomb}
                 torch.save(content, file, _use_new_zipfile_serialization=new)
                 return (*FIT[:-4], "--output", "victim", "--accelerator", "cpu")
@@ -217,7 +215,6 @@ def _scripts() -> Iterator[Attack]:
         def build(folder: Path, text: str = text) -> Any:
             run = folder / "run"
             facts = json.loads((run / "provenance.json").read_text())
-            (run / "checksums.jsonl").unlink()
             (run / "provenance.json").write_text(json.dumps({**facts, "licence": text, text: text}))
             metrics = json.loads((run / "metrics.json").read_text())
             metrics["cost"][text] = text
@@ -293,15 +290,6 @@ def _stores() -> Iterator[Attack]:
         "store with a transformer",
         lambda f: changed(f, lambda d: d.update(storage_transformers=[{"name": "os.system"}])),
     )
-
-    def climbing(folder: Path) -> Any:
-        file = folder / "store" / "manifest.json"
-        known = json.loads(file.read_text())
-        known["poses"]["../../outside/precious"] = next(iter(known["poses"].values()))
-        file.write_text(json.dumps(known))
-        return (*FIT[:-4], "--output", "x", "--accelerator", "cpu")
-
-    yield "store with a pose outside", climbing
 
 
 def _bombs() -> Iterator[Attack]:

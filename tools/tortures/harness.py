@@ -49,7 +49,7 @@ AFTER = {
     "export": ("export", "run", "run/mesh.mat", "--what", "points"),
 }
 """Commands after a fit, by their names."""
-TIMES = ("tensorboard", "report.html", "checksums.jsonl", "checkpoints", "provenance.json")
+TIMES = ("tensorboard", "report.html", "checkpoints", "provenance.json")
 """Files of a run that depend on its time, or on the number of its parts."""
 
 
@@ -276,7 +276,7 @@ def leftovers(folder: Path) -> list[str]:
     return [
         file.relative_to(folder).as_posix()
         for file in folder.rglob(".*")
-        if file.name.endswith(".tmp") or file.name in (".lock", ".probe")
+        if file.name.endswith(".tmp") or file.name == ".probe"
     ]
 
 

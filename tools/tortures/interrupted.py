@@ -325,4 +325,4 @@ def _after_fault(outcome: Outcome, place: Path, old: dict[str, str], end: dict[s
 
 def _may_go(name: str) -> bool:
     """Tell whether a command removes a file on its way, to write it anew or because it is old."""
-    return name.endswith(("read_out.json", "manifest.jsonl", ".lock"))
+    return name.endswith(("read_out.json", ".lock"))

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.head.directivity.record import Directivity, unit_vectors
-from sononerf.input_files import require_sound_matlab
 
 STRUCTS = ("array_struct", "bat_hrtf")
 NUMERIC_CLASSES = {
@@ -40,14 +39,7 @@ Field = Callable[[str], NDArray[Any] | None]
 
 
 def read_mat(path: Path) -> Directivity:
-    """Read a `.mat` file of version 5 or 7.3.
-
-    Args:
-        path: The file.
-
-    Returns:
-        directivity: Receiver 0 is the left ear. Azimuth counts to the left, elevation upward.
-    """
+    """Read a `.mat` file of version 5 or 7.3."""
     with path.open("rb") as file:
         is_new = b"MATLAB 7.3" in file.read(116)
     return _read_new(path) if is_new else _read_old(path)
@@ -77,7 +69,6 @@ def _read_old(path: Path) -> Directivity:
     from scipy.io import loadmat
     from scipy.io.matlab import MatReadError
 
-    require_sound_matlab(path)
     try:
         content = loadmat(path, variable_names=STRUCTS, squeeze_me=True, struct_as_record=False)
     except (MatReadError, NotImplementedError) as error:
@@ -175,11 +166,7 @@ NUMBERS = "biufc"
 
 @contextmanager
 def opened(path: Path) -> Iterator[h5py.File]:
-    """Open an HDF5 file for reading; an error of the library becomes one line.
-
-    Raises:
-        InputError: If it is missing, too large, damaged, or no HDF5 file.
-    """
+    """Open an HDF5 file for reading; an error of the library becomes one line."""
     try:
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"{path}: larger than {MOST_BYTES} bytes")
@@ -193,11 +180,7 @@ def opened(path: Path) -> Iterator[h5py.File]:
 
 
 def find(group: h5py.Group, name: str) -> Any:
-    """Return the group or dataset of a name in a group; None if there is none.
-
-    Raises:
-        InputError: If it is a link to somewhere else.
-    """
+    """Return the group or dataset of a name in a group; None if there is none."""
     link = group.get(name, getlink=True)
     if link is None:
         return None
@@ -207,11 +190,7 @@ def find(group: h5py.Group, name: str) -> Any:
 
 
 def numbers(group: h5py.Group, name: str) -> NDArray[Any]:
-    """Return a numeric dataset whole, real or complex.
-
-    Raises:
-        InputError: If it is missing, is no array of numbers, or lies outside the file.
-    """
+    """Return a numeric dataset whole, real or complex."""
     path = group.file.filename
     array = find(group, name)
     if not isinstance(array, h5py.Dataset):

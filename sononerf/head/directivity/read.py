@@ -30,9 +30,6 @@ def read_csv(path: Path) -> Directivity:
     Columns ``azimuth_deg`` (to the left), ``elevation_deg`` (up), ``frequency_hz``, ``gain``
     (linear) or ``gain_db``, and perhaps ``receiver``: a number from 0 on, or ``emitter``. Every
     receiver has every direction at every frequency, once, in any order.
-
-    Raises:
-        InputError: If columns, values or lines are missing; the message names the line.
     """
     if path.stat().st_size > MOST_BYTES:
         raise InputError(f"{path}: larger than {MOST_BYTES} bytes")
@@ -129,11 +126,7 @@ def read_directivity(path: Path) -> Directivity:
 
 
 def content_hash(path: Path) -> str:
-    """Return the SHA-256 of a file.
-
-    Raises:
-        InputError: If it cannot be read.
-    """
+    """Return the SHA-256 of a file."""
     try:
         require_regular(path)
         with path.open("rb") as file:

@@ -154,9 +154,6 @@ class Directivity:
         beam ((M, F) or None): Beam of the emitter; None where the file has none.
         places ((E, 3) or None, m): Places of the receivers; None where the file does not state
             them.
-
-    Raises:
-        InputError: If shapes do not fit, or a value is not allowed.
     """
 
     source: str

@@ -38,14 +38,8 @@ def read_sofa(path: Path) -> Directivity:
     direction. ``FreeFieldDirectivityTF`` is one transducer, measured as a source by receivers in
     all directions; it is taken to hear as it sends. Phases and delays are left out.
 
-    Args:
-        path: The file.
-
     Returns:
         directivity: In the listener's frame (of a transducer, the source's): its view is ahead.
-
-    Raises:
-        InputError: If it is no SOFA file of these conventions, or a value is not allowed.
     """
     with opened(path) as file:
         if text(file, "Conventions") != "SOFA":
@@ -177,12 +171,7 @@ NO_VARIABLE = "This is a netCDF dimension but not a netCDF variable.%10d"
 
 
 def directivity_of(ears: Ears, *, source: str = "settings") -> Directivity:
-    """Return the tables of a head as a directivity, both ends of the azimuth axis once.
-
-    Args:
-        ears: At the frequencies that are wanted.
-        source: Its name in messages.
-    """
+    """Return the tables of a head as a directivity, both ends of the azimuth axis once."""
     directions = ears.directions[:, :-1].reshape(-1, 3)
 
     def rows(table: Singles) -> Floats:
@@ -199,11 +188,6 @@ def write_sofa(path: Path, directivity: Directivity, *, title: str = "directivit
 
     The emitter's gain, if there is one, is a last receiver with the description ``emitter``.
     Gains are written as real parts.
-
-    Args:
-        path: The file.
-        directivity: The directivity to write.
-        title: Title of the file.
     """
     gains, places = directivity.gains, directivity.places
     names = [f"receiver {number}" for number in range(len(gains))]

@@ -14,13 +14,7 @@ def curves_picture(
     floors: Mapping[str, float] | None = None,
     kind: PictureFormat = "png",
 ) -> bytes:
-    """Draw errors over steps on a logarithmic axis.
-
-    Args:
-        curves: Steps and errors, dB, by their names.
-        floors: Errors, dB, that no prediction can fall below, by their names.
-        kind: Kind of the file.
-    """
+    """Draw errors over steps on a logarithmic axis."""
     with figure(6.4, 3.4, 130) as drawn:
         axes = drawn.subplots()
         for number, (name, (steps, errors)) in enumerate(curves.items()):

@@ -64,7 +64,6 @@ def echo_png(
     Of more than three receivers three are drawn.
 
     Args:
-        mesh: The scene, metres.
         points ((N, 3), m): Points that reflect sound towards the ears, world frame; none is
             allowed.
         level_db ((N,), dB): Level of each; drawn relative to the loudest.
@@ -77,11 +76,6 @@ def echo_png(
         range_m ((R,), m): Range axis, ascending; drawn only around what sounds.
         frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
         speed_of_sound (m/s): Puts the echo on the range axis.
-        title: One line above.
-
-    Raises:
-        ValueError: If shapes do not fit.
-        NumericalError: If the mesh is empty or something is not finite.
     """
     ranges, frequencies = (np.asarray(axis, dtype=np.float64) for axis in (range_m, frequency_hz))
     hits = np.asarray(points, dtype=np.float64).reshape(-1, 3)
@@ -195,20 +189,15 @@ def hits_image(
     """Draw a scene with its hits and the head that hears them, seen over the head's shoulder.
 
     Args:
-        mesh: The scene, metres.
         points ((N, 3), m): Hits, world frame; those behind something are hidden, and the faintest
             left out.
         relative_db ((N,), dB): Their levels below the loudest, zero at most.
         position ((3,), m): Place of the head.
         rotation (3, 3): Head to world.
-        receivers: Number of receivers; a head with two has ears.
         size (int, int): Width and height in pixels.
 
     Returns:
         pixels: (H, W, 3) uint8.
-
-    Raises:
-        NumericalError: If the mesh is empty or something is not finite.
     """
     if not len(mesh.faces):
         raise NumericalError("there is nothing to draw: the scene is empty")

@@ -40,7 +40,6 @@ def mesh_png(
     """Draw a mesh in parallel projection, shaded, with a scale bar.
 
     Args:
-        mesh: Metres; open meshes are seen from both sides.
         size (int, int): Width and height in pixels.
         view (3,): Direction from the mesh to the camera, world frame; z is up.
         colours ((3,) or (V, 3)): Colour in 0 to 1, one for all or one per vertex.
@@ -61,7 +60,6 @@ def side_by_side_png(
     """Draw two meshes next to each other through the same camera.
 
     Args:
-        left, right: Metres, world frame.
         titles (str, str): One line above each.
         size (int, int): Width and height of each half in pixels.
         view (3,): Direction to the camera, world frame.
@@ -89,14 +87,9 @@ def confidence_png(
     """Draw a mesh in the colours of its confidence, with a legend.
 
     Args:
-        mesh: Metres.
         counts (V,): Number of poses that heard the surface around each vertex.
         size (int, int): Width and height in pixels.
         view (3,): Direction from the mesh to the camera, world frame; z is up.
-
-    Raises:
-        ValueError: If size, view or counts have a wrong shape.
-        NumericalError: If the mesh is empty or not finite.
     """
     _require_drawable(mesh, "the mesh")
     if np.shape(counts) != (len(mesh.vertices),):
@@ -183,7 +176,6 @@ def sides_png(
     """Draw meshes from four sides through the same cameras, one mesh per row.
 
     Args:
-        rows: For each row a title, the mesh, its colours as in :func:`mesh_png`, and their legend.
         size (int, int): Width and height of each view in pixels.
     """
     for title, mesh, *_ in rows:

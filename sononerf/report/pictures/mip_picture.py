@@ -72,9 +72,6 @@ def mip_picture(
         extents (((low, high), (low, high)), m): Outer edges of the first (to the right) and the
             second axis (upwards).
         labels (str, str): Names of the two axes.
-        title: One line above.
-        scale: Decibels below the greatest value (10 log10, 40 dB shown), or linear from zero.
-        kind: Kind of the file.
     """
     values = _scaled(projection, scale)
     low, high = _limits(values, scale)
@@ -177,9 +174,6 @@ def _draw(axes: Any, values: Floats, extents: Extents, limits: tuple[float, floa
 def maximum_intensity_projections(volume: Volume) -> dict[str, NDArray[np.floating]]:
     """Return the greatest value along each axis.
 
-    Args:
-        volume: Values (X, Y, Z).
-
     Returns:
         projections: ``"x"`` (Y, Z), ``"y"`` (X, Z) and ``"z"`` (X, Y), named by the axis looked
             along.
@@ -204,9 +198,6 @@ def difference_pngs(
             one.
         titles (str, str): Names of the two.
         truth ((3,), m): Place of the object that was truly added; a cross marks it.
-
-    Returns:
-        pictures: PNG files by the axis looked along.
     """
     volumes = (comparison.first, comparison.second, comparison.difference)
     projections = [maximum_intensity_projections(volume) for volume in volumes[:2]]
@@ -267,8 +258,6 @@ def overlay_png(
     """Draw a mesh coloured by the difference next to its surface: red where the first has more.
 
     Args:
-        mesh: Metres, world frame.
-        comparison: The difference.
         view (3,): Direction to the camera.
     """
     from matplotlib import colormaps

@@ -46,7 +46,6 @@ def scene_png(
     """Draw a scene with where the calls come from and where they go.
 
     Args:
-        mesh: The scene, metres.
         poses_positions ((P, 3), m): Heads, drawn as dots; paler the further away.
         poses_forward (P, 3): Directions of look, drawn as strokes.
         region_box (((3,), (3,)), m): Opposite corners of the box that is fitted.
@@ -54,10 +53,6 @@ def scene_png(
             own.
         size (int, int): Width and height in pixels.
         view (3,): Direction to the camera, world frame.
-
-    Raises:
-        ValueError: If the poses' shapes do not fit.
-        NumericalError: If the mesh is empty or something is not finite.
     """
     heads = np.asarray(poses_positions, dtype=np.float64).reshape(-1, 3)
     looks = np.asarray(poses_forward, dtype=np.float64).reshape(-1, 3)

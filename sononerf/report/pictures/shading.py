@@ -30,8 +30,6 @@ class Camera:
     Args:
         axes (3, 3): Rows: towards the camera, to the right, upwards; orthonormal.
         centre ((3,), m): Point in the middle of the picture.
-        width, height: Pixels.
-        scale: Pixels per metre.
     """
 
     axes: Floats
@@ -55,12 +53,7 @@ def camera_for(
     view: ArrayLike = DEFAULT_VIEW,
     fill: float = 0.78,
 ) -> Camera:
-    """Place a camera so that points (N, 3) fill a share of a picture (width, height).
-
-    Raises:
-        ValueError: If the view has no direction or the size is not positive.
-        NumericalError: If there is no point, or one is not finite.
-    """
+    """Place a camera so that points (N, 3) fill a share of a picture (width, height)."""
     cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     towards = np.asarray(view, dtype=np.float64)
     if towards.shape != (3,) or not np.isfinite(towards).all() or not np.any(towards):
@@ -110,8 +103,6 @@ def draw_mesh(
 
     Args:
         pixels (H, W, 3): Colours in 0 to 1.
-        mesh: Metres.
-        camera: Camera of the same width and height as the pixels.
         colour ((3,) or (V, 3)): Colour in 0 to 1, one for all or one per vertex.
 
     Returns:

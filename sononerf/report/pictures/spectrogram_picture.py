@@ -48,8 +48,6 @@ def spectrogram_picture(
             other is drawn alone.
         range_m ((R,), m): Range axis, ascending; drawn only around what sounds.
         frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
-        title: One line above.
-        kind: Kind of the file.
     """
     given = (measured_db, predicted_db, range_m, frequency_hz)
     with _drawn(*given, title, 130) as drawn:
@@ -165,12 +163,7 @@ def _checked(
 
 
 def drawn_receivers(count: int, most: int = MOST_ROWS) -> tuple[Ints, list[str]]:
-    """Return which receivers are drawn, evenly chosen, and their names.
-
-    Args:
-        count: Number of all.
-        most: Largest number that is drawn.
-    """
+    """Return which receivers are drawn, evenly chosen, and their names."""
     chosen = np.linspace(0, count - 1, min(count, most)).round().astype(np.int64)
     if count == 2:
         return chosen, ["left ear", "right ear"]
@@ -306,11 +299,9 @@ def pings_png(
     Args:
         waveforms (sequence of (E, S) float): From the emission on.
         spectrograms (sequence of (E, R, F) float): Linear magnitude.
-        labels: Names of these pings.
         sampling_rate (Hz): Sampling rate of the waveforms.
         range_m ((R,), m): Ascending.
         frequency_hz ((F,), Hz): Ascending.
-        poses: Poses of all pings; the first ones are marked.
     """
     rows = len(labels)
     with figure(10.5, 3.4 + 2.2 * rows, 100, layout="constrained") as drawn:

@@ -58,15 +58,7 @@ class Boundary(Solved):
     polyhedron, the echo comes later by twice the depth of the facets.
 
     Args:
-        scene: The ensonified scene.
-        hearing: Head and air.
         frequency_max (Hz): Frequency at which the response has fallen to zero.
-        edges_per_wavelength: Mean edges of the mesh over which the wavelength reaches.
-
-    Raises:
-        InputError: If a body is open, or two of them overlap.
-        ResourceError: If the matrix needs more memory than is free, or the solution more than a
-            week.
 
     References:
         .. [1] A. J. Burton and G. F. Miller, "The application of integral equation methods to the
@@ -188,7 +180,6 @@ def excitation(
     """Return the right-hand sides (V, P), m: the incident waves and their normal derivatives.
 
     Args:
-        panels: The surface.
         wavenumber (1/m): Its imaginary part is not positive.
         emitters ((P, 3), m): Points that send e^{-jkr} / r.
         beam (P, Q): Their gains towards the panels' points.
@@ -209,7 +200,6 @@ def radiated(
     """Return the scattered pressure at ears.
 
     Args:
-        panels: The surface.
         wavenumber (1/m): Its imaginary part is not positive.
         pressure ((P, Q) complex): On the panels' points, for each pose; the ear's gain included.
         ears ((P, 3), m): One for each pose.

@@ -27,17 +27,7 @@ def expected_vertices(area: float, edge: float) -> int:
 
 
 def closed_bodies(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-    """Return a surface with each vertex once, if its bodies are closed.
-
-    Args:
-        mesh: Anticlockwise triangles as seen from outside.
-
-    Returns:
-        bodies: Without triangles that have no area.
-
-    Raises:
-        InputError: If a body is open.
-    """
+    """Return a surface with each vertex once, if its bodies are closed."""
     bodies = trimesh.Trimesh(
         np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces), process=False
     )
@@ -55,11 +45,7 @@ def closed_bodies(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def check_apart(bodies: trimesh.Trimesh) -> None:
-    """Refuse bodies that overlap, touch, or are inside out.
-
-    Raises:
-        InputError: If other triangles than the own one are just above a triangle's middle.
-    """
+    """Refuse bodies that overlap, touch, or are inside out."""
     size = np.sqrt(bodies.area_faces)
     above = bodies.triangles_center + OUTSIDE * size[:, None] * bodies.face_normals
     wrong = int((np.abs(winding_numbers(bodies.vertices, bodies.faces, above)) > 0.25).sum())
@@ -79,11 +65,7 @@ def suited(bodies: trimesh.Trimesh, edge: float) -> trimesh.Trimesh:
     are halved; curved surfaces stay as flat as they are.
 
     Args:
-        bodies: As :func:`closed_bodies` returns them.
         edge (m): The wanted length of edges.
-
-    Returns:
-        mesh: Closed as well.
 
     References:
         .. [1] M. Garland and P. S. Heckbert, "Surface simplification using quadric error metrics",
@@ -136,11 +118,7 @@ def halved(mesh: trimesh.Trimesh, longest: float) -> trimesh.Trimesh:
     in Delaunay's sense. So long thin triangles become shorter and not thinner.
 
     Args:
-        mesh: Closed or not.
         longest (m): No edge stays longer.
-
-    Returns:
-        mesh: The same surface, within ``FLAT`` of the longest edge. Closed if it was closed.
 
     References:
         .. [1] M.-C. Rivara, "Algorithms for refining triangular grids suitable for adaptive and

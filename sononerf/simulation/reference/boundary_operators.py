@@ -29,9 +29,6 @@ BLOCK = 1 << 21  # entries of the kernel at a time
 class Operators:
     """The matrix of Burton and Miller's equation on a surface, for any wavenumber.
 
-    Args:
-        panels: The surface.
-
     Attributes:
         panels: The surface.
     """

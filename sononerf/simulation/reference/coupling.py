@@ -59,10 +59,7 @@ class Coupling:
     rows, each relative to its Hankel function on the sphere; P poses.
 
     Args:
-        balls: The spheres.
-        degrees: Highest degree of each.
         wavenumber (1/m): Wavenumber of sound in air.
-        links: The axes between them.
         turns (list of list of (2 n + 1, 2 n + 1) float64): Wigner's matrices of each link by
             degree.
     """

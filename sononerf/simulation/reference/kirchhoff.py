@@ -67,8 +67,6 @@ class Kirchhoff(Engine):
     wavelength long is as good as a round one.
 
     Args:
-        scene: The ensonified scene.
-        hearing: Head and air.
         frequency_max (Hz): Up to which the echo is right; higher ones fade.
         elements_per_wavelength: Pieces over which the way varies by one wavelength of
             ``frequency_max``; no piece is longer than the wavelength.

@@ -19,7 +19,6 @@ def log_outgoing(degree: int, argument: Complexes) -> tuple[Complexes, Complexes
     (DLMF 10.51.1); functions of degrees far above the argument do not overflow.
 
     Args:
-        degree: Highest, N.
         argument ((X,) complex128): Not zero.
 
     Returns:
@@ -42,7 +41,6 @@ def legendre(degree: int, cosine: Floats) -> Floats:
     """Associated Legendre functions, normalised for spherical harmonics, with (-1)^m in them.
 
     Args:
-        degree: Highest, N.
         cosine (X,): Cosines of the polar angle.
 
     Returns:
@@ -68,7 +66,6 @@ def harmonics(degree: int, directions: Floats) -> Complexes:
     """Orthonormal spherical harmonics.
 
     Args:
-        degree: Highest, N.
         directions (X, 3): Unit vectors.
 
     Returns:
@@ -91,7 +88,6 @@ def wigner(degree: int, angles: list[float]) -> list[Floats]:
     """Matrices of one degree n that turn spherical harmonics about y.
 
     Args:
-        degree: n.
         angles (list of float, rad): Angles of the turns.
 
     Returns:

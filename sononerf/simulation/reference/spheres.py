@@ -64,18 +64,11 @@ class Spheres(Solved):
     Beam and ears are taken towards the centres of the spheres.
 
     Args:
-        scene: Rigid spheres that do not touch, as closed meshes.
-        hearing: Head and air.
-        frequency_max: See :class:`Solved`.
         orders: Sum orders of scattering up to this one and solve nothing: 1 leaves out what one
             sphere sends to another. For diagnosis.
 
     Attributes:
         balls: The spheres of the scene.
-
-    Raises:
-        InputError: If the scene has anything else than rigid spheres, if two of them touch, or if
-            they need too many partial waves.
 
     References:
         .. [1] NIST Digital Library of Mathematical Functions, 10.60.1 and 10.60.2.
@@ -112,7 +105,6 @@ class Spheres(Solved):
 
         Args:
             wavenumber (1/m): Wavenumber of sound in air.
-            nearest: Distance of the nearest emitter or ear from a sphere's centre, over its radius.
         """
         found = []
         for index, ball in enumerate(self.balls):
@@ -246,14 +238,7 @@ class Spheres(Solved):
 
 
 def find_balls(scene: Scene) -> list[Ball]:
-    """Recognise the spheres of a scene.
-
-    Args:
-        scene: Closed meshes.
-
-    Returns:
-        balls: One for each connected part of the mesh.
-    """
+    """Recognise the spheres of a scene."""
     vertices = np.asarray(scene.mesh.vertices, dtype=np.float64)
     same = np.round(vertices / (TWICE * np.ptp(vertices, axis=0).max()))
     _, first, index = np.unique(same, axis=0, return_index=True, return_inverse=True)

@@ -6,10 +6,9 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
-import torch
 import trimesh
 from torch import Tensor
 
@@ -105,35 +104,6 @@ class Candidate:
             )
         return self._torn[number]
 
-    def state(self) -> dict[str, Tensor]:
-        """Return all as plain tensors."""
-        found = {f"level.{name}": part for name, part in self.level.state().items()}
-        found["names"] = torch.tensor(list(f"{self.way} {self.start}".encode()), dtype=torch.uint8)
-        found["drawn"] = torch.tensor(self.drawn)
-        found["objectives"] = torch.tensor(self.objectives, dtype=torch.float64)
-        for stage, mesh in enumerate(self.meshes):
-            found[f"mesh.{stage}.vertices"] = torch.as_tensor(np.array(mesh.vertices))
-            found[f"mesh.{stage}.faces"] = torch.as_tensor(np.array(mesh.faces))
-        return found
-
-    @classmethod
-    def of(cls, state: dict[str, Tensor], level: Level, far: float) -> Candidate:
-        """Return the candidate of a state.
-
-        Args:
-            state: From :meth:`state`.
-            level: Takes over that of the state.
-            far (m): As the attribute.
-        """
-        level.load(below(state, "level."))
-        way, start = bytes(state["names"].tolist()).decode().split(" ", 1)
-        meshes: list[trimesh.Trimesh] = []
-        while parts := below(state, f"mesh.{len(meshes)}."):
-            vertices, faces = parts["vertices"].numpy(), parts["faces"].numpy()
-            meshes.append(trimesh.Trimesh(vertices, faces, process=False))
-        objectives, drawn = state["objectives"].tolist(), int(state["drawn"])
-        return cls(cast(Any, way), cast(Any, start), level, meshes, objectives, far, drawn)
-
 
 def below(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
     """Return the tensors whose names begin with a name, by the rest of theirs."""
@@ -144,10 +114,6 @@ def planned(
     starts: Mapping[StartMethod, float], *, flat: bool = False
 ) -> list[tuple[StartMethod, Way]]:
     """Return the start and the way of each candidate.
-
-    Args:
-        starts: Start methods, and their objectives before the first stage.
-        flat: True if ``levels`` explains the echoes better with its flat parts on planes.
 
     Returns:
         plans: ``fuller`` and the best of the others go both ways, ``levels`` is not blurred beside
@@ -167,12 +133,7 @@ def planned(
 
 
 def without_twin(candidate: Candidate, candidates: list[Candidate]) -> list[Candidate]:
-    """Make a candidate sharp, and return all candidates without the other sharp one of its start.
-
-    Args:
-        candidate: Its start is too thin for the blur of the first stage.
-        candidates: It and the others.
-    """
+    """Make a candidate sharp; return all candidates without the other sharp one of its start."""
     candidate.way = "sharp"
     return [
         one
@@ -197,10 +158,6 @@ def after_first_stage(
     others the better one goes on, in doubt both; only their errors count, because free surfaces
     follow the onsets and planes do not. Else each start goes on in its better way, ``levels`` and
     ``fuller`` as one, but none that is clearly worse.
-
-    Args:
-        candidates: Planes are the first one.
-        misfit: Part of a surface's objective that the onsets have, dB.
     """
     good = TOLERATED * min(one.objectives[-1] for one in candidates)
     sheets = [one for one in candidates if one.way == "sheet"]
@@ -247,12 +204,7 @@ def are_alike(one: Candidate, other: Candidate, wavelength: float) -> bool:
 
 
 def best_of(candidates: list[Candidate], is_closed: Callable[[trimesh.Trimesh], bool]) -> Candidate:
-    """Return the best candidate: that of the least objective, in doubt ``levels`` or a closed one.
-
-    Args:
-        candidates: After their stages.
-        is_closed: Whether a surface encloses a body, as far as poses can have heard it.
-    """
+    """Return the candidate of the least objective, in doubt ``levels`` or a closed one."""
     least = min(candidates, key=lambda one: one.objective)
     if least.objective <= RANKS_DB or len(candidates) == 1:
         return least
@@ -277,14 +229,7 @@ def listed(
     candidates: list[Candidate],
     chosen: Candidate,
 ) -> list[dict[str, Any]]:
-    """Return what is told of the candidates, see ``Refined.candidates``.
-
-    Args:
-        starts: All start methods.
-        compared: Objectives of those that were compared before the first stage.
-        candidates: Those that went on after it.
-        chosen: One of them.
-    """
+    """Return what is told of the candidates, see ``Refined.candidates``."""
 
     def finite(value: float | None) -> float | None:
         return value if value is not None and math.isfinite(value) else None

@@ -34,12 +34,7 @@ class Correction:
     """Simulated and rendered echoes of one surface, for some poses.
 
     Args:
-        optics: Renders.
-        mesh: The surface, m.
-        simulator: Simulator of the same surface.
-        echoes: Echoes with the poses.
         numbers (N,): Numbers of the poses.
-        seed: Seed of the simulated rays.
     """
 
     def __init__(
@@ -68,10 +63,6 @@ class Correction:
 
     def magnitudes(self, numbers: list[int], heard: Heard) -> tuple[Tensor, Tensor]:
         """Return simulated and rendered echoes of the surface.
-
-        Args:
-            numbers: Poses.
-            heard: A rendering with the wanted rows.
 
         Returns:
             simulated, rendered ((P, E, W, F) float32): Linear; zero beyond the axis.

@@ -53,17 +53,9 @@ class Descent:
     """Preconditioned descent on one connectivity.
 
     Args:
-        mesh: Start, m.
-        echoes, optics, level: Measurement, head, and gains, which are updated.
         smoothing (m): Length over which steps are smoothed.
         rate: Length of the first steps over the smoothing length; it bounds the tilt of the
             surface.
-        later: Later bounces, added as power.
-        correction: Correction of the start, by the simulator.
-        onsets: Onsets, the least range of the surface.
-        sheet: True for a sheet, whose sides are kept apart.
-        band: As in :class:`Stage`.
-        seed: Seed of poses and rays.
     """
 
     def __init__(
@@ -111,10 +103,6 @@ class Descent:
     def step(self, number: int, part: float) -> float:
         """Do one step.
 
-        Args:
-            number: Number of the step, counted over all stages; it determines the poses.
-            part: Completed fraction of the stage, 0 to 1.
-
         Returns:
             mismatch (dB): Mean over the poses, before the step.
         """
@@ -147,7 +135,6 @@ class Descent:
         """Render poses of the present surface.
 
         Returns:
-            heard: None where no pose hears any of it.
             points, areas ((V, 3) float32): Leaves of the gradients, relative to the middle of the
                 surface.
         """
@@ -195,26 +182,6 @@ class Descent:
             total = total + ONSETS * self._onsets.gradient(self.vertices, number)
         return (total * normals).sum(1, keepdim=True), float(errors.detach().mean())
 
-    def state(self) -> dict[str, Tensor]:
-        """Return the whole state, and the initial mesh, as plain tensors."""
-        return {
-            "start": self._start.cpu(),
-            "faces": torch.as_tensor(self.faces),
-            "vertices": self.vertices.cpu(),
-            "seen": self._seen.cpu(),
-            "direction": self.direction.cpu(),
-            "square": self.square.cpu(),
-            "count": torch.tensor(self.count),
-        }
-
-    def load(self, state: dict[str, Tensor]) -> None:
-        """Load the state of a descent on the same mesh."""
-        self.vertices, self._seen, self.direction, self.square = (
-            state[name].to(self.vertices) for name in ("vertices", "seen", "direction", "square")
-        )
-        self.count = int(state["count"])
-        self._sight = sight_of(self.optics, self._seen.cpu().numpy(), self.faces)
-
 
 def poses_that_hear(mesh: trimesh.Trimesh, echoes: Echoes, optics: Optics) -> Tensor:
     """Number of training poses that see each vertex near the direction of a mirror, (V,)."""
@@ -241,7 +208,6 @@ class Sides:
     """Opposite vertices of a sheet; those of the rim have no partner.
 
     Args:
-        mesh: A closed sheet, m, whose sides do not cross.
         least (m): Thickness that is kept.
     """
 

@@ -58,11 +58,8 @@ class Edges:
         Those count that are convex and sharper than a crease, as in the simulator.
 
         Args:
-            optics: The head.
             vertices ((V, 3) float64, m): Gradients run to them,
             normals ((K', 2, 3) float64): and to the outward unit normals of both sides.
-            sight: Search structure of the surface.
-            heads: In float64.
         """
         places, upright = (part.detach().cpu().numpy() for part in (vertices, normals))
         first, second = upright[:, 0], upright[:, 1]

@@ -53,7 +53,6 @@ class FilterBank:
     """Filters of one call and analysis, computed at the first use of a length.
 
     Args:
-        head: Its call and analysis.
         nodes ((N,), Hz): Nodes of the synthesis: odd multiples of half their spacing.
         soft (Hz): Frequency below which the fade of smooth surfaces falls no further.
 
@@ -77,10 +76,6 @@ class FilterBank:
 
     def power(self, arrivals: Mapping[Source, Arrivals], *, receivers: int, frames: int) -> Tensor:
         """Power of echoes in each frame and row.
-
-        Args:
-            arrivals: By what sends them; they add up in phase.
-            receivers, frames: Numbers of receivers and frames.
 
         Returns:
             power ((receivers, frames, F) float32): Gradients run to strength, time and weight.

@@ -11,21 +11,14 @@ import trimesh
 from torch import Tensor
 
 from sononerf.echoes.echoes import Echoes
-from sononerf.simulation.pool import computed
+from sononerf.executor import computed
 from sononerf.simulation.workers import useful_workers
 from sononerf.surface.refine.optics import Heard, Optics
 from sononerf.surface.refine.tracer import LATER_RAYS, Later, Tracer
 
 
 class LaterBounces:
-    """Later bounces off one surface.
-
-    Args:
-        optics: Head, filters and wavelengths.
-        mesh: The surface, m.
-        echoes: Their poses hear the bounces.
-        seed: Seed of the rays.
-    """
+    """Later bounces off one surface."""
 
     def __init__(self, optics: Optics, mesh: trimesh.Trimesh, echoes: Echoes, *, seed: int) -> None:
         self._optics, self._echoes = optics, echoes

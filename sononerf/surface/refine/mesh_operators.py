@@ -27,7 +27,6 @@ class MeshOperators:
 
     Args:
         faces (T, 3): Triangles.
-        count: Number of vertices, V.
 
     Attributes:
         faces (T, 3): Triangles.
@@ -121,7 +120,6 @@ class MeshOperators:
 
         Args:
             vertices, normals (V, 3): Places (m) and outward unit normals.
-            passes: Number of averages over neighbours.
 
         Returns:
             bending ((V, 6), 1/m): Components xx, yy, zz, xy, xz, yz of the symmetric tensor that

@@ -68,12 +68,9 @@ def without_necks(
     """Cut the necks without which the objective is lower.
 
     Args:
-        mesh: Closed bodies, m; of an open surface nothing is cut.
         wavelength (m): The shortest.
-        compare: Returns the objective of a surface.
 
     Returns:
-        mesh: The given one where nothing is cut.
         doubtful (V,): True for vertices where a neck was cut, or where the objective is about the
             same without it.
     """
@@ -106,7 +103,6 @@ def find_necks(mesh: trimesh.Trimesh, wavelength: float) -> list[Neck]:
     """Return the necks of a closed surface; none where it is open.
 
     Args:
-        mesh: Closed bodies, m.
         wavelength (m): The shortest.
     """
     if not mesh.is_watertight:

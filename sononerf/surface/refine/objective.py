@@ -40,10 +40,6 @@ _DB = 20.0 / math.log(10.0)
 class Level:
     """Running estimates on the training poses: gain, and error per ear and frequency.
 
-    Args:
-        ears, rows: E and F.
-        like: A tensor on the wanted device.
-
     Attributes:
         gain ((E, F) float32): Logarithm of measured over rendered magnitude.
         error ((E, F) float32, dB): Mean error over active cells.
@@ -112,15 +108,10 @@ def differences(
     """Return the measured levels less the rendered ones, by cells.
 
     Args:
-        heard: Rendered first bounce.
         later ((P, E, W, F) float32): Power of the later bounces.
-        found: From :func:`measured`.
-        level: Gains and weights.
         corrected (simulated, rendered, both (P, E, W, F) float32): Echoes of a surface nearby:
             their difference in decibels is added to what is rendered. Cells count less, the larger
             it is; the frequencies' weights are not needed then.
-        learn: True to update gains and errors.
-        band: Fraction of the frequencies over which power is averaged first, 0 to 1.
 
     Returns:
         difference ((P, E, W, F) float32, reported dB): Gradients flow through it.
@@ -232,9 +223,7 @@ class OnsetRanges:
     Up to ``SCALE`` the misfit is quadratic, beyond it is linear (Huber's loss).
 
     Args:
-        hull: Onsets; those of weight zero take no part.
         resolution (m): Range resolution of the analysis.
-        seed: Seed of the order in which poses are drawn.
     """
 
     def __init__(self, hull: EchoHull, resolution: float, seed: int) -> None:

@@ -117,10 +117,6 @@ class Paths:
 class Optics(nn.Module):
     """Physical optics of one head; constant tensors move with the module.
 
-    Args:
-        head: The head; its noise is left out.
-        hearing: Gains at the nodes of a synthesis; those of the simulator where None.
-
     Attributes:
         head: Without noise.
         plane: The support; None if there is none.
@@ -283,7 +279,6 @@ class Optics(nn.Module):
             points, area, bending ((V, 3), (V, 3), (V, 6) float32): The surface.
             pose, vertex (Q,): Way of a pose, and the vertex that it hears.
             visible ((Q, E) float32): Visibility from emitter and ear, 0 to 1.
-            heads: Heads of the poses, float32.
         """
         emitters, ears = heads.emitters, heads.ears
         place, normal, bent = points[vertex], area[vertex], bending[vertex]
@@ -377,7 +372,6 @@ class Optics(nn.Module):
             pose, ear (N,): Indices of pose and ear.
             delay ((N,), s): From the emission.
             weight ((N, N') float32): At the nodes.
-            like: Rows are the same.
         """
         poses, _, frames, _ = like.power.shape
         start = ((like.row + self._first) * self.analysis.hop).to(delay.dtype)

@@ -91,10 +91,8 @@ def patches_of(mesh: trimesh.Trimesh, part: Ints, tolerance: float, *, bent: boo
     """Return the patches of parts; what is far off them, such as a rounded edge, counts little.
 
     Args:
-        mesh: The surface, m.
         part (T,): Number of each triangle's part.
         tolerance (m): Distance at which a triangle has half the weight.
-        bent: False for planes.
     """
     normal, offset = planes_of(mesh, part, tolerance)
     count, area = len(normal), np.asarray(mesh.area_faces)
@@ -121,9 +119,7 @@ def on_patches(
     """Return a mesh with each part on its patch, and sharp edges where patches meet.
 
     Args:
-        mesh: The surface, m.
         part (T,): Number of each triangle's patch.
-        patches: Their shapes.
         home ((V, 3), m): Places from which vertices go no farther than
         far (m): this; where patches are nearly parallel they meet anywhere.
     """
@@ -172,8 +168,6 @@ def motions(vertices: Floats, faces: Ints, part: Ints, patches: Patches, terms: 
         vertices ((V, 3), m): On their patches.
         faces (T, 3): Triangles.
         part (T,): Numbers of their patches.
-        patches: Their shapes.
-        terms: Number of terms that move, K: 3 for planes, 6 for paraboloids.
 
     Returns:
         motion (3 V, K N): Motions of the vertices, m, by one metre of each number.

@@ -54,9 +54,7 @@ def flattened(
     """Return a mesh with its parts on patches, the part of each triangle (T,), and the patches.
 
     Args:
-        mesh: m.
         wavelength (m): The shortest.
-        bent: False for planes.
     """
     tolerance = TOLERANCE * wavelength
     part = flat_parts(mesh, tolerance, (LEAST * wavelength) ** 2)
@@ -68,16 +66,7 @@ def flattened(
 def flattest(
     meshes: Iterable[trimesh.Trimesh], error: Callable[[trimesh.Trimesh], float], optics: Optics
 ) -> trimesh.Trimesh | None:
-    """Return the surface that explains the echoes best with its flat parts on planes.
-
-    Args:
-        meshes: Surfaces, m, the usual one first; open ones take no part.
-        error: Error of a surface, dB.
-        optics: The head.
-
-    Returns:
-        surface: None where the usual one explains them better as it is.
-    """
+    """Return the surface that explains the echoes best with its flat parts on planes."""
 
     def on_planes(mesh: trimesh.Trimesh) -> float:
         return error(flattened(mesh, optics.wavelength)[0])
@@ -91,14 +80,6 @@ def flattest(
 
 class PlaneDescent:
     """Descent of the numbers of patches: planes, and paraboloids where ``band`` is below 1.
-
-    Args:
-        mesh: Its flat parts are put on planes, m.
-        echoes, optics, level: Measurement, head, and gains, which are updated.
-        rate: As in :class:`~sononerf.surface.refine.descent.Stage`; ``RATE`` of it are wavelengths.
-        later: Later bounces, added as power.
-        band: As in :class:`~sononerf.surface.refine.descent.Stage`.
-        seed: Seed of the poses.
 
     Attributes:
         part (T,): Number of each triangle's plane.
@@ -170,7 +151,6 @@ class PlaneDescent:
         """Render poses; None where none of them hears anything.
 
         Args:
-            numbers: Poses.
             vertices ((V, 3) float64, m): Present places; gradients run to them.
         """
         positions, rotations = (
@@ -227,24 +207,3 @@ class PlaneDescent:
         error = mismatch(difference, weight).mean()
         (gradient,) = torch.autograd.grad(error, vertices)
         return gradient.cpu().numpy(), float(error.detach())
-
-    def state(self) -> dict[str, Tensor]:
-        """Return the whole state, and the initial mesh, as plain tensors."""
-        parts = {
-            "start": self._start,
-            "faces": self.faces,
-            "vertices": self.vertices,
-            "direction": self.direction,
-            "square": self.square,
-            "numbers": self.patches.numbers,
-        }
-        found = {name: torch.as_tensor(np.array(part)) for name, part in parts.items()}
-        return {**found, "count": torch.tensor(self.count)}
-
-    def load(self, state: dict[str, Tensor]) -> None:
-        """Load the state of a descent on the same mesh."""
-        self.vertices, self.direction, self.square, numbers = (
-            state[name].numpy() for name in ("vertices", "direction", "square", "numbers")
-        )
-        self.patches = replace(self.patches, numbers=numbers)
-        self.count = int(state["count"])

@@ -33,7 +33,6 @@ def flat_parts(mesh: trimesh.Trimesh, tolerance: float, least: float) -> Ints:
     """Return the number of the flat part (T,) that each triangle belongs to.
 
     Args:
-        mesh: A closed surface, m.
         tolerance (m): Standard deviation of a part from its plane, at most.
         least (m²): Parts with a smaller area are given to their neighbours.
     """
@@ -57,7 +56,6 @@ def planes_of(mesh: trimesh.Trimesh, part: Ints, tolerance: float) -> tuple[Floa
     """Return the planes of parts; what is far off them, such as a rounded edge, counts little.
 
     Args:
-        mesh: The surface, m.
         part (T,): Number of each triangle's part.
         tolerance (m): Distance from the plane at which a triangle has half the weight.
 

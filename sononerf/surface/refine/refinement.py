@@ -6,8 +6,8 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Callable, Mapping
-from typing import Any, get_args
+from collections.abc import Callable, Mapping, MutableMapping
+from typing import Any
 
 import numpy as np
 import torch
@@ -19,7 +19,6 @@ from sononerf.errors import SonoNerfError
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.candidates import (
     Candidate,
-    Way,
     after_first_stage,
     are_alike,
     below,
@@ -60,8 +59,8 @@ change by at most 45 degrees. A hull fits the onsets by construction, so its obj
 where it is coarse. From 100 calls its ridges are 0.08 or higher; there a stool had an F-score at
 2 mm of 0.24 with it and of 0.45 without. From 400 calls they are at most 0.04."""
 Simulate = Callable[[trimesh.Trimesh], Simulator]
-STATE_VERSION = 8
-"""Version of :meth:`Refinement.state`; to be raised when its tensors change."""
+Saved = MutableMapping[str, dict[str, Tensor]]
+"""Stages that are done, by the names of their candidates and their numbers."""
 
 
 def refine(
@@ -71,47 +70,54 @@ def refine(
     optics: Optics | None = None,
     simulate: Simulate,
     seed: int,
-    state: dict[str, Tensor] | None = None,
-    after_step: Callable[[Refinement, float], None] | None = None,
+    stages: tuple[Stage, ...] = STAGES,
+    saved: Saved | None = None,
+    after_step: Callable[[int, float], None] | None = None,
+    after_stage: Callable[[trimesh.Trimesh, float], None] | None = None,
 ) -> Refined:
-    """Refine start surfaces against echoes.
+    """Move start surfaces until physical optics, corrected by the simulator, gives the echoes.
+
+    Every candidate goes through the first stage, and one or two of them through the others, see
+    :func:`~sononerf.surface.refine.candidates.after_first_stage`. Of all surfaces the one that
+    explains the validation poses best is returned.
 
     Args:
-        starts, echoes, simulate, seed: As in :class:`Refinement`.
-        optics: On the device of the computation; that of the echoes' head on the CPU where None.
-        state: State of an interrupted refinement of the same starts and echoes, which resumes.
-        after_step: Called after each step with the refinement and the step's mismatch, dB.
+        starts: Start surfaces, m.
+        echoes, optics, simulate, seed, stages, saved, after_step, after_stage: As in
+            :class:`Refinement`.
     """
-    work = Refinement(starts, echoes, optics or Optics(echoes.head), simulate=simulate, seed=seed)
-    if state is not None:
-        work.load(state)
-    while not work.done:
-        mismatch = work.advance()
-        if after_step is not None:
-            after_step(work, mismatch)
+    work = Refinement(
+        starts,
+        echoes,
+        optics or Optics(echoes.head),
+        simulate=simulate,
+        seed=seed,
+        stages=stages,
+        saved=saved,
+        after_step=after_step,
+        after_stage=after_stage,
+    )
+    work.first_stage()
+    first, *_ = work.candidates
+    for candidate in work.candidates:
+        if candidate is first or not are_alike(candidate, first, work.optics.wavelength):
+            for number in range(1, len(stages)):
+                work.stage(candidate, number)
     return work.result()
 
 
 class Refinement:
-    """Refinement, step by step; between any two steps it can be stopped, saved and resumed.
+    """What the stages of a refinement share.
 
     Args:
-        meshes: Start surfaces, m. ``levels``, ``sheet`` and the best of the others go through the
-            first stage; one or two of the results go through the later stages, see
-            :func:`~sononerf.surface.refine.candidates.after_first_stage`.
         echoes: Measured spectrograms and onsets; the surface must begin at the onsets. If their
             level is absolute, gains are learned in the last stage alone: a rough surface is too
             faint, and a gain would hide that. Otherwise gains are learned from the first stage on.
-        optics: The head; its device is that of the computation.
-        simulate: Makes the simulator of a surface, for the stages that are corrected by it.
-        seed: Seed of the order of poses and of traced rays.
-        stages: From coarse to fine; ``STAGES`` where None.
 
     Attributes:
-        candidates: Those of the first stage; after it, those that go on.
+        candidates: All of them; after the first stage, those that go on.
         history: As in :class:`Refined`, so far.
-        newest: The surface that the last entry of the history tells of; None before the first, and
-            after a state was taken over.
+        compared: Objectives of the starts that were compared.
     """
 
     def __init__(
@@ -122,108 +128,106 @@ class Refinement:
         *,
         simulate: Simulate,
         seed: int,
-        stages: tuple[Stage, ...] | None = None,
+        stages: tuple[Stage, ...] = STAGES,
+        saved: Saved | None = None,
+        after_step: Callable[[int, float], None] | None = None,
+        after_stage: Callable[[trimesh.Trimesh, float], None] | None = None,
     ) -> None:
-        self.simulate = simulate
+        self.simulate, self.stages = simulate, stages
         self.echoes, self.optics, self.seed = echoes, optics, seed
-        self.stages = stages or STAGES
+        self.saved = {} if saved is None else saved
+        self._after_step, self._after_stage = after_step, after_stage
         self.onsets = OnsetRanges(echoes.hull, optics.head.resolution, seed)
+        self.comparison = Comparison(echoes, optics, self.onsets, seed)
         self.starts = {name: _plain(mesh) for name, mesh in meshes.items()}
-        self.candidates: list[Candidate] = []
-        self.stage, self.step, self.drawn = 0, 0, 0
         self.history: list[dict[str, Any]] = []
         self.faults: list[str] = []
-        self.newest: trimesh.Trimesh | None = None
         self.compared: dict[StartMethod, float] = {}
         self._far = optics.head.resolution
-        self._at = 0  # number of the present candidate
-        self._descent: Descent | PlaneDescent | None = None
-        self._later: LaterBounces | None = None
-        self._source = 0  # number of the surface whose later bounces are added
-        self.comparison = Comparison(echoes, optics, self.onsets, seed)
+        self._later: tuple[Candidate, LaterBounces] | None = None
+        self.candidates = self._begun()
 
-    @property
-    def done(self) -> bool:
-        """True if nothing is left to do."""
-        return self.stage >= len(self.stages)
+    def first_stage(self) -> None:
+        """Do the first stage of all candidates, and leave those that lose."""
+        for candidate in list(self.candidates):
+            if candidate in self.candidates:
+                self.stage(candidate, 0)
+        self.candidates = after_first_stage(self.candidates, self.comparison.misfit)
+        for candidate in self.candidates:
+            if math.isnan(candidate.objectives[0]):
+                # Planes may have begun from the fuller surface; they compete with levels.
+                candidate.meshes[0] = self.starts[candidate.start]
+                candidate.objectives[0] = self._compared(candidate.start)
 
-    @property
-    def candidate(self) -> Candidate:
-        """The present candidate."""
-        if not self.candidates:
-            self._choose()
-        return self.candidates[self._at]
-
-    def advance(self) -> float:
-        """Do one step; return its mismatch, dB."""
-        stage, candidate = self.stages[self.stage], self.candidate
-        if self._descent is None:
-            if stage.beyond == "trace":
-                self._source = len(candidate.meshes) - 1
-            self._descent = self._descend(self._prepared())
-        mismatch = self._descent.step(candidate.drawn, self.step / stage.steps)
-        candidate.drawn += 1
-        self.step += 1
-        self.drawn += 1
-        if self.step == stage.steps:
-            self._finish(mismatch)
-        return mismatch
-
-    def _prepared(self) -> trimesh.Trimesh:
-        """Return the surface that a stage begins with."""
-        stage, unit = self.stages[self.stage], self.optics.wavelength
-        candidate, plane = self.candidate, self.optics.plane
-        before = candidate.meshes[-1]
-        if candidate.way in ("sheet", "planes"):
-            return before
-        made = None
-        if candidate.way == "blurred":
-            made = remesh(before, stage.edge * unit, stage.blur * unit, plane)
-            if made is None and self.stage == 0:  # later blurs would remove thin parts
-                self.candidates = without_twin(candidate, self.candidates)
-        if made is None:
-            made = remesh(before, min(SHARP, stage.edge) * unit, 0.0, plane)
-        return before if made is None else made
-
-    def _finish(self, mismatch: float) -> None:
-        """End a stage of the present candidate."""
-        assert self._descent is not None
-        candidate, mesh = self.candidate, self._descent.mesh()
-        self._descent, self.step = None, 0
-        name = f"the surface of stage {self.stage}"
-        objective = self._objective(mesh, name, candidate.level, smooth=candidate.way != "planes")
+    def stage(self, candidate: Candidate, number: int) -> None:
+        """Do a stage of a candidate, or take it from the saved ones."""
+        key = f"{candidate.start}-{candidate.way}-{number}"
+        if key not in self.saved:
+            self.saved[key] = self._done(candidate, number)
+        elif self._after_step is not None:
+            self._after_step(self.stages[number].steps, float(self.saved[key]["mismatch"]))
+        found = self.saved[key]
+        mesh = trimesh.Trimesh(found["vertices"].numpy(), found["faces"].numpy(), process=False)
+        mismatch, objective = float(found["mismatch"]), float(found["objective"])
+        if found["thin"] and candidate.way == "blurred":
+            self.candidates = without_twin(candidate, self.candidates)
+        for fault in bytes(found["faults"].tolist()).decode().splitlines():
+            self._note(fault)
+        candidate.level.load(below(found, "level."))
+        candidate.drawn += self.stages[number].steps
+        candidate.meshes.append(mesh)
+        candidate.objectives.append(objective)
         self.history.append(
             {
-                "stage": self.stage,
+                "stage": number,
                 "start": candidate.start,
                 "way": candidate.way,
                 "mismatch_db": mismatch,
                 "objective_db": objective,
             }
         )
-        self.newest = mesh
-        candidate.meshes.append(mesh)
-        candidate.objectives.append(objective)
-        if self.stage == 0 and self._at + 1 < len(self.candidates):
-            self._at += 1
-            return
-        if self.stage == 0:
-            self.candidates = after_first_stage(self.candidates, self.comparison.misfit)
-            self._at = 0
-            for one in self.candidates:
-                if math.isnan(one.objectives[0]):
-                    # Planes may have begun from the fuller surface; they compete with levels.
-                    one.meshes[0] = self.starts[one.start]
-                    one.objectives[0] = self._compared(one.start)
-            self._later = None
-        self.stage += 1
-        first, *others = self.candidates
-        if self.done and self._at < len(others) and len(self.stages) > 1:
-            if not are_alike(others[self._at], first, self.optics.wavelength):
-                self._at, self.stage, self._later = self._at + 1, 1, None
+        if self._after_stage is not None:
+            self._after_stage(mesh, objective)
 
-    def _choose(self) -> None:
-        """Begin the candidates; of the starts other than levels and sheet, the best takes part."""
+    def _done(self, candidate: Candidate, number: int) -> dict[str, Tensor]:
+        """Do a stage of a candidate; return its surface and all that the next one needs."""
+        before, mismatch, steps = len(self.faults), math.inf, self.stages[number].steps
+        begun, thin = self._prepared(candidate, number)
+        descent = self._descend(candidate, number, begun)
+        for step in range(steps):
+            mismatch = descent.step(candidate.drawn + step, step / steps)
+            if self._after_step is not None:
+                self._after_step(1, mismatch)
+        mesh, name = descent.mesh(), f"the surface of stage {number}"
+        objective = self._objective(mesh, name, candidate.level, smooth=candidate.way != "planes")
+        text = "\n".join(self.faults[before:]).encode()
+        return {
+            "vertices": torch.as_tensor(np.array(mesh.vertices)),
+            "faces": torch.as_tensor(np.array(mesh.faces)),
+            "mismatch": torch.tensor(mismatch, dtype=torch.float64),
+            "objective": torch.tensor(objective, dtype=torch.float64),
+            "thin": torch.tensor(thin),
+            "faults": torch.tensor(list(text), dtype=torch.uint8),
+            **{f"level.{key}": part.clone() for key, part in candidate.level.state().items()},
+        }
+
+    def _prepared(self, candidate: Candidate, number: int) -> tuple[trimesh.Trimesh, bool]:
+        """Return the surface that a stage begins with, and whether it is too thin for its blur."""
+        stage, unit, plane = self.stages[number], self.optics.wavelength, self.optics.plane
+        before = candidate.meshes[-1]
+        if candidate.way in ("sheet", "planes"):
+            return before, False
+        made = None
+        if candidate.way == "blurred":
+            made = remesh(before, stage.edge * unit, stage.blur * unit, plane)
+        # In the first stage such a start becomes sharp; later blurs would remove thin parts.
+        thin = candidate.way == "blurred" and made is None and number == 0
+        if made is None:
+            made = remesh(before, min(SHARP, stage.edge) * unit, 0.0, plane)
+        return (before if made is None else made), thin
+
+    def _begun(self) -> list[Candidate]:
+        """Return all candidates; of the starts other than levels and sheet, the best takes part."""
         names = [name for name in self.starts if name not in (*LEVELS, "sheet")]
         found = dict.fromkeys(self.starts, math.nan)
         if len(names) > 1 and "hull" in names:
@@ -236,10 +240,12 @@ class Refinement:
         network = [self.starts[name] for name in LEVELS if name in self.starts]
         with_planes = [] if self.optics.plane else network
         flat = flattest(with_planes, self._error, self.optics)
+        candidates = []
         for start, way in planned(found, flat=flat is not None):
             mesh = flat if way == "planes" and flat is not None else self.starts[start]
             begun = Candidate(way, start, self._new_level(), [mesh], [found[start]], self._far)
-            self.candidates.append(begun)
+            candidates.append(begun)
+        return candidates
 
     def _new_level(self) -> Level:
         like = self.optics.get_buffer("wavenumber")
@@ -277,20 +283,16 @@ class Refinement:
             self.faults.append(fault)
             logger.warning("%s", fault)
 
-    def _descend(self, mesh: trimesh.Trimesh) -> Descent | PlaneDescent:
-        stage, candidate = self.stages[self.stage], self.candidate
-        last = self.stage == len(self.stages) - 1
+    def _descend(
+        self, candidate: Candidate, number: int, mesh: trimesh.Trimesh
+    ) -> Descent | PlaneDescent:
+        """Return the descent of a stage."""
+        stage, planes = self.stages[number], candidate.way == "planes"
+        last = number == len(self.stages) - 1
         candidate.level.learns = "none" if self.echoes.calibrated and not last else "each"
-        correction = None
-        planes = candidate.way == "planes"
-        if stage.beyond == "simulate" and not planes:
-            self._later, correction = None, self._correction(mesh)
-        elif stage.beyond == "none":
-            self._later = None
-        elif stage.beyond == "trace" or self._later is None:
-            source = candidate.meshes[self._source]
-            self._later = LaterBounces(self.optics, source, self.echoes, seed=self.seed)
-            self._later.trace(self._coming())
+        corrects = stage.beyond == "simulate" and not planes
+        correction = self._correction(mesh, number) if corrects else None
+        later = None if corrects else self._later_bounces(candidate, number)
         if planes:
             return PlaneDescent(
                 mesh,
@@ -298,7 +300,7 @@ class Refinement:
                 self.optics,
                 candidate.level,
                 rate=stage.rate,
-                later=self._later,
+                later=later,
                 band=stage.band,
                 seed=self.seed,
             )
@@ -309,7 +311,7 @@ class Refinement:
             candidate.level,
             smoothing=stage.smoothing * self.optics.wavelength,
             rate=stage.rate,
-            later=self._later,
+            later=later,
             correction=correction,
             # The simulator's correction is more exact than the onsets.
             onsets=None if correction is not None else self.onsets,
@@ -318,95 +320,42 @@ class Refinement:
             seed=self.seed,
         )
 
-    def _coming(self) -> list[int]:
-        """Return the poses of all further steps that use the later bounces of this surface."""
-        steps, first = self.stages[self.stage].steps - self.step, self.candidate.drawn
-        poses = PLANE_POSES if self.candidate.way == "planes" else POSES
-        for stage in itertools.takewhile(
-            lambda stage: stage.beyond == "keep", self.stages[self.stage + 1 :]
-        ):
-            steps += stage.steps
-        drawn = [
-            self.echoes.batch(self.seed, first + step, poses).tolist() for step in range(steps)
-        ]
-        return sorted(set(itertools.chain.from_iterable(drawn)))
+    def _later_bounces(self, candidate: Candidate, number: int) -> LaterBounces | None:
+        """Return the later bounces of a stage, off the surface before the stage that traces."""
+        tracing = [n for n in range(number + 1) if self.stages[n].beyond == "trace"]
+        if self.stages[number].beyond == "none" or not tracing:
+            return None
+        if self._later is None or self._later[0] is not candidate or tracing[-1] == number:
+            source = candidate.meshes[tracing[-1]]
+            later = LaterBounces(self.optics, source, self.echoes, seed=self.seed)
+            later.trace(self._coming(candidate, number))
+            self._later = candidate, later
+        return self._later[1]
 
-    def _correction(self, mesh: trimesh.Trimesh) -> Correction | None:
+    def _coming(self, candidate: Candidate, number: int) -> list[int]:
+        """Return the poses of this stage and of those after it that keep its later bounces."""
+        kept = itertools.takewhile(lambda stage: stage.beyond == "keep", self.stages[number + 1 :])
+        steps = self.stages[number].steps + sum(stage.steps for stage in kept)
+        poses = PLANE_POSES if candidate.way == "planes" else POSES
+        first = candidate.drawn
+        drawn = (self.echoes.batch(self.seed, first + step, poses) for step in range(steps))
+        return sorted({int(pose) for some in drawn for pose in some})
+
+    def _correction(self, mesh: trimesh.Trimesh, number: int) -> Correction | None:
         """Return the correction on a surface; None where it cannot be simulated."""
         training = self.echoes.training
-        rng = np.random.default_rng([self.seed, self.stage])
+        rng = np.random.default_rng([self.seed, number])
         numbers = rng.choice(training, min(SIMULATED, len(training)), replace=False)
         fine, _ = finer(mesh, np.zeros(len(mesh.vertices)), self.optics.wavelength)
         try:
             simulator = self.simulate(fine)
             return Correction(self.optics, mesh, simulator, self.echoes, numbers, seed=self.seed)
         except SonoNerfError as error:
-            self._note(f"stage {self.stage} goes without the simulator's correction: {error}")
+            self._note(f"stage {number} goes without the simulator's correction: {error}")
             return None
-
-    def state(self) -> dict[str, Tensor]:
-        """Return all that is needed to go on, as plain tensors."""
-        starts, ways = list(self.starts), get_args(Way)
-        found = {
-            "progress": torch.tensor([self.stage, self.step, self.drawn, self._at, self._source]),
-            "history": torch.tensor(
-                [
-                    (
-                        one["stage"],
-                        starts.index(one["start"]),
-                        ways.index(one["way"]),
-                        one["mismatch_db"],
-                        one["objective_db"],
-                    )
-                    for one in self.history
-                ],
-                dtype=torch.float64,
-            ).reshape(-1, 5),
-            "faults": torch.tensor(list("\n".join(self.faults).encode()), dtype=torch.uint8),
-            "compared": torch.tensor(
-                [self.compared.get(name, math.nan) for name in starts], dtype=torch.float64
-            ),
-        }
-        for number, candidate in enumerate(self.candidates):
-            parts = candidate.state()
-            found.update({f"candidate.{number}.{name}": part for name, part in parts.items()})
-        if self._descent is not None:
-            parts = self._descent.state()
-            found.update({f"descent.{name}": part for name, part in parts.items()})
-        return found
-
-    def load(self, state: dict[str, Tensor]) -> None:
-        """Go on from a state; meshes, echoes, optics, seed and stages must be the same."""
-        self.stage, self.step, self.drawn, self._at, self._source = (
-            int(part) for part in state["progress"]
-        )
-        starts, ways = list(self.starts), get_args(Way)
-        self.candidates = []
-        while parts := below(state, f"candidate.{len(self.candidates)}."):
-            self.candidates.append(Candidate.of(parts, self._new_level(), self._far))
-        self.history = [
-            {
-                "stage": int(stage),
-                "start": starts[int(start)],
-                "way": ways[int(way)],
-                "mismatch_db": mismatch,
-                "objective_db": objective,
-            }
-            for stage, start, way, mismatch, objective in state["history"].tolist()
-        ]
-        self.faults = bytes(state["faults"].tolist()).decode().splitlines()
-        compared = zip(starts, state["compared"].tolist(), strict=True)
-        self.compared = {name: error for name, error in compared if not math.isnan(error)}
-        self._later, self._descent = None, None
-        if parts := below(state, "descent."):
-            begun = trimesh.Trimesh(parts["start"].numpy(), parts["faces"].numpy(), process=False)
-            self._descent = self._descend(begun)
-            self._descent.load(parts)
 
     def result(self) -> Refined:
         """Return the best surface so far; the start where all refined ones are clearly worse."""
-        if not self.candidates:
-            self._choose()
         candidate = best_of(self.candidates, closed_before(self.echoes.hull, self._far))
         best = candidate.best
         mesh, doubtful = without_necks(

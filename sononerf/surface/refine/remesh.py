@@ -46,14 +46,9 @@ def remesh(
     """Return a surface with even triangles.
 
     Args:
-        mesh: A closed surface, m; what overlaps becomes one.
         edge (m): Mean length of the edges.
         blur (m): Standard deviation of a Gaussian over the signed distance; it removes dents, bumps
             and necks of this size.
-        plane: The support; bodies on it are blurred with their images, so that they stay on it.
-
-    Returns:
-        surface: None where the mesh is open or would lose thin parts, or nothing is left.
     """
     if not mesh.is_watertight or not len(mesh.faces):
         return None
@@ -107,7 +102,6 @@ def finer(
     the normals at both ends [1]_.
 
     Args:
-        mesh: Its vertices lie on the smooth surface.
         values (V, ...): Per vertex; new ones get the mean of both ends.
         wavelength (m): The shortest.
 
@@ -148,9 +142,7 @@ def signed_distance(
     """Signed distance near closed bodies on a lattice, positive outside of all of them.
 
     Args:
-        mesh: Closed bodies, which may overlap; cavities are filled.
         spacing (m): Spacing of the lattice.
-        margin: Voxels around the surface.
 
     Returns:
         lower ((3,), m): The lattice's first place.
@@ -203,8 +195,6 @@ def distance_from(mesh: trimesh.Trimesh, places: Floats, spacing: float) -> Floa
     """Return the distance (N,), m, of places (N, 3), m, from a mesh.
 
     Args:
-        mesh: Any mesh, m.
-        places: The places.
         spacing (m): Distances of much less than this are less exact.
     """
     return np.abs(_heights(places, *_samples(mesh, 0.5 * spacing), spacing))

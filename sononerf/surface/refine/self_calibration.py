@@ -71,13 +71,6 @@ class _Column:
 class Calibrator:
     """Gauss-Newton steps on the errors of a recording.
 
-    Args:
-        mesh: The surface, m.
-        echoes: The measured echoes; its training and validation poses take part.
-        optics: The head.
-        kinds: Errors that are sought; see :data:`KINDS`.
-        dependent: Number of cells of a spectrogram that share their noise.
-
     Attributes:
         change: Length of the last step over one standard deviation, of the error that changed most;
             of poses the root mean square.

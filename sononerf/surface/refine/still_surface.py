@@ -17,10 +17,6 @@ from sononerf.surface.refine.visibility import listen, sight_of
 class StillSurface:
     """A surface, prepared once for all poses.
 
-    Args:
-        mesh: m.
-        optics: The head; its device is that of the computation.
-
     Attributes:
         operators: Operators on the surface.
         vertices, normals ((V, 3) float64): Places (m) and outward unit normals.
@@ -61,7 +57,6 @@ class StillSurface:
 
         Args:
             positions, rotations ((P, 3), (P, 3, 3)): Places (m) and rotations of the heads.
-            stretch, late: Factor on the paths, and m added to them; (P,), or one for all poses.
         """
         optics = self.optics
         shape = (len(positions), optics.ears, optics.rows, len(optics.frequencies))

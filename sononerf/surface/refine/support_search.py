@@ -52,16 +52,7 @@ def above(mesh: trimesh.Trimesh, height: float) -> trimesh.Trimesh:
 def find_support(
     mesh: trimesh.Trimesh, echoes: Echoes, shown: Callable[[float], None]
 ) -> tuple[float, float]:
-    """Return the height of a level support and its standard deviation, m, world frame.
-
-    Args:
-        mesh: A surface that was fitted without a support, m.
-        echoes: The measured echoes.
-        shown: Called with the part of the work that is done.
-
-    Raises:
-        InputError: If the surface is flatter than the range resolution.
-    """
+    """Return the height of a level support and its standard deviation, m, world frame."""
     low, high = mesh.bounds[:, 2]
     step = echoes.head.resolution / 2.0
     if high - low < 8.0 * step:

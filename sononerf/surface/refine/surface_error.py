@@ -113,13 +113,8 @@ def surface_error(
     """Return the error of a surface.
 
     Args:
-        mesh: A refined surface, m.
-        echoes: Measured echoes.
-        optics: The head, on the device of the computation.
-        starts: Start surfaces, m.
         validation_db: Objective of the surface on validation poses, see
             :class:`~sononerf.surface.refine.comparison.Comparison`.
-        seed: Seed of poses and probes.
     """
     bumps, wavelength = Bumps(mesh, optics), optics.wavelength
     misfit = Misfit(bumps, echoes, seed)
@@ -150,10 +145,6 @@ def error_from_twice(error: float, wavelength: float) -> float:
 
 class Bumps:
     """Smooth displacements along the normals of a surface.
-
-    Args:
-        mesh: The surface, m.
-        optics: The head.
 
     Attributes:
         vertices, normals ((V, 3) float64): Places (m) and outward unit normals.
@@ -186,7 +177,6 @@ class Bumps:
             positions, rotations ((P, 3), (P, 3, 3)): Poses.
 
         Returns:
-            heard: None if no pose hears any of the surface.
             moves ((P, B) float64): Heights of the bumps, 0 m, one row for each pose; gradients
                 flow to them.
         """
@@ -206,11 +196,6 @@ class Bumps:
 
 class Misfit:
     """Squared misfit of training poses over the bumps; the unit of displacement is ``PRIOR``.
-
-    Args:
-        bumps: Bumps of the surface.
-        echoes: The measured echoes.
-        seed: Seed of poses and probes.
 
     Attributes:
         gradient, curvature (B,): Sums over the training poses of squared gradient, and of

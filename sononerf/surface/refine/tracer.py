@@ -45,14 +45,7 @@ class Later:
 
 
 class Tracer:
-    """The simulator's rays on a surface.
-
-    Args:
-        optics: Head, air, call and analysis.
-        mesh: The surface, m.
-        rays: Per pose.
-        seed: Seed of the pattern of rays.
-    """
+    """The simulator's rays on a surface."""
 
     def __init__(self, optics: Optics, mesh: trimesh.Trimesh, *, rays: int, seed: int) -> None:
         wanted = SimulationSettings(

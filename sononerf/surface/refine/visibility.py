@@ -22,7 +22,6 @@ def seen(sight: Occlusion, points: Floats, target: Floats, *, free: float) -> Bo
     """Return which points (N, 3) on the surface are seen from targets (N, 3), m.
 
     Args:
-        sight: Search structure of the surface.
         points, target ((N, 3), m): World frame.
         free (m): Length of the way, from the point on, that cannot be blocked.
     """
@@ -36,7 +35,6 @@ def sight_of(optics: Optics, vertices: Floats, faces: Ints) -> Occlusion:
     """Return the search structure of a surface, on a support with its image.
 
     Args:
-        optics: Knows the support.
         vertices ((V, 3), m): Vertices of the surface.
         faces (T, 3): Its triangles.
     """
@@ -59,8 +57,6 @@ def listen(
     """Return the pieces of a surface that poses hear.
 
     Args:
-        optics: The head.
-        operators: Operators on the surface.
         vertices, area, bending ((V, 3), (V, 3), (V, 6) float64): Places, vector areas and
             curvature.
         sight: Search structure of the same surface, or of one a little earlier; see
@@ -68,8 +64,6 @@ def listen(
         positions, rotations ((P, 3), (P, 3, 3) float64): Places and rotations of the heads.
 
     Returns:
-        pieces: The pieces that are heard.
-        heads: About the middle of the surface, float32, as :meth:`Optics.render` wants them.
         middle ((3,), m): To be taken off the vertices before they are rendered.
     """
     middle = 0.5 * (vertices.amin(0) + vertices.amax(0))

@@ -69,14 +69,9 @@ def locate_sound(
     """Return the places from which poses hear a field, as points at the ranges of its sound.
 
     Args:
-        field: The fitted field.
         places ((N, 3), m): Places that are not silent.
         sources ((P, 3), m): Half way between emitter and ears of each pose.
         resolution (m): Range resolution; points of one pose in one cube of this side become one.
-        progress: Called with the poses done and the poses in all.
-
-    Returns:
-        evidence: Empty where nothing is heard.
     """
     bands = torch.arange(_BANDS, device=places.device) * (len(field.frequency) - 1) // (_BANDS - 1)
     where = places.cpu().double().numpy()
@@ -162,9 +157,7 @@ def signed_distance(
         weight (X, Y, Z): Weight of the targets, from 0 to 1.
         target ((X, Y, Z), voxels): Signed distance by the evidence.
         bound ((X, Y, Z), voxels): Lower bound of the distance.
-        pull: Weight of the distance to the bound.
         empty (X, Y, Z): Weight with which a place is outside.
-        bending: Weight of the squared Laplacian.
 
     Returns:
         distance: (X, Y, Z), voxels.
@@ -259,8 +252,6 @@ def reliability(evidence: Evidence, hull: EchoHull, resolution: float) -> Floats
     pose.
 
     Args:
-        evidence: Evidence of all poses.
-        hull: The onsets of the same poses.
         resolution (m): Range resolution.
     """
     if not len(evidence.points):
@@ -317,8 +308,6 @@ def poses_that_heard(
     looks the same way within 60 degrees, and lies on one smooth surface with it.
 
     Args:
-        mesh: Normals outward, m.
-        evidence: Evidence of all poses.
         resolution (m): Range resolution.
 
     Returns:

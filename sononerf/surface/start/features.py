@@ -164,10 +164,6 @@ class PlaceFeatures:
     def turned(self, order: tuple[int, ...], signs: tuple[int, ...]) -> tuple[Singles, Singles]:
         """Return the input of the network in a turned or mirrored frame.
 
-        Args:
-            order: Axis of the lattice that becomes each axis of the frame.
-            signs: -1 for the axes of the frame that point backwards.
-
         Returns:
             features (FEATURES, X, Y, Z): No unit.
             bound ((X, Y, Z), voxels): Distance in front of all onsets but one.
@@ -221,10 +217,7 @@ def features_of(
     """Return the features of the places of a lattice, each of which stands for 2 x 2 x 2 voxels.
 
     Args:
-        levels: Levels of the echoes.
         some (N,): Poses of the levels that are used.
-        hull: Onsets and poses, those of the levels among them.
-        lattice: The voxels; all sides are even.
         free (X, Y, Z): Places well in front of the onsets, from :func:`free_places`.
     """
     spacing, unit = lattice.spacing, 4 * lattice.spacing

@@ -80,7 +80,6 @@ def lattice_of(hull: EchoHull, box: Floats, resolution: float) -> Lattice | None
     """Return the lattice over all places that the onsets leave; None if they leave none.
 
     Args:
-        hull: Onsets and poses.
         box ((2, 3), m): Lower and upper corner of the region.
         resolution (m): Range resolution.
     """
@@ -119,9 +118,6 @@ class StartNetwork(nn.Module):
     """U-Net from features to the signed distance, eight voxels of it for each place.
 
     It adds to the bound of free space.
-
-    Args:
-        channels: Number of channels, from fine to coarse.
     """
 
     def __init__(self, channels: tuple[int, ...] = CHANNELS) -> None:
@@ -194,13 +190,7 @@ def lots_of(levels: RangeLevels) -> list[Ints]:
 
 
 def signed_distance(levels: RangeLevels, hull: EchoHull, lattice: Lattice) -> Singles:
-    """Return the signed distance by the network, (X, Y, Z) voxels, positive outside.
-
-    Args:
-        levels: Levels of the echoes.
-        hull: Onsets of the same poses, and of all others.
-        lattice: From :func:`lattice_of`.
-    """
+    """Return the signed distance by the network, (X, Y, Z) voxels, positive outside."""
     free = free_places(hull, lattice)
     lots = [features_of(levels, some, hull, lattice, free) for some in lots_of(levels)]
     passes = max(len(FRAMES), len(lots))
@@ -228,18 +218,8 @@ def levels_surfaces(
     """Return the closed surface of the body by the network, and a fuller one, m, normals outward.
 
     Args:
-        levels: Levels of the echoes.
-        hull: Onsets and poses; on a support, body and image are heard by poses and images.
         box ((2, 3), m): Region that holds the body.
         resolution (m): Range resolution.
-
-    Returns:
-        surface: At the level that :func:`expected_level` gives.
-        fuller: ``FULLER`` outside of it; narrow gaps are closed.
-
-    Raises:
-        NumericalError: If the onsets leave no place for a body, or the network finds none, or the
-            levels of the echoes are not known.
     """
     if levels is None:
         raise NumericalError("the start levels needs the echoes; their free space is not enough")

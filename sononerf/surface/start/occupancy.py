@@ -46,7 +46,6 @@ def thinness(lattice: Lattice, points: Floats, normals: Floats, weight: Floats) 
     behind a point. In a narrow gap they are reversed in front of it.
 
     Args:
-        lattice: The voxels.
         points, normals (G, 3): Oriented points, m and unit vectors.
         weight (G,): Their weights.
 
@@ -80,7 +79,6 @@ def planes(
     """Return the weight of the evidence at voxels near points, and their distance to its planes.
 
     Args:
-        lattice: The voxels.
         points, normals (G, 3): Oriented points, m and unit vectors.
         weight (G,): Their weights.
 
@@ -112,7 +110,6 @@ def winding_of(lattice: Lattice, points: Floats, normals: Floats, weight: Floats
     """Return the winding number of oriented points; each part of the surface counts once.
 
     Args:
-        lattice: The voxels.
         points, normals (G, 3): Oriented points, m and unit vectors; at least one.
         weight (G,): Their power. It is divided by the power around, so that loud places count no
             more than others.
@@ -235,15 +232,10 @@ def gather_evidence(
     """Return the evidence of field and onsets about a region.
 
     Args:
-        field: The fitted field.
         places ((N, 3), m): Places that are not silent.
-        hull: Free space in front of the onsets.
         lower, upper ((3,), m): The region.
         spacing (m): Spacing of the voxels.
         resolution (m): Range resolution of the analysis.
-
-    Raises:
-        NumericalError: If nothing was heard.
     """
     evidence = locate_sound(field, places, hull.sources, resolution=resolution)
     evidence = evidence.where(evidence.weight > QUIET)
@@ -261,16 +253,7 @@ def gather_evidence(
 
 
 def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> trimesh.Trimesh:
-    """Return the closed surface of the body, m, normals outward.
-
-    Args:
-        known: The evidence.
-        belief: Weight of the field's sound, see ``Belief``.
-
-    Raises:
-        NumericalError: If the onsets contradict one another: no place is left by nearly all of
-            them. With the belief ``hull`` also if there is no onset.
-    """
+    """Return the closed surface of the body, m, normals outward."""
     lattice, spacing = known.lattice, known.lattice.spacing
     if not (known.bound < _CONTRADICTED * known.resolution / spacing).any():
         raise NumericalError(
@@ -300,10 +283,6 @@ def thickened(known: Gathered, belief: Literal["open", "filled"]) -> Singles:
     """Return the signed distance by all evidence, (X, Y, Z) voxels; thin parts are too thick.
 
     It is too small by ``THICKER`` times the thinness. A second call returns it without computing.
-
-    Args:
-        known: The evidence.
-        belief: As in :func:`estimate_occupancy`.
     """
     if belief not in known._found:
         known._found[belief] = _by_all_evidence(known, belief)
@@ -344,8 +323,6 @@ def without_parts(distance: Singles, lattice: Lattice, known: Gathered | None) -
 
     Args:
         distance ((X, Y, Z), voxels): Signed distance.
-        lattice: The voxels.
-        known: The evidence; None to judge no part by it.
     """
     labels, count = ndimage.label(distance < 0)
     if not count:
@@ -379,10 +356,6 @@ _COARSER = 4  # voxels between the places of the first look; only saves time
 
 def clearance_grid(hull: EchoHull, lattice: Lattice) -> Floats:
     """Return the distance of each voxel behind the onsets, (X, Y, Z) m; exact near zero.
-
-    Args:
-        hull: Places that the onsets leave.
-        lattice: The voxels.
 
     Returns:
         clearance ((X, Y, Z), m): Its slope is at most one, so voxels that a coarse pass finds far

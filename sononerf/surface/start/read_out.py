@@ -35,12 +35,12 @@ _FAINTEST = (
 )
 _CHUNK = 16_384  # places at a time, a bound of memory
 
-StartMethod = Literal["open", "filled", "hull", "sheet", "levels", "fuller"]
+StartMethod = Literal["open", "filled", "hull", "sheet", "levels", "fuller", "given"]
 """Method of a start surface. The first three are the surface of the occupancy
 (:mod:`sononerf.surface.start.occupancy`); ``sheet`` is one thin body
 (:mod:`sononerf.surface.start.sheet`); ``levels`` is that of a network, and the only one that needs
 no fitted field (:mod:`sononerf.surface.start.network`). ``fuller`` is that of the network with gaps
-closed; the refinement of ``levels`` begins with it too."""
+closed; the refinement of ``levels`` begins with it too. ``given`` is a surface of the user's."""
 LEVELS: tuple[StartMethod, ...] = ("levels", "fuller")
 """Start surfaces that the network makes at once."""
 Method = StartMethod | Literal["isosurface"]
@@ -90,13 +90,8 @@ def read_field(
     """Read volume and evidence out of a field.
 
     Args:
-        field: A fitted field.
-        hull: The onsets and the poses that they were heard from.
         resolution (m): Range resolution of the analysis.
         spacing (m): Voxel size; half of the field's own resolution where None.
-        directions: Size of the spherical lattice that is summed over where the field has no lobes.
-        levels: Levels of the echoes over range, for the method ``levels``.
-        progress: Called with the voxels done and the voxels in all.
     """
     lower, upper, step = _grid_of(field, spacing)
     energy = _energy(field, directions)
@@ -112,9 +107,6 @@ def read_echoes(echoes: Echoes) -> Reading:
     Args:
         echoes: Measured echoes; their region is the box that they are known to come from, or else
             the one that they leave possible.
-
-    Raises:
-        NumericalError: If no pose received an echo that another one confirms.
     """
     box = echoes.region.box() if echoes.box is None else echoes.box
     return Reading(echoes.hull, box, echoes.head.resolution, echoes.levels, methods=LEVELS)
@@ -123,16 +115,7 @@ def read_echoes(echoes: Echoes) -> Reading:
 def start_surfaces(
     reading: Reading, methods: Sequence[StartMethod]
 ) -> Iterator[tuple[StartMethod, trimesh.Trimesh]]:
-    """Yield each method that gives a surface, and its closed mesh, m.
-
-    Args:
-        reading: Evidence that they are made of.
-        methods: In this order.
-
-    Raises:
-        NumericalError: If no method gives a surface: the onsets contradict one another, or the
-            evidence does not lie on one sheet.
-    """
+    """Yield each method that gives a surface, and its closed mesh, m."""
     first: NumericalError | None = None
     found = False
     for method in methods:
@@ -157,6 +140,7 @@ def _start(reading: Reading, method: StartMethod) -> trimesh.Trimesh:
         raise NumericalError(f"the start {method} needs a fitted field; without one take levels")
     if method == "sheet":
         return fit_sheet(reading.gathered)
+    assert method != "given"  # nothing is read out for it
     return estimate_occupancy(reading.gathered, method)
 
 
@@ -172,15 +156,8 @@ def read_isosurface(
     """Return an iso-surface of a field's loudness, the volume it lies in, and its level.
 
     Args:
-        field, spacing, directions, progress: As in :func:`read_field`.
-        level: Value of the volume on the surface; by Otsu's rule where "auto".
         smoothing (m): Side of a box over which the volume is averaged first, an odd number of
             voxels; the published code of the paper takes 9 of 5 mm.
-
-    Raises:
-        SettingsError: If the spacing is larger than the region.
-        NumericalError: If the field is silent everywhere, or nowhere at the level.
-        ResourceError: If the grid does not fit in memory.
     """
     lower, upper, step = _grid_of(field, spacing)
     loudness = _loudness(field, directions)
@@ -211,9 +188,7 @@ def energy_volume(field: Field, spacing: float, directions: int) -> Volume:
     """Return the energy of a field on a grid over its region.
 
     Args:
-        field: The fitted field.
         spacing (m): Voxel size.
-        directions: Size of the spherical lattice that is summed over where the field has no lobes.
     """
     lower, upper = (corner.cpu().double().numpy() for corner in field.region)
     return volume_from_function(_energy(field, directions), lower, upper, spacing, chunk=_CHUNK)

@@ -72,17 +72,7 @@ class _Frame:
 
 
 def fit_sheet(known: Gathered) -> trimesh.Trimesh:
-    """Return the sheet that the evidence lies on.
-
-    Args:
-        known: The evidence.
-
-    Returns:
-        sheet: One closed body, m, with even triangles.
-
-    Raises:
-        NumericalError: If the evidence does not lie on one sheet.
-    """
+    """Return the sheet that the evidence lies on."""
     evidence, weight, resolution = known.evidence, known.weight, known.resolution
     frame = _framed(known)
     shape = frame.depth.shape[:2]

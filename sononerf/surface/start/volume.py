@@ -28,9 +28,6 @@ class Volume:
         values (X, Y, Z): One value per voxel.
         origin ((3,), m): Centre of voxel [0, 0, 0], world frame.
         spacing (m): Distance between the centres of neighbouring voxels, equal on all axes.
-
-    Raises:
-        ValueError: If the shapes or the spacing are wrong.
     """
 
     values: NDArray[np.floating]
@@ -96,11 +93,7 @@ def _box(lower: ArrayLike, upper: ArrayLike) -> tuple[Floats, Floats]:
 
 
 def grid_shape(lower: ArrayLike, upper: ArrayLike, spacing: float) -> tuple[int, int, int]:
-    """Return how many voxels cover a box, so that the outermost centres lie on it or beyond.
-
-    Raises:
-        ValueError: If the box is empty or the spacing is not positive.
-    """
+    """Return how many voxels cover a box, so that the outermost centres lie on it or beyond."""
     low, high = _box(lower, upper)
     if not (np.isfinite(spacing) and spacing > 0):
         raise ValueError(f"spacing: {spacing!r} m, expected a positive number")
@@ -120,11 +113,7 @@ def estimated_bytes(
 def check_memory(
     lower: ArrayLike, upper: ArrayLike, spacing: float, *, bytes_per_voxel: int = BYTES_PER_VOXEL
 ) -> None:
-    """Refuse a grid that would not fit in memory, before anything is computed.
-
-    Raises:
-        ResourceError: With the bytes needed, the bytes free, and the finest spacing that fits.
-    """
+    """Refuse a grid that would not fit in memory, before anything is computed."""
     needed = estimated_bytes(lower, upper, spacing, bytes_per_voxel=bytes_per_voxel)
     free = available_memory()
     if free is None or needed <= free:
@@ -146,9 +135,6 @@ def grid_over(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Volume:
     Args:
         lower, upper ((3,), m): Opposite corners of the box.
         spacing (m): Distance between voxel centres.
-
-    Returns:
-        volume: float64 zeros; the outermost centres lie on the box or less than one spacing beyond.
     """
     shape = grid_shape(lower, upper, spacing)
     check_memory(lower, upper, spacing)
@@ -172,20 +158,8 @@ def volume_from_function(
     alone gives the same volume whatever ``chunk`` is.
 
     Args:
-        function: Maps positions (N, 3) m to values (N,).
         lower, upper ((3,), m): Opposite corners of the box.
         spacing (m): Distance between voxel centres.
-        chunk: Greatest N.
-        progress: Called with the voxels done and the voxels in all, after each chunk.
-
-    Returns:
-        volume: The values, float64.
-
-    Raises:
-        ValueError: If the box, the spacing, the chunk, or the shape that the function returns is
-            wrong.
-        ResourceError: If the grid would not fit in memory.
-        NumericalError: If a value is not finite.
     """
     if chunk < 1:
         raise ValueError(f"chunk: {chunk}, expected 1 or more")
@@ -212,11 +186,7 @@ def volume_from_function(
 
 
 def require_finite(volume: Volume) -> None:
-    """Refuse a volume that holds NaN or infinity.
-
-    Raises:
-        NumericalError: With the number of voxels that are not finite.
-    """
+    """Refuse a volume that holds NaN or infinity."""
     faulty = volume.values.size - int(np.isfinite(volume.values).sum())
     if faulty:
         raise NumericalError(
@@ -225,18 +195,7 @@ def require_finite(volume: Volume) -> None:
 
 
 def vti_bytes(volume: Volume, name: str = "reflectivity") -> bytes:
-    """Return a VTK image file (``.vti``) that ParaView and 3D Slicer open, in metres.
-
-    Args:
-        volume: Stored as float32, x fastest, as VTK has it.
-        name: Name of the values inside the file; letters, digits and underscores.
-
-    Returns:
-        data: The file, the same for the same volume.
-
-    Raises:
-        ValueError: If the name holds anything else.
-    """
+    """Return a VTK image file (``.vti``) that ParaView and 3D Slicer open, in metres."""
     if not name.isidentifier():
         raise ValueError(f"name: {name!r}, expected letters, digits and underscores")
     import pyvista
@@ -262,16 +221,6 @@ def isosurface(volume: Volume, level: float) -> trimesh.Trimesh:
     """Extract the closed surface around all that exceeds a level.
 
     Beyond the grid there is nothing: a body that reaches the grid's border is closed there.
-
-    Args:
-        volume: Greater values are inside.
-        level: Value on the surface, in the volume's own unit.
-
-    Returns:
-        mesh: Metres, world frame, normals outward, positive volume.
-
-    Raises:
-        NumericalError: If a value is not finite, or the level lies outside the range of the values.
     """
     require_finite(volume)
     values = np.asarray(volume.values, dtype=np.float64)
@@ -317,15 +266,6 @@ def automatic_level(volume: Volume) -> float:
     as even in itself as can be. The choice scales with the values. On blurred, uneven shells it
     comes within 0.04 of the F-score at 5 mm of the best of twelve levels; thresholds on decibels or
     at the steepest gradient, tried in its place, swell or shatter the body.
-
-    Args:
-        volume: Reflectivity (energy) or an indicator; greater values are inside.
-
-    Returns:
-        level: In the volume's own unit.
-
-    Raises:
-        NumericalError: If a value is not finite or all are equal.
 
     References:
         .. [1] N. Otsu, "A threshold selection method from gray-level histograms", 1979.

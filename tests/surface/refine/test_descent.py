@@ -56,19 +56,6 @@ def test_where_nobody_listens_nothing_moves(too_large, echoes, optics):
     assert float(moved[below].mean()) < 0.35 * float(moved[above].mean())
 
 
-def test_a_step_depends_on_the_state_alone(too_large, echoes, optics):
-    work = descent_on(too_large, echoes, optics)
-    for number in range(3):
-        work.step(number, 0.0)
-    other = descent_on(too_large, echoes, optics)
-    other.load(work.state())
-    other.level.load(work.level.state())
-    for number in range(3, 6):
-        work.step(number, 0.1)
-        other.step(number, 0.1)
-    assert torch.equal(work.vertices, other.vertices)
-
-
 def test_onsets_move_the_surface_to_where_it_must_begin(echoes, optics):
     ball = trimesh.creation.icosphere(subdivisions=4, radius=RADIUS)
     onsets = OnsetRanges(

@@ -100,19 +100,6 @@ def test_a_box_with_wrong_planes_and_worn_edges_comes_back(fine, heard, optics):
     assert np.mean(errors[-3:]) < 0.3 * np.mean(errors[:3])
 
 
-@pytest.mark.parametrize("band", [1.0, 0.0])
-def test_a_step_depends_on_the_state_alone(fine, heard, optics, band):
-    work = descent(fine, heard, optics, band)
-    for number in range(6):
-        work.step(number, 0.0)
-    again = descent(fine, heard, optics, band)
-    again.load(work.state())
-    again.level.load(work.level.state())
-    for one in (work, again):
-        one.step(6, 0.1)
-    assert np.array_equal(work.vertices, again.vertices)
-
-
 def test_of_surfaces_the_one_that_is_best_on_planes_is_chosen(fine, optics):
     worn = trimesh.smoothing.filter_laplacian(fine.copy(), iterations=3)
     ball = trimesh.creation.icosphere(subdivisions=4, radius=0.02)

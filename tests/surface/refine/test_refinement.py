@@ -2,12 +2,10 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
 import pytest
-import torch
 import trimesh
 
 from sononerf.echoes.free_space import EchoHull
@@ -30,7 +28,7 @@ from sononerf.surface.refine.candidates import (
 from sononerf.surface.refine.descent import Descent, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.refinement import Refinement
+from sononerf.surface.refine.refinement import Refinement, refine
 from sononerf.surface.refine.remesh import distance_from
 from tests.memory import changed, deaf_hull, echoes_of
 from tests.surface.conftest import RADIUS
@@ -40,16 +38,21 @@ def unasked(mesh):
     raise AssertionError("no stage asks for the simulator")
 
 
-def refined(mesh, echoes, optics, **given):
-    work = started(mesh, echoes, optics, **given)
-    while not work.done:
-        work.advance()
-    return work.result()
+def refined(meshes, echoes, optics, *, simulate=unasked, stages=None, **given):
+    return refine(
+        meshes if isinstance(meshes, dict) else {"body": meshes},
+        echoes,
+        optics=optics,
+        simulate=simulate,
+        seed=1,
+        stages=stages or SHORT,
+        **given,
+    )
 
 
-def started(mesh, echoes, optics, *, simulate=unasked, stages=None):
+def begun(meshes, echoes, optics, **given):
     return Refinement(
-        {"body": mesh}, echoes, optics, simulate=simulate, seed=1, stages=stages or SHORT
+        meshes, echoes, optics, simulate=unasked, seed=1, **{"stages": SHORT, **given}
     )
 
 
@@ -64,17 +67,9 @@ def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, e
     tilted = changed(
         echoes, read=lambda n: echoes.store.read_pose(n) * tilt, hull=deaf_hull(), origin="recorded"
     )
-    work = Refinement(
-        {"body": bumpy},
-        tilted,
-        optics,
-        simulate=unasked,
-        seed=1,
-        stages=SHORT,
-    )
-    while work.stage == 0:
-        work.advance()
-    gain = work.candidate.level.gain[0].exp().numpy()
+    work = begun({"body": bumpy}, tilted, optics)
+    work.first_stage()
+    gain = work.candidates[0].level.gain[0].exp().numpy()
     assert gain[-1] / gain[0] > 5.0
 
 
@@ -124,17 +119,13 @@ def test_a_surface_that_gets_worse_is_not_kept(echoes, optics, monkeypatch):
 def test_of_two_starts_the_one_that_explains_more_is_refined(bumpy, echoes, optics):
     half = bumpy.copy().apply_scale(0.5)
     for starts in ({"whole": bumpy, "half": half}, {"half": half, "whole": bumpy}):
-        work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-        work.advance()
+        work = begun(starts, echoes, optics)
         assert [(one.start, one.way) for one in work.candidates] == [
             ("whole", "blurred"),
             ("whole", "sharp"),
         ]
-        (begun,) = work.candidate.meshes
-        np.testing.assert_array_equal(begun.vertices, bumpy.vertices)
-        again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-        again.load(work.state())
-        assert again.candidate.start == "whole"
+        (mesh,) = work.candidates[0].meshes
+        np.testing.assert_array_equal(mesh.vertices, bumpy.vertices)
 
 
 @pytest.mark.parametrize(("count", "chosen"), [(20, "filled"), (1000, "hull")])
@@ -146,8 +137,7 @@ def test_a_hull_takes_part_only_if_poses_are_dense(bumpy, echoes, optics, count,
     echoes = changed(echoes, hull=heard)
     starts = {"hull": bumpy, "filled": bumpy.copy().apply_scale(0.5)}
     for given, found in ((starts, chosen), ({"hull": bumpy}, "hull")):
-        work = Refinement(given, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-        assert work.candidate.start == found
+        assert begun(given, echoes, optics).candidates[0].start == found
 
 
 @pytest.fixture
@@ -169,17 +159,12 @@ def test_a_surface_that_cannot_be_simulated_is_refined_all_the_same_and_told(
         raise InputError("the mesh is 1e-06 m large")
 
     simulated_stage["simulate"] = refuse
-    work = started(bumpy, echoes, optics, **simulated_stage)
-    while work.step == 0 or work.stage == 0:
-        work.advance()
-    again = started(bumpy, echoes, optics, **simulated_stage)
-    again.load({name: part.clone() for name, part in work.state().items()})
-    while not again.done:
-        again.advance()
-    found = again.result()
-    assert found.kept
     fault = "stage 1 goes without the simulator's correction: the mesh is 1e-06 m large"
-    assert found.faults == [fault]
+    saved = {}
+    for _ in range(2):  # the second time the stages are saved
+        found = refined(bumpy, echoes, optics, saved=saved, **simulated_stage)
+        assert found.kept
+        assert found.faults == [fault]
     assert fault in caplog.text
 
 
@@ -187,12 +172,7 @@ def test_a_start_that_cannot_be_traced_is_told_and_counts_as_the_worst(
     bumpy, echoes, optics, caplog
 ):
     flat = trimesh.Trimesh(np.zeros((3, 3)), [[0, 1, 2]], process=False)
-    work = Refinement(
-        {"open": flat, "filled": bumpy}, echoes, optics, simulate=unasked, seed=1, stages=SHORT
-    )
-    while not work.done:
-        work.advance()
-    found = work.result()
+    found = refined({"open": flat, "filled": bumpy}, echoes, optics)
     assert found.start == "filled"
     (fault,) = found.faults
     assert fault.startswith("the start open cannot be compared and counts as the worst: ")
@@ -201,21 +181,23 @@ def test_a_start_that_cannot_be_traced_is_told_and_counts_as_the_worst(
 
 @pytest.mark.thorough
 @pytest.mark.parametrize("corrected", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_going_on_from_any_step_ends_the_same(bumpy, echoes, optics, simulated_stage, corrected):
+def test_saved_stages_are_not_repeated_and_the_end_is_the_same(
+    bumpy, echoes, optics, simulated_stage, corrected
+):
     given = simulated_stage if corrected else {}
-    whole = started(bumpy, echoes, optics, **given)
-    states = {}
-    while not whole.done:
-        states[whole.drawn] = {k: v.clone() for k, v in whole.state().items()}
-        whole.advance()
-    for step in (5, 8, 20):  # within stages, and between two
-        again = started(bumpy, echoes, optics, **given)
-        again.load(states[step])
-        while not again.done:
-            again.advance()
-        one, other = again.candidate, whole.candidate
-        assert np.array_equal(one.meshes[-1].vertices, other.meshes[-1].vertices)
-        assert torch.equal(one.level.gain, other.level.gain)
+    saved, ends = {}, {}
+    whole = refined(bumpy, echoes, optics, saved=saved, **given)
+    assert list(saved) == ["body-blurred-0", "body-sharp-0", f"body-{whole.history[-1]['way']}-1"]
+    for kept in range(4):  # a kill after each stage
+        some = dict(list(saved.items())[:kept])
+        steps = []
+        ends[kept] = refined(
+            bumpy, echoes, optics, saved=some, after_step=lambda n, _, s=steps: s.append(n), **given
+        )
+        assert steps == [8] * kept + [1] * 8 * (3 - kept)
+        assert ends[kept].history == whole.history
+        assert np.array_equal(ends[kept].mesh.vertices, whole.mesh.vertices)
+        assert np.array_equal(ends[kept].gain, whole.gain)
 
 
 def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
@@ -278,48 +260,50 @@ def test_a_world_three_times_as_large_gives_the_same_three_times_as_large(
     assert float((one - three).abs().max()) < 2e-3 * optics.wavelength
 
 
-def test_the_better_of_the_blurred_and_the_sharp_surface_goes_on(
-    bumpy, echoes, optics, monkeypatch
-):
+def preset(work, objective):
+    """Let the objectives of surfaces be those that a function gives; of starts and others too."""
+    real = work.stage
+
+    def stage(candidate, number):
+        preset.now = candidate, number
+        real(candidate, number)
+
+    def found(mesh, *given, **named):
+        return objective(mesh, *preset.now)
+
+    work.stage, work.comparison.objective = stage, found
+    preset.now = None, 0
+    return work
+
+
+def test_the_better_of_the_blurred_and_the_sharp_surface_goes_on(bumpy, echoes, optics):
     # Of two that explain about as much the blurred one goes on.
     for worse, better, value in (
         ("blurred", "sharp", 9.0),
         ("sharp", "blurred", 9.0),
         ("blurred", "blurred", 1.1),
     ):
-        work = started(bumpy, echoes, optics)
-        monkeypatch.setattr(
-            work.comparison,
-            "objective",
-            lambda *a, work=work, worse=worse, v=value, **k: v if way_of(work) == worse else 1.0,
-        )
         ends = []
-        while work.stage == 0:
-            work.advance()
-            if work.step == 0:
-                ends.append(work.newest)
+        work = preset(
+            begun({"body": bumpy}, echoes, optics, after_stage=lambda m, _, e=ends: e.append(m)),
+            lambda mesh, one, number, w=worse, v=value: v if one and one.way == w else 1.0,
+        )
+        work.first_stage()
         (candidate,) = work.candidates
         assert candidate.way == better
         assert candidate.meshes[1:] == [ends[0] if better == "blurred" else ends[1]]
 
 
-def test_what_is_too_thin_for_the_first_blur_is_never_blurred(bumpy, echoes, optics):
+def test_what_is_too_thin_for_the_first_blur_is_never_blurred(echoes, optics):
     thick = 0.5 * optics.wavelength
     disc = trimesh.creation.cylinder(RADIUS, thick, sections=96).subdivide_to_size(thick / 2)
     stages = (dataclasses.replace(SHORT[0], blur=1.2, steps=2), SHORT[1])
-    work = started(disc, echoes, optics, stages=stages)
-    work.advance()
-    again = started(disc, echoes, optics, stages=stages)
-    again.load(work.state())
-    for one in (work, again):
-        while one.stage == 0:
-            one.advance()
-        assert [(each["stage"], each["way"]) for each in one.history] == [(0, "sharp")]
-        assert [each.way for each in one.candidates] == ["sharp"]
-
-
-def way_of(work):
-    return work.candidates[work._at].way if work.candidates else "start"
+    saved = {}
+    for _ in range(2):  # the second time the stage is saved
+        work = begun({"body": disc}, echoes, optics, stages=stages, saved=saved)
+        work.first_stage()
+        assert [(each["stage"], each["way"]) for each in work.history] == [(0, "sharp")]
+        assert [each.way for each in work.candidates] == ["sharp"]
 
 
 PLANS = [(start, way) for start in ("levels", "body") for way in ("blurred", "sharp")]
@@ -343,32 +327,32 @@ def test_levels_and_the_best_other_start_stay_until_they_lose(
 ):
     small, large = (bumpy.copy().apply_scale(factor) for factor in (0.8, 1.1))
     starts = {"small": small, "body": bumpy, "levels": large}
-    work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
     first = dict(zip(PLANS, objectives, strict=True))
+    history = []
 
-    def objective(mesh, *given, **named):
-        if any(mesh is start for start in work.starts.values()):
-            return 9.0 + abs(np.ptp(mesh.vertices[:, 0]) / np.ptp(bumpy.vertices[:, 0]) - 1.0)
-        if not work.candidates:
-            return math.inf  # its flat parts
-        if work.stage == 0:
-            return first[work.candidate.start, work.candidate.way]
-        return last[work.candidate.start]
+    def objective(comparison, mesh, *given, **named):
+        factor = np.ptp(mesh.vertices[:, 0]) / np.ptp(bumpy.vertices[:, 0])
+        if any(len(mesh.vertices) == len(one.vertices) for one in starts.values()):
+            return 9.0 + abs(factor - 1.0)
+        if len(history) < 4:
+            return first[PLANS[len(history)]]
+        return last[order[0] if len(history) == 4 else order[1]]
 
-    monkeypatch.setattr(work.comparison, "objective", objective)
-    while not work.done:
-        work.advance()
-    assert [(one["start"], one["way"]) for one in work.history[:4]] == PLANS
-    assert len(work.history) == stages
-    assert work.drawn == 8 * stages <= number_of_steps(starts, SHORT)
-    again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-    again.load(work.state())
-    assert again.history == work.history
-    for one in (work, again):
-        found = one.result()
+    order = sorted(last, key=lambda name: min(v for k, v in first.items() if k[0] == name))
+    monkeypatch.setattr(comparison.Comparison, "objective", objective)
+    saved = {}
+    for _ in range(2):  # the second time all stages are saved
+        history.clear()
+        found = refined(
+            starts, echoes, optics, saved=saved, after_stage=lambda *given: history.append(given)
+        )
+        assert [(one["start"], one["way"]) for one in found.history[:4]] == PLANS
+        assert len(found.history) == len(history) == stages
+        assert 8 * stages <= number_of_steps(starts, SHORT)
         assert (found.start, found.kept) == (chosen[0], True)
-        ways = {each.start: each.way for each in one.candidates}
-        assert ways[chosen[0]] == chosen[1]
+        assert (
+            found.history[-1 if found.history[-1]["start"] == chosen[0] else -2]["way"] == chosen[1]
+        )
         listed = {each["start"]: each for each in found.candidates}
         assert [name for name, each in listed.items() if each["chosen"]] == [chosen[0]]
         assert listed["small"]["error_db"] is None
@@ -483,23 +467,16 @@ def box_echoes(box, settings, poses, simulated):
 def test_flat_parts_move_as_planes_and_go_on_alone_where_they_are_right(box, box_echoes, optics):
     fine = box.subdivide_to_size(0.6 * optics.wavelength)
     worn = trimesh.smoothing.filter_laplacian(fine.copy().apply_scale(1.02), iterations=3)
-    work = Refinement({"levels": worn}, box_echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-    again = Refinement({"levels": worn}, box_echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-    for step in itertools.count():
-        if work.done:
-            break
-        if step == 20:
-            again.load(work.state())
-        work.advance()
-    assert [(one["stage"], one["way"]) for one in work.history] == [
+    saved = {}
+    found = refined({"levels": worn}, box_echoes, optics, saved=saved)
+    assert [(one["stage"], one["way"]) for one in found.history] == [
         (0, "planes"),
         (0, "sharp"),
         (1, "planes"),
     ]
-    while not again.done:
-        again.advance()
-    found = work.result()
-    np.testing.assert_array_equal(found.mesh.vertices, again.result().mesh.vertices)
+    del saved["levels-planes-1"]
+    again = refined({"levels": worn}, box_echoes, optics, saved=saved)
+    np.testing.assert_array_equal(found.mesh.vertices, again.mesh.vertices)
     off = [distance_from(box, np.asarray(m.vertices), 1e-3).mean() for m in (worn, found.mesh)]
     assert off[1] < 0.5 * off[0]
     angles = np.sort(found.mesh.face_adjacency_angles)
@@ -512,43 +489,34 @@ def test_planes_that_begin_from_the_fuller_surface_compete_with_levels(box, box_
     fuller = trimesh.smoothing.filter_laplacian(fine.copy(), iterations=2)
     levels = trimesh.smoothing.filter_laplacian(fine.copy().apply_scale(0.9), iterations=3)
     starts = {"levels": levels, "fuller": fuller}
-    work = Refinement(starts, box_echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-    begun = work.candidate
-    np.testing.assert_array_equal(begun.meshes[0].vertices, fuller.vertices)
-    while work.stage == 0:
-        work.advance()
-    assert (begun.way, begun.start) == ("planes", "levels")
-    np.testing.assert_array_equal(begun.meshes[0].vertices, levels.vertices)
-    assert begun.objectives[0] == work.compared["levels"]
+    work = begun(starts, box_echoes, optics)
+    first = work.candidates[0]
+    np.testing.assert_array_equal(first.meshes[0].vertices, fuller.vertices)
+    work.first_stage()
+    assert (first.way, first.start) == ("planes", "levels")
+    np.testing.assert_array_equal(first.meshes[0].vertices, levels.vertices)
+    assert first.objectives[0] == work.compared["levels"]
 
 
 def test_a_ball_has_no_flat_parts(bumpy, echoes, optics):
-    work = Refinement({"levels": bumpy}, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-    assert work.candidate.way == "blurred"
+    work = begun({"levels": bumpy}, echoes, optics)
     assert [one.way for one in work.candidates] == ["blurred", "sharp"]
 
 
 def test_a_candidate_does_not_depend_on_the_others(bumpy, echoes, optics):
     ends = []
     for starts in ({"body": bumpy}, {"levels": bumpy.copy().apply_scale(1.05), "body": bumpy}):
-        work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-        found = {}
-        while work.stage == 0:
-            work.advance()
-            if work.step == 0:
-                last = work.history[-1]
-                found[last["start"], last["way"]] = work.newest.vertices
-        ends.append(found)
+        saved = {}
+        begun(starts, echoes, optics, saved=saved).first_stage()
+        ends.append(saved)
     for way in ("blurred", "sharp"):
-        np.testing.assert_array_equal(ends[0]["body", way], ends[1]["body", way])
+        one, other = (saved[f"body-{way}-0"]["vertices"].numpy() for saved in ends)
+        np.testing.assert_array_equal(one, other)
 
 
 def test_of_two_surfaces_that_sound_alike_one_goes_on(bumpy, echoes, optics):
     starts = {"body": bumpy, "levels": bumpy.copy()}
-    work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-    while not work.done:
-        work.advance()
-    assert len(work.history) == 5
+    assert len(refined(starts, echoes, optics).history) == 5
 
 
 @pytest.mark.parametrize(
@@ -609,28 +577,20 @@ def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
     thin = slab(2e-4)
     for value, start in ((1.1, "sheet"), (2.0, "body")):
         starts = {"body": bumpy, "sheet": thin}
-        work = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-        monkeypatch.setattr(
-            work.comparison,
-            "objective",
-            lambda *a, work=work, value=value, **k: value if way_of(work) == "sheet" else 1.0,
-        )
-        while not work.done:
-            work.advance()
-        assert work.drawn == number_of_steps(starts, SHORT)
-        (candidate,) = work.candidates
-        assert candidate.start == start
-        again = Refinement(starts, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-        again.load(work.state())
-        assert (again.candidate.start, again.candidate.way) == (start, candidate.way)
-        assert again.history == work.history
-        if start == "sheet":
-            assert all(len(mesh.faces) == len(thin.faces) for mesh in candidate.meshes)
+        saved = {}
+        for _ in range(2):  # the second time the stages are saved
+            work = preset(
+                begun(starts, echoes, optics, saved=saved),
+                lambda mesh, one, number, v=value: v if one and one.way == "sheet" else 1.0,
+            )
+            work.first_stage()
+            (candidate,) = work.candidates
+            assert candidate.start == start
+            if start == "sheet":
+                assert all(len(mesh.faces) == len(thin.faces) for mesh in candidate.meshes)
 
 
 def test_a_sheet_alone_is_refined(echoes, optics):
-    work = Refinement({"sheet": slab(2e-4)}, echoes, optics, simulate=unasked, seed=0, stages=SHORT)
-    while not work.done:
-        work.advance()
-    assert work.result().start == "sheet"
-    assert {one["way"] for one in work.history} == {"sheet"}
+    found = refined({"sheet": slab(2e-4)}, echoes, optics)
+    assert found.start == "sheet"
+    assert {one["way"] for one in found.history} == {"sheet"}

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: MIT
+"""A fitted field, read back from the two files of its run."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from sononerf.echoes.free_space import EchoHull
+from sononerf.errors import IncompatibleError, InputError, SettingsError
+from sononerf.field.checkpoint_io import DESCRIPTION_NAME, load_weights
+from sononerf.field.module import EchoModule
+from sononerf.run.build import head_of, module_for, with_attached
+from sononerf.settings.loading import validate_settings
+from sononerf.settings.schema import Settings
+
+
+@dataclass(frozen=True)
+class Model:
+    """A fitted field as its run's two files describe it."""
+
+    module: EchoModule
+    hull: EchoHull
+    settings: Settings
+    echo_hash: str
+
+
+def read_model(path: Path) -> Model:
+    """Read a fitted field from ``model.safetensors`` and ``model.json`` alone; runs no code."""
+    if not (path / DESCRIPTION_NAME).is_file():
+        raise InputError(
+            f"{path}: no fitted run (no {DESCRIPTION_NAME}); make or finish one with `sononerf fit`"
+        )
+    state, description = load_weights(path)
+    try:
+        settings = validate_settings(description["settings"], str(path / "model.json"))
+        reference = float(description["reference"])
+        echoes = str(description["echo_hash"])
+        region = state["field.region"]
+        hull = _hull(state)
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: incomplete ({error}); repeat the fit") from None
+    except SettingsError as error:
+        raise IncompatibleError(f"settings of another version: {error}") from None
+    if not 0.0 < reference < math.inf:  # JSON as Python reads it knows NaN
+        raise InputError(
+            f"{path / DESCRIPTION_NAME}: reference is {reference}, expected a finite number above "
+            "0; fetch the run again, or repeat the fit with --overwrite"
+        )
+    settings = with_attached(settings, path)
+    head = head_of(settings)
+    hull = replace(hull, plane=head.plane)
+    module = module_for(settings, head, region, reference)
+    for part, prefix in ((module.field, "field."), (module.renderer, "renderer.")):
+        own = {k.removeprefix(prefix): v for k, v in state.items() if k.startswith(prefix)}
+        try:
+            part.load_state_dict(own)
+        except RuntimeError as error:
+            raise IncompatibleError(
+                f"{path / 'model.safetensors'}: does not fit {settings.field.kind} and "
+                f"{settings.renderer.kind} of this version: {str(error).splitlines()[-1].strip()}"
+            ) from None
+    module.eval()
+    return Model(module, hull, settings, echoes)
+
+
+def _hull(state: dict[str, torch.Tensor]) -> EchoHull:
+    read: dict[str, Any] = {
+        name: state[f"hull.{name}"].double().numpy() for name in EchoHull.ARRAYS
+    }
+    return EchoHull(**{**read, "within": float(read["within"])})
