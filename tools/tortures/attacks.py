@@ -24,7 +24,7 @@ from typing import Any
 import h5py
 import numpy as np
 import torch
-from tools.tortures.samples import samples
+import trimesh
 
 from tools.tortures.harness import FIT, SIMULATE, Report, contents, give, prepared
 
@@ -59,8 +59,10 @@ SCRIPTS = (
     '"><img src=x onerror=alert(1)>',
     "</style><script>x</script>",
 )
-SEEN = ("socket.connect", "socket.getaddrinfo", "socket.bind", "os.system", "os.exec", "os.fork",
-        "os.posix_spawn", "pty.spawn", "webbrowser.open")  # fmt: skip
+SEEN = (
+    *("subprocess.Popen", "socket.connect", "socket.getaddrinfo", "socket.bind", "os.system"),
+    *("os.exec", "os.fork", "os.posix_spawn", "pty.spawn", "webbrowser.open"),
+)
 UNIX = 1
 """Family of sockets that do not leave the machine."""
 Attack = tuple[str, Callable[[Path], tuple[Any, ...]]]
@@ -95,9 +97,6 @@ def _watched(folder: Path) -> Callable[[], None]:
             bad = event in SEEN
             if event.startswith("socket.") and given and getattr(given[0], "family", 0) == UNIX:
                 bad = False  # of this process and its own workers
-            if event == "subprocess.Popen":
-                words = [os.fsdecode(word) for word in given[1]]
-                bad = words[:2] != [sys.executable, "-I"]  # ours, which tries a file apart
             if event == "open" and isinstance(given[0], (str, bytes)):
                 mode, flags = given[1], given[2] or 0
                 writes = set(mode or "") & set("wax+") or flags & (os.O_WRONLY | os.O_RDWR)
@@ -355,7 +354,9 @@ def _meshes() -> Iterator[Attack]:
         yield f"glTF with a buffer at {uri}", gltf
 
     def material(folder: Path) -> Any:
-        sphere = next(one for one in samples(folder) if one.name == "OBJ").data
+        sphere = (
+            trimesh.creation.icosphere(subdivisions=1, radius=0.03).export(file_type="obj").encode()
+        )
         (folder / "x.obj").write_bytes(f"mtllib {outside}\nusemtl x\n".encode() + sphere)
         return (
             *("simulate", *SIMULATE[3:-4], "scene.name=mesh", "scene.options.path=x.obj"),
