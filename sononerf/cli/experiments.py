@@ -131,17 +131,16 @@ def fit(
     settings = load_settings(config, [*(overrides or ()), *extra])
     _begin(settings, workers)
     from sononerf.progress import Progress
-    from sononerf.run.fit import fit as run
     from sononerf.run.fit import follows
+    from sononerf.run.run import Run as RunOnDisk
 
     folder = output or Path("runs") / _name(settings, config)
     if tensorboard and not follows():
         from sononerf.callbacks.tensorboard import serve
 
         say(f"TensorBoard until the end of this command: {serve(folder)}")
-    done = run(
+    done = RunOnDisk(folder).fit(
         settings,
-        folder,
         accelerator=accelerator,
         devices=devices or "auto",
         num_nodes=num_nodes,
@@ -245,10 +244,9 @@ def predict(
     if pictures != "all" and not pictures.isdecimal():
         raise SettingsError(f"--pictures: found {pictures!r}; give all or a whole number from 0 on")
     from sononerf.progress import Progress
-    from sononerf.run.predict import predict as predict_run
+    from sononerf.run.run import Run as RunOnDisk
 
-    folder = predict_run(
-        run,
+    folder = RunOnDisk(run).write_prediction(
         split=split or "test",
         poses_csv=poses,
         frame=frame,
@@ -298,10 +296,9 @@ def reconstruct(
     if spacing is not None and not (math.isfinite(spacing) and spacing > 0):
         raise SettingsError(f"--spacing: found {spacing}; give metres above zero")
     from sononerf.progress import Progress
-    from sononerf.run.reconstruct import reconstruct as reconstruct_run
+    from sononerf.run.run import Run as RunOnDisk
 
-    folder = reconstruct_run(
-        run,
+    folder = RunOnDisk(run).reconstruct(
         spacing=spacing,
         level=number,
         method=method,
@@ -336,10 +333,9 @@ def evaluate(
 ) -> None:
     """Compare a run's mesh with the true surface, and show all its numbers."""
     from sononerf.progress import Progress
-    from sononerf.run.evaluate import evaluate as evaluate_run
+    from sononerf.run.run import Run as RunOnDisk
 
-    metrics = evaluate_run(
-        run,
+    metrics = RunOnDisk(run).evaluate(
         truth=truth,
         registration=registration,
         unit=unit,

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import logging
 import resource
+import shutil
 import sys
 import time
 from contextlib import ExitStack
@@ -293,7 +294,7 @@ def _fit(
     keeper = CheckpointCallback(run.path, settings.fit.checkpoint_seconds)
     resumed = run.checkpoint.is_file()
     if not resumed and not follows():
-        run.clear_previews()
+        shutil.rmtree(run.path / "epochs", ignore_errors=True)  # previews of an older fit
     preview = PreviewCallback(
         run.path,
         every_epochs=settings.preview.every_epochs,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""A fitted field, read back from the two files of its run."""
+"""A fitted field, read back from the two files of its run, and its surface."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+import trimesh
 
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import IncompatibleError, InputError, SettingsError
@@ -73,3 +74,16 @@ def _hull(state: dict[str, torch.Tensor]) -> EchoHull:
         name: state[f"hull.{name}"].double().numpy() for name in EchoHull.ARRAYS
     }
     return EchoHull(**{**read, "within": float(read["within"])})
+
+
+def read_mesh(file: Path, command: str) -> trimesh.Trimesh:
+    """Read the surface of a run; errors name the command that makes it."""
+    if not file.is_file():
+        raise InputError(f"{file}: there is no surface; make one with `{command}`")
+    try:
+        mesh = trimesh.load_mesh(file, file_type="ply")
+    except Exception as error:  # the error of a damaged file depends on trimesh's reader
+        raise InputError(f"{file}: damaged ({error}); reconstruct again") from error
+    if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
+        raise InputError(f"{file}: holds no surface; reconstruct again")
+    return mesh

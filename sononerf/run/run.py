@@ -17,7 +17,6 @@ from its last stage. The formulas are in ``docs/method.md``.
 from __future__ import annotations
 
 import html
-import shutil
 import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -44,9 +43,9 @@ from sononerf.geometry.poses import Poses
 from sononerf.head.attached import attach
 from sononerf.head.head import Head
 from sononerf.progress import Progress
-from sononerf.run.model_files import Model, read_model
+from sononerf.run.model_files import Model, read_mesh, read_model
 from sononerf.run.provenance import differing_keys, versions
-from sononerf.run.simulate import default_store, open_ensemble
+from sononerf.run.simulate import find_ensemble
 from sononerf.run.traced_file import load_traced, same_mesh, save_traced
 from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
 from sononerf.settings.schema import Settings
@@ -148,25 +147,8 @@ class Run(Shown):
             InputError: If the store is not where the settings say.
             IncompatibleError: If other echoes lie there.
         """
-        settings, wanted = self.settings, self.echo_hash
-        stated = settings.data.store or default_store(settings, wanted)
-        # A fit that was started elsewhere: above its run the store lies as it did from there.
-        places = [stated, *(folder / stated for folder in self.path.absolute().parents)]
-        stores = [open_ensemble(settings, one) for one in places if (one / "zarr.json").is_file()]
-        if not stores:
-            again = (
-                "import the recordings again"
-                if settings.scene is None
-                else "make it again with `sononerf simulate RUN/config.yaml`"
-            )
-            raise InputError(
-                f"{stated}: the ensemble of this run is not there; {again}, or predict poses of "
-                "your own with --poses"
-            )
-        for store in stores:
-            if store.attributes.get("echo_hash") == wanted:
-                return Echoes(store, self.head, self.hull)
-        raise IncompatibleError(f"{stores[0].path}: holds other echoes than those of this run")
+        store = find_ensemble(self.settings, self.echo_hash, self.path)
+        return Echoes(store, self.head, self.hull)
 
     def all_poses(self) -> tuple[Poses, NDArray[np.int8]]:
         """Return all poses and the use of each (P,): 0 train, 1 val, 2 test."""
@@ -196,18 +178,7 @@ class Run(Shown):
 
     def mesh(self) -> trimesh.Trimesh:
         """Read the reconstructed surface."""
-        file = self.reconstruction / "mesh.ply"
-        if not file.is_file():
-            raise InputError(
-                f"{file}: there is no surface; make one with `sononerf reconstruct {self.path}`"
-            )
-        try:
-            mesh = trimesh.load_mesh(file, file_type="ply")
-        except Exception as error:  # the error of a damaged file depends on trimesh's reader
-            raise InputError(f"{file}: damaged ({error}); reconstruct again") from error
-        if not isinstance(mesh, trimesh.Trimesh) or not len(mesh.faces):
-            raise InputError(f"{file}: holds no surface; reconstruct again")
-        return mesh
+        return read_mesh(self.reconstruction / "mesh.ply", f"sononerf reconstruct {self.path}")
 
     @property
     def read_out(self) -> dict[str, Any]:
@@ -308,6 +279,38 @@ class Run(Shown):
             accelerator=accelerator,
             progress=progress,
         )
+
+    # Its stages; each is the function of that name, which says what may be given.
+
+    def fit(self, settings: Settings, **given: Any) -> Run:
+        """Simulate where needed, and fit; see :func:`sononerf.run.fit.fit`."""
+        from sononerf.run.fit import fit
+
+        return fit(settings, self.path, **given)
+
+    def reconstruct(self, **given: Any) -> Path:
+        """Reconstruct the surface; see :func:`sononerf.run.reconstruct.reconstruct`."""
+        from sononerf.run.reconstruct import reconstruct
+
+        return reconstruct(self, **given)
+
+    def write_prediction(self, **given: Any) -> Path:
+        """Predict a split, or a table of poses; see :func:`sononerf.run.predict.predict`."""
+        from sononerf.run.predict import predict as write
+
+        return write(self, **given)
+
+    def evaluate(self, **given: Any) -> dict[str, Any]:
+        """Compare with the true surface; see :func:`sononerf.run.evaluate.evaluate`."""
+        from sononerf.run.evaluate import evaluate
+
+        return evaluate(self, **given)
+
+    def finish(self, **given: Any) -> dict[str, Any]:
+        """Do the stages after the fit that are not done; see :func:`sononerf.run.fit.finish`."""
+        from sononerf.run.fit import finish
+
+        return finish(self, **given)
 
     # Which stages are done.
 
@@ -432,10 +435,6 @@ class Run(Shown):
     def write_provenance(self, **facts: Any) -> None:
         """Record versions and sources of the run, without names of people, machines or folders."""
         storage.commit_json(self.path / "provenance.json", {**versions(), **facts})
-
-    def clear_previews(self) -> None:
-        """Remove the previews of a fit that starts anew."""
-        shutil.rmtree(self.path / "epochs", ignore_errors=True)
 
 
 def open_run(path: Path | str) -> Run:

@@ -9,7 +9,7 @@ from sononerf import storage
 from sononerf.echoes.echoes import Echoes, complete_store
 from sononerf.echoes.store import EnsembleStore
 from sononerf.echoes.subtracted import SubtractedStore
-from sononerf.errors import InputError, SettingsError
+from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.progress import Progress
 from sononerf.recordings.audio import pose_table, wav_bytes
 from sononerf.run.build import head_of, simulator_of
@@ -71,6 +71,34 @@ def open_ensemble(settings: Settings, path: Path) -> EnsembleStore:
     """Open a simulated ensemble, without its surroundings if the settings say so."""
     background = background_path(settings)
     return EnsembleStore.open(path) if background is None else SubtractedStore(path, background)
+
+
+def find_ensemble(settings: Settings, echo_hash: str, folder: Path) -> EnsembleStore:
+    """Open the ensemble that a run was fitted to.
+
+    Args:
+        settings: Settings of the run.
+        echo_hash: Hash of its echoes.
+        folder: Its folder. Where the fit was started elsewhere, the store lies relative to one of
+            the folders above it.
+    """
+    stated = settings.data.store or default_store(settings, echo_hash)
+    places = [stated, *(above / stated for above in folder.absolute().parents)]
+    stores = [open_ensemble(settings, one) for one in places if (one / "zarr.json").is_file()]
+    if not stores:
+        again = (
+            "import the recordings again"
+            if settings.scene is None
+            else "make it again with `sononerf simulate RUN/config.yaml`"
+        )
+        raise InputError(
+            f"{stated}: the ensemble of this run is not there; {again}, or predict poses of your "
+            "own with --poses"
+        )
+    for store in stores:
+        if store.attributes.get("echo_hash") == echo_hash:
+            return store
+    raise IncompatibleError(f"{stores[0].path}: holds other echoes than those of this run")
 
 
 def open_or_simulate(

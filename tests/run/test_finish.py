@@ -192,7 +192,7 @@ def test_one_call_loads_field_and_echoes_once(run, no_projections, monkeypatch):
     monkeypatch.setattr(geometry_module, "BASELINE_VOXELS", 16)
     monkeypatch.setattr(baseline, "LEVEL_SAMPLES", 300)
     loaded = []
-    for name in ("read_model", "default_store"):
+    for name in ("read_model", "find_ensemble"):
         real = getattr(run_module, name)
         monkeypatch.setattr(
             run_module, name, lambda *given, real=real, n=name: loaded.append(n) or real(*given)
@@ -201,7 +201,7 @@ def test_one_call_loads_field_and_echoes_once(run, no_projections, monkeypatch):
         finish_module, "learn_traced", lambda f, e, m, s, **o: finish_module.Traced.none(m, f.head)
     )
     finish(run, accelerator="cpu")
-    assert sorted(loaded) == ["read_model"]
+    assert sorted(loaded) == ["find_ensemble", "read_model"]
 
 
 @pytest.mark.parametrize("command", [reconstruct, predict, evaluate, finish])

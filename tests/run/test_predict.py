@@ -109,7 +109,7 @@ def test_poses_of_ones_own_need_neither_store_nor_scene(run, tmp_path, monkeypat
     def gone(*given):
         raise AssertionError("asked for the ensemble")
 
-    monkeypatch.setattr(run_module, "open_ensemble", gone)
+    monkeypatch.setattr(run_module, "find_ensemble", gone)
     (tmp_path / "poses.csv").write_text(CSV)
     folder = predict(run, poses_csv=tmp_path / "poses.csv", accelerator="cpu")
     assert folder == run / "prediction-poses"

@@ -112,10 +112,3 @@ def test_moving_aside_keeps_what_was_there(run, tiny):
     assert aside.name == "run.old-1"
     assert Run(aside).open() == tiny()
     assert not run.path.exists()
-
-
-def test_previews_of_an_older_fit_go(run):
-    (run.path / "epochs" / "0001").mkdir(parents=True)
-    run.clear_previews()
-    run.clear_previews()
-    assert not (run.path / "epochs").exists()

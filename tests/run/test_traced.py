@@ -557,7 +557,7 @@ def test_poses_of_ones_own_are_traced_off_the_run_without_store_or_scene(
     believe(run, 1.0)
     (run / "reconstruction" / "mesh.ply").unlink()
     monkeypatch.setattr(EnsembleStore, "read_pose", never)
-    monkeypatch.setattr(run_module, "open_ensemble", never)
+    monkeypatch.setattr(run_module, "find_ensemble", never)
     (tmp_path / "poses.csv").write_text(CSV)
     arrays, numbers = arrays_and_numbers(run, poses_csv=tmp_path / "poses.csv")
     assert numbers is None
