@@ -509,3 +509,15 @@ def test_a_fit_that_needs_too_much_memory_leaves_nothing(tiny, tmp_path, monkeyp
     with pytest.raises(ResourceError, match="a step of 2 poses needs about"):
         fit(tiny(), tmp_path / "run", accelerator="cpu", workers=1)
     assert not (tmp_path / "run").exists()
+
+
+def test_a_process_that_follows_does_not_wait_for_one_that_was_killed(tiny, tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    path.mkdir()
+    (path / ".lock").write_text("of a dead process")
+    monkeypatch.setattr(rank_zero_only, "rank", 1)
+    monkeypatch.setattr(fit_module, "PATIENCE_SECONDS", 0.2)
+    monkeypatch.setattr(fit_module, "WAIT_SECONDS", 0.05)
+    settings = tiny(data={"store": str(tmp_path / "none")})
+    with pytest.raises(ResourceError, match="the first process of this fit does not run"):
+        fit(settings, path, accelerator="cpu")
