@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Baselines without a learned field: backprojection with and without phase, and a voxel fit."""
+"""Baselines without a learned field: backprojection, and a voxel fit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import NumericalError
 from sononerf.evaluation.solid import Nearest, Solid, sample_surface
 from sononerf.geometry.poses import Poses
-from sononerf.head.call import matched_filter
 from sononerf.head.head import Head
 from sononerf.surface.start.volume import Volume, grid_over, isosurface
 
@@ -25,10 +24,6 @@ from sononerf.surface.start.volume import Volume, grid_over, isosurface
 LEVEL_SHARES = np.geomspace(0.002, 0.5, 12)
 LEVEL_SAMPLES = 4000
 LEVEL_DISTANCE = 0.005
-# Of the coherent sum: samples per period of the call's highest frequency (straight lines between
-# them err by 2 %), and how much of the call's energy lies below that.
-SAMPLES_PER_PERIOD = 16
-ENERGY = 0.99
 
 
 def backprojection(
@@ -60,65 +55,8 @@ def backprojection(
     for energy, emitter, ears in zip(profiles, emitters, receivers, strict=True):
         for profile, receiver in zip(energy, ears, strict=True):
             squares = _squares(axes, emitter, receiver)
-            _spread(total, _padded(profile, np.float32), *squares, float(axis[0]), step)
+            _spread(total, _padded(profile), *squares, float(axis[0]), step)
     return volume.with_values(total / max(len(emitters), 1))
-
-
-def coherent_backprojection(
-    waveforms: Iterable[ArrayLike],
-    poses: Poses,
-    head: Head,
-    lower: ArrayLike,
-    upper: ArrayLike,
-    spacing: float,
-) -> Volume:
-    r"""Delay-and-sum with phase over poses and ears, for comparison.
-
-    .. math:: I(x) = \left|\frac{1}{P E} \sum_p \sum_e
-              y_{p,e}\left(\frac{|x - x_p| + |x - x_{p,e}|}{c}\right)\right|
-
-    with :math:`y` the pulse-compressed recordings,
-    :func:`sononerf.head.call.matched_filter`. It needs poses that are right to a
-    fraction of a wavelength.
-
-    Args:
-        waveforms (iterable of (E, S) float): Recordings from the start of the emission on, one per
-            pose in order; read one at a time.
-        spacing (m): Voxel size; a quarter of the shortest wavelength shows all there is.
-    """
-    emitted = head.waveform
-    finer = _oversampling(emitted)
-    step = head.speed_of_sound / (2.0 * head.sampling_rate * finer)
-    emitters, receivers = head.places(poses.positions, poses.rotations)
-    volume = grid_over(lower, upper, spacing)
-    axes = volume.axes()
-    total = np.zeros(volume.values.shape, dtype=np.complex64)
-    count = 0
-    for count, recording in enumerate(waveforms, start=1):
-        heard = np.asarray(recording, dtype=np.float64)
-        if count > len(emitters) or heard.ndim != 2 or len(heard) != receivers.shape[1]:
-            raise ValueError(
-                f"recording {count - 1}: shape {heard.shape}, expected ({receivers.shape[1]}, S), "
-                f"one for each of {len(emitters)} poses"
-            )
-        if not np.isfinite(heard).all():
-            raise NumericalError(f"the recording of pose {count - 1} is not finite")
-        compressed = matched_filter(heard, emitted, oversampling=finer).astype(np.complex64)
-        for echo, receiver in zip(compressed, receivers[count - 1], strict=True):
-            squares = _squares(axes, emitters[count - 1], receiver)
-            _spread(total, _padded(echo, np.complex64), *squares, 0.0, step)
-    if count != len(emitters):
-        raise ValueError(f"recordings: {count}, expected one for each of {len(emitters)} poses")
-    summed = np.abs(total).astype(np.float64) / max(receivers.shape[0] * receivers.shape[1], 1)
-    return volume.with_values(summed)
-
-
-def _oversampling(call: Floats) -> int:
-    """Return how much finer a compressed call is sampled, so that straight lines will do."""
-    power = np.abs(np.fft.rfft(call, 2 * max(len(call), 8))) ** 2
-    below = np.cumsum(power) / max(power.sum(), 1e-300)
-    highest = (int(np.searchsorted(below, ENERGY)) + 1) / (2 * len(power))  # per sample
-    return max(1, int(np.ceil(SAMPLES_PER_PERIOD * highest)))
 
 
 def range_profiles(
@@ -161,9 +99,9 @@ def _squares(axes: tuple[Floats, Floats, Floats], out: Floats, back: Floats) -> 
     return x, y, z, u, v, w
 
 
-def _padded(profile: NDArray[Any], kind: type[np.generic]) -> NDArray[Any]:
+def _padded(profile: NDArray[Any]) -> Singles:
     """Put one silent slice at each end, and one more, so that the last index stays inside."""
-    padded = np.zeros(len(profile) + 3, kind)
+    padded = np.zeros(len(profile) + 3, np.float32)
     padded[1:-2] = profile
     return padded
 

@@ -9,11 +9,8 @@ from sononerf.errors import NumericalError
 from sononerf.evaluation.baseline import (
     backprojection,
     best_level_surface,
-    coherent_backprojection,
 )
 from sononerf.geometry.poses import Poses
-from sononerf.head.call import call_waveform, emit
-from sononerf.settings.schema import CallSettings
 from sononerf.surface.start.volume import grid_over, volume_from_function
 
 EMITTER = np.array([0.0, 0.0, -0.01])
@@ -43,7 +40,7 @@ def echoes(positions, rotations):
         yield spectrogram
 
 
-def listener(ranges=RANGES, ears=EARS, call=None):
+def listener(ranges=RANGES, ears=EARS):
     """What the baselines ask of a head."""
 
     def places(positions, rotations):
@@ -52,9 +49,6 @@ def listener(ranges=RANGES, ears=EARS, call=None):
     return SimpleNamespace(
         range=np.asarray(ranges),
         places=places,
-        waveform=call,
-        sampling_rate=1e6,
-        speed_of_sound=343.0,
     )
 
 
@@ -106,45 +100,3 @@ def test_the_best_level_is_that_of_the_true_surface():
 def test_a_constant_volume_has_no_best_level():
     with pytest.raises(NumericalError, match="no level"):
         best_level_surface(grid_over(*BOX), trimesh.creation.box())
-
-
-SWEEP = call_waveform(CallSettings(kind="linear", frequency_start=90e3, duration=1e-3), 1e6)
-
-
-def recordings(positions, rotations, gain=0.25):
-    """Sweep's echo of one point, delayed between samples too, at both ears."""
-    frequency = np.fft.rfftfreq(8192, 1e-6)
-    for position, rotation in zip(positions, rotations, strict=True):
-        out = np.linalg.norm(TARGET - (position + rotation @ EMITTER))
-        back = np.linalg.norm(TARGET - (position + EARS @ rotation.T), axis=1)
-        turn = np.exp(-2j * np.pi * frequency * (out + back)[:, None] / 343.0)
-        yield emit(gain * np.fft.irfft(turn, 8192), SWEEP)[:, :6000]
-
-
-def test_with_phase_a_point_is_found_to_a_fraction_of_a_wavelength():
-    positions, rotations = poses()
-    box = TARGET - 0.011, TARGET + 0.011, 0.001
-    heard = recordings(positions, rotations)
-    volume = coherent_backprojection(heard, Poses(positions, rotations), listener(call=SWEEP), *box)
-    peak = volume.points()[volume.values.argmax()]
-    np.testing.assert_allclose(peak, TARGET, atol=1e-9)
-    assert volume.values.max() == pytest.approx(0.25, rel=0.03)
-    away = np.linalg.norm(volume.points() - TARGET, axis=1) > 0.004  # half of the mean wavelength
-    assert volume.values.ravel()[away].max() < 0.5 * 0.25
-
-
-def test_the_coherent_sum_refuses_wrong_input():
-    positions, rotations = poses(2)
-    heard = np.zeros((2, 2, 300))
-
-    def told(error, waveforms, call=SWEEP):
-        with pytest.raises(error) as caught:
-            coherent_backprojection(
-                waveforms, Poses(positions, rotations), listener(call=call), *BOX
-            )
-        return str(caught.value)
-
-    assert "one for each of 2 poses" in told(ValueError, heard[:1])
-    assert "recording 0: shape (1, 300)" in told(ValueError, heard[:, :1])
-    assert "pose 1 is not finite" in told(NumericalError, [heard[0], heard[1] + np.nan])
-    assert "not silent" in told(ValueError, heard, call=np.zeros(4))
