@@ -60,6 +60,8 @@ def test_tasks_are_computed_by_other_processes_with_the_thing_they_were_given():
 
 def test_the_task_of_a_killed_worker_is_computed_once_more(tmp_path):
     assert dict(computed(killed_once, tmp_path, TASKS, 2)) == {number: number for number in TASKS}
+    (tmp_path / "killed").unlink()
+    assert dict(computed(killed_once, tmp_path, {3: (3,)}, 1)) == {3: 3}  # the first of all
 
 
 def test_workers_that_are_always_killed_are_an_error_of_one_line():

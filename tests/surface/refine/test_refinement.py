@@ -69,6 +69,7 @@ def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, e
     )
     work = begun({"body": bumpy}, tilted, optics)
     work.first_stage()
+    assert work.candidates[0].drawn == SHORT[0].steps  # the next stage begins with other poses
     gain = work.candidates[0].level.gain[0].exp().numpy()
     assert gain[-1] / gain[0] > 5.0
 
@@ -101,6 +102,33 @@ def test_a_bumpy_sphere_becomes_round(bumpy, echoes, optics):
         return np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).mean()
 
     assert off(found.mesh) < 0.5 * off(bumpy)
+
+
+def test_later_bounces_come_off_the_surface_before_the_stage_that_traces(
+    bumpy, echoes, optics, monkeypatch
+):
+    sources, real = [], module.LaterBounces
+
+    def noted(optics, mesh, *given, **named):
+        sources.append(mesh)
+        return real(optics, mesh, *given, **named)
+
+    monkeypatch.setattr(module, "LaterBounces", noted)
+    stages = (
+        dataclasses.replace(SHORT[0], beyond="none"),
+        dataclasses.replace(SHORT[0], beyond="trace"),
+        SHORT[1],
+    )
+    saved = {}
+    for _ in range(2):  # the second time it goes on after the stage that traces
+        work = begun({"body": bumpy}, echoes, optics, stages=stages, saved=saved)
+        work.first_stage()
+        (candidate,) = work.candidates
+        for number in (1, 2):
+            work.stage(candidate, number)
+        assert sources == [candidate.meshes[1]]
+        sources.clear()
+        saved.popitem()
 
 
 def test_a_surface_that_gets_worse_is_not_kept(echoes, optics, monkeypatch):
