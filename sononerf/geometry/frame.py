@@ -10,11 +10,9 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation
 
 from sononerf.array_types import Floats
 from sononerf.errors import InputError
-from sononerf.geometry.poses import Poses
 
 FrameName = Literal["auto", "world", "original"]
 KEYS = ("to_original", "head_to_original")
@@ -102,20 +100,6 @@ class Frame:
         """Return a mesh whose axes are this frame's, but whose unit is the metre, in the world."""
         metres = np.diag([1.0 / self.unit] * 3 + [1.0])
         return _moved(mesh, np.asarray(np.linalg.inv(self.matrix) @ metres, np.float64))
-
-    def table(self, poses: Poses) -> str:
-        """Return poses as a table: in the world angles (degrees), else unit quaternions.
-
-        The import reads both. Quaternions do not depend on the sense of a positive pitch.
-        """
-        if self.is_world:
-            return poses.table()
-        turned = Rotation.from_matrix(self.rotations(poses.rotations)).as_quat(scalar_first=True)
-        rows = np.column_stack([self.places(poses.positions), turned])
-        unit = self.unit_name if self.unit_name in UNITS.values() else "m"
-        names = [*(f"{axis}_{unit}" for axis in "xyz"), "qw", "qx", "qy", "qz"]
-        lines = [",".join(names), *(",".join(repr(float(value)) for value in row) for row in rows)]
-        return "\n".join(lines) + "\n"
 
 
 def _moved(mesh: trimesh.Trimesh, matrix: Floats) -> trimesh.Trimesh:
