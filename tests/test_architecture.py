@@ -41,9 +41,7 @@ DEVICELESS = ROOMS[: ROOMS.index("run")]
 # the options of a factory in its annotations.
 PURE = {
     f"sononerf.field.{name}"
-    for name in (
-        "field fourier grid hash lobe lobe_correction profile range_bins renderer shell"
-    ).split()
+    for name in ("field fourier grid lobe profile range_bins renderer shell").split()
 }
 
 

@@ -29,6 +29,9 @@ def names_of(code):
     return names
 
 
+HASH_GRID = names_of(next(block for block in BLOCKS if "class HashGrid" in block))["HashGrid"]
+
+
 @pytest.fixture(scope="module")
 def splats():
     return names_of(next(block for block in BLOCKS if "class SplatField" in block))
@@ -41,6 +44,7 @@ def test_the_page_shows_the_field_that_is_written():
 def test_fields_and_renderers_hold(splats):
     testing.check_field(names_of(FIELD)["make"], width=16)
     testing.check_renderer(names_of(RENDERER)["make"])
+    testing.check_field(HASH_GRID, entries=64)
     testing.check_field(splats["SplatField"])
     testing.check_renderer(splats["SplatRenderer"], field=splats["SplatField"])
 
@@ -65,11 +69,13 @@ def echoes():
 
 @pytest.mark.slow
 @pytest.mark.thorough
-@pytest.mark.parametrize(("kind", "left"), [("siren", 0.95), ("splats", 0.9)])
+@pytest.mark.parametrize(("kind", "left"), [("siren", 0.95), ("hash", 0.97), ("splats", 0.9)])
 def test_they_learn(kind, left, echoes, splats, tmp_path):
     quiet_lightning()
     field, renderer, options = names_of(FIELD)["make"], "profile", {"width": 64}
-    if kind == "splats":
+    if kind == "hash":
+        field, options = HASH_GRID, {"entries": 4096}
+    elif kind == "splats":
         field, renderer, options = splats["SplatField"], splats["SplatRenderer"], {"count": 50}
     model = sn.EchoModule.for_echoes(
         echoes, field, renderer, region=((-0.02,) * 3, (0.02,) * 3), field_options=options,

@@ -18,7 +18,6 @@ from sononerf.scene.scene import Scene
     [
         ("grid", {"finest": 0.01, "levels": 2}),
         ("fourier", {"width": 16, "octaves": 6}),
-        ("hash", {"finest": 0.01}),
     ],
 )
 def test_built_in_fields_hold(name, options):

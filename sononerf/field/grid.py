@@ -13,8 +13,7 @@ from pydantic import Field as Option
 from torch import Tensor, nn
 
 from sononerf.errors import SettingsError
-from sononerf.field.lobe import CODE, LobeField, Lobes, Places
-from sononerf.field.lobe_correction import Correction
+from sononerf.field.lobe import CODE, LobeField
 
 SLIGHT = 1e-5
 """Weight below which a vertex of the grid is not read: rounding moves places of a lattice by as
@@ -117,9 +116,6 @@ class GridField(LobeField):
         finest, coarsest (m): Bounds of the spacing that is found.
         rank: Number of spectra that places add by coefficients of their own; at most one less than
             there are frequencies.
-        correction: Width of the hidden layers of a network that corrects what places answer; 0 for
-            none. Only :meth:`select` and :meth:`echo` hear it: which places are audible, and their
-            energy and axis, go by the lobe alone.
     """
 
     origin: Tensor
@@ -135,7 +131,6 @@ class GridField(LobeField):
         coarsest: Annotated[float, Option(gt=0, le=0.1)] = 0.02,
         levels: Annotated[int, Option(ge=1, le=8)] = 3,
         rank: Annotated[int, Option(ge=0, le=64)] = 0,
-        correction: Annotated[int, Option(ge=0, le=256)] = 0,
     ) -> None:
         super().__init__(region, frequency, rank)
         extent = (region[1] - region[0]).double()
@@ -156,9 +151,6 @@ class GridField(LobeField):
             # Channels as in a code; grid_sample wants (Z, Y, X).
             self.grids.append(nn.Parameter(torch.zeros(1, CODE + self.rank, *size[::-1])))
         self._reading: _Reading | None = None
-        self.correction = (
-            Correction(region, spacing, correction, len(frequency)) if correction else None
-        )
 
     @property
     def _steps(self) -> list[float]:
@@ -189,11 +181,3 @@ class GridField(LobeField):
                 self._reading = _Reading(lattice, self.origin, self._steps, grids)
         code = self._reading(grids)
         return code if which is None else code.index_select(0, which)
-
-    def _log_response(
-        self, lobes: Lobes, tilt: Tensor, seen: Places, bins: Tensor | None
-    ) -> Tensor:
-        response = super()._log_response(lobes, tilt, seen, bins)
-        if self.correction is None:
-            return response
-        return response + self.correction(seen.positions, seen.directions, bins, seen.of)

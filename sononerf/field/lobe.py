@@ -7,7 +7,6 @@ import math
 from typing import NamedTuple
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 
 from sononerf.field.field import Field
@@ -23,22 +22,6 @@ RADIUS_UNIT = 0.015
 """Radius of curvature per unit of the learned number, m. It sets how fast radii are learned."""
 CODE = 5
 """Numbers of a place before the coefficients: log strength, lobe vector (x, y, z), radius."""
-CALM = 0.1
-"""Length of Adam's step for a weight that all places share, relative to that of a single vertex."""
-
-
-class CalmLayer(nn.Linear):
-    """A layer that moves calmly: with steps as large as a vertex takes, a whole field may die."""
-
-    def __init__(self, start: int, end: int) -> None:
-        super().__init__(start, end)
-        with torch.no_grad():
-            self.weight.div_(CALM)
-            self.bias.zero_()
-
-    def forward(self, x: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
-        """Return some of the numbers, all by default: (..., start) to (..., B)."""
-        return F.linear(x, self.weight[rows] * CALM, self.bias[rows] * CALM)
 
 
 def along(vectors: Tensor, axes: Tensor) -> Tensor:
@@ -46,14 +29,6 @@ def along(vectors: Tensor, axes: Tensor) -> Tensor:
     # Unbound rather than indexed: each index would have a pass of its own in the gradient.
     (x, y, z), (a, b, c) = vectors.unbind(-1), axes.unbind(0)
     return x * a + y * b + z * c
-
-
-class Places(NamedTuple):
-    """Positions of N places, and the directions in which they are seen."""
-
-    positions: Tensor  # (N, 3) m
-    directions: Tensor  # (..., N, 3) unit vectors, or (M, 3) of M pairs
-    of: Tensor | None = None  # (M,) int, which place each pair is for
 
 
 class Lobes(NamedTuple):
@@ -74,11 +49,6 @@ class Lobes(NamedTuple):
         # The small number keeps the gradient finite where there is no lobe yet.
         length = (along(self.vector.T, self.vector) + 1e-6).sqrt()
         return along(directions, self.vector) - length, length
-
-
-def hidden_layers(start: int, width: int) -> nn.Sequential:
-    """Return two hidden layers that move calmly."""
-    return nn.Sequential(CalmLayer(start, width), nn.ReLU(), CalmLayer(width, width), nn.ReLU())
 
 
 class LobeField(Field):
@@ -142,11 +112,8 @@ class LobeField(Field):
             return spectrum
         return spectrum + self.basis[:, bins].T @ own
 
-    def _log_response(
-        self, lobes: Lobes, tilt: Tensor, seen: Places, bins: Tensor | None
-    ) -> Tensor:
+    def _log_response(self, lobes: Lobes, tilt: Tensor, bins: Tensor | None) -> Tensor:
         """Return the log reflectivity of N lobes seen at a (..., N) tilt, (..., N, B)."""
-        del seen
         which = slice(None) if bins is None else bins
         strength = lobes.strength.clamp_min(LOG_STRENGTH_FLOOR) + self._spectrum(lobes.own, which)
         sharpness = self.sharpness[which].exp()[:, None]
@@ -158,7 +125,7 @@ class LobeField(Field):
         """Return the reflectivity of (N, 3) places towards (..., N, 3) directions."""
         lobes = Lobes.of(self.code(positions).T)
         tilt, _ = lobes.tilt(directions)
-        response = self._log_response(lobes, tilt, Places(positions, directions), bins).exp()
+        response = self._log_response(lobes, tilt, bins).exp()
         return response * self.inside(positions)[:, None]
 
     @torch.no_grad()
@@ -186,7 +153,7 @@ class LobeField(Field):
             outside = None if outside is None else outside.index_select(0, place)
         lobes = Lobes.of(code)
         tilt, length = lobes.tilt(directions)
-        response = self._log_response(lobes, tilt, Places(positions, directions, place), bins).exp()
+        response = self._log_response(lobes, tilt, bins).exp()
         if outside is not None:
             response = response.masked_fill(outside[:, None], 0.0)
         with torch.no_grad():  # the range must not turn the lobes

@@ -63,8 +63,8 @@ class EchoModule(lightning.LightningModule):
     was given as an object has to be given again.
 
     Args:
-        field: The learned field: the name of a plugin, such as ``"grid"``, ``"fourier"`` or
-            ``"hash"``; a factory; or a field.
+        field: The learned field: the name of a plugin, ``"grid"`` or ``"fourier"``; a factory;
+            or a field.
         renderer: Its renderer: the name of a plugin, ``"profile"`` or ``"shell"``; a factory; or
             a renderer.
         reference: Magnitude m0 of the reported decibels.

@@ -25,6 +25,8 @@ from sononerf.settings.loading import describe_faults, refuse_truths
 SCENES = "sononerf.scenes"
 FIELDS = "sononerf.fields"
 RENDERERS = "sononerf.renderers"
+GONE = {("field", "hash"): "take grid, or the plugin in docs/extending.md, A hash grid"}
+"""What to use instead of built-in plugins that were removed."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,8 @@ def load(group: str, name: str) -> Callable[..., Any]:
     plugins = registered(group)
     claims = [plugin for plugin in plugins if plugin.name == name]
     if not claims:
+        if (kind, name) in GONE:
+            raise SettingsError(f"{kind} {name!r} was removed in version 0.2.0; {GONE[kind, name]}")
         names = sorted({plugin.name for plugin in plugins})
         near = difflib.get_close_matches(name, names, n=1)
         hint = f"did you mean {near[0]}? " if near else ""

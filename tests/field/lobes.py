@@ -1,28 +1,18 @@
 # SPDX-License-Identifier: MIT
-"""Small fields of lobes of both kinds, alike in region and spacing."""
+"""Small fields of lobes, alike in region and spacing."""
 
 import torch
 
 from sononerf.field.grid import GridField
-from sononerf.field.hash import HashField
-from sononerf.field.lobe import CALM
 
 # 51, 40 and 27 mm: in steps of 10 mm 7 x 5 x 4 vertices, in steps of 20 mm 4 x 3 x 3.
 REGION = torch.tensor([[-0.03, 0.01, 0.2], [0.021, 0.05, 0.227]], dtype=torch.float64)
 FREQUENCY = torch.tensor([30e3, 50e3, 70e3], dtype=torch.float64)
-# Tables of 64 entries: the coarse level's 36 vertices have their own, the fine one's 140 share.
-SHARED = {"log2_entries": 6}
 
 
 def grid(region=REGION, frequency=FREQUENCY, *, seed=0, **options):
     torch.manual_seed(seed)
     return GridField(region, frequency, **{"spacing": 0.01, "levels": 2, **options}).double()
-
-
-def hashed(region=REGION, frequency=FREQUENCY, *, seed=0, **options):
-    torch.manual_seed(seed)
-    given = {"finest": 0.01, "levels": 2, "width": 8, **options}
-    return HashField(region, frequency, **given).double()
 
 
 def places_in(count, region=REGION, seed=0):
@@ -44,11 +34,7 @@ def say(field, *code):
     """Make a field put out the same code everywhere; numbers that are not given are zero."""
     code = torch.tensor([*code, *[0.0] * (5 + field.rank - len(code))])
     with torch.no_grad():
-        if isinstance(field, GridField):
-            for values in field.grids:
-                values.zero_()
-            field.grids[0][0] = code[:, None, None, None]
-        else:
-            field.out.weight.zero_()
-            field.out.bias.copy_(code / CALM)
+        for values in field.grids:
+            values.zero_()
+        field.grids[0][0] = code[:, None, None, None]
     return field

@@ -6,7 +6,7 @@ from sononerf.errors import SettingsError
 from sononerf.field.field import lattice_over, sphere_directions
 from tests.field.lobes import REGION, fill, grid, places_in
 
-WITH_OPTIONS = pytest.mark.parametrize("options", [{}, {"rank": 2}, {"rank": 1, "correction": 4}])
+WITH_OPTIONS = pytest.mark.parametrize("options", [{}, {"rank": 2}])
 
 
 @WITH_OPTIONS
@@ -130,42 +130,3 @@ def test_the_spacing_is_found_from_the_number_of_vertices():
     with pytest.raises(SettingsError, match="coarsest"):
         grid(region, **options | crossed)
     assert grid(region, **crossed | {"spacing": 0.1}).resolution == 0.1  # which needs no bounds
-
-
-@pytest.mark.parametrize("bins", [None, torch.tensor([2, 0])])
-def test_what_is_corrected_is_what_is_heard(bins):
-    """And nothing else: who is audible, the energy and the axis are the lobe's."""
-    plain, field = fill(grid()), fill(grid(correction=8))
-    field.load_state_dict(plain.state_dict(), strict=False)
-    places, directions = places_in(20), sphere_directions(20, REGION)
-    wanted = field.correction(places, directions, bins)
-    assert wanted.abs().max() > 0.1
-    ratio = field.select(places, directions, bins) / plain.select(places, directions, bins)
-    torch.testing.assert_close(ratio.log(), wanted)
-    several = directions.roll(1, 0).expand(2, 20, 3)
-    ratio = field.select(places, several, bins) / plain.select(places, several, bins)
-    torch.testing.assert_close(ratio.log(), field.correction(places, several, bins))
-    assert torch.equal(field.audible(places, directions), plain.audible(places, directions))
-    for one, two in zip(field.oriented(places, 8), plain.oriented(places, 8), strict=True):
-        assert torch.equal(one, two)
-
-
-def test_only_what_is_asked_for_is_corrected():
-    field = fill(grid(correction=8))
-    seen = []
-    field.correction.register_forward_hook(lambda module, given, found: seen.append(found.shape))
-    place = torch.tensor([4, 0, 0, 5, 2, 4])
-    places, directions, bins = places_in(50), sphere_directions(6, REGION), torch.tensor([1])
-    found = field.echo(places, directions, bins, place)[0]
-    torch.testing.assert_close(found, field.select(places[place], directions, bins))
-    field.audible(places, directions)
-    field.oriented(places, 8)
-    assert seen == [(6, 1), (6, 1)]
-
-
-def test_the_waves_of_the_correction_follow_the_finest_spacing():
-    """They end at four times of it, within an octave."""
-    found = grid(vertices=8000, spacing=None, finest=0.001, correction=4)
-    assert found.resolution == pytest.approx((0.051 * 0.04 * 0.027 / 8000) ** (1 / 3))
-    shortest = 2 * torch.pi / float(found.correction.waves.max())
-    assert 4 <= shortest / found.resolution < 8

@@ -9,10 +9,8 @@ from sononerf.field.lobe import LOG_STRENGTH_FLOOR, RADIUS_UNIT
 from tests.field.lobes import (
     FREQUENCY,
     REGION,
-    SHARED,
     fill,
     grid,
-    hashed,
     places_in,
     say,
 )
@@ -20,13 +18,12 @@ from tests.field.lobes import (
 LOBE = torch.tensor([2.0, -4.0, 4.0], dtype=torch.float64)  # of length 6
 
 
-@pytest.fixture(params=["grid", "ranked", "hash"])
+@pytest.fixture(params=["grid", "ranked"])
 def make(request):
     """What makes a field of each kind; all that is said here holds of all of them."""
     kinds = {
         "grid": grid,
         "ranked": lambda *region, **options: grid(*region, **{"rank": 2, **options}),
-        "hash": lambda *region, **options: hashed(*region, **SHARED, **options),
     }
     return kinds[request.param]
 
@@ -35,10 +32,7 @@ def steep(field):
     """Lobes that differ from place to place, with concentrations of about ten."""
     fill(field, seed=3, size=0.5)
     with torch.no_grad():
-        if hasattr(field, "grids"):
-            field.grids[0][:, 1:4] *= 16
-        else:
-            field.out.bias[1:4] = torch.tensor([30.0, -80.0, 50.0])
+        field.grids[0][:, 1:4] *= 16
     return field
 
 
@@ -126,8 +120,7 @@ def test_the_spectra_begin_as_slow_cosines_that_leave_the_mean_alone(make):
     assert single(places_in(2), sphere_directions(2, REGION)).shape == (2, 1)
 
 
-def test_energy_and_axis_are_those_of_a_dense_sphere(make, monkeypatch):
-    monkeypatch.setattr("sononerf.field.hash.CHUNK", 4)  # in parts, as a large lattice is
+def test_energy_and_axis_are_those_of_a_dense_sphere(make):
     field = steep(make())
     places = torch.cat((places_in(8), REGION[1:] + 0.01))
     dense = sphere_directions(20_000, REGION)

@@ -10,14 +10,13 @@ import trimesh
 from sononerf.field.field import lattice_over
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
-from sononerf.field.hash import HashField
 from sononerf.field.profile import ProfileRenderer
 from sononerf.geometry.plane import Plane
 from sononerf.geometry.poses import look_at, rotation_from_euler
 from sononerf.run.build import head_of, simulator_of
 from sononerf.scene.scene import Scene
 from sononerf.settings.loading import validate_settings
-from tests.field.lobes import fill, grid, hashed
+from tests.field.lobes import fill, grid
 
 REGION = torch.tensor([[-0.02, -0.03, -0.01], [0.02, 0.01, 0.03]], dtype=torch.float64)
 POSITION = np.array([[0.29, 0.02, 0.01], [0.0, -0.28, 0.05]])
@@ -271,7 +270,7 @@ def test_many_places_against_a_slow_loop(head, listener, formula, kind, monkeypa
         assert expected.max() > 5 * expected.min()
 
 
-LOBES = pytest.mark.parametrize("make", [grid, hashed])
+LOBES = pytest.mark.parametrize("make", [grid])
 
 
 def heard_by_lobes(make, listener, **options):
@@ -327,7 +326,7 @@ def test_what_is_heard_follows_the_places_that_are_alive(make, listener):
     assert hear().max() < 1e-10
 
 
-class Direct(HashField):
+class Direct(GridField):
     """Multiplies the places themselves with what is learned, so that its gradient needs them."""
 
     def code(self, positions):
@@ -335,10 +334,10 @@ class Direct(HashField):
 
 
 def direct(region, frequency):
-    return Direct(region, frequency, finest=0.01, levels=2, rank=0).double()
+    return Direct(region, frequency, spacing=0.01, levels=2).double()
 
 
-@pytest.mark.parametrize("make", [grid, hashed, direct])
+@pytest.mark.parametrize("make", [grid, direct])
 def test_a_fit_may_begin_with_a_validation(make, listener):
     field, _, hear = heard_by_lobes(make, listener)
     with torch.inference_mode():

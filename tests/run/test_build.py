@@ -25,7 +25,6 @@ from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
-from sononerf.field.hash import HashField
 from sononerf.field.module import EchoModule
 from sononerf.field.profile import ProfileRenderer
 from sononerf.field.renderer import ShellRenderer
@@ -87,7 +86,6 @@ def test_a_sweep_is_heard_longer_and_later_in_each_row(tiny):
     [
         ("grid", "profile", (GridField, ProfileRenderer)),
         ("fourier", "shell", (FourierField, ShellRenderer)),
-        ("hash", "profile", (HashField, ProfileRenderer)),
     ],
 )
 def test_any_field_with_any_renderer(tiny, field, renderer, kinds):
@@ -243,10 +241,7 @@ def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):
         ({"field": {"options": {"spacing": 4}}}, r"field\.options\.spacing: found 4; .*0\.1"),
         ({"field": {"options": {"finest": 4}}}, r"field\.options\.finest: found 4; .*0\.1"),
         ({"field": {"options": {"coarsest": 20}}}, r"field\.options\.coarsest: found 20; .*0\.1"),
-        (
-            {"field": {"kind": "hash", "options": {"finest": 2}}},
-            r"field\.options\.finest: found 2; .*0\.1",
-        ),
+        ({"field": {"kind": "hash"}}, "field 'hash' was removed in version 0.2.0; take grid"),
         (
             {"field": {"options": {"finest": 0.03}}},
             r"field\.options\.finest: found 0\.03; must not lie above coarsest, 0\.02$",

@@ -39,7 +39,6 @@ from sononerf.surface.refine.descent import (
     poses_that_hear,
 )
 from sononerf.surface.refine.later_bounces import LaterBounces
-from sononerf.surface.refine.necks import without_necks
 from sononerf.surface.refine.objective import Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.plane_descent import POSES as PLANE_POSES
@@ -358,13 +357,7 @@ class Refinement:
         """Return the best surface so far; the start where all refined ones are clearly worse."""
         candidate = best_of(self.candidates, closed_before(self.echoes.hull, self._far))
         best = candidate.best
-        mesh, doubtful = without_necks(
-            candidate.meshes[best],
-            self.optics.wavelength,
-            lambda mesh: self._objective(
-                mesh, "a surface with a cut neck", candidate.level, smooth=False
-            ),
-        )
+        mesh = candidate.meshes[best]
         confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
         known = surface_error(
             mesh,
@@ -374,7 +367,7 @@ class Refinement:
             validation_db=candidate.objective,
             seed=self.seed,
         )
-        confidence *= known.heard & ~doubtful
+        confidence *= known.heard
         values = np.stack([confidence, known.error], axis=1)
         if best and candidate.way != "planes":
             mesh, values = finer(mesh, values, self.optics.wavelength)
