@@ -2,13 +2,7 @@
 # SPDX-License-Identifier: MIT
 """Measure what sononerf costs and how well it does.
 
-    python tools/benchmark.py simulate [--scene ua] [--rays 300000] [--poses 400]
-    python tools/benchmark.py cost configs/three_spheres.yaml [--poses 20]
-    python tools/benchmark.py noise [--scene ua] [--poses 20]
-    python tools/benchmark.py physics
-    python tools/benchmark.py exact [--scene three_spheres] [--engines hybrid rays] [--poses 8]
-    python tools/benchmark.py wave [--bodies spheres leaf beaker] [--poses 8]
-    python tools/benchmark.py dechirp
+    python tools/benchmark.py exact [--bodies three_spheres balls leaf beaker]
     python tools/benchmark.py surfaces [--only NAME ...] [--seeds 0 1 2] [--exact STORE]
     python tools/benchmark.py surfaces --foreign FOLDER [--calls 400 100 25]
     python tools/benchmark.py step [--accelerator cpu] [--compare OLD.json]
@@ -17,15 +11,8 @@
     python tools/benchmark.py errors RUN [RUN ...] [--calibrate]
     python tools/benchmark.py next_poses [--only NAME ...] [--seeds 0 1 2]
 
-``simulate``: seconds per pose, against those that embreex alone needs for the same rays, those for
-visibility included, and the greatest memory. ``cost``: CPU seconds per pose of a configuration, the
-low band of all its poses included; set OMP_NUM_THREADS=1 first. ``noise``: by how much two
-simulations differ that have other rays, 16 times as many, or twice as many; with the reported
-decibels, on active cells.
-``physics``: both engines against exact solutions. ``exact``: engines against exact multiple
-scattering of spheres, by band, and what they put before the first echo. ``wave``: bem against exact
-spheres, then the others against bem on a leaf and a beaker; some ten minutes. ``dechirp``: where
-and how long a point echo is in the rows of a dechirped sweep.
+``exact``: the simulator against frozen solutions of the wave equation, by band, and what it puts
+before the first echo.
 
 ``step``: what a step of a fit costs for each field through each renderer, medians of at least
 five, beside equation 17 of the paper written down as it stands (which takes 9 GB of memory), the
@@ -62,13 +49,11 @@ from tools.benchmarks.errors import errors  # noqa: E402
 from tools.benchmarks.exact import exact  # noqa: E402
 from tools.benchmarks.fit import fit  # noqa: E402
 from tools.benchmarks.next_poses import WAYS, next_poses  # noqa: E402
-from tools.benchmarks.physics import dechirp, physics  # noqa: E402
 from tools.benchmarks.reconstruct import reconstruct  # noqa: E402
-from tools.benchmarks.simulator import cost, noise, simulate  # noqa: E402
 from tools.benchmarks.step import step  # noqa: E402
 from tools.benchmarks.surfaces import CASES, surfaces  # noqa: E402
-from tools.benchmarks.wave import wave  # noqa: E402
 
+BODIES = ["three_spheres", "balls", "leaf", "beaker"]
 LISTENED = ["three_spheres", "rings", "procedural-108", "procedural-113"]
 ERROR_HELP = "over all cells of held-out poses, dB (0.45)"
 ONLY_HELP = "rows of the table; all, but exact only with --exact"
@@ -89,21 +74,10 @@ def main() -> None:
         command.set_defaults(run=run)
         return command
 
-    for run, default in ((simulate, 400), (noise, 20)):
-        command = added(run)
-        command.add_argument("--scene", default="ua")
-        command.add_argument("--poses", type=int, default=default)
-        command.add_argument("--bounces", type=int, default=3)
-        command.add_argument("--rays", type=int, default=300_000)
-    added(physics)
-    added(dechirp)
-    command = added(cost)
-    command.add_argument("config", type=Path)
-    command.add_argument("--poses", type=int, default=20, help="that are traced (20)")
     command = added(exact)
-    command.add_argument("--scene", default="three_spheres")
-    command.add_argument("--engines", nargs="+", default=["hybrid", "rays", "kirchhoff"])
-    command.add_argument("--poses", type=int, default=8)
+    command.add_argument("--bodies", nargs="+", choices=BODIES, default=BODIES, help="all")
+    command.add_argument("--engines", nargs="+", default=["hybrid", "rays"])
+    command.add_argument("--rays", type=int, default=100_000, help="per pose (100000)")
     command = added(errors)
     command.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="finished runs")
     command.add_argument("--calibrate", action="store_true", help="print exponents and scale")
@@ -116,9 +90,6 @@ def main() -> None:
     command.add_argument("--score", type=float, default=0.9, help="F-score at 2 mm (0.9)")
     command.add_argument("--most", type=int, default=100, help="calls (100)")
     command.add_argument("--output", type=Path, default=Path("runs") / "next_poses")
-    command = added(wave)
-    command.add_argument("--bodies", nargs="+", choices=("spheres", "leaf", "beaker"), help="all")
-    command.add_argument("--poses", type=int, default=8)
     for series in (surfaces, step, fit, reconstruct):
         command = added(series)
         if series is surfaces:

@@ -102,8 +102,8 @@ def module_for(
 
 
 def simulator_of(scene: Scene, settings: Settings) -> Simulator:
-    """Return the simulator of a scene that settings describe; raises as :meth:`Simulator.of`."""
-    return Simulator.of(scene, head_of(settings), settings.simulation)
+    """Return the simulator of a scene that settings describe; see :class:`Simulator`."""
+    return Simulator(scene, head_of(settings), settings.simulation)
 
 
 @contextmanager

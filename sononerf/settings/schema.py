@@ -13,7 +13,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from sononerf.settings.call_presets import CALL_PRESETS, fft_of, hop_of, window_of
 from sononerf.settings.scene_schema import PoseSettings, SceneSettings, SupportSettings
@@ -43,20 +43,24 @@ class SimulationSettings(Section):
     The number of ``rays`` per pose is set, or as large as ``accuracy_db`` needs: that is the mean
     difference between two seeds over active cells, measured at a few poses before all are traced.
     The engine ``hybrid`` solves the wave equation of small bodies at low frequencies, with up to
-    ``sources`` unknowns, and traces rays at high ones. The engines ``spheres`` and ``bem`` solve
-    it up to ``frequency_max``. It may be half the sampling rate at most; where it is not set, the
-    analysis decides.
+    ``sources`` unknowns, and traces rays at high ones; ``rays`` traces rays alone.
     """
 
-    engine: Literal["hybrid", "rays", "kirchhoff", "spheres", "bem"] = "hybrid"
+    engine: Literal["hybrid", "rays"] = "hybrid"
     accuracy_db: Annotated[float, Field(ge=0.01, le=10)] = 0.2
     rays: Annotated[int, Field(ge=100, le=100_000_000)] | None = None
     bounces: Annotated[int, Field(ge=1, le=10)] = 3
     diffraction_points: Annotated[int, Field(ge=1, le=10_000_000)] = 10_000
     sources: Annotated[int, Field(ge=10, le=20_000)] = 1000
-    frequency_max: Positive | None = None  # Hz
     seed: Seed = 0
     noise_floor_poses: Annotated[int, Field(ge=0)] = 20
+
+    @field_validator("engine", mode="before")
+    @classmethod
+    def _engine_is_there(cls, engine: object) -> object:
+        if engine in ("kirchhoff", "spheres", "bem"):
+            raise ValueError(f"{engine} was removed in version 0.2.0; take hybrid or rays")
+        return engine
 
 
 class AirSettings(Section):
@@ -380,16 +384,6 @@ class Settings(Section):
             raise ValueError(
                 f"noise.snr_db: gives 2 levels for {len(places)} ears.receivers; give one level "
                 "for all"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _solved_frequencies_are_sampled(self) -> Settings:
-        highest, half = self.simulation.frequency_max, self.spectrogram.sampling_rate / 2
-        if highest is not None and highest > half:
-            raise ValueError(
-                f"simulation.frequency_max is {highest:g} Hz, above half of "
-                f"spectrogram.sampling_rate ({half:g} Hz); lower it"
             )
         return self
 

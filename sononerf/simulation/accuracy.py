@@ -13,7 +13,6 @@ from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import RANGE_DB, compress, mae_db
 from sononerf.progress import Progress, Task
 from sononerf.settings.schema import SimulationSettings
-from sononerf.simulation.hybrid import tracer_of
 from sononerf.simulation.simulator import Simulator
 from sononerf.simulation.workers import simulated
 
@@ -42,16 +41,14 @@ def settle_rays(
     progress: Progress,
     *,
     workers: int | None = None,
-) -> int | None:
+) -> int:
     """Set the number of rays per pose that reaches the accuracy of the settings.
 
     The difference between two seeds is measured at a few poses, as the noise floor is: the mean
     over active cells of reported decibels. Call :meth:`Simulator.prepare` first; its results are
     used.
     """
-    tracer = tracer_of(simulator.engine)
-    if tracer is None:
-        return None
+    tracer = simulator.rays
     if options.rays is not None:
         tracer.rays = options.rays
         return tracer.rays

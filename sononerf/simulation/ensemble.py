@@ -99,7 +99,7 @@ def simulate(
     if path is not None and (finished := _finished(path, wanted)) is not None:
         return Echoes(finished, head)
     warn_of_call(head.call, head.analysis)
-    simulator = Simulator.of(scene, head, settings)
+    simulator = Simulator(scene, head, settings)
     offsets = np.vstack((head.emitter, head.receivers))
     check_poses(scene, poses, offsets=offsets, plane=head.plane)
     check_aim(scene, poses, is_directional=head.ears.is_directional)
@@ -119,8 +119,8 @@ def simulate(
             f"{path}: the echoes of {len(poses):,} poses",
             "lower poses.count, or choose another disk with --output",
         )
-    if simulator.engine.note:
-        progress.say(f"echoes: {simulator.engine.note}")
+    if simulator.note:
+        progress.say(f"echoes: {simulator.note}")
     given: dict[str, Any] = {
         "split": purposes,
         "range": head.range,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Engine `rays`: rays over several bounces, summed as Kirchhoff's integral."""
+"""Rays over several bounces, summed as Kirchhoff's integral."""
 
 from __future__ import annotations
 
@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 from sononerf.array_types import Bools, Floats, Ints, Singles
 from sononerf.geometry.directions import CapSpiral
 from sononerf.geometry.normals import bodies, enclosing_balls
-from sononerf.geometry.raycast import Hits
+from sononerf.geometry.raycast import Hits, RayCaster
 from sononerf.scene.scene import Scene
 from sononerf.simulation.audibility import EARS_APART, RESOLVED_FREQUENCY, Audibility
 from sononerf.simulation.diffraction import Diffraction
-from sononerf.simulation.engine import Engine
 from sononerf.simulation.hearing import Hearing, Listener
 from sononerf.simulation.outlines import Outlines
 from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
-from sononerf.simulation.reflection import coarse_gain, unfaded
+from sononerf.simulation.reflection import Reflection, coarse_gain, reflection, unfaded
 from sononerf.simulation.shadows import LEAST, Shadow, behind, passing
 
 HIDDEN_SHARE = 0.15  # as many rays again, for surfaces behind obstacles
@@ -34,7 +33,7 @@ SILENT = 7.0  # e to the minus this is -61 dB
 BALLS = 32  # number of balls that enclose the scene; rays that miss all of them are not traced
 
 
-class Rays(Engine):
+class Rays:
     r"""Echoes by rays.
 
     Rays fill the cap under which the emitter sees the scene, each standing for the same solid
@@ -76,7 +75,12 @@ class Rays(Engine):
         diffraction_points: int,
         band: Floats | None = None,
     ) -> None:
-        super().__init__(scene, hearing)
+        self.scene, self.hearing = scene, hearing
+        self.reflections: tuple[Reflection, ...] = tuple(
+            reflection(material, hearing.synthesis.nodes, speed_of_sound=hearing.speed_of_sound)
+            for material in scene.materials
+        )
+        self._caster: RayCaster | None = None
         self._rays = rays
         self.bounces = bounces
         vertices = np.asarray(scene.mesh.vertices, dtype=np.float64)
@@ -132,8 +136,21 @@ class Rays(Engine):
         if self._of_image is not None:
             self._of_image.rays = count
 
+    @property
+    def caster(self) -> RayCaster:
+        """The scene's ray caster, built when it is first needed."""
+        if self._caster is None:
+            self._caster = RayCaster(self.scene.mesh)
+        return self._caster
+
     def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
-        """Pressure at both ears; the seed turns and shifts the pattern of rays as a whole."""
+        """Return the pressure at the ears (E, S) for a call that is one sample of height 1.
+
+        Args:
+            position ((3,), m): Place of the head, world frame.
+            rotation (3, 3): Head to world.
+            seed: Turns and shifts the pattern of rays as a whole.
+        """
         echo = self._echo(position, rotation, seed=seed)
         if self._of_image is not None:
             echo += self._of_image.echo(position, rotation, seed=seed)
@@ -176,7 +193,8 @@ class Rays(Engine):
             self._of_image.later(sound, position, rotation, seed=seed)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**super().__getstate__(), "_diffraction": None, "_outlines": None}
+        # Search trees cannot be pickled; who receives the mesh builds them anew.
+        return {**self.__dict__, "_caster": None, "_diffraction": None, "_outlines": None}
 
     def _shadows(self, position: Floats, rotation: Floats) -> list[Shadow]:
         """Shadows of the emitter and of each ear."""
@@ -196,7 +214,7 @@ class Rays(Engine):
         ]
 
     def hits(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
-        """Places that send sound straight back, and how much; see :meth:`Engine.hits`."""
+        """Return places that send sound straight back (N, 3), m, and their strength (N,)."""
         first, second, _ = np.random.default_rng(seed).random(3)
         points, strength = [np.zeros((0, 3))], [np.zeros(0)]
         for bounce in self._paths(position, rotation, (first, second), 1):
@@ -393,9 +411,9 @@ class Rays(Engine):
             return self.reflections[0].heard(cosine, detour, curvature)
         part = self._part(triangle)
         gain = np.zeros((len(triangle), len(self.hearing.synthesis.nodes)), dtype=np.float32)
-        for index, reflection in enumerate(self.reflections):
+        for index, of_surface in enumerate(self.reflections):
             of_part = part == index
-            found = reflection.heard(cosine[of_part], detour[of_part], curvature[of_part])
+            found = of_surface.heard(cosine[of_part], detour[of_part], curvature[of_part])
             gain[of_part] = found if self._smooth[index] else found * self._lobed_level
         return gain
 

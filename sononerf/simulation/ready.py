@@ -40,7 +40,7 @@ def trace_once() -> None:
         analysis=SpectrogramSettings(),
         noise=NoiseSettings(),
     )
-    simulator = Simulator.of(Scene(trimesh.util.concatenate(balls), warns=False), head, options)
+    simulator = Simulator(Scene(trimesh.util.concatenate(balls), warns=False), head, options)
     simulator.spectrogram(np.array([-0.4, 0.0, 0.0]), np.eye(3), seed=0)
 
 

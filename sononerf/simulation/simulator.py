@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sononerf.array_types import Floats, Singles
 from sononerf.echoes.splits import TEST, TRAIN, VALIDATION
-from sononerf.errors import InputError, SettingsError
+from sononerf.errors import InputError
 from sononerf.geometry.poses import (
     Poses,
     cap_poses,
@@ -26,19 +26,15 @@ from sononerf.geometry.poses import (
     random_sphere_poses,
 )
 from sononerf.head.head import Head
-from sononerf.head.row_filters import row_widths
 from sononerf.memory import require_memory
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
 from sononerf.settings.scene_schema import PoseSettings
-from sononerf.settings.schema import SimulationSettings, SpectrogramSettings
-from sononerf.simulation.audibility import RESOLVED_FREQUENCY, silence_before
-from sononerf.simulation.engine import Engine
+from sononerf.settings.schema import SimulationSettings
+from sononerf.simulation.audibility import RESOLVED_FREQUENCY, Arrival, silence_before
 from sononerf.simulation.hearing import hearing_of
-from sononerf.simulation.hybrid import Hybrid, hybrid
+from sononerf.simulation.low_band import LowBand, low_band
 from sononerf.simulation.rays import Rays
-from sononerf.simulation.reference.kirchhoff import Kirchhoff
-from sononerf.simulation.solved import TAPER, Solved
 
 logger = logging.getLogger("sononerf")
 
@@ -50,114 +46,110 @@ VERSION = 5  # to be raised when the same settings give other echoes: stores are
 
 
 class Simulator:
-    """Simulator of what the receivers of a pose hear of a scene.
+    """Simulator of what the receivers of a pose hear of a scene: rays, and a low band without.
 
     Attributes:
         head: The head.
+        rays: The part that traces rays.
+        low: The solution of the wave equation at low frequencies, where there is one.
+        note: Text for the user: what simulates this scene, and why.
     """
 
-    def __init__(self, engine: Engine) -> None:
-        self.engine = engine
-        self.head = engine.hearing.head
-
-    @classmethod
-    def of(cls, scene: Scene, head: Head, options: SimulationSettings) -> Simulator:
-        """Return the simulator of a scene and a head.
+    def __init__(self, scene: Scene, head: Head, options: SimulationSettings) -> None:
+        """Prepare a scene for a head.
 
         Args:
             head: The head. Of a scene on its support the part above it is ensonified together
                 with its image: a rigid plane is exactly that.
         """
-        hearing, analysis = hearing_of(head), head.analysis
+        self.head, hearing, analysis = head, hearing_of(head), head.analysis
         if head.plane is not None:
-            if options.engine == "kirchhoff":
-                raise SettingsError(
-                    "simulation.engine=kirchhoff knows no support; set simulation.engine=rays"
-                )
             scene = scene.with_image(head.plane)
-        if options.engine in ("spheres", "bem"):
-            return cls(
-                _solver(options.engine)(
-                    scene, hearing, frequency_max=solved_frequency(options, analysis)
-                )
-            )
-        if options.engine == "kirchhoff":
-            if any(material.lobe_width is not None for material in scene.materials):
-                logger.warning(
-                    "simulation.engine=kirchhoff takes surfaces as smooth; the material's lobes "
-                    "are left out, simulation.engine=rays has them"
-                )
-            return cls(Kirchhoff(scene, hearing, frequency_max=1.1 * analysis.frequency_max))
         if analysis.frequency_max > COARSE * RESOLVED_FREQUENCY:
             logger.warning(
                 "spectrogram.frequency_max=%g Hz: simulation.engine=%s resolves edges and shadows "
                 "up to %g Hz; echoes of edges above it are less exact",
                 *(analysis.frequency_max, options.engine, RESOLVED_FREQUENCY),
             )
-        rays: dict[str, Any] = {
-            "rays": options.rays or UNSETTLED,
-            "bounces": options.bounces,
-            "diffraction_points": options.diffraction_points,
-        }
-        if options.engine == "rays":
-            return cls(Rays(scene, hearing, **rays))
-        lowest, most = analysis.frequency_min, options.sources
-        return cls(hybrid(scene, hearing, sources=most, frequency_min=lowest, **rays))
+        self.scene, self.hearing, self.arrival = scene, hearing, Arrival(scene)
+        self.low: LowBand | None = None
+        self.note, band = "", None
+        if options.engine == "hybrid":
+            low = low_band(
+                scene,
+                hearing,
+                self.arrival,
+                sources=options.sources,
+                frequency_min=analysis.frequency_min,
+            )
+            if isinstance(low, str):
+                self.note = f"rays at all frequencies, because {low}"
+            else:
+                self.low, band = low, 1.0 - low.taper(hearing.synthesis.frequency)
+                self.note = (
+                    f"wave equation up to {low.frequency_full / 1e3:.0f} kHz with {low.most} "
+                    f"sources, rays from {low.frequency_max / 1e3:.0f} kHz on"
+                )
+        self.rays = Rays(
+            scene,
+            hearing,
+            rays=options.rays or UNSETTLED,
+            bounces=options.bounces,
+            diffraction_points=options.diffraction_points,
+            band=band,
+        )
 
     @classmethod
     def of_surface(
         cls, mesh: trimesh.Trimesh, head: Head, options: SimulationSettings, *, rays: int
     ) -> Simulator:
         """Return the hybrid engine on a reconstructed surface, without noise."""
-        wanted = options.model_copy(update={"engine": "hybrid", "rays": rays})
-        return cls.of(Scene(mesh, warns=False), head.without_noise(), wanted)
+        chosen = options.model_copy(update={"engine": "hybrid", "rays": rays})
+        return cls(Scene(mesh, warns=False), head.without_noise(), chosen)
 
     def keep_equations(self) -> None:
         """Keep factorised equations in memory, so that single poses are solved for at once."""
-        if isinstance(self.engine, Hybrid):
-            self.engine.low.keeps = True
+        if self.low is not None:
+            self.low.keeps = True
 
-    def prepare(
-        self,
-        positions: Floats,
-        rotations: Floats,
-        progress: Progress,
-    ) -> None:
-        """Let the engine do its work for all poses at once, and show how far it is.
+    def prepare(self, positions: Floats, rotations: Floats, progress: Progress) -> None:
+        """Solve for the low band of all poses at once, and show how far it is.
 
         Args:
             positions ((P, 3), m): Places of the head, world frame.
             rotations (P, 3, 3): Head to world.
         """
-        if len(positions) and self.engine.parts:
-            with progress.task("solving", self.engine.parts) as task:
-                self.engine.prepare(positions, rotations, lambda *_: task.advance())
+        if len(positions) and self.low is not None:
+            with progress.task("solving", len(self.low.frequency)) as task:
+                self.low.prepare(positions, rotations, task.advance)
 
     def hits(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
         """Places (N, 3) that send sound straight back, m, and how much (N,), dB below the most."""
-        points, strength = self.engine.hits(position, rotation, seed=seed)
+        points, strength = self.rays.hits(position, rotation, seed=seed)
         loudest = max(float(strength.max(initial=0.0)), 1e-300)
         return points, 20.0 * np.log10(np.maximum(strength / loudest, 1e-10))
 
     def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
-        """Pressure at both ears for an impulse; see :meth:`Engine.echo`.
+        """Return the pressure at the ears (E, S) for a call that is one sample of height 1.
 
-        Engines that solve the wave equation hear with the head as it is; those of other engines are
-        silent before sound can arrive, see :func:`silence_before`.
+        It is silent before sound can arrive, see :func:`silence_before`.
+
+        Args:
+            position ((3,), m): Place of the head, world frame.
+            rotation (3, 3): Head to world.
         """
-        engine = self.engine
-        echo = engine.echo(position, rotation, seed=seed)
-        if isinstance(engine, Solved):
-            return echo
-        emitter, ears = engine.hearing.places(position, rotation)
-        first = engine.arrival.shortest(emitter[None], ears[None])[0] / self.head.speed_of_sound
-        rate = engine.hearing.synthesis.sampling_rate
+        if not (np.isfinite(position).all() and np.isfinite(rotation).all()):
+            raise ValueError("the pose is no finite number")
+        echo = self.rays.echo(position, rotation, seed=seed)
+        if self.low is not None:
+            echo += self.low.echo(position, rotation)
+        emitter, ears = self.hearing.places(position, rotation)
+        first = self.arrival.shortest(emitter[None], ears[None])[0] / self.head.speed_of_sound
+        rate = self.hearing.synthesis.sampling_rate
         return silence_before(echo, first, sampling_rate=rate)
 
     def spectrogram(self, position: Floats, rotation: Floats, *, seed: int) -> Singles:
         """Return the magnitude at both ears, over range and frequency.
-
-        Position, rotation and seed are those of :meth:`Engine.echo`.
 
         Returns:
             magnitude ((E, R, F) float32): Linear.
@@ -166,8 +158,6 @@ class Simulator:
 
     def receive(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
         """Return the sound at both ears for the call, noise included, and its spectrogram.
-
-        Position, rotation and seed are those of :meth:`Engine.echo`.
 
         Returns:
             waveform (E, S): Pressure from the start of the emission on.
@@ -181,35 +171,6 @@ def pose_seed(seed: int, index: int) -> int:
     """Seed of one pose of an ensemble; who simulates it, and when, does not matter."""
     state = np.random.SeedSequence([seed, index]).generate_state(1, np.uint64)
     return int(state[0])
-
-
-def _solver(engine: str) -> type[Solved]:
-    if engine == "spheres":
-        from sononerf.simulation.reference.spheres import Spheres
-
-        return Spheres
-    from sononerf.simulation.reference.boundary import Boundary  # imports torch: seconds
-
-    return Boundary
-
-
-def solved_frequency(wanted: SimulationSettings, analysis: SpectrogramSettings) -> float:
-    """Return the frequency (Hz) at which the solved response has fallen to zero.
-
-    Where it is not set, the response is whole up to the highest analysed frequency and the
-    bandwidth (-6 dB) of a row there above it.
-    """
-    if wanted.frequency_max is None:
-        bandwidth = float(row_widths(analysis, analysis.frequency_max)[1])
-        return min(TAPER * (analysis.frequency_max + bandwidth), analysis.sampling_rate / 2.0)
-    whole = wanted.frequency_max / TAPER
-    if whole < analysis.frequency_max:
-        logger.warning(
-            "simulation.frequency_max=%g Hz: what is heard fades from %.0f Hz on, below "
-            "spectrogram.frequency_max (%g Hz)",
-            *(wanted.frequency_max, whole, analysis.frequency_max),
-        )
-    return wanted.frequency_max
 
 
 POSE_BYTES = 550

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Generator
 
 from sononerf.array_types import Floats, Singles
@@ -11,17 +10,11 @@ from sononerf.errors import SonoNerfError
 from sononerf.executor import TaskError, computed
 from sononerf.geometry.poses import Poses
 from sononerf.memory import available_cores
-from sononerf.simulation.hybrid import tracer_of
 from sononerf.simulation.simulator import Simulator
-
-logger = logging.getLogger("sononerf")
 
 MOST_WORKERS = 8
 WORTH_RAYS = 250_000
 """Rays of all poses from which other processes save time: fewer are traced before these start."""
-RAYS_FOR_OTHERS = 4_000
-"""Number of rays that a pose counts for if its engine traces none: from 63 poses on processes save
-time."""
 
 Results = Generator[tuple[int, Singles], None, None]
 SeedOf = Callable[[int], int]
@@ -48,18 +41,10 @@ def simulated(
         workers: Processes on this machine; one means this process. Where None, as many as there are
             cores, at most 8, if they save time.
     """
-    engine = simulator.engine
     if workers is None:
-        tracer = tracer_of(engine)
-        rays = RAYS_FOR_OTHERS if tracer is None else tracer.rays
-        workers = 1 if engine.prepares else useful_workers(len(indices), rays)
-    if engine.prepares and (scheduler is not None or workers > 1):
-        logger.warning(
-            "%s solves for all poses at once, in this process; workers and scheduler are not used",
-            type(engine).__name__,
-        )
-        workers, scheduler = 1, None
-    engine.prepare(poses.positions[indices], poses.rotations[indices])
+        workers = useful_workers(len(indices), simulator.rays.rays)
+    if simulator.low is not None:
+        simulator.low.prepare(poses.positions[indices], poses.rotations[indices])
     tasks = {i: (poses.positions[i], poses.rotations[i], seed_of(i)) for i in indices}
     try:
         if workers > 1 or scheduler is not None:

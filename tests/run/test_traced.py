@@ -302,7 +302,7 @@ def switched_off(path, patch):
 def test_what_cannot_be_borne_out_or_is_not_wanted_is_not_traced(run, believe, monkeypatch, why):
     believe(run, 1.0)  # as an earlier fit may have left it
     why(run, monkeypatch)
-    monkeypatch.setattr(Simulator, "of", never)
+    monkeypatch.setattr(Simulator, "__init__", never)
     monkeypatch.setattr(traced_module, "render_poses", never)
     heard = Heard()
     assert not learn(run, progress=heard).any()
@@ -368,7 +368,7 @@ def test_traced_echoes_are_those_that_were_measured(traceable, echoes):
     ("section", "values"),
     [
         ("noise", {"snr_db": (0.0, 0.0)}),
-        ("simulation", {"engine": "kirchhoff"}),
+        ("simulation", {"engine": "rays"}),
         ("simulation", {"rays": 7}),
     ],
 )
@@ -542,7 +542,7 @@ def test_a_prediction_without_belief_is_the_rendering(run, believe):
     np.testing.assert_array_equal(never_learned["predicted"], rendered)
     believe(run, 0.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Simulator, "of", never)
+        patch.setattr(Simulator, "__init__", never)
         unbelieved, same = arrays_and_numbers(run)
     np.testing.assert_array_equal(unbelieved["predicted"], rendered)
     assert same == numbers

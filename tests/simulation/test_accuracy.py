@@ -69,12 +69,7 @@ def test_noise_of_the_ears_asks_for_no_more_rays(few):
 
 def test_a_number_of_rays_is_taken_as_it_is():
     rays, simulator = settled(settings(rays=777))
-    assert rays == simulator.engine.rays == 777
-
-
-def test_an_engine_without_rays_has_no_number():
-    wanted = settings(engine="kirchhoff")
-    assert settled(wanted)[0] is None
+    assert rays == simulator.rays.rays == 777
 
 
 def test_no_more_rays_are_taken_than_the_most(few, monkeypatch):

@@ -49,15 +49,15 @@ def heard_near():
         found = simulator_of(scene, validate_settings(options, "test"))
         places = np.array([[0.4, 0.02, 0.01], [0.1, -0.25, 0.3]])
         turns = look_at(places, np.zeros((2, 3)))
-        found.engine.prepare(places, turns)
+        found.low and found.low.prepare(places, turns)
         magnitudes = np.stack(
             [found.spectrogram(*pose, seed=0) for pose in zip(places, turns, strict=True)]
         )
         levels = compress(magnitudes, 1e-3 * magnitudes.max())
         worst = 0.0
         for pose in range(2):
-            emitter, ears = found.engine.hearing.places(places[pose], turns[pose])
-            nearest = found.engine.arrival.shortest(emitter[None], ears[None])[0] / 2
+            emitter, ears = found.hearing.places(places[pose], turns[pose])
+            nearest = found.arrival.shortest(emitter[None], ears[None])[0] / 2
             for ear in range(2):
                 early = found.head.range < nearest[ear] - 0.010
                 worst = max(worst, levels[pose, ear][early].max())

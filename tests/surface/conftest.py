@@ -64,7 +64,7 @@ def simulated():
     """Spectrograms (P, E, R, F) of a mesh, by the simulator."""
 
     def simulate(mesh, settings, poses):
-        simulator = Simulator.of(Scene(mesh), head_of(settings), settings.simulation)
+        simulator = Simulator(Scene(mesh), head_of(settings), settings.simulation)
         pairs = zip(poses.positions, poses.rotations, strict=True)
         return np.stack([simulator.spectrogram(at, turn, seed=0) for at, turn in pairs])
 

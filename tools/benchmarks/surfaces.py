@@ -78,7 +78,6 @@ CASES = (
     Case("three-times-as-large", (SPHERES, "scene.options.radius=0.045")),
     Case("unscaled", (SPHERES, *UNSCALED)),
     Case("scaled", (SPHERES, *UNSCALED)),
-    Case("kirchhoff", (SPHERES, "simulation.engine=kirchhoff")),
     Case("noisy-rays", (SPHERES, "simulation.engine=rays", "noise.snr_db=20")),
     Case("exact", (SPHERES, "poses.count=100", "spectrogram.frequency_max=80e3")),
     *(Case(name, (f"scene.name={name}",)) for name in NEW),

@@ -14,7 +14,6 @@ from sononerf.array_types import Floats, Ints, Singles
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.ensemble import spectrograms
-from sononerf.simulation.rays import Rays
 from sononerf.simulation.simulator import Simulator
 
 if TYPE_CHECKING:
@@ -54,7 +53,7 @@ class Tracer:
             bounces=BOUNCES,
             diffraction_points=max(rays // 30, 1),  # as many as the simulator's defaults have
         )
-        self._simulator = Simulator.of(Scene(mesh, warns=False), optics.head, wanted)
+        self._simulator = Simulator(Scene(mesh, warns=False), optics.head, wanted)
         self._nodes, self._seed = _Nodes.of(optics), seed
 
     def spectrograms(self, positions: Floats, rotations: Floats) -> Singles:
@@ -63,10 +62,9 @@ class Tracer:
 
     def later(self, position: Floats, rotation: Floats) -> Later:
         """Return the echoes of a pose after the first bounce."""
-        found, engine = _Collected(self._nodes), self._simulator.engine
-        assert isinstance(engine, Rays)
-        engine.later(found, position, rotation, seed=self._seed)
-        return found.whole()
+        collected = _Collected(self._nodes)
+        self._simulator.rays.later(collected, position, rotation, seed=self._seed)
+        return collected.whole()
 
 
 @dataclass(frozen=True, eq=False)

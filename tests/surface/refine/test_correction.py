@@ -23,7 +23,7 @@ class Shifted:
     """A simulator that hears everything twice as loud as another one."""
 
     def __init__(self, simulator):
-        self.simulator, self.engine = simulator, simulator.engine
+        self.simulator, self.rays, self.low = simulator, simulator.rays, simulator.low
 
     def spectrogram(self, position, rotation, *, seed):
         return 2.0 * self.simulator.spectrogram(position, rotation, seed=seed)

@@ -174,7 +174,7 @@ def simulated_stage(settings):
     few = settings.simulation.model_copy(update={"rays": 2000})
 
     def simulate(mesh):
-        return Simulator.of(Scene(mesh, warns=False), head_of(settings), few)
+        return Simulator(Scene(mesh, warns=False), head_of(settings), few)
 
     last = dataclasses.replace(SHORT[1], beyond="simulate")
     return {"simulate": simulate, "stages": (SHORT[0], last)}

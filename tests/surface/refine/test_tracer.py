@@ -30,7 +30,7 @@ def test_later_bounces_are_as_loud_as_the_simulator_makes_them(optics, ball):
     pair = trimesh.util.concatenate([ball, other])
     tracer = Tracer(optics, pair, rays=20_000, seed=0)
     at, turn = np.array([0.3, 0.0, 0.0]), np.diag([-1.0, -1.0, 1.0])
-    engine = tracer._simulator.engine
+    engine = tracer._simulator.rays
     sound = engine.hearing.silence()
     engine.later(sound, at, turn, seed=0)
     echo = engine.hearing.echo(sound, engine._basis)
