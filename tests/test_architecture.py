@@ -19,7 +19,7 @@ PACKAGE = ROOT / "sononerf"
 
 FLOORS = (
     ("errors", "array_types", "compiled", "progress", "memory", "executor"),
-    ("storage", "locks", "input_files", "shown", "tables", "settings", "geometry"),
+    ("storage", "locks", "input_files", "matlab_files", "shown", "tables", "settings", "geometry"),
     ("scene", "head"),
     ("echoes",),
     ("simulation", "recordings"),

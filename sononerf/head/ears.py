@@ -21,7 +21,7 @@ from scipy.special import j1
 from sononerf.array_types import Floats, Singles
 from sononerf.compiled import compiled
 from sononerf.errors import SettingsError
-from sononerf.head.directivity.read import content_hash, read_directivity
+from sononerf.head.directivity.files import content_hash, read_directivity
 from sononerf.head.directivity.record import Directivity, unit_vectors
 from sononerf.head.spectrogram import frequency_axis, smearing
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
@@ -140,6 +140,17 @@ class Ears:
         gain = (self.beam * self.ears.max(axis=0)).max(axis=0).astype(np.float64)
         deaf = self.directions[..., 0][gain < least * gain.max()]
         return float(deaf.max()) if len(deaf) else -1.0
+
+    def directivity(self, source: str = "settings") -> Directivity:
+        """Return these tables as a directivity, both ends of the azimuth axis once."""
+
+        def rows(table: Singles) -> Floats:
+            part = table[..., :-1].astype(np.float64)
+            return np.moveaxis(part.reshape(*part.shape[:-2], -1), -1, -2)
+
+        directions = self.directions[:, :-1].reshape(-1, 3)
+        gains, beam = rows(self.ears), rows(self.beam)
+        return Directivity(source, directions, self.frequency, gains, beam, self.positions)
 
     @cached_property
     def _by_direction(self) -> Singles:

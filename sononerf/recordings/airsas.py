@@ -27,9 +27,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf import matlab_files as hdf5
 from sononerf.array_types import Floats
 from sononerf.errors import InputError
-from sononerf.recordings import matlab as hdf5
 from sononerf.recordings.audio import Recording
 from sononerf.recordings.columns import PLACE, Columns
 from sononerf.settings.import_schema import ImportSettings

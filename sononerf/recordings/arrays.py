@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from sononerf import matlab_files as hdf5
 from sononerf.echoes.layout import SPLITS
 from sononerf.errors import InputError
-from sononerf.recordings import matlab as hdf5
 from sononerf.recordings.audio import Recording
 from sononerf.recordings.columns import EULER, PLACE, Columns, columns_of
 from sononerf.settings.import_schema import ImportSettings

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf.errors import InputError
+from sononerf.matlab_files import as_list, read_mat, vector
 from sononerf.recordings.audio import Recording
 from sononerf.recordings.columns import Columns
-from sononerf.recordings.matlab import as_list, read_mat, vector
 from sononerf.settings.import_schema import ImportSettings
 
 SONONERF_RATE, SONONERF_SPEED = 1e6, 343.0  # Hz, m/s: of its first script

@@ -12,7 +12,7 @@ from sononerf.geometry.poses import rotation_from_euler
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.sonotrace import read_sononerf_matlab, read_sonotracelab
 from sononerf.settings.import_schema import ImportSettings
-from tests.recordings.matlab_files import write_new
+from tests.matlab_writer import write_new
 
 PLAIN = ImportSettings()
 MICROPHONES = np.array([[-0.01, 0.01, 0.005], [-0.01, -0.01, 0.005], [0.0, 0.0, 0.01]])

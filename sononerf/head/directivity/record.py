@@ -10,7 +10,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from sononerf.array_types import Bools, Floats, Ints
+from sononerf.array_types import Floats, Ints
 from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_sphere
 
@@ -26,8 +26,6 @@ BULGE = 1e-4
 """The sphere is deformed by this fraction before it is triangulated. So the diagonals of the
 cells of a regular grid do not depend on rounding or on the order of the directions."""
 SAME = 1e-6  # rad; directions nearer than this are one
-EDGE = 1e-9  # weight of a corner; below minus this a direction lies beyond the edge
-NEAR = 24  # triangles that are tried for a direction before all are
 CHUNK = 512
 
 
@@ -61,21 +59,22 @@ def interpolation(known: Floats, wanted: Floats) -> csr_array:
     every = np.concatenate([points, around])
     # A direction that fills the rest has the value of the nearest measured one.
     source = np.concatenate([np.arange(len(points)), nearest])
-    triangles = _hull(every)
+    hull = _hull(every)
+    triangles = np.asarray(hull.simplices, dtype=np.int64)
     measured = (triangles < len(points)).all(axis=1) & (_radius(every, triangles) <= GAP * spacing)
-    found, weights = _locate(every, triangles, measured, wanted)
+    facet, weights = _locate(every, hull, wanted)
     off = 2.0 * np.arcsin(np.minimum(tree.query(wanted)[0] / 2.0, 1.0)) - spacing
-    fade = np.where(measured[found], 1.0, np.clip(1.0 - off / FADE, 0.0, 1.0))
+    fade = np.where(measured[facet], 1.0, np.clip(1.0 - off / FADE, 0.0, 1.0))
     rows = np.repeat(np.arange(len(wanted)), 3)
-    columns = source[triangles[found]].reshape(-1)
+    columns = source[triangles[facet]].reshape(-1)
     values = (weights * fade[:, None]).reshape(-1)
     return csr_array((values, (rows, columns)), shape=(len(wanted), len(points))) @ merge
 
 
-def _hull(points: Floats) -> Ints:
+def _hull(points: Floats) -> ConvexHull:
     x, y, z = points.T
     radius = 1.0 + BULGE * (x * y + 0.7 * y * z + 0.4 * z * x + 0.3 * x * x + 0.1 * y * y)
-    return np.asarray(ConvexHull(points * radius[:, None]).simplices, dtype=np.int64)
+    return ConvexHull(points * radius[:, None])
 
 
 def _radius(points: Floats, triangles: Ints) -> Floats:
@@ -89,7 +88,7 @@ def _radius(points: Floats, triangles: Ints) -> Floats:
 def _spacing(points: Floats) -> float:
     """Return the usual radius of the circles that hold no measured direction, rad."""
     try:
-        radius = float(np.median(_radius(points, _hull(points))))
+        radius = float(np.median(_radius(points, _hull(points).simplices)))
     except (QhullError, ValueError):  # directions in one plane, or fewer than four
         radius = MOST_SPACING
         if len(points) > 1:
@@ -98,39 +97,20 @@ def _spacing(points: Floats) -> float:
     return min(max(radius, LEAST_SPACING), MOST_SPACING)
 
 
-def _locate(points: Floats, triangles: Ints, first: Bools, wanted: Floats) -> tuple[Ints, Floats]:
-    """Return the triangle that each direction runs through, and the weights (N, 3) of its corners.
+def _locate(points: Floats, hull: ConvexHull, wanted: Floats) -> tuple[Ints, Floats]:
+    """Return the facet that each direction runs through, and the weights (N, 3) of its corners.
 
-    The triangles enclose the origin. On the edge of two of them, those that come ``first`` count.
+    The hull encloses the origin: a ray from there leaves by the facet whose plane it meets first.
     """
-
-    def best(inside: Floats, of: Ints) -> Ints:
-        least = inside.min(axis=2)
-        return np.asarray(np.where(least > -EDGE, 1.0 + first[of], least).argmax(axis=1))
-
-    inverse = np.linalg.inv(points[triangles].transpose(0, 2, 1))
-    centres = points[triangles].sum(axis=1)
-    centres /= np.linalg.norm(centres, axis=1, keepdims=True)
-    near = cKDTree(centres).query(wanted, k=min(NEAR, len(triangles)))[1]
-    found = np.zeros(len(wanted), dtype=np.int64)
-    weights = np.zeros((len(wanted), 3))
-    for start in range(0, len(wanted), CHUNK):
-        part = slice(start, start + CHUNK)
-        tried = near[part]
-        inside = np.einsum("nkij,nj->nki", inverse[tried], wanted[part])
-        chosen, rows = best(inside, tried), np.arange(len(tried))
-        found[part], weights[part] = tried[rows, chosen], inside[rows, chosen]
-    every = np.arange(len(triangles))[None]
-    for missed in np.array_split(*_portions(np.flatnonzero(weights.min(axis=1) < -EDGE))):
-        inside = np.einsum("kij,nj->nki", inverse, wanted[missed])
-        chosen = best(inside, every)
-        found[missed], weights[missed] = chosen, inside[np.arange(len(chosen)), chosen]
-    weights = weights.clip(0.0)
-    return found, weights / weights.sum(axis=1, keepdims=True)
+    slope = hull.equations[:, :3] / -hull.equations[:, 3:]
+    facet = np.concatenate([(part @ slope.T).argmax(axis=1) for part in _parts(wanted)])
+    corners = points[hull.simplices[facet]].transpose(0, 2, 1)
+    weights = np.linalg.solve(corners, wanted[:, :, None])[:, :, 0].clip(0.0)
+    return facet, weights / weights.sum(axis=1, keepdims=True)
 
 
-def _portions(missed: Ints) -> tuple[Ints, int]:
-    return missed, max(1, math.ceil(len(missed) / 64))
+def _parts(wanted: Floats) -> list[Floats]:
+    return np.array_split(wanted, max(1, math.ceil(len(wanted) / CHUNK)))
 
 
 MOST_RECEIVERS = 256

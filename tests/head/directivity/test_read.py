@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.head.directivity.read import content_hash, read_csv, read_directivity
-from sononerf.head.directivity.sofa import write_sofa
+from sononerf.head.directivity.files import content_hash, read_csv, read_directivity, write_sofa
 from tests.head.directivity.patterns import (
     batslam_fields,
     pair,
@@ -105,15 +104,15 @@ def test_receivers_emitter_and_decibels(tmp_path):
         ("azimuth_deg,elevation_deg,gain\n0,0,1\n", "expected azimuth_deg, elevation_deg, freq"),
         (HEAD.replace("gain", "gain,gain_db") + "0,0,1,1,0\n", "one of gain and gain_db"),
         (HEAD, "holds no gains"),
-        (HEAD + "0,0,4e4,1\n0,0,4e4\n", "line 3: 3 values, expected 4"),
-        (HEAD + "0,0,4e4,loud\n", "line 2: could not convert string to float: 'loud'"),
+        (HEAD + "0,0,4e4,1\n0,0,4e4\n", "4 columns but 3 were found at row 2"),
+        (HEAD + "0,0,4e4,loud\n", "could not convert string 'loud' to float64 at row 0"),
         (HEAD + "0,0,4e4,nan\n", "NaN or infinite"),
         (HEAD + "0,91,4e4,1\n", "an elevation is beyond 90 degrees"),
         (HEAD + "0,0,4e4,-1\n", "negative value -1"),
-        (HEAD + "\n".join(LINES[:-1]), "azimuth 20, elevation 10, 50000 Hz stands there 0 times"),
-        (HEAD + "\n".join([*LINES, LINES[0]]), "40000 Hz stands there 2 times"),
+        (HEAD + "\n".join(LINES[:-1]), "has 0 gains at azimuth 20, elevation 10, 50000 Hz"),
+        (HEAD + "\n".join([*LINES, LINES[0]]), "has 2 gains at azimuth -20, elevation 0, 40000 Hz"),
         ("receiver," + HEAD + "1,0,0,4e4,1\n", "the receivers are 1; expected 0, 1"),
-        ("receiver," + HEAD + "left,0,0,4e4,1\n", "line 2: receiver 'left', expected a number"),
+        ("receiver," + HEAD + "left,0,0,4e4,1\n", "the receivers are left; expected 0, 1"),
     ],
 )
 def test_a_bad_table_is_one_line(tmp_path, text, said):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.head.directivity.sofa import read_sofa
+from sononerf.head.directivity.files import read_sofa
 from tests.head.directivity.patterns import FREQUENCY, PLACES, pair
 from tests.head.directivity.sofa_files import written
 
@@ -91,23 +91,18 @@ def replaced(name, make):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (attribute("", "Conventions", "other"), "no SOFA file"),
         (
             attribute("", "SOFAConventions", "MultiSpeakerBRIR"),
-            "SOFA convention 'MultiSpeakerBRIR', expected SimpleFreeFieldHRIR",
+            "MultiSpeakerBRIR v2.0 is not a valid SOFA Convention",
         ),
-        (attribute("SourcePosition", "Units", "radian"), "SourcePosition is spherical in radian"),
         (attribute("SourcePosition", "Type", "spherical harmonics"), "is spherical harmonics"),
-        (attribute("ReceiverPosition", "Units", "mm"), "ReceiverPosition is cartesian in mm"),
+        (attribute("ReceiverPosition", "Units", "mm"), "ReceiverPosition is in mm, expected metre"),
         (replaced("Data.Real", lambda v: v * np.nan), "the gains hold NaN"),
         (replaced("Data.Real", lambda v: v[:, :, 1:]), "Data.Real and Data.Imag differ"),
         (replaced("SourcePosition", lambda v: v[1:]), r"SourcePosition has the shape \(322, 3\)"),
         (replaced("SourcePosition", lambda v: 0 * v), "a position or view gives no direction"),
         (replaced("ReceiverPosition", lambda v: np.ones((3, 3))), r"expected \(2, 3\)"),
-        (lambda file: file.__delitem__("ReceiverPosition"), "holds no ReceiverPosition"),
         (lambda file: file.__delitem__("Data.Real"), "holds no Data.Real"),
-        (replaced("N", lambda v: v[::-1]), "do not ascend"),
-        (replaced("N", lambda v: v[1:]), "expected .measurements, receivers, 2 frequencies"),
     ],
 )
 def test_a_bad_file_is_one_line(tmp_path, change, said):
@@ -137,3 +132,32 @@ def test_a_truncated_file_is_one_line(tmp_path, part):
     with pytest.raises(InputError, match="damaged or truncated") as raised:
         read_sofa(path)
     assert "\n" not in str(raised.value)
+
+
+def test_angles_in_radians_are_told_and_read(tmp_path, caplog):
+    path = written(tmp_path / "a.sofa", "GeneralTF")
+    with h5py.File(path, "r+") as file:
+        replaced("SourcePosition", lambda v: v * [np.pi / 180, np.pi / 180, 1])(file)
+        attribute("SourcePosition", "Units", "radian, radian, metre")(file)
+    np.testing.assert_allclose(read_sofa(path).directions, pair().directions, atol=1e-9)
+    assert "SourcePosition is in radians" in caplog.text
+
+
+def test_a_missing_place_of_the_receivers_is_no_fault(tmp_path):
+    path = written(tmp_path / "a.sofa", "GeneralTF")
+    with h5py.File(path, "r+") as file:
+        del file["ReceiverPosition"]
+    assert read_sofa(path).places is None
+
+
+@pytest.mark.parametrize(
+    ("convention", "version"), [("SimpleFreeFieldHRIR", "0.4"), ("FreeFieldDirectivityTF", "1.0")]
+)
+def test_old_versions_are_read(tmp_path, convention, version):
+    path = written(tmp_path / "a.sofa", convention)
+    new = read_sofa(path)
+    with h5py.File(path, "r+") as file:
+        attribute("", "SOFAConventionsVersion", version)(file)
+    old = read_sofa(path)
+    np.testing.assert_array_equal(old.gains, new.gains)
+    np.testing.assert_array_equal(old.directions, new.directions)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""MATLAB files, version 5 (SciPy) and 7.3 (HDF5), as plain dicts, lists and arrays."""
+"""HDF5 files, and MATLAB files of version 5 (SciPy) and 7.3 (HDF5), as plain data."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from sononerf.array_types import Floats
 from sononerf.errors import InputError
-from sononerf.recordings import matlab as hdf5
 
 NUMERIC = {"double", "single", "logical", "char"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
@@ -36,9 +35,9 @@ def read_mat(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
     with path.open("rb") as file:
         start = file.read(128)
     if start.startswith(b"MATLAB 7.3 MAT-file"):
-        with hdf5.opened(path) as group:
+        with opened(path) as group:
             return {
-                name: _new(path, group, hdf5.child(group, name), name, 0)
+                name: _new(path, group, child(group, name), name, 0)
                 for name in wanted
                 if name in group
             }
@@ -101,7 +100,7 @@ def _new(path: Path, file: Any, node: Any, name: str, depth: int) -> Any:
             _new(path, file, _target(path, file, one, name), name, depth + 1)
             for one in node[()].T.reshape(-1, order="F")
         ]
-    values = np.asarray(hdf5.dataset(node.parent, node.name.rpartition("/")[2])[()]).T
+    values = np.asarray(numbers(node.parent, node.name.rpartition("/")[2])).T
     if kind == "char":
         return "".join(chr(int(letter)) for letter in values.reshape(-1, order="F"))
     return values
@@ -115,7 +114,7 @@ def _target(path: Path, file: Any, reference: Any, name: str) -> Any:
 
 def _struct(path: Path, file: Any, node: Any, name: str, depth: int) -> Any:
     """Return a struct; an array of structs has references in each of its fields."""
-    fields = {key: hdf5.child(node, key) for key in node}
+    fields = {key: child(node, key) for key in node}
     many = [
         one
         for one in fields.values()
@@ -172,8 +171,8 @@ def child(group: Any, name: str) -> Any:
     return group[name]
 
 
-def dataset(group: Any, name: str) -> Any:
-    """Return a dataset of numbers of its own file, not read; None if there is none."""
+def numbers(group: Any, name: str) -> NDArray[Any] | None:
+    """Return a dataset of numbers of its own file, real or complex; None if there is none."""
     node = group
     for part in name.strip("/").split("/"):
         if not isinstance(node, h5py.Group):
@@ -182,16 +181,12 @@ def dataset(group: Any, name: str) -> Any:
     if node is None:
         return None
     path = group.file.filename
-    if not isinstance(node, h5py.Dataset) or node.dtype.kind not in "biuf":
+    is_complex = isinstance(node, h5py.Dataset) and node.dtype.names == ("real", "imag")
+    if not isinstance(node, h5py.Dataset) or (node.dtype.kind not in "biufc" and not is_complex):
         raise InputError(f"{path}: {name} is no array of numbers")
     if node.is_virtual or node.external:
         raise InputError(f"{path}: {name} lies in another file; copy the data into this one")
     if node.nbytes > MOST_TIMES * max(Path(path).stat().st_size, 1):
         raise InputError(f"{path}: {name} declares {node.nbytes} bytes, more than the file holds")
-    return node
-
-
-def numbers(group: Any, name: str) -> NDArray[Any] | None:
-    """Return a dataset's numbers; see :func:`dataset`."""
-    found = dataset(group, name)
-    return None if found is None else np.asarray(found[()])
+    values = np.asarray(node[()])
+    return values["real"] + 1j * values["imag"] if is_complex else values

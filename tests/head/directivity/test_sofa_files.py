@@ -4,7 +4,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sononerf.head.directivity.sofa import directivity_of, read_sofa, write_sofa
+from sononerf.head.directivity.files import read_sofa, write_sofa
 from sononerf.head.ears import ear_tables
 from sononerf.settings.schema import EarSettings
 from tests.head.directivity.patterns import pair
@@ -50,7 +50,7 @@ def test_a_head_comes_back_from_its_file_within_a_tenth_of_a_decibel(tmp_path):
     frequency = np.arange(20e3, 101e3, 10e3)
     head = ear_tables(EarSettings(), frequency)
     path = tmp_path / "head.sofa"
-    write_sofa(path, directivity_of(head))
+    write_sofa(path, head.directivity())
     again = ear_tables(EarSettings(directivity="file", file=path), frequency)
     for found, wanted in ((again.ears, head.ears), (again.beam, head.beam)):
         heard = wanted > 1e-4

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.recordings.matlab import numbers, opened
+from sononerf.matlab_files import numbers, opened
 
 
 def read(path, name):

@@ -9,8 +9,8 @@ import pytest
 import scipy.io
 
 from sononerf.errors import InputError
-from sononerf.recordings.matlab import as_list, read_mat, vector
-from tests.recordings.matlab_files import write_new
+from sononerf.matlab_files import as_list, read_mat, vector
+from tests.matlab_writer import write_new
 
 INNER = {
     "position": np.array([[1.0, 2.0, 3.0]]),
