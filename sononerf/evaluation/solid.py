@@ -15,14 +15,10 @@ from scipy.spatial import cKDTree
 
 from sononerf.array_types import Bools, Floats
 from sononerf.errors import NumericalError
-from sononerf.geometry.raycast import RayCaster
+from sononerf.geometry.raycast import contains
 
 Samples = tuple[Floats, Floats]
 
-DIRECTIONS = np.array([[0.62, 0.33, 0.71], [-0.45, 0.83, -0.33], [0.21, -0.56, -0.80]])
-DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
-"""Directions of the rays that tell inside from outside. The majority counts, because a ray may
-slip between two triangles. None is parallel to an axis, because many faces are."""
 SMALLEST_PART = 0.01
 """Parts with less than this fraction of the largest part's area are not counted."""
 ROUNDING = 1e-9
@@ -99,15 +95,10 @@ class Solid:
 
     def contains(self, points: Floats) -> Bools:
         """Return whether points (N, 3), in m, lie inside the union, (N,)."""
-        if self.union.is_empty() or not len(points):
+        if self.union.is_empty():
             return np.zeros(len(points), bool)
-        caster = RayCaster(_trimesh(self.union))
-        origins, votes = np.asarray(points, dtype=np.float64), np.zeros(len(points), int)
-        for direction in DIRECTIONS:
-            hits = caster.first_hit(origins, np.broadcast_to(direction, origins.shape))
-            # From inside, a ray leaves through the first surface that it meets.
-            votes[hits.ray] += (hits.flat @ direction) > 0
-        return votes * 2 > len(DIRECTIONS)
+        mesh = _trimesh(self.union)
+        return contains(mesh.vertices, mesh.faces, points)
 
     @cached_property
     def surface(self) -> trimesh.Trimesh:

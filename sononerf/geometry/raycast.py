@@ -19,11 +19,8 @@ try:
     from embreex.rtcore_scene import EmbreeScene
 except ImportError:  # no wheels for Linux on ARM nor Windows on ARM
     EmbreeScene = None
-from collections.abc import Iterator
 
 from numpy.typing import ArrayLike
-
-from sononerf.geometry.poses import rotation_from_euler
 
 # Of the mesh's size. Single precision puts a point up to 1e-7 sizes off its triangle, on either
 # side; without a lift half of all reflected rays hit the triangle they start from.
@@ -336,6 +333,10 @@ class Occlusion:
             _VtkEngine(scaled, faces) if EmbreeScene is None else _EmbreeEngine(scaled, faces)
         )
 
+    def first(self, points: Floats, directions: Floats) -> Ints:
+        """Return the triangle that each ray (N,) from a point, m, meets first; -1 for none."""
+        return self._engine.first((points - self._middle) * self._scale, directions)
+
     def blocked(self, points: Floats, targets: Floats) -> Bools:
         """True where the segment from a point to its target (N,), m, meets a triangle, (N,)."""
         return self._engine.blocked(
@@ -343,85 +344,29 @@ class Occlusion:
         )
 
 
-# No line of sight runs along these axes through an edge or a corner but by ill chance.
-TURNED = rotation_from_euler(0.5, 0.7, 0.3)
-PAIRS_AT_ONCE = 1_000_000
+DIRECTIONS = np.array([[0.62, 0.33, 0.71], [-0.45, 0.83, -0.33], [0.21, -0.56, -0.80]])
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
+"""Directions of the rays that tell inside from outside. The majority counts, because a ray may
+slip between two triangles. None is parallel to an axis, because many faces are."""
 
 
-def winding_numbers(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> Floats:
-    """Count how often a surface winds round points.
-
-    Six lines of sight leave each point, along three axes square to one another. On each the
-    triangles that are left behind count one, those that are entered minus one, and the mean is
-    taken. Of closed bodies it is exact: one inside, two where two overlap, negative where they
-    are inside out. Of an open surface it is the share of the directions that it fills, in sixths.
+def contains(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> Bools:
+    """Return which points lie inside closed bodies: a ray leaves through what it meets first.
 
     Args:
         vertices ((V, 3), m): Vertices of the surface.
         faces (T, 3): Its triangles, counter-clockwise from outside.
         points ((N, 3), m): The places.
-
-    Returns:
-        windings (N,): Above one half is inside.
     """
-    corners = np.asarray(vertices, dtype=np.float64)
-    triangles, places = np.asarray(faces), np.asarray(points, dtype=np.float64)
-    total = np.zeros(len(places))
-    low, high = corners[triangles].min(axis=(0, 1)), corners[triangles].max(axis=(0, 1))
-    near = np.flatnonzero(((places >= low) & (places <= high)).all(axis=1))
-    if len(near):
-        corners, places = corners @ TURNED, places[near] @ TURNED
-        for axes in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-            total[near] += _both_ways(corners[:, axes], triangles, places[:, axes]) / 6.0
-    return total
-
-
-def _both_ways(corners: Floats, triangles: Ints, places: Floats) -> Floats:
-    """Return the signed number of crossings up and down the third axis."""
-    order = np.argsort(places[:, 0], kind="stable")
-    sorted_places = places[order]
-    total = np.zeros(len(places))
-    for triangle, place in _near_pairs(corners, triangles, sorted_places):
-        q = sorted_places[place]
-        a, b, c = (corners[triangles[triangle, k]] for k in range(3))
-        # Twice the areas of the triangles that the place makes with the sides, seen from above.
-        of_c, of_a, of_b = (_area(q, a, b), _area(q, b, c), _area(q, c, a))
-        up = (of_a > 0) & (of_b > 0) & (of_c > 0)
-        down = (of_a < 0) & (of_b < 0) & (of_c < 0)
-        hit = np.flatnonzero(up | down)
-        weights = np.stack([of_a, of_b, of_c])[:, hit]
-        heights = np.stack([a[hit, 2], b[hit, 2], c[hit, 2]])
-        above = (weights * heights).sum(axis=0) / weights.sum(axis=0) > q[hit, 2]
-        total += np.bincount(
-            order[place[hit]], np.where(up[hit] == above, 1.0, -1.0), minlength=len(places)
-        )
-    return total
-
-
-def _near_pairs(corners: Floats, triangles: Ints, places: Floats) -> Iterator[tuple[Ints, Ints]]:
-    """Yield triangles and places, sorted along the first axis, whose first two axes overlap."""
-    along = corners[:, 0][triangles]
-    first = np.searchsorted(places[:, 0], along.min(axis=1))
-    count = np.searchsorted(places[:, 0], along.max(axis=1), side="right") - first
-    chosen = np.flatnonzero(count)
-    ends = np.cumsum(count[chosen])
-    start = 0
-    while start < len(chosen):
-        before = ends[start - 1] if start else 0
-        stop = max(start + 1, int(np.searchsorted(ends, before + PAIRS_AT_ONCE, side="right")))
-        some = chosen[start:stop]
-        triangle = np.repeat(some, count[some])
-        within = np.arange(len(triangle)) - np.repeat(
-            np.cumsum(count[some]) - count[some], count[some]
-        )
-        place = first[triangle] + within
-        across = corners[:, 1][triangles[triangle]]
-        y = places[place, 1]
-        both = (across.min(axis=1) <= y) & (y <= across.max(axis=1))
-        yield triangle[both], place[both]
-        start = stop
-
-
-def _area(q: Floats, a: Floats, b: Floats) -> Floats:
-    """Twice the signed area of triangles over the first two axes."""
-    return (a[:, 0] - q[:, 0]) * (b[:, 1] - q[:, 1]) - (a[:, 1] - q[:, 1]) * (b[:, 0] - q[:, 0])
+    corners, places = np.asarray(vertices, dtype=np.float64), np.asarray(points, dtype=np.float64)
+    triangles = np.asarray(faces)
+    if not len(places) or not len(triangles):
+        return np.zeros(len(places), dtype=bool)
+    a, b, c = (corners[triangles[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    occlusion = Occlusion(corners, triangles)
+    votes = np.zeros(len(places), dtype=int)
+    for direction in DIRECTIONS:
+        first = occlusion.first(places, np.broadcast_to(direction, places.shape))
+        votes += (first >= 0) & (normals[first] @ direction > 0.0)
+    return votes * 2 > len(DIRECTIONS)

@@ -210,7 +210,7 @@ def _warn_of_faults(mesh: trimesh.Trimesh) -> None:
             "the mesh is %.3g mm large; were metres taken for millimetres? It would be %.3g m",
             *(1e3 * size, 1e3 * size),
         )
-    for line in surface_faults(mesh.vertices, mesh.faces):
+    for line in surface_faults(mesh):
         logger.warning("%s", line)
 
 

@@ -13,7 +13,7 @@ from sononerf.errors import InputError, NumericalError
 from sononerf.geometry.aim import aim_fault
 from sononerf.geometry.plane import Plane
 from sononerf.geometry.poses import Poses
-from sononerf.geometry.raycast import winding_numbers
+from sononerf.geometry.raycast import contains
 from sononerf.scene.scene import Scene
 
 logger = logging.getLogger("sononerf")
@@ -30,8 +30,9 @@ def check_poses(
     """
     points = np.zeros((1, 3)) if offsets is None else np.vstack([np.zeros((1, 3)), offsets])
     places = poses.positions[:, None] + np.einsum("pij,kj->pki", poses.rotations, points)
-    winding = winding_numbers(scene.mesh.vertices, scene.mesh.faces, places.reshape(-1, 3))
-    inside = np.abs(winding.reshape(places.shape[:2])) > 0.5
+    mesh = scene.mesh
+    faces = mesh.faces[:, ::-1] if mesh.volume < 0.0 else mesh.faces  # inside out
+    inside = contains(mesh.vertices, faces, places.reshape(-1, 3)).reshape(places.shape[:2])
     _refuse(inside.any(axis=1), "inside the scene's surface")
     if plane is not None and (low := (plane.height(places) <= 0.0).any(axis=1)).any():
         raise InputError(

@@ -15,7 +15,7 @@ from sononerf.scene.scene import MATERIALS, load_scene
 def test_a_beaker_is_walls_and_a_floor(radius, height, wall):
     options = {"radius": radius, "height": height, "wall": wall}
     mesh = load_scene("beaker", options).mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert (mesh.euler_number, mesh.body_count) == (2, 1)
     assert mesh.edges_unique_length.max() <= EDGE
     np.testing.assert_allclose(mesh.bounds[:, 2], [-height / 2.0, height / 2.0])

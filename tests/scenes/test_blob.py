@@ -11,7 +11,7 @@ from sononerf.scene.scene import load_scene
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_blob_is_one_smooth_closed_body(seed):
     mesh = load_scene("blob", {"seed": seed}).mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert (mesh.euler_number, mesh.body_count) == (2, 1)
     assert mesh.edges_unique_length.max() <= EDGE
     assert mesh.volume == pytest.approx(4.0 / 3.0 * np.pi * 0.045**3, rel=1e-6)

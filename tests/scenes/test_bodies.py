@@ -19,12 +19,12 @@ def test_a_ball_is_round_and_fine(radius):
     body = ball(centre, radius)
     np.testing.assert_allclose(np.linalg.norm(body.vertices - centre, axis=1), radius, rtol=1e-9)
     assert body.edges_unique_length.max() <= EDGE
-    assert surface_faults(body.vertices, body.faces) == []
+    assert surface_faults(body) == []
 
 
 def test_a_straight_tube_is_a_capsule_along_its_path():
     body = tube([(0.0, 0.0), (0.03, 0.04)], RADIUS)
-    assert surface_faults(body.vertices, body.faces) == []
+    assert surface_faults(body) == []
     assert body.edges_unique_length.max() <= EDGE
     along = np.array([0.0, 0.6, 0.8])
     at = np.clip(body.vertices @ along, 0.0, 0.05)
@@ -39,7 +39,7 @@ def test_a_closed_tube_has_the_volume_of_its_section_times_its_length():
     wide, high = 0.02, 0.03
     around = angles(0, 360)
     body = tube(np.stack([wide * np.cos(around), high * np.sin(around)], axis=1), RADIUS)
-    assert surface_faults(body.vertices, body.faces) == []
+    assert surface_faults(body) == []
     assert body.euler_number == 0  # it has a hole
     length = 4.0 * high * ellipe(1.0 - (wide / high) ** 2)
     # A polygon of sides s has (s/r)^2 / 6 less area than its circle, less again along the bend.

@@ -11,7 +11,7 @@ def test_a_box_has_its_size_about_the_origin():
     mesh = load_scene("box", {"size": [0.1, 0.06, 0.02]}).mesh
     np.testing.assert_allclose(mesh.bounds, [[-0.05, -0.03, -0.01], [0.05, 0.03, 0.01]])
     assert mesh.volume == pytest.approx(0.1 * 0.06 * 0.02)
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
 
 
 def test_a_box_is_turned():

@@ -10,7 +10,7 @@ from sononerf.scene.scene import load_scene
 
 def test_a_capsule_stands_upright_about_the_origin():
     mesh = load_scene("capsule").mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     np.testing.assert_allclose(mesh.bounds[:, 2], [-0.045, 0.045], atol=1e-9)
     np.testing.assert_allclose(mesh.extents[:2], 0.03, rtol=1e-3)
     assert mesh.edges_unique_length.max() <= EDGE

@@ -23,7 +23,7 @@ def balls(mesh):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_spheres_of_mixed_radii_do_not_touch(seed):
     mesh = load_scene("cluster", {"seed": seed, "count": 8, "spread": 0.09}).mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert mesh.edges_unique_length.max() <= EDGE
     found = balls(mesh)
     assert len(found) == 8

@@ -35,7 +35,7 @@ def test_nothing_touches_the_target_nor_comes_near_the_poses(seed):
     # What is not the ground lies behind the target.
     assert background.vertices[~on_ground, 0].max() <= -0.09 + 1e-9
     assert target.bounds[0, 2] > -0.14
-    assert surface_faults(scene.mesh.vertices, scene.mesh.faces) == []
+    assert surface_faults(scene.mesh) == []
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from sononerf.scene.scene import load_scene
 @pytest.mark.parametrize(("radius", "height"), [(0.04, 0.09), (0.06, 0.01), (0.01, 0.12)])
 def test_a_cone_has_a_tip_and_a_base(radius, height):
     mesh = load_scene("cone", {"radius": radius, "height": height}).mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert (mesh.euler_number, mesh.body_count) == (2, 1)
     assert mesh.edges_unique_length.max() <= EDGE
     above = mesh.vertices[:, 2] + height / 2.0

@@ -35,7 +35,7 @@ def on_flat():
 
 
 def test_it_has_all_its_parts_each_closed_and_fine(on_flat):
-    assert surface_faults(on_flat.vertices, on_flat.faces) == []
+    assert surface_faults(on_flat) == []
     bodies = parts(on_flat)
     # Head, two eyes, thorax, abdomen, six legs and four wings.
     assert len(bodies) == 15

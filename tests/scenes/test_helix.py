@@ -16,7 +16,7 @@ from sononerf.scene.scene import load_scene
 def test_a_helix_is_a_round_wire_along_its_line(radius, rise, turns, wire):
     options = {"radius": radius, "pitch_length": rise, "turns": turns, "wire_radius": wire}
     mesh = load_scene("helix", options).mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert (mesh.euler_number, mesh.body_count) == (2, 1)
     assert mesh.edges_unique_length.max() <= 1.1 * EDGE
     assert mesh.extents[2] == pytest.approx(turns * rise + 2.0 * wire, rel=0.02)

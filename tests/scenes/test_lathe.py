@@ -11,7 +11,7 @@ CYLINDER = [(0.0, 0.0), (0.02, 0.0), (0.02, 0.03), (0.0, 0.03)]
 
 def test_a_profile_from_axis_to_axis_makes_a_closed_body_that_faces_outward():
     body = lathe(CYLINDER)
-    assert surface_faults(body.vertices, body.faces) == []
+    assert surface_faults(body) == []
     assert body.euler_number == 2
     np.testing.assert_allclose(body.bounds[:, 2], [0.0, 0.03])
     exact = np.pi * 0.02**2 * 0.03

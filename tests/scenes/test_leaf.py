@@ -18,7 +18,7 @@ CORNERS = [
 @pytest.mark.parametrize("options", CORNERS)
 def test_a_leaf_is_one_closed_fine_sheet(options):
     mesh = load_scene("leaf", options).mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert mesh.euler_number == 2
     assert mesh.body_count == 1
     assert mesh.edges_unique_length.max() <= EDGE

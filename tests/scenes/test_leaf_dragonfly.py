@@ -21,7 +21,7 @@ def test_the_leaf_is_the_same_with_and_without_prey(caplog):
     np.testing.assert_array_equal(np.flatnonzero(~prey), np.arange(len(alone.mesh.faces)))
     assert both.materials == (MATERIALS["leaf"], MATERIALS["insect"])
     assert both.mesh.faces[prey].min() == count
-    assert surface_faults(both.mesh.vertices, both.mesh.faces) == []
+    assert surface_faults(both.mesh) == []
     assert not caplog.records
 
 

@@ -50,7 +50,7 @@ def test_no_stroke_bends_so_much_that_its_tube_folds(letter):
 
 def test_text_is_closed_fine_and_about_the_origin():
     mesh = load_scene("letters", {"text": "b 8"}).mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert mesh.edges_unique_length.max() <= 1.1 * EDGE
     np.testing.assert_allclose(mesh.bounds.mean(axis=0), 0.0, atol=1e-9)
     np.testing.assert_allclose(mesh.extents[[0, 2]], [0.016, 0.1], rtol=2e-3)

@@ -11,7 +11,7 @@ def test_a_straight_loft_is_a_body_of_revolution():
     at = np.linspace(0.0, 0.04, 41)
     radius = 0.005 * np.sin(np.pi * at / 0.04)
     body = loft(at[:, None] * along, radius)
-    assert surface_faults(body.vertices, body.faces) == []
+    assert surface_faults(body) == []
     height = body.vertices @ along
     off = np.linalg.norm(body.vertices - height[:, None] * along, axis=1)
     np.testing.assert_allclose(off, np.interp(height, at, radius), atol=1e-9)
@@ -23,7 +23,7 @@ def test_a_loft_along_a_helix_neither_twists_nor_thins():
     turn = np.linspace(0.0, 4.0 * np.pi, 400)
     path = np.stack([0.02 * np.cos(turn), 0.02 * np.sin(turn), 0.004 * turn], axis=1)
     body = loft(path, np.full(400, 0.003))
-    assert surface_faults(body.vertices, body.faces) == []
+    assert surface_faults(body) == []
     rings = body.vertices[:-2].reshape(398, -1, 3)
     np.testing.assert_allclose(np.linalg.norm(rings - path[1:-1, None], axis=2), 0.003, rtol=1e-9)
     # A section square to the path all along: volume is its area times the length (Pappus).

@@ -11,7 +11,7 @@ def test_a_plate_faces_x():
     mesh = load_scene("plate", {"sides": [0.08, 0.12]}).mesh
     np.testing.assert_allclose(mesh.bounds, [[-5e-4, -0.04, -0.06], [5e-4, 0.04, 0.06]])
     assert mesh.volume == pytest.approx(1e-3 * 0.08 * 0.12)
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     ahead = mesh.face_normals[:, 0] > 0.99
     assert mesh.area_faces[ahead].sum() == pytest.approx(0.08 * 0.12)
 

@@ -18,7 +18,7 @@ def shape(seed):
 @pytest.mark.parametrize("seed", range(15))
 def test_a_shape_is_sound_fine_and_of_a_hand_s_size(seed):
     mesh = shape(seed)
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     np.testing.assert_allclose(mesh.bounds.mean(axis=0), 0.0, atol=1e-8)
     assert 0.06 <= mesh.extents.max() <= 0.2
     assert np.linalg.norm(mesh.vertices, axis=1).max() < 0.14  # before the first range, 15 cm

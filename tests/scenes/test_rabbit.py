@@ -9,7 +9,7 @@ from sononerf.scene.scene import load_scene
 
 def test_a_rabbit_is_one_body_with_two_ears():
     mesh = load_scene("rabbit").mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert mesh.extents[2] == pytest.approx(0.12, rel=0.01)
     assert Solid(mesh).components == 1
     # A section through the ears has two parts, with nothing between them.

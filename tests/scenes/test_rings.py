@@ -13,7 +13,7 @@ from sononerf.scene.scene import load_scene
 @pytest.mark.parametrize(("major", "minor"), [(0.035, 0.007), (0.04, 0.018)])
 def test_rings_are_two_tori_that_do_not_touch(major, minor):
     mesh = load_scene("rings", {"major_radius": major, "minor_radius": minor}).mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert mesh.edges_unique_length.max() <= EDGE
     assert Solid(mesh).components == 2
     first, second = mesh.split()

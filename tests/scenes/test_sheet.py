@@ -64,7 +64,7 @@ def test_two_sides_and_a_rim_make_a_closed_body():
     height = np.full((len(points), 1), 0.0004)
     top, bottom = np.hstack([points, height]), np.hstack([points, 0.0 * height])
     mesh = two_sided(top, bottom, triangles)
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert mesh.euler_number == 2
     assert mesh.volume == pytest.approx(0.03 * 0.01 * 0.0004)
     assert mesh.area == pytest.approx(2 * 0.03 * 0.01 + 2 * 0.04 * 0.0004)

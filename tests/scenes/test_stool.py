@@ -15,7 +15,7 @@ from sononerf.scene.scene import load_scene
 )
 def test_a_stool_is_one_closed_body(options):
     mesh = load_scene("stool", options).mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert (mesh.euler_number, mesh.body_count) == (2, 1)
     assert mesh.edges_unique_length.max() <= 1.1 * EDGE
     legs, wide = options.get("legs", 3), options.get("seat_radius", 0.05)

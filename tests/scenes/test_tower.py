@@ -11,7 +11,7 @@ from sononerf.scene.scene import load_scene
 @pytest.mark.parametrize(("width", "height", "steps"), [(0.09, 0.09, 3), (0.06, 0.1, 2)])
 def test_a_tower_is_storeys_of_equal_steps(width, height, steps):
     mesh = load_scene("tower", {"width": width, "height": height, "steps": steps}).mesh
-    assert surface_faults(mesh.vertices, mesh.faces) == []
+    assert surface_faults(mesh) == []
     assert (mesh.euler_number, mesh.body_count) == (2, 1)
     assert mesh.edges_unique_length.max() <= EDGE
     half = np.array([width, width, height]) / 2.0

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from sononerf.array_types import Floats, Singles
 from sononerf.geometry.lattice import level_surface, signed_volume
 from sononerf.geometry.plane import Plane
-from sononerf.geometry.raycast import winding_numbers
+from sononerf.geometry.raycast import contains
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
 
 CELL = 1.1
@@ -177,12 +177,12 @@ def _of_body(
     distance = np.full(shape, farthest, dtype=np.float32)
     distance[near] = np.clip(height, -farthest, farthest)
     # Where the surface crosses itself, planes give wrong signs, and one would empty the whole body.
-    # So the regions beyond the band are judged one by one, by the winding number.
+    # So the regions beyond the band are judged one by one, by rays.
     regions, count = ndimage.label(~near)
     if count > 1:
         _, voxel = np.unique(regions.ravel(), return_index=True)
         places = lower + spacing * np.stack(np.unravel_index(voxel[-count:], shape), axis=1)
-        inside = winding_numbers(body.vertices, body.faces, places) > 0.5
+        inside = contains(body.vertices, body.faces, places)
         distance[np.isin(regions, 1 + np.flatnonzero(inside))] = -farthest
     # Voxels that cannot be reached from the outside are inside.
     labels, _ = ndimage.label(distance > 0)
