@@ -203,16 +203,10 @@ def export(
 
 @app.command()
 def calibrate(
-    source: Annotated[
-        Path, typer.Argument(help="Folder of a run with a surface; for lag, a store too.")
-    ],
+    source: Annotated[Path, typer.Argument(help="Folder of a run with a surface.")],
     kinds: Annotated[
         list[str],
-        typer.Argument(
-            metavar="ERROR...",
-            help="lag, gain, range_offset, speed_of_sound, radius, support, beam_radius, position, "
-            "aim.",
-        ),
+        typer.Argument(metavar="ERROR...", help="gain, range_offset, speed_of_sound, support."),
     ],
     output: Annotated[Path | None, typer.Option(help="The corrected store.")] = None,
 ) -> None:

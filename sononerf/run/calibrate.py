@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import trimesh
-from scipy.spatial.transform import Rotation
 
 from sononerf import storage
 from sononerf.array_types import Floats
@@ -18,30 +17,16 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, SettingsError
-from sononerf.geometry.poses import Poses
 from sononerf.head.head import Head
 from sononerf.head.row_filters import row_widths
 from sononerf.progress import Progress
-from sononerf.recordings.lag import LAGS, find_lag, is_path, later
-from sononerf.recordings.pose_check import Consistency
 from sononerf.run.corrected_store import DECIBELS, write_corrected
 from sononerf.run.run import Run
-from sononerf.run.trial_fits import fitted_error, least_error
 from sononerf.settings.schema import SpectrogramSettings
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.recording_errors import (
-    KINDS,
-    Calibration,
-    Estimate,
-    Kind,
-    changed_head,
-)
+from sononerf.surface.refine.recording_errors import KINDS, Calibration, Estimate, Kind
 from sononerf.surface.refine.self_calibration import Calibrator
-from sononerf.surface.refine.support_search import (
-    above,
-    find_support,
-    with_support,
-)
+from sononerf.surface.refine.support_search import above, find_support, with_support
 
 STEPS = 20
 """Largest number of Gauss-Newton steps; they usually end earlier."""
@@ -52,17 +37,9 @@ DETERMINED = 0.25
 DETERMINED_DB = 1.0
 """DETERMINED of a gain, dB."""
 DETERMINED_RESOLUTIONS = 1.0
-"""Largest uncertainty of the turntable's radius, the support's height and the emitter's radius,
-range resolutions, at which they count as found."""
+"""Largest uncertainty of the support's height, range resolutions, at which it counts as found."""
 ON_CYLINDER = 0.02
 """Largest range of the poses' distances from the axis of a turntable, over their mean."""
-LAG = "lag"
-"""Name of the lag of poses behind pings, which is found from first echoes alone."""
-DETERMINED_ROWS = 0.5
-"""Largest uncertainty of a lag, rows, at which it counts as found."""
-INFORMED = 0.7
-"""Largest uncertainty of a pose over the spread of all poses, no unit, at which the echoes say more
-than the spread does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +64,7 @@ def kinds_of(names: Sequence[str]) -> tuple[Kind, ...]:
     unknown = [name for name in names if name not in KINDS]
     if unknown or not names:
         found = f"unknown error {unknown[0]!r}" if unknown else "no error is given"
-        raise SettingsError(f"{found}; known: {', '.join((LAG, *KINDS))}")
+        raise SettingsError(f"{found}; known: {', '.join(KINDS)}")
     return tuple(kind for kind in KINDS if kind in names)
 
 
@@ -97,22 +74,19 @@ def calibrate(
     """Estimate errors of the recording behind a run, and write a corrected store.
 
     Args:
-        source: Folder of a run with a surface; for the lag, a store too.
+        source: Folder of a run with a surface.
         output: The corrected store; the source's own store is left as it is.
-        kinds: Errors of :data:`KINDS`, or :data:`LAG` alone.
+        kinds: Errors of :data:`KINDS`.
         progress: Display of progress.
 
     Raises:
-        SettingsError: If a kind is unknown, or the poses are not those of a turntable (``radius``)
-            or of a path (``lag``).
+        SettingsError: If a kind is unknown, or the run was fitted with a support already.
         InputError: If the run has no surface, or its echoes are not there.
         IncompatibleError: If there is a store at ``output`` already.
     """
     progress = progress or Progress(quiet=True)
     if output.exists() and any(output.iterdir()):
         raise IncompatibleError(f"{output}: holds something already; choose another --output")
-    if LAG in kinds:
-        return _without_lag(source, output, kinds, progress)
     wanted = kinds_of(kinds)
     if _is_store(source):
         raise SettingsError(
@@ -120,19 +94,12 @@ def calibrate(
         )
     opened = Run.of(source)
     echoes, mesh = opened.echoes, opened.mesh()
-    if "radius" in wanted and not _is_turntable(echoes.positions):
-        raise SettingsError(
-            "radius: the poses are not those of a turntable: their distances from the z axis "
-            "differ; leave radius out"
-        )
     storage.remove_if_empty(storage.probe_writable(output))
-    tried = [
-        kind for kind in wanted if kind == "radius" or (kind == "support" and echoes.head.plane)
-    ]
-    if tried and len(wanted) > 1:
-        raise SettingsError(f"{tried[0]} is found by fits at several values: calibrate it alone")
-    if tried:
-        return _by_trials(opened, tried[0], output, progress)
+    if "support" in wanted and echoes.head.plane is not None:
+        raise SettingsError(
+            "support: this run was fitted with one; fit without support.point first, so that the "
+            "surface shows the image"
+        )
     known: dict[str, float] = {}
     if "support" in wanted:
         echoes, mesh, known["support"] = _with_support(echoes, mesh, progress)
@@ -148,77 +115,10 @@ def _is_store(source: Path) -> bool:
     return (source / "zarr.json").is_file()
 
 
-def _without_lag(
-    source: Path, output: Path, kinds: Sequence[str], progress: Progress
-) -> Calibrated:
-    """Write a store whose poses are those of their pings; see :func:`calibrate`."""
-    if set(kinds) != {LAG}:
-        raise SettingsError(f"{LAG} is found before a surface is known: calibrate it alone")
-    echoes = Echoes.open(source) if _is_store(source) else Run.of(source).echoes
-    store, head = echoes.store, echoes.head
-    poses, onsets = Poses(store.positions, store.rotations), echoes.onsets
-    if not is_path(poses):
-        raise SettingsError(
-            f"{LAG}: successive poses are no neighbours, so the places between them are unknown; "
-            f"leave {LAG} out"
-        )
-    check = Consistency(head.emitter, head.receivers, head.resolution)
-    with progress.task("searching the lag", len(LAGS)) as task:
-        rows, deviation = find_lag(poses, onsets.first, onsets.poses, check, task.advance)
-    storage.remove_if_empty(storage.probe_writable(output))
-    moved_on = later(poses, rows)
-    found = replace(
-        Calibration.none(len(head.receivers), len(poses)),
-        position=moved_on.positions - poses.positions,
-        aim=Rotation.from_matrix(
-            moved_on.rotations @ poses.rotations.transpose(0, 2, 1)
-        ).as_rotvec(),
-    )
-    uncertain = "the first echoes hardly tell; compare the clocks"
-    return Calibrated(
-        write_corrected(echoes, output, found, progress),
-        Estimate(found, {LAG: deviation}, []),
-        [f"lag:            ping n belongs to row n {rows:+.2f} ± {deviation:.2f} of the poses"],
-        [f"{LAG}: {uncertain}"] if deviation > DETERMINED_ROWS else [],
-    )
-
-
 def _is_turntable(positions: Floats) -> bool:
     """Return whether poses (P, 3), m, are at one distance from the z axis."""
     distance = np.linalg.norm(positions[:, :2], axis=1)
     return bool(np.ptp(distance) < ON_CYLINDER * distance.mean())
-
-
-def _by_trials(opened: Run, kind: str, output: Path, progress: Progress) -> Calibrated:
-    """Find the radius or the support's height by fits at several; see :func:`calibrate`."""
-    echoes, settings = opened.echoes, opened.settings
-    folder, step = output.with_name(f"{output.name}-trials"), echoes.head.resolution
-    nothing = Calibration.none(len(echoes.head.receivers), len(echoes.store))
-
-    def corrected(offset: float) -> tuple[Echoes, Calibration]:
-        if kind == "radius":
-            return echoes, replace(nothing, radius=offset)
-        return Echoes(echoes.store, changed_head(echoes.head, support=offset)), nothing
-
-    def error_at(trial: int) -> float:
-        if not trial:  # the run itself, where it was refined
-            own = opened.read_out["validation_error_db"]
-            if own is not None:
-                return float(own)
-        name = f"{1e3 * step * trial:+.1f}"
-        place = folder / f"{kind}{name}mm"
-        right, found = corrected(step * trial)
-        write_corrected(right, place / "store", found, progress)
-        error = fitted_error(settings, place / "store", place / "run", progress)
-        progress.say(f"{kind} {name} mm: {error:.2f} dB on validation poses")
-        return error
-
-    at, deviation = least_error(error_at)
-    right, found = corrected(step * at)
-    estimate = Estimate(found, {kind: step * deviation}, [])
-    store = write_corrected(right, output, found, progress)
-    said = describe(right.head, echoes.store, opened.mesh(), estimate, [kind])
-    return Calibrated(store, estimate, *said)
 
 
 def _with_support(
@@ -243,7 +143,7 @@ def _estimate(
 ) -> Estimate:
     head = echoes.head
     if not kinds:
-        nothing = Calibration.none(len(head.receivers), len(echoes.store))
+        nothing = Calibration.none(len(head.receivers))
         return Estimate(nothing, {}, [])
     work = Calibrator(mesh, echoes, Optics(head), kinds, dependent=dependent_cells(head.analysis))
     with progress.task("calibrating", STEPS * len(work.poses)) as task:
@@ -314,15 +214,16 @@ def describe(
             "gain and range_offset together: a larger object is louder and nearer, so both may be "
             "wrong together; calibrate one of them by a reference target (import.reference)"
         )
-    for kind, value in _lengths(head, store, found).items():
-        if kind in kinds:
-            uncertain = deviation[kind]
-            vague = uncertain > DETERMINED_RESOLUTIONS * head.resolution
-            say(
-                kind,
-                f"{1e3 * value:.1f} ± {1e3 * uncertain:.1f} mm",
-                "the echoes hardly determine it; measure it" if vague else None,
-            )
+    if "support" in kinds and head.plane is not None:
+        height = float(np.dot(head.plane.point, head.plane.normal))
+        uncertain = deviation["support"]
+        say(
+            "support",
+            f"{1e3 * height:.1f} ± {1e3 * uncertain:.1f} mm",
+            "the echoes hardly determine it; measure it"
+            if uncertain > DETERMINED_RESOLUTIONS * head.resolution
+            else None,
+        )
     if "speed_of_sound" in kinds:
         uncertain, speed = deviation["speed_of_sound"], head.speed_of_sound
         vague = uncertain * distance.mean() > DETERMINED * head.resolution
@@ -334,26 +235,4 @@ def describe(
             if vague or distance.std() < head.resolution
             else None,
         )
-    for kind, factor, unit in (("position", 1e3, "mm"), ("aim", math.degrees(1.0), "degrees")):
-        if kind in kinds:
-            values, uncertain = getattr(found, kind)[store.indices("train")], deviation[kind]
-            usual = math.sqrt(float(np.square(values).mean()))
-            vague = uncertain > INFORMED * math.hypot(usual, uncertain)
-            say(
-                kind,
-                f"{factor * usual:.2f} {unit} per axis, each ± {factor * uncertain:.2f} {unit}",
-                "the echoes hardly determine it; the poses stay about as they were"
-                if vague
-                else None,
-            )
     return lines, warnings
-
-
-def _lengths(head: Head, store: Ensemble, found: Calibration) -> dict[str, float]:
-    """Return the estimated lengths of a recording, m."""
-    lengths = {"beam_radius": head.ears.beam_radius + found.beam_radius}
-    at = store.positions[store.indices("train")]
-    lengths["radius"] = float(np.linalg.norm(at[:, :2], axis=1).mean()) + found.radius
-    if head.plane is not None:
-        lengths["support"] = float(np.dot(head.plane.point, head.plane.normal))
-    return lengths

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from sononerf import locks
 from sononerf.array_types import Floats
@@ -22,7 +21,7 @@ from sononerf.geometry.poses import Poses
 from sononerf.head.attached import attach
 from sononerf.head.head import Head
 from sononerf.progress import Progress
-from sononerf.surface.refine.recording_errors import Calibration, changed_head, outward
+from sononerf.surface.refine.recording_errors import Calibration
 
 DECIBELS = 20.0 / math.log(10.0)
 """Decibels of a natural logarithm of magnitude."""
@@ -32,7 +31,7 @@ def write_corrected(
     echoes: Echoes, output: Path, found: Calibration, progress: Progress
 ) -> EnsembleStore:
     """Write echoes without the errors of their recording; an interrupted call resumes."""
-    store, head = echoes.store, changed_head(echoes.head, beam_radius=found.beam_radius)
+    store, head = echoes.store, echoes.head
     sections = head.plain()
     speed = head.speed_of_sound * math.exp(found.speed_of_sound)
     axis = np.asarray(store.range, dtype=np.float64)
@@ -46,15 +45,13 @@ def write_corrected(
         }
         sections["air"] = {**sections["air"], "speed_of_sound": speed}
         sections["spectrogram"] = {**sections["spectrogram"], **limits}
-    turned = Rotation.from_rotvec(found.aim).as_matrix()
-    positions = store.positions + found.position + found.radius * outward(store.positions)
     earlier = store.attributes
     kept = ("origin", "source", "licence", "format", "units", "import", *KEYS)
     with locks.lock(output):
         made = EnsembleStore.create(
             output,
-            poses_positions=positions,
-            poses_rotations=turned @ store.rotations,
+            poses_positions=store.positions,
+            poses_rotations=store.rotations,
             split=store.split,
             range=axis,
             frequency=store.frequency,
@@ -70,8 +67,6 @@ def write_corrected(
                         "gain_db": (found.gain * DECIBELS).tolist(),
                         "range_offset_m": found.range_offset,
                         "speed_of_sound": speed,
-                        "radius_m": found.radius,
-                        "beam_radius_m": found.beam_radius,
                         "support": sections["support"],
                     },
                 },
@@ -112,10 +107,7 @@ def _fingerprint(found: Calibration, head: Head) -> str:
         [
             found.gain,
             [found.range_offset, found.speed_of_sound],
-            [found.radius, found.beam_radius],
             [] if plane is None else [*plane.point, *plane.normal],
-            found.position.ravel(),
-            found.aim.ravel(),
         ]
     )
     return hashlib.sha256(np.round(values, 9).astype("<f8").tobytes()).hexdigest()[:12]

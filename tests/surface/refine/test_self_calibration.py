@@ -6,11 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial.transform import Rotation
 
-from sononerf.geometry.poses import cylinder_poses
-from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.recording_errors import changed_head
 from sononerf.surface.refine.self_calibration import Calibrator
 from sononerf.surface.refine.still_surface import StillSurface
 from tests.memory import echoes_of
@@ -65,48 +61,7 @@ def test_the_speed_of_sound_is_found_from_several_distances(bumpy, heard, optics
     assert several.calibration.speed_of_sound == pytest.approx(0.005, abs=0.0005)
 
 
-def test_positions_and_aims_are_found(bumpy, heard, optics):
-    echoes = heard()
-    rng = np.random.default_rng(1)
-    shift = rng.normal(0.0, 0.001, echoes.positions.shape)
-    turn = np.radians(rng.normal(0.0, 1.0, echoes.positions.shape))
-    true, echoes.positions = echoes.positions, echoes.positions + shift
-    straight = echoes.rotations
-    echoes.rotations = Rotation.from_rotvec(turn).as_matrix() @ straight
-    estimate = found(bumpy, echoes, optics, "position", "aim", steps=8)
-    corrected = echoes.positions + estimate.calibration.position
-    towards = true / np.linalg.norm(true, axis=1, keepdims=True)
-    off = ((corrected - true) * towards).sum(axis=1)
-    before = (shift * towards).sum(axis=1)
-    assert np.sqrt((off**2).mean()) < 0.25 * np.sqrt((before**2).mean())
-    assert estimate.error_db[-1] < 0.3 * estimate.error_db[0]
-    assert 0.0 < estimate.deviation["position"] < 0.01
-
-
 def test_without_errors_nothing_is_found(bumpy, heard, optics):
     estimate = found(bumpy, heard(), optics, "gain", "speed_of_sound", steps=2)
     assert np.abs(estimate.calibration.gain).max() < 1e-3
     assert abs(estimate.calibration.speed_of_sound) < 1e-4
-
-
-def turntable(optics, head, bumpy, *, radius=0.0):
-    """What poses of a turntable hear with a head, stated with another head and another radius."""
-    poses = cylinder_poses(
-        24, radius=0.3, heights=(-0.1, 0.2), aim_jitter=0.0, generator=np.random.default_rng(0)
-    )
-    heard = StillSurface(bumpy, Optics(head)).render(
-        poses.positions, poses.rotations, np.ones(24), np.zeros(24)
-    )
-    stated = poses.positions * (1.0 + radius / 0.3 * np.array([1.0, 1.0, 0.0]))
-    return echoes_of(
-        optics.head, stated, poses.rotations, lambda pose: 2.0 * heard[pose],
-        np.zeros(24, dtype=int), origin="recorded",
-    )  # fmt: skip
-
-
-@pytest.mark.slow
-def test_the_radius_of_the_emitter_is_found(bumpy, optics):
-    true = changed_head(optics.head, beam_radius=0.3 * optics.head.ears.beam_radius)
-    estimate = found(bumpy, turntable(optics, true, bumpy), optics, "beam_radius", steps=8)
-    expected = 0.3 * optics.head.ears.beam_radius
-    assert estimate.calibration.beam_radius == pytest.approx(expected, rel=0.2)
