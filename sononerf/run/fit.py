@@ -8,7 +8,6 @@ import resource
 import shutil
 import sys
 import time
-from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -34,7 +33,7 @@ from sononerf.field.step_cost import StepCost, step_cost
 from sononerf.memory import gigabytes, require_memory
 from sononerf.progress import Progress, duration
 from sononerf.run.build import head_of, module_for, with_store
-from sononerf.run.evaluate import EvaluationWork, evaluate
+from sononerf.run.evaluate import evaluate
 from sononerf.run.fit_warnings import fit_warnings
 from sononerf.run.predict import predict
 from sononerf.run.provenance import flat, stated_frame
@@ -72,15 +71,10 @@ def finish(
     run = Run.of(run)
     shown: dict[str, Any] = {"accelerator": accelerator, "progress": progress}
     no_surface: NumericalError | None = None
-    with run.locked(), ExitStack() as stack:
-        evaluation = None
-        if not run.is_done("evaluation"):
-            evaluation = stack.enter_context(EvaluationWork(run))
+    with run.locked():
         try:
             if not run.is_done("surface"):
                 reconstruct(run, **shown)
-            if evaluation is not None:
-                evaluation.begin()
             if not run.is_done("traced"):
                 _learn_traced(run, accelerator, progress)
         except NumericalError as error:
@@ -90,7 +84,7 @@ def finish(
         if no_surface is not None:
             raise no_surface
         if not run.is_done("evaluation"):
-            evaluate(run, begun=evaluation, progress=progress)
+            evaluate(run, progress=progress)
             log_results(run.path, flat(run.settings.plain()), run.read_metrics())
     return run.read_metrics()
 

@@ -25,9 +25,6 @@ MARGIN = 0.02
 """Range that is shown before the first and after the last active cell, m."""
 LEVEL_MAP, DIFFERENCE_MAP = "magma", "RdBu_r"
 MOST_ROWS = 8  # number of receivers, at most, that are drawn, evenly chosen
-# Inches: space for labels on each side of the panels, between them, and for a colour bar.
-LEFT, TOP, BOTTOM, GAP = 0.76, 0.48, 0.46, 0.13
-BAR, BAR_GAP, BAR_WIDTH = 0.82, 0.08, 0.19
 # Where a logarithmic axis is marked.
 KHZ_MARKS = [digit * 10.0**power for power in range(-3, 4) for digit in (1, 2, 5)]
 
@@ -224,12 +221,17 @@ def _drawn(
     top = _round_up(max(values.max() for values in panels.values()), 5)
     chosen, names = drawn_receivers(len(next(iter(panels.values()))))
     panels = {name: values[chosen] for name, values in panels.items()}
-    columns, ears = len(panels), len(chosen)
-    if columns == 2:
+    ears, levels = len(chosen), len(panels)
+    if levels == 2:
         panels["predicted − measured"] = panels["predicted"] - panels["measured"]
     width, height = 10.5 * len(panels) / 3 + (len(panels) == 1), 0.9 + 2.3 * ears
+    # Where all pictures have the same parts, a layout need not be found for each of them.
     with figure(width, height, dpi, layout=None) as drawn:
-        axes, bars = _axes(drawn, ears, columns, len(panels))
+        axes = drawn.subplots(ears, len(panels), sharex=True, sharey=True, squeeze=False)
+        sides = {"left": 0.76 / width, "right": 1 - 0.45 / width}
+        drawn.subplots_adjust(
+            **sides, bottom=0.46 / height, top=1 - 0.48 / height, hspace=0.12, wspace=0.12
+        )
         for column, (name, values) in enumerate(panels.items()):
             options: dict[str, Any] = {"cmap": LEVEL_MAP, "vmin": 0, "vmax": top}
             if column == 2:
@@ -241,43 +243,15 @@ def _drawn(
             for row, level in zip(axes, values, strict=True):
                 picture = draw_cells(row[column], level, ranges, frequencies, **options)
                 row[column].locator_params(axis="x", nbins=5)  # more would touch one another
-            if column in bars:
-                label = "difference (dB)" if column == 2 else "level (dB)"
-                drawn.colorbar(picture, cax=bars[column], label=label)
+            if column == 2:
+                drawn.colorbar(picture, ax=axes[:, 2], label="difference (dB)", pad=0.04)
+            elif column == levels - 1:
+                drawn.colorbar(picture, ax=axes[:, :levels], label="level (dB)", pad=0.02)
         for row, name in zip(axes, names, strict=True):
             row[0].set_ylabel(f"{name}\nfrequency (kHz)")
         if title:
             drawn.suptitle(title, fontsize=10, y=1 - 0.06 / height, va="top")
         yield drawn
-
-
-def _axes(
-    drawn: Any, ears: int, columns: int, panels: int
-) -> tuple[list[list[Any]], dict[int, Any]]:
-    """Return axes by ear and column, and a bar's beside the last level and the difference.
-
-    Where all pictures have the same parts, a layout need not be found for each of them.
-    """
-    width, height = drawn.get_size_inches()
-    last = {columns - 1, panels - 1}  # a bar follows
-    wide = (width - LEFT - len(last) * BAR - (panels - len(last)) * GAP) / panels
-    tall = (height - TOP - BOTTOM - (ears - 1) * GAP) / ears
-
-    def part(x: float, y: float, w: float, h: float) -> Any:
-        return drawn.add_axes((x / width, y / height, w / width, h / height))
-
-    axes: list[list[Any]] = [[] for _ in range(ears)]
-    bars = {}
-    x = LEFT
-    for column in range(panels):
-        for ear, row in enumerate(axes):
-            row.append(part(x, BOTTOM + (ears - 1 - ear) * (tall + GAP), wide, tall))
-            row[-1].tick_params(labelleft=column == 0, labelbottom=ear == ears - 1)
-        x += wide
-        if column in last:
-            bars[column] = part(x + BAR_GAP, BOTTOM, BAR_WIDTH, height - TOP - BOTTOM)
-        x += BAR if column in last else GAP
-    return axes, bars
 
 
 SHOWN_DB = 50.0

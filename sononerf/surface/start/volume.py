@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from skimage.filters import threshold_otsu
 
 from sononerf.array_types import Floats
-from sononerf.errors import NumericalError, ResourceError
+from sononerf.errors import NumericalError
 from sononerf.geometry.lattice import level_surface
-from sononerf.memory import available_memory
+from sononerf.memory import require_memory
 
-# The value itself and the copies that an iso-surface takes, measured.
 BYTES_PER_VOXEL = 80
+"""Memory of a value and of the copies that an iso-surface takes, bytes, measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,19 +33,6 @@ class Volume:
     values: NDArray[np.floating]
     origin: Floats
     spacing: float
-
-    def __post_init__(self) -> None:
-        origin = np.asarray(self.origin, dtype=np.float64)
-        values = np.asarray(self.values)
-        if values.ndim != 3 or not values.size:
-            raise ValueError(f"values: shape {values.shape}, expected (X, Y, Z) with no empty axis")
-        if origin.shape != (3,) or not np.isfinite(origin).all():
-            raise ValueError(f"origin: {origin!r}, expected three finite numbers")
-        if not (np.isfinite(self.spacing) and self.spacing > 0):
-            raise ValueError(f"spacing: {self.spacing!r} m, expected a positive number")
-        object.__setattr__(self, "values", values)
-        object.__setattr__(self, "origin", origin)
-        object.__setattr__(self, "spacing", float(self.spacing))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -72,8 +59,6 @@ class Volume:
 
     def with_values(self, values: NDArray[np.floating]) -> Volume:
         """Return a volume on the same grid with other values, (X, Y, Z)."""
-        if np.shape(values) != self.shape:
-            raise ValueError(f"values: shape {np.shape(values)}, expected {self.shape}")
         return Volume(values, self.origin, self.spacing)
 
 
@@ -83,52 +68,6 @@ def _centres(axes: tuple[Floats, ...], start: int, stop: int) -> Floats:
     return np.stack([axis[index] for axis, index in zip(axes, indices, strict=True)], axis=1)
 
 
-def _box(lower: ArrayLike, upper: ArrayLike) -> tuple[Floats, Floats]:
-    low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
-    if low.shape != (3,) or high.shape != (3,) or not np.isfinite([low, high]).all():
-        raise ValueError(f"box {lower!r} to {upper!r}: expected three finite numbers each, in m")
-    if not (low < high).all():
-        raise ValueError(f"box {low.tolist()} to {high.tolist()}: lower must lie below upper")
-    return low, high
-
-
-def grid_shape(lower: ArrayLike, upper: ArrayLike, spacing: float) -> tuple[int, int, int]:
-    """Return how many voxels cover a box, so that the outermost centres lie on it or beyond."""
-    low, high = _box(lower, upper)
-    if not (np.isfinite(spacing) and spacing > 0):
-        raise ValueError(f"spacing: {spacing!r} m, expected a positive number")
-    # The small number keeps 0.3 / 0.1 from asking for a fourth interval.
-    x, y, z = (int(np.ceil(n - 1e-9)) + 1 for n in (high - low) / spacing)
-    return x, y, z
-
-
-def estimated_bytes(
-    lower: ArrayLike, upper: ArrayLike, spacing: float, *, bytes_per_voxel: int = BYTES_PER_VOXEL
-) -> int:
-    """Return the memory that a grid over a box takes, in bytes."""
-    x, y, z = grid_shape(lower, upper, spacing)
-    return x * y * z * bytes_per_voxel
-
-
-def check_memory(
-    lower: ArrayLike, upper: ArrayLike, spacing: float, *, bytes_per_voxel: int = BYTES_PER_VOXEL
-) -> None:
-    """Refuse a grid that would not fit in memory, before anything is computed."""
-    needed = estimated_bytes(lower, upper, spacing, bytes_per_voxel=bytes_per_voxel)
-    free = available_memory()
-    if free is None or needed <= free:
-        return
-    fits = float(spacing)
-    while estimated_bytes(lower, upper, fits, bytes_per_voxel=bytes_per_voxel) > max(
-        free, 8 * bytes_per_voxel
-    ):
-        fits *= 1.02
-    raise ResourceError(
-        f"spacing {spacing:.4g} m: the grid needs {needed:,} bytes and {free:,} are free; "
-        f"the finest spacing that fits is {fits:.4g} m"
-    )
-
-
 def grid_over(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Volume:
     """Return a volume of zeros whose voxel centres cover a box, centred on it.
 
@@ -136,11 +75,16 @@ def grid_over(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Volume:
         lower, upper ((3,), m): Opposite corners of the box.
         spacing (m): Distance between voxel centres.
     """
-    shape = grid_shape(lower, upper, spacing)
-    check_memory(lower, upper, spacing)
-    low, high = _box(lower, upper)
-    origin = (low + high) / 2 - spacing * (np.asarray(shape) - 1) / 2
-    return Volume(np.zeros(shape), origin, spacing)
+    low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
+    # The small number keeps 0.3 / 0.1 from asking for a fourth interval.
+    x, y, z = (int(np.ceil(n - 1e-9)) + 1 for n in (high - low) / spacing)
+    require_memory(
+        float(x) * y * z * BYTES_PER_VOXEL,
+        f"a grid of {x} by {y} by {z} voxels",
+        f"choose a spacing above {spacing:.3g} m",
+    )
+    origin = (low + high) / 2 - spacing * (np.array([x, y, z]) - 1) / 2
+    return Volume(np.zeros((x, y, z)), origin, float(spacing))
 
 
 def volume_from_function(
@@ -161,19 +105,12 @@ def volume_from_function(
         lower, upper ((3,), m): Opposite corners of the box.
         spacing (m): Distance between voxel centres.
     """
-    if chunk < 1:
-        raise ValueError(f"chunk: {chunk}, expected 1 or more")
     volume = grid_over(lower, upper, spacing)
     axes, flat, total = volume.axes(), volume.values.reshape(-1), volume.values.size
     for start in range(0, total, chunk):
         stop = min(start + chunk, total)
         points = _centres(axes, start, stop)
         values = np.asarray(function(points), dtype=np.float64)
-        if values.shape != (stop - start,):
-            raise ValueError(
-                f"function: returned shape {values.shape} for {stop - start} points; "
-                "expected one value per point"
-            )
         if not np.isfinite(values).all():
             where = points[np.flatnonzero(~np.isfinite(values))[0]]
             raise NumericalError(
@@ -196,8 +133,6 @@ def require_finite(volume: Volume) -> None:
 
 def vti_bytes(volume: Volume, name: str = "reflectivity") -> bytes:
     """Return a VTK image file (``.vti``) that ParaView and 3D Slicer open, in metres."""
-    if not name.isidentifier():
-        raise ValueError(f"name: {name!r}, expected letters, digits and underscores")
     import pyvista
     from vtkmodules.vtkIOXML import vtkXMLImageDataWriter
 
