@@ -6,7 +6,11 @@ from __future__ import annotations
 import os
 import stat
 import struct
+import warnings
 from pathlib import Path
+from typing import Any
+
+from numpy.typing import NDArray
 
 from sononerf.errors import InputError
 
@@ -46,3 +50,35 @@ def require_whole_wav(path: Path) -> None:
                         f"samples and holds {held}; copy it again"
                     )
             file.seek(stated + stated % 2, os.SEEK_CUR)
+
+
+def read_wav(path: Path) -> tuple[int, NDArray[Any]]:
+    """Return sampling rate (Hz) and samples (S,) or (S, E) of a WAV file, as they are stored."""
+    from scipy.io import wavfile
+
+    try:
+        require_regular(path)
+        with path.open("rb") as file:
+            start = file.read(12)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    if start[:4] not in (b"RIFF", b"RIFX", b"RF64") or start[8:12] != b"WAVE":
+        raise InputError(f"{path}: no WAV file, whatever its name says")
+    require_whole_wav(path)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", wavfile.WavFileWarning)
+            # Chunks of other programs are no fault.
+            warnings.filterwarnings("ignore", message="Chunk .non-data. not understood")
+            try:
+                rate, samples = wavfile.read(path, mmap=True)
+            except ValueError as error:
+                if "mmap" not in str(error):
+                    raise
+                rate, samples = wavfile.read(path)  # 24 bits cannot be mapped
+    except Exception as error:  # the error of a damaged file depends on the parser
+        said = " ".join(str(error).split())
+        raise InputError(f"{path}: damaged or truncated WAV file ({said})") from None
+    if rate <= 0:
+        raise InputError(f"{path}: has a sampling rate of {rate} Hz; write the file anew")
+    return int(rate), samples

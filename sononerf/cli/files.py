@@ -195,7 +195,7 @@ def export(
     ] = "auto",
     frame: InFrame = "auto",
 ) -> None:
-    """Write echoes, predictions, volumes, meshes or surface points for other programs."""
+    """Write echoes, predictions, volumes or meshes for other programs."""
     from sononerf.run.export import export as export_part
 
     say(f"wrote {export_part(source, output, what=what, frame=frame)}")

@@ -216,8 +216,6 @@ def voxel_fit(
     """
     emitters, receivers = head.places(poses.positions, poses.rotations)
     axis = head.range
-    if passes < 1:
-        raise ValueError(f"passes: {passes}, expected 1 or more")
     volume = grid_over(lower, upper, spacing)
     step = float(np.diff(axis).mean())
     # Of a sweep each row has a window of its own; where rows are added up, their mean.

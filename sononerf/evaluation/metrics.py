@@ -59,8 +59,6 @@ def geometry_metrics(
             ``components``, ``components_true``
                 Connected parts with more than 1 % of the largest one's area.
     """
-    if samples < 1:
-        raise ValueError(f"samples: {samples}, expected 1 or more")
     true = truth if isinstance(truth, Solid) else Solid(truth)
     found = Solid(reconstructed, fill_cavities=False)
     true_points, true_normals = true.samples(samples, seed)
@@ -103,8 +101,6 @@ def target_metrics(
             ``chamfer_m``, ``fscore``
                 None and 0 where no part of it does.
     """
-    if samples < 1:
-        raise ValueError(f"samples: {samples}, expected 1 or more")
     true = Solid(target)
     points, face = sample_surface(reconstructed, samples, seed + 1)
     around = Nearest(background)

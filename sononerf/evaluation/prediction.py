@@ -261,10 +261,6 @@ def prediction_metrics(
     """
     measured, predicted = same_shape(measured_db, predicted_db)
     mean = np.asarray(mean_db, dtype=np.float64)
-    if measured.ndim != 4:
-        raise ValueError(f"measured has shape {measured.shape}, expected (P, E, R, F)")
-    if mean.shape != measured.shape[1:]:
-        raise ValueError(f"mean_db has shape {mean.shape}, expected {measured.shape[1:]}")
     error, active_error = mae_all_and_active(measured, predicted, active_db)
     expected = np.broadcast_to(mean, measured.shape)
     mean_error, mean_active_error = mae_all_and_active(measured, expected, active_db)

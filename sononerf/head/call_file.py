@@ -12,7 +12,6 @@ the first one. *Covered* is what lies within
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
@@ -20,14 +19,12 @@ from pathlib import Path
 
 import numpy as np
 import scipy.fft
-import scipy.io.wavfile
 import scipy.ndimage
-from numpy.typing import NDArray
 
 from sononerf.array_types import Bools, Floats
 from sononerf.errors import InputError
 from sononerf.head.row_filters import WINDOW_BANDWIDTH, WINDOW_DURATION
-from sononerf.input_files import require_regular, require_whole_wav
+from sononerf.input_files import read_wav
 
 LONGEST = 0.1  # s, as the settings' longest sweep
 SHORTEST = 8  # samples
@@ -115,7 +112,7 @@ def _load(path: Path, changed: int, size: int) -> CallFile:
     del changed
     if size > MOST_BYTES:
         raise InputError(f"{path}: {size:,} bytes; cut one call out, of {LONGEST:g} s at most")
-    rate, samples = _read(path)
+    rate, samples = read_wav(path)
     if samples.ndim != 1:
         raise InputError(
             f"{path}: {samples.shape[1]} channels, expected 1; write out the channel of the call"
@@ -135,26 +132,6 @@ def _load(path: Path, changed: int, size: int) -> CallFile:
     if highest == 0.0:
         raise InputError(f"{path}: is silent; expected one call")
     return _examined(waveform / highest, float(rate))
-
-
-def _read(path: Path) -> tuple[int, NDArray[np.generic]]:
-    with warnings.catch_warnings(record=True) as told:
-        warnings.simplefilter("always")
-        try:
-            require_regular(path)
-            require_whole_wav(path)
-            rate, samples = scipy.io.wavfile.read(path)
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-        except InputError:
-            raise
-        except Exception:  # the error of a damaged file depends on the parser
-            raise InputError(f"{path}: is no WAV of samples; write the call as WAV") from None
-    if any("EOF" in str(each.message) for each in told):
-        raise InputError(f"{path}: is cut off; copy it again")
-    if rate <= 0:
-        raise InputError(f"{path}: has a sampling rate of {rate} Hz; write the file anew")
-    return int(rate), np.asarray(samples)
 
 
 def _examined(waveform: Floats, rate: float) -> CallFile:

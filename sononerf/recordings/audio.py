@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import io
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -19,7 +18,7 @@ from sononerf.array_types import Floats
 from sononerf.echoes.layout import SPLITS
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses, euler_from_rotation
-from sononerf.input_files import require_regular, require_whole_wav
+from sononerf.input_files import read_wav
 from sononerf.recordings.columns import Columns
 
 WAV, OTHERS = (".wav",), (".flac", ".ogg", ".aiff", ".aif", ".w64", ".caf")
@@ -43,36 +42,12 @@ def read_audio(path: Path) -> tuple[float, NDArray[Any]]:
 def _read(path: Path, *stamp: int) -> tuple[float, NDArray[Any]]:
     """Read a file as it was at a time and of a size."""
     del stamp
-    rate, samples = (_wav if path.suffix.lower() in WAV else _other)(path)
+    rate, samples = (read_wav if path.suffix.lower() in WAV else _other)(path)
     if samples.ndim == 1:
         samples = samples[:, None]
     if samples.ndim != 2 or not samples.size:
         raise InputError(f"{path}: holds no samples")
     return float(rate), samples.T
-
-
-def _wav(path: Path) -> tuple[float, NDArray[Any]]:
-    require_regular(path)
-    with path.open("rb") as file:
-        start = file.read(12)
-    if start[:4] not in (b"RIFF", b"RIFX", b"RF64") or start[8:12] != b"WAVE":
-        raise InputError(f"{path}: no WAV file, whatever its name says")
-    require_whole_wav(path)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error", wavfile.WavFileWarning)
-            # Chunks of other programs are no fault.
-            warnings.filterwarnings("ignore", message="Chunk .non-data. not understood")
-            try:
-                rate, samples = wavfile.read(path, mmap=True)
-            except ValueError as error:
-                if "mmap" not in str(error):
-                    raise
-                rate, samples = wavfile.read(path)  # 24 bits cannot be mapped
-    except Exception as error:  # the error of a damaged file depends on the parser
-        said = " ".join(str(error).split())
-        raise InputError(f"{path}: damaged or truncated WAV file ({said})") from None
-    return rate, samples
 
 
 def _other(path: Path) -> tuple[float, NDArray[Any]]:

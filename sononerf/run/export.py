@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Echoes, predictions, volumes and surface points as files of MATLAB and HDF5, and meshes."""
+"""Echoes, predictions and volumes as files of MATLAB and HDF5, and meshes."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _hdf5(arrays: Mapping[str, Named], attributes: Mapping[str, str]) -> bytes:
     return buffer.getvalue()
 
 
-What = Literal["auto", "echoes", "prediction", "volume", "points", "mesh"]
+What = Literal["auto", "echoes", "prediction", "volume", "mesh"]
 
 ARRAYS: dict[str, FileType] = {".mat": "mat", ".h5": "h5", ".hdf5": "h5"}
 MESHES: dict[str, MeshFormat] = {".ply": "ply", ".stl": "stl", ".glb": "glb"}
@@ -114,7 +114,6 @@ def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName 
     echoes      ``.mat .h5``        spectrograms, poses, axes
     prediction  ``.mat .h5``        predicted and measured spectrograms
     volume      ``.mat .h5``        summed reflectivity on a grid
-    points      ``.mat .h5``        vertices, normals, poses that heard them
     mesh        ``.ply .stl .glb``  the surface
     =========== =================== ==========================================
 
@@ -146,7 +145,7 @@ def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName 
     if is_store != (what == "echoes"):
         kind = "a store" if is_store else "no store"
         raise InputError(
-            f"{source}: is {kind}; echoes come from a store, prediction, volume, points and mesh "
+            f"{source}: is {kind}; echoes come from a store, prediction, volume and mesh "
             "from the folder of a run"
         )
     if (what == "mesh") != (suffix in MESHES):
@@ -167,7 +166,7 @@ def _content(source: Path, suffix: str, what: What, frame: Frame) -> bytes:
         mesh = Run(source).mesh()
         known = {"confidence": confidence_of(mesh), "error": error_of(mesh)}
         return mesh_bytes(frame.mesh(mesh), MESHES[suffix], **known)
-    parts = {"echoes": _echoes, "prediction": _prediction, "volume": _volume, "points": _points}
+    parts = {"echoes": _echoes, "prediction": _prediction, "volume": _volume}
     arrays, attributes = parts[what](source, frame)
     plain = {"software": f"sononerf {__version__}", "frame": frame.name, **attributes}
     return file_bytes(ARRAYS[suffix], arrays, plain)
@@ -246,49 +245,17 @@ def read_volume(source: Path) -> Volume:
 
 
 def _volume(source: Path, frame: Frame) -> Part:
+    if not frame.is_world:
+        raise InputError(f"{source}: a volume is exported in the world's frame; add --frame world")
     volume = read_volume(source)
-    turn = (frame.matrix[:3, :3] * frame.unit).round(6)
-    if not np.isin(turn, (-1.0, 0.0, 1.0)).all():
-        raise InputError(
-            f"{source}: the axes of the original frame are not those of the grid; export the "
-            "volume with --frame world"
-        )
-    order = np.abs(turn).argmax(axis=1)
-    values, places = volume.values.transpose(order), []
-    for axis, old in enumerate(order.tolist()):
-        along = volume.axes()[old]
-        ends = np.zeros((len(along), 3))
-        ends[:, old] = along
-        placed = frame.places(ends)[:, axis]
-        backwards = len(placed) > 1 and placed[1] < placed[0]
-        values = np.flip(values, axis) if backwards else values
-        places.append(placed[::-1] if backwards else placed)
     axes = {
-        name: Named(axis, (name,), frame.unit_name, f"centre of the voxel along {name}")
-        for name, axis in zip("xyz", places, strict=True)
+        name: Named(axis, (name,), "m", f"centre of the voxel along {name}")
+        for name, axis in zip("xyz", volume.axes(), strict=True)
     }
     meaning = "reflectivity summed over directions and frequencies"
     return {
-        "reflectivity": Named(np.ascontiguousarray(values), ("x", "y", "z"), "1", meaning),
+        "reflectivity": Named(volume.values, ("x", "y", "z"), "1", meaning),
         **axes,
-    }, {}
-
-
-def _points(source: Path, frame: Frame) -> Part:
-    mesh = Run(source).mesh()
-    heard = confidence_of(mesh)
-    if heard is None:
-        heard = np.zeros(len(mesh.vertices), np.int32)
-    places, normals = frame.places(mesh.vertices), frame.directions(mesh.vertex_normals)
-    error = error_of(mesh)
-    if error is None:
-        error = np.full(len(mesh.vertices), np.nan, np.float32)
-    meaning = "the true surface is within it with a probability of 90 %, if poses heard it"
-    return {
-        "position": Named(places, ("point", "world"), frame.unit_name, "vertex of the mesh"),
-        "normal": Named(normals, ("point", "world"), "", "outward unit normal"),
-        "poses": Named(heard, ("point",), "", "number of poses that heard the surface around it"),
-        "error": Named(error, ("point",), "m", meaning),
     }, {}
 
 

@@ -112,5 +112,3 @@ def test_wrong_input_is_refused():
         run(good[:, :, 1:], positions, rotations)
     with pytest.raises(NumericalError, match="pose 0"):
         run(np.full_like(good, np.nan), positions, rotations)
-    with pytest.raises(ValueError, match="passes"):
-        run(good, positions, rotations, passes=0)

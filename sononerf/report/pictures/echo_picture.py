@@ -82,18 +82,6 @@ def echo_png(
     levels = np.asarray(level_db, dtype=np.float64)
     waves = np.asarray(echo, dtype=np.float64)
     sounds = np.asarray(spectrogram_db, dtype=np.float64)
-    if levels.shape != (len(hits),):
-        raise ValueError(f"levels have shape {levels.shape}, expected ({len(hits)},)")
-    if waves.ndim != 2 or not waves.size:
-        raise ValueError(f"the echo has shape {waves.shape}, expected (E, S)")
-    if sounds.shape != (len(waves), len(ranges), len(frequencies)) or not sounds.size:
-        raise ValueError(
-            f"the spectrogram has shape {sounds.shape}, expected (E, R, F) with "
-            f"E = {len(waves)}, R = {len(ranges)} and F = {len(frequencies)}"
-        )
-    for name, values in (("hits", hits), ("levels", levels), ("echo", waves), ("dB", sounds)):
-        if not np.isfinite(values).all():
-            raise NumericalError(f"the {name} hold values that are not finite")
     place = np.asarray(position, dtype=np.float64).reshape(3)
     turn = np.asarray(rotation, dtype=np.float64).reshape(3, 3)
     relative = levels - levels.max() if len(levels) else levels

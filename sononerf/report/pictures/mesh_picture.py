@@ -92,8 +92,6 @@ def confidence_png(
         view (3,): Direction from the mesh to the camera, world frame; z is up.
     """
     _require_drawable(mesh, "the mesh")
-    if np.shape(counts) != (len(mesh.vertices),):
-        raise ValueError(f"counts: shape {np.shape(counts)}, expected one per vertex")
     camera = camera_for(mesh.vertices, size=size, view=view, fill=0.74)
     picture = Image.fromarray(_picture(mesh, camera, confidence_colours(counts)))
     _draw_colour_bar(picture, CONFIDENCE_BAR)
@@ -228,8 +226,6 @@ def _require_drawable(mesh: trimesh.Trimesh, name: str) -> None:
 
 def _picture(mesh: trimesh.Trimesh, camera: Camera, colour: ArrayLike) -> NDArray[np.uint8]:
     base = np.asarray(colour, dtype=np.float64)
-    if base.shape not in ((3,), (len(mesh.vertices), 3)):
-        raise ValueError(f"colours: shape {base.shape}, expected (3,) or one per vertex")
     fine = oversampled(camera)
     pixels = background(fine.width, fine.height)
     draw_mesh(pixels, mesh, fine, base)

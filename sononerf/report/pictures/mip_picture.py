@@ -36,8 +36,6 @@ Extents = tuple[tuple[float, float], tuple[float, float]]
 def _scaled(projection: ArrayLike, scale: Scale) -> Floats:
     """Return decibels below the greatest value, or the values themselves from zero."""
     values = np.asarray(projection, dtype=np.float64)
-    if values.ndim != 2 or not values.size:
-        raise ValueError(f"projection: shape {values.shape}, expected two axes, neither empty")
     if not np.isfinite(values).all():
         raise NumericalError("the projection holds values that are not finite")
     if scale == "linear":

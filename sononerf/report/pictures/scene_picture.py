@@ -56,15 +56,9 @@ def scene_png(
     """
     heads = np.asarray(poses_positions, dtype=np.float64).reshape(-1, 3)
     looks = np.asarray(poses_forward, dtype=np.float64).reshape(-1, 3)
-    if heads.shape != looks.shape:
-        raise ValueError(f"positions {heads.shape} and forward {looks.shape} differ in shape")
     kinds = np.zeros(len(heads), dtype=np.int64) if split is None else np.asarray(split)
-    if kinds.shape != (len(heads),) or not np.isin(kinds, range(len(SPLITS))).all():
-        raise ValueError(f"split of shape {kinds.shape}: expected 0, 1 or 2 for each pose")
     if not len(mesh.faces):
         raise NumericalError("there is nothing to draw: the scene is empty")
-    if not np.isfinite(looks).all():
-        raise NumericalError("the poses' directions are not finite")
     corners = np.zeros((0, 3)) if region_box is None else _corners(*region_box)
     everything = np.vstack([mesh.vertices, heads, corners])
     camera = camera_for(everything, size=size, view=view, fill=0.86)

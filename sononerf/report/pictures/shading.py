@@ -56,10 +56,6 @@ def camera_for(
     """Place a camera so that points (N, 3) fill a share of a picture (width, height)."""
     cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     towards = np.asarray(view, dtype=np.float64)
-    if towards.shape != (3,) or not np.isfinite(towards).all() or not np.any(towards):
-        raise ValueError(f"view: {view!r}, expected three numbers, not all zero")
-    if min(size) < 1:
-        raise ValueError(f"size: {size}, expected a positive width and height in pixels")
     if not len(cloud):
         raise NumericalError("there is nothing to draw: the mesh is empty")
     if not np.isfinite(cloud).all():

@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sononerf.array_types import Floats, Ints
-from sononerf.errors import NumericalError
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.report.pictures.figure import (
@@ -147,15 +146,6 @@ def _checked(
         for name, values in (("measured", measured_db), ("predicted", predicted_db))
         if values is not None
     }
-    expected = (len(next(iter(levels.values()))), len(ranges), len(frequencies))
-    if any(values.shape != expected or not values.size for values in levels.values()):
-        found = " and ".join(f"{name} {values.shape}" for name, values in levels.items())
-        raise ValueError(
-            f"{found}: expected (E, R, F) with R = {len(ranges)} and F = {len(frequencies)}"
-        )
-    for name, values in levels.items():
-        if not np.isfinite(values).all():
-            raise NumericalError(f"the {name} spectrogram holds values that are not finite")
     return levels, ranges, frequencies
 
 
