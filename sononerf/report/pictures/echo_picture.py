@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from numpy.typing import ArrayLike, NDArray
-from PIL import Image, ImageDraw, ImageFont
+from numpy.typing import ArrayLike
+from PIL import Image
 
-from sononerf.array_types import Floats
+from sononerf.array_types import Floats, Ints
 from sononerf.errors import NumericalError
 from sononerf.report.pictures.figure import figure, picture_bytes
 from sononerf.report.pictures.mesh_picture import INK, draw_scale_bar, oversampled
 from sononerf.report.pictures.scene_picture import draw_axes
 from sononerf.report.pictures.shading import (
-    OVERSAMPLING,
     Camera,
     averaged,
     background,
@@ -38,6 +37,7 @@ HIT_RANGE_DB = 40.0
 EARS = ((46, 125, 50), (21, 101, 192))  # left, right
 MOST_ROWS = 3  # number of receivers, at most, that are drawn, evenly chosen
 SIZE = (760, 800)
+MANY = 2000  # hits, from which on each is drawn as a small dot
 # Of the head and of its look, as shares of the picture's height.
 HEAD, LOOK = 0.022, 0.25
 # How far beside the line from scene to head the camera stands, as a sine.
@@ -86,13 +86,12 @@ def echo_png(
     turn = np.asarray(rotation, dtype=np.float64).reshape(3, 3)
     relative = levels - levels.max() if len(levels) else levels
     receivers = len(waves)
-    view = hits_image(mesh, hits, relative, place, turn, receivers=receivers)
     shown = sounding_slice(sounds, ranges)
     distance = np.arange(waves.shape[1], dtype=np.float64) * speed_of_sound / (2.0 * sampling_rate)
     with figure(13.0, 6.6, 130) as drawn:
         left, right = drawn.subfigures(1, 2, width_ratios=[1.0, 1.08])
         unhit = "no hit: edges alone are heard" if waves.any() else "no hit is heard"
-        _draw_view(left, view, len(hits), int((relative >= -HIT_RANGE_DB).sum()), unhit)
+        _draw_view(left, mesh, hits, relative, place, turn, receivers, unhit)
         chosen, names = drawn_receivers(receivers, MOST_ROWS)
         rows = len(chosen)
         axes = right.subplots(2 * rows, 1, sharex=True, height_ratios=[1.0] * rows + [1.5] * rows)
@@ -106,17 +105,53 @@ def echo_png(
         return picture_bytes(drawn)
 
 
-def _draw_view(part: Any, view: NDArray[np.uint8], count: int, drawn: int, unhit: str) -> None:
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
-
+def _draw_view(
+    part: Any,
+    mesh: trimesh.Trimesh,
+    points: Floats,
+    relative_db: Floats,
+    position: Floats,
+    rotation: Floats,
+    ears: int,
+    unhit: str,
+) -> None:
+    """Draw a scene with its hits and the head that hears them, seen over the head's shoulder."""
+    if not len(mesh.faces):
+        raise NumericalError("there is nothing to draw: the scene is empty")
+    middle = np.asarray(mesh.bounds).mean(axis=0)
+    view = _over_shoulder(position - middle, float(mesh.scale) / 2.0)
+    camera = camera_for(np.vstack([mesh.vertices, position]), size=SIZE, view=view, fill=0.70)
+    fine = oversampled(camera)
+    pixels = background(fine.width, fine.height)
+    nearness = draw_mesh(pixels, mesh, fine, PALE)
+    picture = Image.fromarray(averaged(pixels))
+    draw_scale_bar(picture, camera)
+    draw_axes(picture, camera)
     panel = part.subplots()
-    panel.imshow(view, origin="upper", interpolation="bilinear")
+    panel.imshow(np.asarray(picture), origin="upper", interpolation="bilinear")
     panel.set_axis_off()
-    said = f"{count} hits, {drawn} within {HIT_RANGE_DB:g} dB of the loudest"
-    panel.set_title(said if count else unhit)
-    scale = ScalarMappable(Normalize(-HIT_RANGE_DB, 0.0), HIT_MAP)
-    bar = part.colorbar(scale, ax=panel, orientation="horizontal", aspect=40, shrink=0.8, pad=0.02)
+    drawn = visible_hits(points, relative_db, fine, nearness, 0.01 * float(mesh.scale))
+    colours = {"c": relative_db[drawn], "cmap": HIT_MAP, "vmin": -HIT_RANGE_DB, "vmax": 0.0}
+    # Many hits melt together; few are dots.
+    size = 6.0 if len(drawn) < MANY else 1.5
+    dots = panel.scatter(*camera.project(points[drawn])[0].T, s=size, linewidths=0, **colours)
+    unit = camera.height / camera.scale  # m per height of the picture
+    forward, left, up = rotation.T
+    sides = [HEAD * unit * (side * 0.75 * left + 0.9 * up) for side in (1.0, -1.0)]
+    marks = [position, position + LOOK * unit * forward, *(position + side for side in sides)]
+    (start, end, *ends), _ = camera.project(np.stack(marks))
+    ink = tuple(np.divide(INK, 255))
+    panel.annotate("", end, start, arrowprops={"arrowstyle": "-|>", "color": ink})
+    for place, colour, name in zip(ends if ears == 2 else [], EARS, "LR", strict=False):
+        outwards = (place - start) / max(float(np.linalg.norm(place - start)), 1e-9)
+        tint = tuple(np.divide(colour, 255))
+        panel.plot(*place, "o", color=tint, markersize=6)
+        at = place + 0.04 * camera.height * outwards
+        panel.text(*at, name, color=tint, ha="center", va="center")
+    panel.plot(*start, "o", color=ink, markersize=11)
+    said = f"{len(points)} hits, {int((relative_db >= -HIT_RANGE_DB).sum())} within "
+    panel.set_title(f"{said}{HIT_RANGE_DB:g} dB of the loudest" if len(points) else unhit)
+    bar = part.colorbar(dots, ax=panel, orientation="horizontal", aspect=40, shrink=0.8, pad=0.02)
     bar.set_label("strength of a hit (dB below the loudest)")
 
 
@@ -164,45 +199,25 @@ def _add_time_axis(panel: Any, speed_of_sound: float) -> None:
     above.set_xlabel("time since the call (ms)")
 
 
-def hits_image(
-    mesh: trimesh.Trimesh,
-    points: Floats,
-    relative_db: Floats,
-    position: Floats,
-    rotation: Floats,
-    *,
-    receivers: int = 2,
-    size: tuple[int, int] = SIZE,
-) -> NDArray[np.uint8]:
-    """Draw a scene with its hits and the head that hears them, seen over the head's shoulder.
+def visible_hits(
+    points: Floats, relative_db: Floats, camera: Camera, nearness: Floats, depth: float
+) -> Ints:
+    """Return the numbers of the hits that a camera sees, the loudest last.
 
     Args:
-        points ((N, 3), m): Hits, world frame; those behind something are hidden, and the faintest
-            left out.
-        relative_db ((N,), dB): Their levels below the loudest, zero at most.
-        position ((3,), m): Place of the head.
-        rotation (3, 3): Head to world.
-        size (int, int): Width and height in pixels.
-
-    Returns:
-        pixels: (H, W, 3) uint8.
+        points ((N, 3), m): World frame.
+        relative_db ((N,), dB): Their levels below the loudest, zero at most; the faintest are left
+            out.
+        nearness ((H, W), m): What is seen at each pixel of the camera.
+        depth (m): Depth by which a surface may differ from the one in the middle of its pixel.
     """
-    if not len(mesh.faces):
-        raise NumericalError("there is nothing to draw: the scene is empty")
-    middle = np.asarray(mesh.bounds).mean(axis=0)
-    everything = np.vstack([mesh.vertices, position])
-    view = _over_shoulder(position - middle, float(mesh.scale) / 2.0)
-    camera = camera_for(everything, size=size, view=view, fill=0.70)
-    fine = oversampled(camera)
-    pixels = background(fine.width, fine.height)
-    nearness = draw_mesh(pixels, mesh, fine, PALE)
-    _draw_hits(pixels, nearness, fine, points, relative_db, float(mesh.scale))
-    picture = Image.fromarray(np.round(255 * pixels).astype(np.uint8))
-    _draw_head(picture, fine, position, rotation, ears=receivers == 2)
-    done = Image.fromarray(averaged(np.asarray(picture) / 255.0))
-    draw_scale_bar(done, camera)
-    draw_axes(done, camera)
-    return np.asarray(done)
+    places, near = camera.project(points)
+    column, row = np.floor(places).astype(np.int64).T
+    height, width = nearness.shape
+    within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    chosen = np.flatnonzero(within & (relative_db >= -HIT_RANGE_DB))
+    chosen = chosen[near[chosen] > nearness[row[chosen], column[chosen]] - depth]
+    return chosen[np.argsort(relative_db[chosen], kind="stable")]
 
 
 def _over_shoulder(away: Floats, radius: float) -> Floats:
@@ -214,84 +229,3 @@ def _over_shoulder(away: Floats, radius: float) -> Floats:
     # A camera that looks straight down has no up.
     tilt = float(np.clip(np.arctan2(away[2], level) + 0.5 * aside, -1.2, 1.2))
     return np.array([np.cos(turn) * np.cos(tilt), np.sin(turn) * np.cos(tilt), np.sin(tilt)])
-
-
-def _draw_hits(
-    pixels: Floats,
-    nearness: Floats,
-    camera: Camera,
-    points: Floats,
-    relative_db: Floats,
-    scale: float,
-) -> None:
-    from matplotlib import colormaps
-
-    if not len(points):
-        return
-    places, depth = camera.project(points)
-    column, row = np.floor(places).astype(np.int64).T
-    height, width = nearness.shape
-    within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    seen = within & (relative_db >= -HIT_RANGE_DB)
-    # The surface of a pixel is its middle's, so a steep one is a little off.
-    chosen = np.flatnonzero(seen)
-    surface = nearness[row[chosen], column[chosen]]
-    chosen = chosen[depth[chosen] > surface - 0.01 * scale]
-    chosen = chosen[np.argsort(relative_db[chosen], kind="stable")]  # the loudest last
-    colours = colormaps[HIT_MAP](1.0 + relative_db[chosen] / HIT_RANGE_DB)[:, :3]
-    # Many hits melt together; few are dots.
-    covered = np.isfinite(nearness).sum() / max(1, len(chosen))
-    radius = int(np.clip(round(0.6 * float(np.sqrt(covered))), OVERSAMPLING, 3 * OVERSAMPLING))
-    for down, across in np.ndindex(2 * radius + 1, 2 * radius + 1):
-        if (down - radius) ** 2 + (across - radius) ** 2 <= radius**2:
-            y = np.clip(row[chosen] + down - radius, 0, height - 1)
-            x = np.clip(column[chosen] + across - radius, 0, width - 1)
-            pixels[y, x] = colours
-
-
-def _draw_head(
-    picture: Image.Image,
-    camera: Camera,
-    position: Floats,
-    rotation: Floats,
-    *,
-    ears: bool,
-) -> None:
-    """Draw a head of a fixed size in the picture, its ears if any, and where it looks."""
-    draw = ImageDraw.Draw(picture)
-    unit = camera.height / camera.scale  # m per height of the picture
-    forward, left, up = rotation.T
-    tip = position + LOOK * unit * forward
-    (start, end, *sides), _ = camera.project(
-        np.stack(
-            [
-                position,
-                tip,
-                position + HEAD * unit * (0.75 * left + 0.9 * up),
-                position + HEAD * unit * (-0.75 * left + 0.9 * up),
-            ]
-        )
-    )
-    along = end - start
-    length = float(np.linalg.norm(along))
-    draw.line([tuple(start), tuple(end)], fill=INK, width=2 * OVERSAMPLING)
-    if length > 1.0:
-        back, side = along / length, np.array([-along[1], along[0]]) / length
-        barb = 7.0 * OVERSAMPLING
-        corners = [end + back * barb, end - side * barb / 2, end + side * barb / 2]
-        draw.polygon([tuple(corner) for corner in corners], fill=INK)
-    radius = HEAD * camera.height * 0.8
-    for ear, colour, name in zip(sides if ears else [], EARS, "LR", strict=False):
-        _disc(draw, ear, 0.55 * radius, colour)
-        outwards = ear - start
-        outwards = outwards / max(float(np.linalg.norm(outwards)), 1e-9)
-        font = ImageFont.load_default(camera.height // 42)
-        draw.text(tuple(ear + 1.5 * radius * outwards), name, fill=colour, font=font, anchor="mm")
-    _disc(draw, start, radius, INK)
-
-
-def _disc(
-    draw: ImageDraw.ImageDraw, centre: Floats, radius: float, colour: tuple[int, ...]
-) -> None:
-    (x, y), r = centre, radius
-    draw.ellipse([x - r, y - r, x + r, y + r], fill=colour)
