@@ -15,17 +15,15 @@ from sononerf.array_types import Floats
 from sononerf.evaluation.geometry import signed_error
 from sononerf.report.pictures.mesh_picture import (
     CLAY,
-    CONFIDENCE_BAR,
     STEEL,
     UNHEARD,
-    ColourBar,
-    distance_bar,
-    distance_colours,
-    error_bar,
-    error_colours,
+    ColourScale,
+    confidence_scale,
+    distance_scale,
+    error_scale,
     sides_png,
 )
-from sononerf.surface.mesh_files import confidence_colours, linear_light
+from sononerf.surface.mesh_files import linear_light
 
 MOST_TRIANGLES = 60_000
 """Largest number of triangles of a mesh in a page: three such meshes take about 6 MB of the 15 MB
@@ -49,20 +47,22 @@ class SurfaceViews:
     limit: float
 
     @cached_property
-    def _rows(self) -> list[tuple[str, trimesh.Trimesh, Floats, ColourBar | None]]:
-        rows: list[tuple[str, trimesh.Trimesh, Floats, ColourBar | None]] = []
+    def _rows(self) -> list[tuple[str, trimesh.Trimesh, Floats, ColourScale | None]]:
+        rows: list[tuple[str, trimesh.Trimesh, Floats, ColourScale | None]] = []
         if self.truth is not None:
-            off = distance_colours(signed_error(self.mesh, self.truth), self.limit)
+            scale = distance_scale(self.limit)
+            off = scale(1e3 * signed_error(self.mesh, self.truth))
             rows.append(("truth", self.truth, np.array(STEEL), None))
-            rows.append(("distance", self.mesh, off, distance_bar(self.limit)))
+            rows.append(("distance", self.mesh, off, scale))
         if self.error is not None:
-            colours = error_colours(self.error, self.limit)
+            scale = error_scale(self.limit)
+            colours = scale(1e3 * self.error)
             if self.confidence is not None:
                 colours[self.confidence == 0] = UNHEARD
-            rows.append(("error", self.mesh, colours, error_bar(self.limit)))
+            rows.append(("error", self.mesh, colours, scale))
         elif self.confidence is not None:
-            colours = confidence_colours(self.confidence)
-            rows.append(("confidence", self.mesh, colours, CONFIDENCE_BAR))
+            scale = confidence_scale()
+            rows.append(("confidence", self.mesh, scale(self.confidence), scale))
         return rows or [("reconstruction", self.mesh, np.array(CLAY), None)]
 
     def png(self, size: tuple[int, int] = (380, 340)) -> bytes:

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -14,7 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
-from sononerf.report.pictures.figure import png_from_pixels
+from sononerf.report.pictures.figure import figure, picture_bytes, png_from_pixels
 from sononerf.report.pictures.shading import (
     DEFAULT_VIEW,
     OVERSAMPLING,
@@ -93,81 +94,67 @@ def confidence_png(
     """
     _require_drawable(mesh, "the mesh")
     camera = camera_for(mesh.vertices, size=size, view=view, fill=0.74)
-    picture = Image.fromarray(_picture(mesh, camera, confidence_colours(counts)))
-    _draw_colour_bar(picture, CONFIDENCE_BAR)
-    return png_from_pixels(np.asarray(picture))
+    row = ("", _picture(mesh, camera, confidence_colours(counts)), confidence_scale())
+    return _laid_out([[row]])
 
 
 @dataclass(frozen=True, eq=False)
-class ColourBar:
-    """Legend of the colours of a mesh.
+class ColourScale:
+    """Colours of values on a mesh, and their legend.
 
     Attributes:
-        title: Title, with the unit.
-        colours: Colours (N, 3), 0 to 1, of places (N,) from 0 to 1 along the bar.
-        marks: Place along the bar, 0 to 1, and its label.
+        label: Quantity and unit.
+        mappable: Norm and colour map of matplotlib.
+        ticks: Values that the legend names; chosen by matplotlib where None.
     """
 
-    title: str
-    colours: Callable[[Floats], Floats]
-    marks: tuple[tuple[float, str], ...]
+    label: str
+    mappable: Any
+    ticks: Sequence[float] | None = None
+
+    def __call__(self, values: ArrayLike) -> Floats:
+        """Return the colours (V, 3), 0 to 1, of values (V,); larger ones as the largest shown."""
+        return np.asarray(self.mappable.to_rgba(np.asarray(values)))[:, :3]
 
 
-CONFIDENCE_BAR = ColourBar(
-    "poses that heard this place",
-    lambda places: confidence_colours(np.expm1(places * np.log1p(MANY_POSES))),
-    tuple(
-        (float(np.log1p(n) / np.log1p(MANY_POSES)), f"{n}+" if n == MANY_POSES else str(n))
-        for n in (0, 3, 10, 30, MANY_POSES)
-    ),
-)
+def confidence_scale() -> ColourScale:
+    """Return the scale of numbers of poses."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import FuncNorm, ListedColormap
+
+    norm = FuncNorm((np.log1p, np.expm1), 0, MANY_POSES)
+    colours = confidence_colours(np.expm1(np.linspace(0, np.log1p(MANY_POSES), 256)))
+    mappable = ScalarMappable(norm, ListedColormap(colours))
+    return ColourScale("poses that heard this place", mappable, (0, 3, 10, 30, MANY_POSES))
 
 
-def distance_bar(limit: float) -> ColourBar:
-    """Return the colour bar of signed distances up to a limit, m: red outside, blue inside."""
-    marks = tuple((0.5 + 0.5 * part, f"{1e3 * part * limit:+.2g}") for part in (-1, -0.5, 0.5, 1))
-    return ColourBar("mm outside (+) or inside (-) of the truth", _diverging, (*marks, (0.5, "0")))
+def distance_scale(limit: float) -> ColourScale:
+    """Return the scale of signed distances in mm, up to a limit in m: red outside, blue inside."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    mappable = ScalarMappable(Normalize(-1e3 * limit, 1e3 * limit), "coolwarm")
+    return ColourScale("mm outside (+) or inside (-) of the truth", mappable)
 
 
-def distance_colours(distance: ArrayLike, limit: float) -> Floats:
-    """Colour signed distances (V,), m, as :func:`distance_bar` shows; larger ones as the limit."""
-    return _diverging(0.5 + 0.5 * np.clip(np.asarray(distance) / limit, -1, 1))
+def error_scale(limit: float) -> ColourScale:
+    """Return the scale of errors in mm, up to a limit in m: yellow for small, violet for large."""
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    mappable = ScalarMappable(Normalize(0.0, 1e3 * limit), "plasma_r")
+    return ColourScale("error in mm (90 %); grey: unheard", mappable)
 
 
 UNHEARD = (0.35, 0.35, 0.35)
 """Colour (sRGB, 0 to 1) of vertices that no echo bounds."""
 
 
-def error_bar(limit: float) -> ColourBar:
-    """Return the colour bar of errors up to a limit, m: yellow for small, violet for large ones."""
-    marks = tuple((part, f"{1e3 * part * limit:.2g}") for part in (0, 0.5, 1))
-    return ColourBar("error in mm (90 %); grey: unheard", _sequential, marks)
-
-
-def error_colours(error: ArrayLike, limit: float) -> Floats:
-    """Colour errors (V,), m, as :func:`error_bar` shows; larger ones as the limit."""
-    return _sequential(np.clip(np.asarray(error) / limit, 0, 1))
-
-
-def _sequential(places: Floats) -> Floats:
-    from matplotlib import colormaps
-
-    colours: Floats = colormaps["plasma_r"](np.asarray(places))[:, :3]
-    return colours
-
-
-def _diverging(places: Floats) -> Floats:
-    from matplotlib import colormaps
-
-    colours: Floats = colormaps["RdBu_r"](0.08 + 0.84 * np.asarray(places))[:, :3]
-    return colours
-
-
 SIDES = ("front", "left", "back", "right")
 
 
 def sides_png(
-    rows: Sequence[tuple[str, trimesh.Trimesh, ArrayLike, ColourBar | None]],
+    rows: Sequence[tuple[str, trimesh.Trimesh, ArrayLike, ColourScale | None]],
     *,
     size: tuple[int, int],
 ) -> bytes:
@@ -179,42 +166,47 @@ def sides_png(
     for title, mesh, *_ in rows:
         _require_drawable(mesh, title)
     points = np.vstack([mesh.vertices for _, mesh, *_ in rows])
-    font = ImageFont.load_default(15)
-    lines = []
-    for title, mesh, colours, bar in rows:
-        line = []
-        for number, side in enumerate(SIDES):
-            x, y, z = DEFAULT_VIEW
-            view = [(x, y, z), (-y, x, z), (-x, -y, z), (y, -x, z)][number]
-            camera = camera_for(points, size=size, view=view, fill=0.7)
-            cell = Image.fromarray(_picture(mesh, camera, colours))
-            text = f"{title}, from the {side}" if not number else f"from the {side}"
-            ImageDraw.Draw(cell).text((10, 8), text, fill=INK, font=font)
-            if bar is not None and not number:
-                _draw_colour_bar(cell, bar)
-            line.append(np.asarray(cell))
-        lines.append(np.hstack(line))
-    return png_from_pixels(np.vstack(lines))
+    x, y, z = DEFAULT_VIEW
+    views = [(x, y, z), (-y, x, z), (-x, -y, z), (y, -x, z)]
+    cameras = [camera_for(points, size=size, view=view, fill=0.7) for view in views]
+    return _laid_out(
+        [
+            [
+                (
+                    f"{title}, from the {side}" if not number else f"from the {side}",
+                    _picture(mesh, camera, colours),
+                    None if number else scale,
+                )
+                for number, (side, camera) in enumerate(zip(SIDES, cameras, strict=True))
+            ]
+            for title, mesh, colours, scale in rows
+        ]
+    )
 
 
-def _draw_colour_bar(picture: Image.Image, bar: ColourBar) -> None:
-    """Draw the legend near the lower left corner, in place."""
-    width, height = picture.size
-    margin, length, thick = height // 24, max(width // 4, 150), max(6, height // 55)
-    left, bottom = max(margin, 22), height - margin  # half of the first mark stands to the left
-    strip = np.round(255 * bar.colours(np.linspace(0, 1, length))).astype(np.uint8)
-    strip = np.ascontiguousarray(np.broadcast_to(strip, (thick, length, 3)))
-    draw = ImageDraw.Draw(picture)
-    font = ImageFont.load_default(max(11, height // 40))
-    line = round(1.3 * font.getbbox("0")[3])
-    top = bottom - line - thick
-    picture.paste(Image.fromarray(strip), (left, top))
-    draw.rectangle([(left, top), (left + length - 1, top + thick - 1)], outline=INK)
-    for place, text in bar.marks:
-        x = left + place * (length - 1)
-        draw.line([(x, top + thick), (x, top + thick + 4)], fill=INK, width=1)
-        draw.text((x, bottom), text, fill=INK, font=font, anchor="ms")
-    draw.text((left, top - 6), bar.title, fill=INK, font=font, anchor="ls")
+def _laid_out(
+    rows: Sequence[Sequence[tuple[str, NDArray[np.uint8], ColourScale | None]]],
+) -> bytes:
+    """Lay pictures (H, W, 3) of one size side by side, with their titles and legends."""
+    height, width, _ = rows[0][0][1].shape
+    down, across = 1.0 / len(rows), 1.0 / len(rows[0])
+    with figure(width * len(rows[0]) / 100, height * len(rows) / 100, 100, layout=None) as drawn:
+        for row, cells in enumerate(rows):
+            for column, (title, pixels, scale) in enumerate(cells):
+                axes = drawn.add_axes((column * across, 1 - (row + 1) * down, across, down))
+                axes.imshow(pixels, origin="upper", aspect="auto")
+                axes.set_axis_off()
+                axes.text(10, 8, title, va="top", fontsize=10)
+                if scale is not None:
+                    bar = axes.inset_axes((0.05, 0.075, 0.4, 0.02))
+                    drawn.colorbar(
+                        scale.mappable, cax=bar, orientation="horizontal", ticks=scale.ticks
+                    )
+                    bar.set_title(scale.label, fontsize=8, loc="left", pad=3)
+                    bar.tick_params(labelsize=7)
+                    if scale.ticks is not None:
+                        bar.set_xticks(scale.ticks, [f"{tick:g}" for tick in scale.ticks])
+        return picture_bytes(drawn)
 
 
 def _require_drawable(mesh: trimesh.Trimesh, name: str) -> None:

@@ -76,6 +76,6 @@ def test_confidence_is_drawn_bright_where_many_poses_heard(ball):
     assert drawn[270, 240, 0] > drawn[100, 240, 0] + 50
     # The bar in the lower left corner runs from dark to bright yellow.
     yellow = drawn[..., 0] - drawn[..., 2] > 90
-    assert yellow[300:, :150].any()
+    assert yellow[300:, :250].any()
     with pytest.raises(NumericalError, match="empty"):
         confidence_png(trimesh.Trimesh(), [])
