@@ -8,11 +8,12 @@ import stat
 import struct
 import warnings
 from pathlib import Path
-from typing import Any
-
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from sononerf.errors import InputError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
 
 UNSTATED = 0xFFFF_FFFF
 """Number of bytes in the header of a WAV file above 4 GB, whose size another chunk states."""

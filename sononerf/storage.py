@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: MIT
 """The one write path: a file is there whole, old or new, or it is not there.
 
-Every file goes through :func:`commit`, whatever wrote it; what must grow line by line goes
-through :func:`append_line`. POSIX only: durability rests on ``rename``, on the ``fsync`` of
-folders and on ``flock``.
+Every file goes through :func:`commit`, whatever wrote it. POSIX only: durability rests on
+``rename``, on the ``fsync`` of folders and on ``flock``.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import json
 import os
 import re
 import shutil
-import stat
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -170,29 +168,6 @@ def read_json(path: Path) -> Any:
         raise InputError(f"{path}: damaged, or no JSON ({error})") from None
 
 
-def append_line(path: Path, text: str) -> None:
-    """Append one line of text to a file, durably; the file is created if it does not exist.
-
-    A line that a crash tore is ended first, so that it does not absorb the next one.
-    """
-    try:
-        is_new = not path.exists()
-        descriptor = open_own(path, os.O_RDWR | os.O_APPEND)
-        try:
-            size = os.fstat(descriptor).st_size
-            is_torn = size > 0 and os.pread(descriptor, 1, size - 1) != b"\n"
-            data = (("\n" if is_torn else "") + text + "\n").encode()
-            if os.write(descriptor, data) != len(data):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
-        if is_new:
-            sync_folder(path.parent)
-    except OSError as error:
-        raise storage_error("cannot be appended to", path, error) from error
-
-
 def remove_file(path: Path) -> None:
     """Remove a file, durably; a missing file is no error."""
     try:
@@ -257,14 +232,3 @@ def remove_if_empty(folders: list[Path]) -> None:
             if [path.name for path in folder.iterdir()] == [LOCK]:
                 (folder / LOCK).unlink()
             folder.rmdir()
-
-
-def open_own(path: Path, flags: int) -> int:
-    """Open or create a file that is changed in place; links and special files are errors."""
-    descriptor = os.open(path, flags | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
-    found = os.fstat(descriptor)
-    # A lock that its owner has just removed has no name.
-    if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
-        os.close(descriptor)
-        raise OSError(errno.EMLINK, "is no file of its own; remove it")
-    return descriptor

@@ -13,7 +13,6 @@ import subprocess
 import sys
 import threading
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -175,21 +174,6 @@ def test_read_json_of_nothing_and_of_a_folder(tmp_path):
         storage.read_json(tmp_path)
 
 
-def test_append_line_closes_a_torn_line_first(tmp_path):
-    path = tmp_path / "journal"
-    storage.append_line(path, "one")
-    with path.open("ab") as file:
-        file.write(b"tor")
-    storage.append_line(path, "two")
-    storage.append_line(path, "three")
-    assert path.read_bytes() == b"one\ntor\ntwo\nthree\n"
-
-
-def test_append_line_tells_a_full_disk():
-    with pytest.raises(StorageError, match="cannot be appended to"):
-        storage.append_line(storage.Path("/dev/full"), "one")
-
-
 def test_clean_leftovers_removes_those_of_the_dead_only(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
@@ -265,18 +249,6 @@ def test_messages_say_what_to_do(tmp_path):
     assert json.loads(storage.to_json({"b": 1, "a": 2}, sort_keys=True)) == {"a": 2, "b": 1}
 
 
-def test_what_is_changed_in_place_is_a_file_of_its_own(tmp_path):
-    outside = tmp_path / "outside"
-    outside.write_text("precious\n")
-    (tmp_path / "link").symlink_to(outside)
-    (tmp_path / "second").hardlink_to(outside)
-    os.mkfifo(tmp_path / "pipe")
-    for name in ("link", "second", "pipe"):
-        with pytest.raises((StorageError, OSError)):
-            storage.append_line(tmp_path / name, "x")
-    assert outside.read_text() == "precious\n"
-
-
 def test_all_of_a_file_is_there_when_it_is_synced(tmp_path, monkeypatch):
     sizes, real = [], os.fsync
 
@@ -288,33 +260,6 @@ def test_all_of_a_file_is_there_when_it_is_synced(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", fsync)
     storage.commit_bytes(tmp_path / "file", b"content")
     assert sizes == [7, "folder"]
-    storage.append_line(tmp_path / "journal", "line")
-    assert sizes[2:] == [5, "folder"]
-    storage.append_line(tmp_path / "journal", "more")
-    assert sizes[4:] == [10]
-
-
-OPEN = Path("/proc/self/fd")
-"""Lists the files that this process has open, on Linux."""
-
-
-def descriptors():
-    return len(list(OPEN.iterdir()))
-
-
-@pytest.mark.skipif(not OPEN.is_dir(), reason="Linux alone lists open files")
-def test_no_descriptor_stays_open(tmp_path):
-    journal, twice = tmp_path / "journal", tmp_path / "twice"
-    storage.append_line(journal, "one")
-    os.link(journal, twice)
-    before = descriptors()
-    for _ in range(5):
-        with pytest.raises(StorageError, match="is no file of its own"):
-            storage.append_line(journal, "two")
-    twice.unlink()
-    for _ in range(5):
-        storage.append_line(journal, "two")
-    assert descriptors() == before
 
 
 def test_a_file_in_place_of_a_folder_is_refused(tmp_path):

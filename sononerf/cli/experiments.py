@@ -150,12 +150,12 @@ def fit(
         progress=Progress(),
     )
     if not follows():  # the first process does the rest
-        from sononerf.run.report_runs import PAGE
-        from sononerf.run.report_runs import report as report_runs
+        from sononerf.run.report import PAGE
+        from sononerf.run.report import report as write
 
         page, numbers = folder / PAGE, folder / "metrics.json"
         if not page.is_file() or page.stat().st_mtime < numbers.stat().st_mtime:
-            report_runs([folder], progress=Progress())
+            write(folder, progress=Progress())
         _summary(folder, done.read_metrics())
 
 
@@ -376,7 +376,7 @@ def compare(
 
 @app.command()
 def report(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs.")],
+    run: Run,
     paper: Annotated[
         bool, typer.Option("--paper", help="Also draw the counterparts of the paper's figures.")
     ] = False,
@@ -386,16 +386,14 @@ def report(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option(help="The page; RUN/report.html of one run, report.html of several."),
+        typer.Option(help="The page; RUN/report.html by default."),
     ] = None,
 ) -> None:
-    """Write one page of a run, or of several beside one another: numbers, pictures, settings."""
-    if (paper or figures) and len(runs) > 1:
-        raise SettingsError("--paper and --format draw the figures of one run; found several")
+    """Write one page of a run: numbers, pictures, settings."""
     from sononerf.progress import Progress
-    from sononerf.run.report_runs import report as report_runs
+    from sononerf.run.report import report as write
 
-    page = report_runs(runs, paper=paper, figures=figures, output=output, progress=Progress())
+    page = write(run, paper=paper, figures=figures, output=output, progress=Progress())
     say(f"wrote {page}")
     if figures is not None:
         say(f"wrote {page.parent / 'figures'}")

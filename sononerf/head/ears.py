@@ -21,7 +21,7 @@ from scipy.special import j1
 from sononerf.array_types import Floats, Singles
 from sononerf.compiled import compiled
 from sononerf.errors import SettingsError
-from sononerf.head.directivity.files import content_hash, read_directivity
+from sononerf.head.directivity.directivity_files import content_hash, read_directivity
 from sononerf.head.directivity.record import Directivity, unit_vectors
 from sononerf.head.spectrogram import frequency_axis, smearing
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings

@@ -148,15 +148,10 @@ ASKED = 64
 """Number of pings, evenly over all, that determine ranges and noise."""
 
 
-def analysis_bytes(head: Head) -> float:
-    """Return the memory that the analysis of one ping takes, bytes: its frames and products."""
+def analysis_bytes(head: Head, pings: int) -> float:
+    """Return the memory of an analysis, bytes: frames of one ping, and copies of all powers."""
     frame = head.analysis.window + 4 * len(head.frequency)
-    return 8.0 * len(head.receivers) * len(head.range) * frame
-
-
-def kept_bytes(head: Head, pings: int) -> float:
-    """Return the memory that the powers over range of some pings take, with working copies."""
-    return 6 * 8.0 * len(head.receivers) * len(head.range) * min(pings, MOST_POSES)
+    return 8.0 * len(head.receivers) * len(head.range) * (frame + 6 * min(pings, MOST_POSES))
 
 
 def found_ranges(
@@ -214,7 +209,7 @@ def found_ranges(
     asked = np.linspace(0, len(long_enough) - 1, min(ASKED, len(long_enough))).round().astype(int)
     pings = long_enough[np.unique(asked)]
     require_memory(
-        analysis_bytes(wide) + kept_bytes(wide, len(pings)),
+        analysis_bytes(wide, len(pings)),
         f"{recording.path}: the analysis of {high:.3g} m of range",
         "set spectrogram.range_max",
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Check of the machine: versions, memory, GPU, graphics, disk; with advice for each problem."""
+"""Check of the machine: versions, memory, GPU, disk; with advice for each problem."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import importlib.util
 import os
 import platform
 import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -38,16 +36,6 @@ PACKAGES = (
 ENOUGH_MEMORY, ENOUGH_DISK = 2e9, 2e9
 """Bytes that a run of the defaults needs: 1.3 GB of memory were measured, and stores of 400 poses
 with their runs take less than 1 GB."""
-PATIENCE = 60.0
-"""Time after which drawing counts as broken, s."""
-DRAW = (
-    "import vtk; w = vtk.vtkRenderWindow(); w.SetOffScreenRendering(1); w.SetSize(8, 8);"
-    "w.AddRenderer(vtk.vtkRenderer()); w.Render();"
-    "print([l for l in w.ReportCapabilities().splitlines() if 'renderer string' in l][0]"
-    ".partition(':')[2].strip())"
-)
-"""Script that opens an off-screen window and prints its class; a missing library ends the
-process."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +64,6 @@ def examine(folder: Path | None = None) -> list[Finding]:
         _torch,
         _gpu,
         _embree,
-        _graphics,
         lambda: _disk(folder or Path()),
         _viewer,
     )
@@ -158,24 +145,6 @@ def _embree() -> Finding:
             "ray casting", f"by VTK, slower ({error})", False, "python -m pip install embreex"
         )
     return Finding("ray casting", "by Embree")
-
-
-def _graphics() -> Finding:
-    remedy = "apt install libgl1 libegl1; without a display also libosmesa6"
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", DRAW],
-            capture_output=True,
-            text=True,
-            timeout=PATIENCE,
-            check=False,
-        )
-    except (OSError, subprocess.TimeoutExpired) as error:
-        return Finding("graphics", f"OpenGL does not answer ({error})", False, remedy)
-    if done.returncode or not done.stdout.strip():
-        text = "no OpenGL; our own pictures do without, windows of pyvista need it"
-        return Finding("graphics", text, remedy=remedy)
-    return Finding("graphics", done.stdout.strip().splitlines()[-1])
 
 
 def _disk(folder: Path) -> Finding:

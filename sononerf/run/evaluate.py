@@ -33,7 +33,8 @@ def evaluate(
         run: A run that was reconstructed.
         truth: File of the true surface; ``evaluation.truth`` of the run's settings where None, or
             else the surface of its scene.
-        registration, unit, frame: How it is laid; ``evaluation`` of the settings where None.
+        registration, unit, frame: Its registration, unit and frame; those of the settings where
+            None.
         progress: Display of progress.
 
     Returns:

@@ -8,7 +8,7 @@ from pathlib import Path
 from sononerf import storage
 from sononerf.errors import InputError
 from sononerf.run.predict import read_poses
-from sononerf.run.run import Run, open_run
+from sononerf.run.run import open_run
 from sononerf.surface.next_poses import Within, next_poses
 
 
@@ -21,12 +21,12 @@ def propose(
         file: The table in the frame of the world; ``predict --frame world`` reads it for
             recordings too.
     """
-    opened, folder = open_run(run), Run(run)
-    file = output or folder.path / "next.csv"
+    opened = open_run(run)
+    file = output or opened.path / "next.csv"
     if file.is_dir():
         raise InputError(f"{file}: is a folder; give --output the name of a file")
-    given = None if candidates is None else read_poses(folder, candidates)
-    with folder.locked(file.parent):
+    given = None if candidates is None else read_poses(opened, candidates)
+    with opened.locked(file.parent):
         found = next_poses(
             opened.surface,
             opened.echoes,

@@ -13,7 +13,6 @@ from sononerf.errors import InputError
 from sononerf.report.key_numbers import run_rows
 from sononerf.run.build import locked
 from sononerf.run.provenance import flat
-from sononerf.run.report_runs import names_of
 from sononerf.run.run import Run
 
 
@@ -39,7 +38,9 @@ def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
             raise InputError(
                 f"{run.metrics_file}: damaged ({error}); remove it and evaluate again"
             ) from None
-    names = names_of(runs)
+    names = [run.path.resolve().name for run in runs]
+    if len(set(names)) < len(names):
+        names = [str(run.path) for run in runs]
     rows = [("", *names), *run_rows(found)]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     if csv is not None:

@@ -19,7 +19,6 @@ from sononerf.head.call import call_content, call_waveform
 from sononerf.head.head import Head
 from sononerf.head.reception import warn_of_band
 from sononerf.head.spectrogram import echo_samples
-from sononerf.memory import require_memory
 from sononerf.progress import Progress
 from sononerf.recordings.airsas import read_airsas
 from sononerf.recordings.arrays import read_numpy
@@ -27,7 +26,7 @@ from sononerf.recordings.audio import Recording
 from sononerf.recordings.channel_check import Channel, channels_of, check_channels
 from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.folder import read_folder
-from sononerf.recordings.import_ranges import analysis_bytes, calibrated, found_ranges, kept_bytes
+from sononerf.recordings.import_ranges import calibrated, found_ranges
 from sononerf.recordings.pings import Cutter, check_numbers, clipped_pings, mix
 from sononerf.recordings.sonotrace import read_sononerf_matlab, read_sonotracelab
 from sononerf.run.build import head_of
@@ -143,11 +142,6 @@ def understand(
     settings = validate_settings(plain, settings.source or "import")
     head = head_of(settings)
     check_numbers(recording, cutter, head.samples)
-    require_memory(
-        analysis_bytes(head) + kept_bytes(head, len(recording)),
-        f"{recording.path}: the analysis of {len(recording)} pings",
-        "lower spectrogram.range_max, or raise spectrogram.hop",
-    )
     kept, clipped = _without_clipped(recording, cutter, head, wanted)
     stated, where = recording.columns.take(kept).split(), str(recording.path)
     if stated is not None:

@@ -8,7 +8,7 @@ from scipy.interpolate import RegularGridInterpolator
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.call import call_waveform, sweep_delay
-from sononerf.head.directivity.files import write_sofa
+from sononerf.head.directivity.directivity_files import write_sofa
 from sononerf.head.ears import (
     SPEED,
     Ears,

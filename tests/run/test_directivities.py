@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from sononerf.head.directivity.files import write_sofa
+from sononerf.head.directivity.directivity_files import write_sofa
 from tests.command import succeed
 from tests.head.directivity.patterns import FREQUENCY, pair, sononerf_fields, write_v5
 

@@ -39,7 +39,7 @@ from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import EpochSampler
 from sononerf.field.fitting import require_accelerator
 from sononerf.field.module import EchoModule
-from sononerf.head.directivity.files import write_sofa
+from sononerf.head.directivity.directivity_files import write_sofa
 from sononerf.run import fit as fit_module
 from sononerf.run.build import head_of
 from sononerf.run.fit import fit, peak_memory_bytes

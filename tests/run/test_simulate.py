@@ -24,7 +24,7 @@ from sononerf.errors import (
     SettingsError,
 )
 from sononerf.head.decibels import compress
-from sononerf.head.directivity.files import write_sofa
+from sononerf.head.directivity.directivity_files import write_sofa
 from sononerf.locks import lock
 from sononerf.run import simulate as run_module
 from sononerf.run.import_recordings import read_recordings

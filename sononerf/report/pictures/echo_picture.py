@@ -208,8 +208,8 @@ def visible_hits(
         points ((N, 3), m): World frame.
         relative_db ((N,), dB): Their levels below the loudest, zero at most; the faintest are left
             out.
-        nearness ((H, W), m): What is seen at each pixel of the camera.
-        depth (m): Depth by which a surface may differ from the one in the middle of its pixel.
+        nearness ((H, W), m): Depth of the surface at each pixel of the camera.
+        depth (m): Tolerance: a surface may differ by it from the middle of its pixel.
     """
     places, near = camera.project(points)
     column, row = np.floor(places).astype(np.int64).T

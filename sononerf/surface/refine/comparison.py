@@ -11,7 +11,7 @@ import trimesh
 
 from sononerf.array_types import Singles
 from sononerf.echoes.echoes import Echoes
-from sononerf.head.decibels import ACTIVE_DB
+from sononerf.head.decibels import ACTIVE_DB, compress
 from sononerf.surface.refine.descent import ONSETS
 from sononerf.surface.refine.objective import FLOOR_DB, Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
@@ -27,7 +27,6 @@ they are, they would be an error of the truth."""
 RAYS = 30_000
 """Number of rays per validation pose; on three spheres the result differs from that of 300,000 rays
 by 0.2 dB."""
-_DB = 20.0 / math.log(10.0)
 
 
 class Comparison:
@@ -96,6 +95,6 @@ def _common_gain(heard: list[Singles], rendered: list[Singles]) -> float:
 def _difference(heard: Singles, rendered: Singles) -> float:
     """Mean difference of spectrograms (E, R, F) over the active cells, compressed decibels."""
     reference = max(float(heard.max()) * 10.0 ** (-FLOOR_DB / 20.0), 1e-30)
-    a, b = (_DB * np.log1p(part / reference) for part in (heard, rendered))
+    a, b = compress(heard, reference), compress(rendered, reference)
     active = (a >= ACTIVE_DB) | (b >= ACTIVE_DB)
     return float(np.abs(a - b)[active].mean()) if active.any() else 0.0

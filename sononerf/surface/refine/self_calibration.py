@@ -21,7 +21,7 @@ import trimesh
 from sononerf.array_types import Bools, Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.head.decibels import ACTIVE_DB
+from sononerf.head.decibels import ACTIVE_DB, compress
 from sononerf.surface.refine.objective import FLOOR_DB, TRUST
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.recording_errors import Calibration, Estimate, Kind
@@ -224,9 +224,9 @@ class Calibrator:
             late = 2.0 * self._value("range_offset", values)
             at = self.echoes.positions[pose], self.echoes.rotations[pose]
             magnitude = np.exp(gain)[:, None, None] * body.render(*at, stretch, late)[0]
-            return np.asarray(_DB * np.log1p(magnitude / reference))
+            return compress(magnitude, reference)
 
-        a, b = _DB * np.log1p(measured / reference), level(bodies[-1], self.values)
+        a, b = compress(measured, reference), level(bodies[-1], self.values)
         active = (a >= ACTIVE_DB) | (b >= ACTIVE_DB)
         if len(bodies) == 1:
             return a - b, a, active

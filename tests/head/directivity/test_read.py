@@ -5,7 +5,12 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.head.directivity.files import content_hash, read_csv, read_directivity, write_sofa
+from sononerf.head.directivity.directivity_files import (
+    content_hash,
+    read_csv,
+    read_directivity,
+    write_sofa,
+)
 from tests.head.directivity.patterns import (
     batslam_fields,
     pair,

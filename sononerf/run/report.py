@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 from zipfile import BadZipFile
 
 import numpy as np
@@ -25,15 +25,92 @@ from sononerf.report.key_numbers import NONE, run_rows
 from sononerf.report.page import Page
 from sononerf.report.pictures.curve_picture import curves_picture
 from sononerf.report.pictures.mesh_picture import mesh_png
+from sononerf.report.pictures.mip_picture import mip_pictures
 from sononerf.report.pictures.scene_picture import scene_png
+from sononerf.report.pictures.spectrogram_picture import spectrogram_picture
 from sononerf.report.surface_views import SurfaceViews
 from sononerf.run.build import true_mesh
+from sononerf.run.export import read_volume
 from sononerf.run.provenance import flat
 from sononerf.run.run import Run
 from sononerf.settings.loading import dump_yaml
 from sononerf.settings.schema import Settings
 from sononerf.surface.mesh_files import confidence_of, error_of
 from sononerf.surface.start.read_out import read_isosurface
+
+PAGE = "report.html"
+
+
+def report(
+    path: Path,
+    *,
+    paper: bool = False,
+    figures: Literal["svg", "pdf"] | None = None,
+    output: Path | None = None,
+    progress: Progress | None = None,
+) -> Path:
+    """Write one page of HTML with all its pictures inside.
+
+    An interrupted fit has a page too, with its results so far.
+
+    Args:
+        path: A run.
+        paper: Whether the counterparts of the paper's figures 4 to 8 are drawn too: the scene with
+            its poses, an iso-surface of the summed reflectivity, and, where the run was compared
+            with others, what was heard in it and not in them.
+        figures: Kind of vector graphics in which curves, projections and spectrograms are also
+            written, into the folder ``figures`` beside the page.
+        output: File of the page; ``RUN/report.html`` where None.
+        progress: Display of progress.
+
+    Returns:
+        page: The file. What a run has not come to yet is named with the command that makes it.
+
+    Raises:
+        InputError: If it is no run, or one of its files is damaged.
+
+    References:
+        .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, figures 4 to 8.
+    """
+    progress = progress or Progress(quiet=True)
+    run = Run(path)
+    settings = run.open()
+    target = output or path / PAGE
+    if target.suffix.lower() != ".html":
+        raise InputError(f"{target}: expected a file whose name ends in .html")
+    with run.locked(target):
+        page = page_of(run, settings, paper, progress)
+        drawn = {} if figures is None else _vector_figures(run, figures)
+        storage.make_folder(target.parent)
+        for name, data in drawn.items():
+            storage.commit_bytes(target.parent / "figures" / f"{name}.{figures}", data)
+        storage.commit_text(target, page.html())
+    return target
+
+
+def _vector_figures(run: Run, kind: Literal["svg", "pdf"]) -> dict[str, bytes]:
+    """Return the figures of a run that are drawn by lines and letters, by name."""
+    found = {}
+    curves, floors = curves_of(run)
+    if curves:
+        found["curves"] = curves_picture(curves, floors=floors, kind=kind)
+    if (run.reconstruction / "volume.vti").is_file():
+        projections = mip_pictures(read_volume(run.path), kind=kind)
+        found |= {f"mip_{axis}": data for axis, data in projections.items()}
+    predicted = read_predictions(run.path)
+    if predicted is not None:
+        for _, row in predicted.chosen():
+            number = predicted.numbers[row]
+            found[f"pose_{number:04d}"] = spectrogram_picture(
+                predicted.measured[row],
+                predicted.predicted[row],
+                predicted.range,
+                predicted.frequency,
+                f"pose {number}",
+                kind=kind,
+            )
+    return found
+
 
 SIDES = (380, 340)
 """Width and height of the views of a surface, pixels: four fit into the page's width."""
@@ -51,7 +128,7 @@ def damage_named(file: Path) -> Iterator[None]:
 
 
 def page_of(run: Run, settings: Settings, paper: bool, progress: Progress) -> Page:
-    """Return the page of a run; see :func:`sononerf.run.report_runs.report`."""
+    """Return the page of a run; see :func:`report`."""
     page = Page(run.path.resolve().name)
     with damage_named(run.metrics_file):
         _made(page, run, settings)
@@ -133,8 +210,6 @@ def _numbers(page: Page, run: Run) -> None:
 
 
 CURVES = {"all cells": "val/mae_db", "active cells": "val/mae_db_active"}
-
-
 Curves = dict[str, tuple[list[float], list[float]]]
 
 
@@ -347,12 +422,9 @@ def _isosurface(page: Page, run: Run, progress: Progress) -> None:
     except NumericalError as error:
         page.say(f"None: {error}.")
         return
-    said = (
-        f"Sum over {options.directions} directions, voxels of "
-        f"{1e3 * volume.spacing:.3g} mm, level "
-        + ("by Otsu's rule" if level == "auto" else "as set")
-        + f": {found:.3g}."
-    )
+    rule = "by Otsu's rule" if level == "auto" else "as set"
+    voxels = f"voxels of {1e3 * volume.spacing:.3g} mm"
+    said = f"Sum over {options.directions} directions, {voxels}, level {rule}: {found:.3g}."
     page.pictures({said: picture})
 
 
@@ -371,7 +443,6 @@ def _comparisons(path: Path) -> Iterator[tuple[str, dict[str, bytes]]]:
                     else f", {1e3 * away:.1f} mm from the middle of what was added"
                 )
             )
-        names = {name: file.with_name(f"{name}.png") for name in ("mip_x", "mip_y", "mip_z")}
-        names["overlay"] = file.with_name("overlay.png")  # not without a true surface
+        names = {n: file.with_name(f"{n}.png") for n in ("mip_x", "mip_y", "mip_z", "overlay")}
         found = {n: picture.read_bytes() for n, picture in names.items() if picture.is_file()}
         yield f"{said}.", found

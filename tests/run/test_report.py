@@ -10,7 +10,6 @@ import json
 import re
 import shutil
 import time
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,8 +19,8 @@ from PIL import Image
 
 from sononerf.errors import InputError, NumericalError
 from sononerf.report.surface_views import SurfaceViews
-from sononerf.run import run_page as report_module
-from sononerf.run.report_runs import report as report_runs
+from sononerf.run import report as report_module
+from sononerf.run.report import report as write_report
 from sononerf.run.table import table
 from sononerf.surface.mesh_files import mesh_bytes
 from tests.browser import CHROMIUM, browser
@@ -94,7 +93,7 @@ def finished(run, monkeypatch):
 
 
 def report(run, **options):
-    return report_runs([run], **options)
+    return write_report(run, **options)
 
 
 def plain(page):
@@ -213,27 +212,6 @@ def test_an_interrupted_fit_has_a_page_of_what_it_has(run):
     page = report(run)
     assert "The fit has not come to its end; sononerf fit" in plain(page)
     assert list(pictures_of(page)) == ["The field alone on validation poses."]
-
-
-def test_several_runs_stand_side_by_side(finished, tmp_path, monkeypatch):
-    other = shutil.copytree(finished, tmp_path / "other")
-    numbers = {**METRICS, "prediction": {**METRICS["prediction"], "mae_db": 0.5}}
-    (other / "metrics.json").write_text(json.dumps(numbers))
-    config = (other / "config.yaml").read_text()
-    assert "learning_rate: " in config
-    (other / "config.yaml").write_text(
-        re.sub(r"learning_rate: .*", "learning_rate: 0.007", config, count=1)
-    )
-    monkeypatch.chdir(tmp_path)
-    page = report_runs([finished, other])
-    assert page == Path("report.html")
-    rows = rows_of(page)
-    assert rows[""] == ["leaf-7", "other"]
-    assert rows["held-out error, all cells, dB"] == ["0.29", "0.50"]
-    assert rows["fit.learning_rate"][1] == "0.007"
-    assert "fit.epochs" not in rows
-    assert "noise floor, all cells, dB" not in rows  # no run has one
-    assert page.read_text().count('alt="other"') == 4  # view and three projections
 
 
 def test_a_table_has_a_column_per_run_and_a_line_of_csv(finished, tmp_path):
