@@ -8,7 +8,11 @@ rays, ``B`` batch, ``V`` vertices, ``T`` triangles.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from sononerf.shown import show_by
+from sononerf.version import __version__
 
 if TYPE_CHECKING:
     from sononerf.echoes.echoes import Echoes
@@ -32,7 +36,6 @@ if TYPE_CHECKING:
     from sononerf.surface.reconstruction import reconstruct, refine
     from sononerf.surface.surface import Surface
 
-__version__ = "0.1.0"
 __all__ = [
     "Comparison",
     "EchoDataModule",
@@ -93,10 +96,20 @@ _HOMES = {
 def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    import importlib
-
     return getattr(importlib.import_module(f"sononerf.{_HOMES[name]}"), name)
 
 
 def __dir__() -> list[str]:
     return __all__
+
+
+def _notebook(name: str) -> Any:
+    """Return a function of the notebook's module, which imports all kinds of objects, when used."""
+
+    def call(*given: Any, **options: Any) -> Any:
+        return getattr(importlib.import_module("sononerf.report.notebook"), name)(*given, **options)
+
+    return call
+
+
+show_by(_notebook("html_of"), _notebook("png_of"))

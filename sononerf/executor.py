@@ -30,8 +30,13 @@ CONNECT_SECONDS = 30
 """Time to wait for a Dask scheduler, s; across a network it answers in one."""
 _DEAD = ("KilledWorker", "CancelledError", "FutureCancelledError")
 """Names of Dask's errors for a task whose workers, or whose scheduler, are gone."""
-PRELOADED = "sononerf.simulation.ready"
-"""What worker processes have imported when they start."""
+_preloaded: list[str] = []
+
+
+def preload(module: str) -> None:
+    """Let worker processes that start from now on have imported a module."""
+    if module not in _preloaded:
+        _preloaded.append(module)
 
 
 class TaskError(SonoNerfError):
@@ -158,16 +163,16 @@ def _call(function: Callable[..., Any], held: Any, *task: Any) -> Any:
 
 
 def process_context() -> BaseContext:
-    """Return how workers are started: on Linux by a server that has imported the simulator."""
+    """Return how workers are started: on Linux by a server that has imported what they need."""
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([PRELOADED])
+    context.set_forkserver_preload(_preloaded)
     return context
 
 
 def begin() -> None:
-    """Let that server import the simulator while this process goes on."""
+    """Let that server import while this process goes on."""
     process_context()
     if sys.platform == "linux":
         forkserver.ensure_running()

@@ -3,15 +3,19 @@
 
 from __future__ import annotations
 
-from importlib import import_module
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from sononerf import storage
 
-NOTEBOOK = "sononerf.report.notebook"
-"""Module that shows each kind of object. It imports all of them, so that they cannot import it; it
-is imported at first use."""
+Display = Callable[..., Any]
+_displays: dict[str, Display] = {}
+
+
+def show_by(html: Display, picture: Display) -> None:
+    """Set what makes the HTML and the picture of an object; the package does so when imported."""
+    _displays.update(html=html, picture=picture)
 
 
 class Picture:
@@ -32,9 +36,9 @@ class Shown:
     """Shows itself in a notebook."""
 
     def _repr_html_(self) -> str:
-        return str(import_module(NOTEBOOK).html_of(self))
+        return str(_displays["html"](self))
 
 
 def picture_of(thing: object, **options: Any) -> Picture:
     """Return the picture of an object, see :func:`sononerf.report.notebook.png_of`."""
-    return Picture(import_module(NOTEBOOK).png_of(thing, **options))
+    return Picture(_displays["picture"](thing, **options))

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Tables of poses as CSV: UTF-8, one header line, commas, semicolons or tabulators."""
+"""Tables of poses as CSV (UTF-8; commas, semicolons or tabulators), and tables on the screen."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 from sononerf.errors import InputError
@@ -56,3 +57,15 @@ def number_in(path: Path, line: int, name: str, cell: str) -> float:
             "point"
         )
     return number
+
+
+def aligned(rows: Sequence[Sequence[str]], sides: str) -> list[str]:
+    """Return rows as lines with columns of one width; each column's side is ``<`` or ``>``."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    columns = list(zip(sides, widths, strict=True))
+    return [
+        "  ".join(
+            f"{cell:{side}{width}}" for cell, (side, width) in zip(row, columns, strict=True)
+        ).rstrip()
+        for row in rows
+    ]

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sononerf.field.factories import FieldFactory, RendererFactory, make_field, make_renderer
+from sononerf.field.factories import FieldFactory, RendererFactory, make
 from sononerf.field.field import Field
 from sononerf.field.renderer import Renderer
 from sononerf.geometry.poses import Poses
@@ -65,9 +65,9 @@ def check_field(field: str | FieldFactory, **options: Any) -> Field:
         field: The object under test.
     """
     torch.manual_seed(0)
-    made = make_field(field, REGION, HEAD, options)
+    made = make(field, Field, REGION, HEAD, options)
     torch.manual_seed(0)
-    again = make_field(field, REGION, HEAD, options)
+    again = make(field, Field, REGION, HEAD, options)
     for (name, one), two in zip(
         made.state_dict().items(), again.state_dict().values(), strict=True
     ):
@@ -115,9 +115,9 @@ def check_renderer(
     Returns:
         renderer: The object under test.
     """
-    made = make_renderer(renderer, REGION, HEAD, options)
+    made = make(renderer, Renderer, REGION, HEAD, options)
     torch.manual_seed(1)
-    heard = make_field(field, REGION, HEAD, {})
+    heard = make(field, Field, REGION, HEAD, {})
     with torch.no_grad():
         for parameter in heard.parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
@@ -144,7 +144,7 @@ def check_renderer(
     made.calibrate(found.detach(), 2 * found.detach())
     after = made(heard, position, rotation, rows).square().sum()
     _close(after / before, torch.tensor(4.0), "calibrate does not scale it to what was measured")
-    again = make_renderer(renderer, REGION, HEAD, options)
+    again = make(renderer, Renderer, REGION, HEAD, options)
     _same_after_loading(made, again, lambda part: part(heard, position, rotation, rows))
     return made
 

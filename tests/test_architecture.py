@@ -19,7 +19,17 @@ PACKAGE = ROOT / "sononerf"
 
 FLOORS = (
     ("errors", "array_types", "compiled", "progress", "memory", "executor"),
-    ("storage", "locks", "input_files", "matlab_files", "shown", "tables", "settings", "geometry"),
+    (
+        "version",
+        "storage",
+        "locks",
+        "input_files",
+        "matlab_files",
+        "shown",
+        "tables",
+        "settings",
+        "geometry",
+    ),
     ("scene", "head"),
     ("echoes",),
     ("simulation", "recordings"),
@@ -105,9 +115,20 @@ def arrows_up(tree, room):
         target = rest.partition(".")[0]
         if first == "sononerf_scenes":
             yield line
-        elif first == "sononerf" and target and target != "__version__":
+        elif first == "sononerf" and target:
             if target not in ROOMS or ROOMS.index(target) > own:
                 yield line
+
+
+def strings_up(tree, room):
+    """Find names of modules of higher floors in strings, which are imports in disguise."""
+    own = ROOMS.index(room)
+    for node in ast.walk(tree):
+        if not (isinstance(node, ast.Constant) and isinstance(node.value, str)):
+            continue
+        found = re.fullmatch(r"sononerf\.(\w+)(\.\w+)+", node.value)
+        if found and found[1] in ROOMS and ROOMS.index(found[1]) > own:
+            yield node.lineno
 
 
 def relative_imports(tree):
@@ -243,6 +264,7 @@ def faults(path):
     module = name_of(path).removesuffix(".py").replace("/", ".")
     found = {
         "an arrow that points up": arrows_up(tree, room),
+        "an arrow up by a string": strings_up(tree, room),
         "a relative import": relative_imports(tree),
         "not pure": impure_imports(tree, module),
         "chooses a device": device_choices(tree, room),
@@ -263,6 +285,7 @@ def test_every_source_keeps_the_rules():
     ("rule", "arguments", "bad", "good"),
     [
         (arrows_up, ("storage",), "import sononerf.echoes.store", "import sononerf.errors"),
+        (strings_up, ("scene",), 'm = "sononerf.report.page"', 'm = "sononerf.errors.x"'),
         (arrows_up, ("geometry",), "from sononerf import scene", "from sononerf import storage"),
         (arrows_up, ("scene",), "import sononerf_scenes.sphere", "import trimesh"),
         (arrows_up, ("scene",), "import sononerf.head.ears", "import sononerf.settings.plugins"),

@@ -38,7 +38,7 @@ def test_from_wav_and_csv_to_two_spheres(tmp_path):
     )
     run("import", "recordings", "recordings", "--output", "store")
     said = run("fit", "fit.yaml", "--output", "run")
-    assert "in the frame and unit of the recordings" in said
+    assert "mesh_original.ply" in said
     mesh = trimesh.load(tmp_path / "run/reconstruction/mesh_original.ply")
     parts = mesh.split()
     assert len(parts) == 2

@@ -11,13 +11,13 @@ from typing import Annotated
 
 import typer
 
-from sononerf import __version__
 from sononerf.cli import experiments, files
 from sononerf.cli.options import app, say
 from sononerf.errors import SettingsError, SonoNerfError
 from sononerf.memory import memory_faults
 from sononerf.progress import Progress
 from sononerf.storage import WAYS_OUT, commit_text, storage_error
+from sononerf.version import __version__
 
 __all__ = ["app", "experiments", "fault_of", "files", "run"]
 

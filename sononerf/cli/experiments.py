@@ -43,8 +43,9 @@ def _begin(settings: Settings, workers: int | None) -> None:
     if sys.stderr.isatty():  # elsewhere an error message stays the only line
         say(f"echoes of {settings.data.store or (settings.scene and settings.scene.name)}")
     if settings.data.store is None and settings.poses.count >= MANY and workers != 1:
-        from sononerf.executor import begin
+        from sononerf.executor import begin, preload
 
+        preload("sononerf.simulation.ready")
         begin()
 
 
@@ -187,13 +188,6 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
             f"{geometry['components']} part{'s' * (geometry['components'] != 1)} "
             f"(true: {geometry['components_true']})"
         )
-        target = geometry.get("target")
-        if target:
-            near = target["fscore"]
-            say(
-                f"the target alone: F-score {near['0.002']:.2f} at 2 mm and "
-                f"{near['0.005']:.2f} at 5 mm"
-            )
         other = (metrics.get("baseline") or {}).get("backprojection")
         if other:
             say(
@@ -210,10 +204,8 @@ def _summary(folder: Path, metrics: dict[str, Any]) -> None:
         )
     if (folder / "report.html").is_file():
         say(f"report:      {folder / 'report.html'}")
-    original = folder / "reconstruction" / "mesh_original.ply"
-    say(f"mesh:        {folder / 'reconstruction' / 'mesh.ply'}")
-    if original.is_file():
-        say(f"             {original} in the frame and unit of the recordings")
+    for mesh in sorted((folder / "reconstruction").glob("mesh*.ply")):
+        say(f"mesh:        {mesh}")
     say(f"pictures:    {folder / 'reconstruction' / 'view.png'}, {folder / 'prediction'}")
     say(f"numbers:     {folder / 'metrics.json'}")
     say(f"TensorBoard: tensorboard --logdir {folder}")

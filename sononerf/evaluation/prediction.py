@@ -4,10 +4,10 @@
 from __future__ import annotations
 
 import logging
-import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -165,24 +165,25 @@ def _corners(model: EchoModule) -> tuple[Floats, Floats]:
     return lower, upper
 
 
+TRACED: WeakKeyDictionary[Surface, WeakKeyDictionary[EchoModule, Traced]] = WeakKeyDictionary()
+"""Surfaces with the weight of their echoes beside what a model renders, as long as both live."""
+
+
 def traced_of(
     model: EchoModule, surface: Surface, options: SimulationSettings, **how: Any
 ) -> Traced:
     """Return a surface with the weight of its echoes; learned once for each model and surface."""
-    for known, traced in surface.learned:
-        if known() is model:
-            assert isinstance(traced, Traced)
-            return traced
+    of_surface = TRACED.setdefault(surface, WeakKeyDictionary())
+    if model in of_surface:
+        return of_surface[model]
     if surface.echoes is None:
         raise InputError(
             "the surface does not know the echoes that it was made from; take one from reconstruct "
             "or refine, Surface(mesh, echoes=...), or None"
         )
-    found = learn_traced(
-        model, surface.echoes, surface.mesh, options, seed=model.options.seed, **how
-    )
-    surface.learned.append((weakref.ref(model), found))
-    return found
+    seed = model.options.seed
+    of_surface[model] = learn_traced(model, surface.echoes, surface.mesh, options, seed=seed, **how)
+    return of_surface[model]
 
 
 def prediction_numbers(

@@ -36,62 +36,39 @@ def box_of(region: ArrayLike | Tensor) -> Tensor:
     return box
 
 
-def make_field(
-    field: Field | FieldFactory | str,
-    region: Tensor,
-    head: Head | None,
-    options: Mapping[str, Any],
-) -> Field:
-    """Return the field of a name, of a factory, or the field itself.
-
-    Args:
-        region ((2, 3), m): Lower and upper corner.
-    """
-    return _made(field, Field, plugins.FIELDS, region, head, options)
-
-
-def make_renderer(
-    renderer: Renderer | RendererFactory | str,
-    region: Tensor,
-    head: Head | None,
-    options: Mapping[str, Any],
-) -> Renderer:
-    """Return the renderer of a name, of a factory, or the renderer itself.
-
-    Args:
-        region ((2, 3), m): Lower and upper corner.
-    """
-    return _made(renderer, Renderer, plugins.RENDERERS, region, head, options)
-
-
-def _made(
+def make(
     given: Made | Callable[..., Made] | str,
     kind: type[Made],
-    group: str,
     region: Tensor,
     head: Head | None,
     options: Mapping[str, Any],
 ) -> Made:
-    """Return the object itself, or the one that a plugin's factory, or a factory, makes."""
+    """Return the object itself, or the one that a plugin's factory, or a factory, makes.
+
+    Args:
+        given: Field or renderer; the name of a plugin; or a factory.
+        region ((2, 3), m): Lower and upper corner.
+    """
     if isinstance(given, kind):
         return given
     what = kind.__name__.lower()
-    make = plugins.load(group, given) if isinstance(given, str) else given
-    if not callable(make):
+    group = plugins.FIELDS if issubclass(kind, Field) else plugins.RENDERERS
+    factory = plugins.load(group, given) if isinstance(given, str) else given
+    if not callable(factory):
         raise InputError(
-            f"{what} is a {type(make).__name__}, expected the name of a plugin, a factory or a "
+            f"{what} is a {type(factory).__name__}, expected the name of a plugin, a factory or a "
             f"sononerf {kind.__name__}"
         )
     if head is None:
         raise SettingsError("head: missing; give the head that heard the echoes")
-    chosen = plugins.check_options(make, options, where=f"{what}.options", given=2)
+    chosen = plugins.check_options(factory, options, where=f"{what}.options", given=2)
     heard = tensor(head.frequency) if group == plugins.FIELDS else head
     if isinstance(given, str):
-        made = plugins.call(f"{what} {given!r}", make, region, heard, **chosen)
+        result = plugins.call(f"{what} {given!r}", factory, region, heard, **chosen)
     else:
-        made = make(region, heard, **chosen)
-    if not isinstance(made, kind):
+        result = factory(region, heard, **chosen)
+    if not isinstance(result, kind):
         raise InputError(
-            f"{given!r} makes a {type(made).__name__}, expected a sononerf {kind.__name__}"
+            f"{given!r} makes a {type(result).__name__}, expected a sononerf {kind.__name__}"
         )
-    return made
+    return result

@@ -24,8 +24,7 @@ from sononerf.field.factories import (
     FieldFactory,
     RendererFactory,
     box_of,
-    make_field,
-    make_renderer,
+    make,
 )
 from sononerf.field.field import Field
 from sononerf.field.range_slices import RangeSlices, seed_of
@@ -128,8 +127,8 @@ class EchoModule(lightning.LightningModule):
         # A generator of its own leaves the caller's random numbers alone.
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(options.seed)
-            self.field = make_field(field, box, self.head, field_options or {})
-            self.renderer = make_renderer(renderer, box, self.head, renderer_options or {})
+            self.field = make(field, Field, box, self.head, field_options or {})
+            self.renderer = make(renderer, Renderer, box, self.head, renderer_options or {})
         if options.silent_share < 1.0 and self.renderer.whole_poses:
             raise SettingsError(
                 f"fit.silent_share: found {options.silent_share:g}, but renderer {renderer!r} "

@@ -14,9 +14,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sononerf import __version__, locks, storage
+from sononerf import locks, storage
 from sononerf.errors import SonoNerfError
 from sononerf.memory import available_cores, available_memory
+from sononerf.version import __version__
 
 PACKAGES = (
     "lightning",

@@ -16,7 +16,7 @@ import pyvista
 import scipy.io
 from numpy.typing import NDArray
 
-from sononerf import __version__, storage
+from sononerf import storage
 from sononerf.echoes.echoes import complete_store
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
@@ -25,6 +25,7 @@ from sononerf.run.build import locked
 from sononerf.run.run import Run
 from sononerf.surface.mesh_files import MeshFormat, confidence_of, error_of, mesh_bytes
 from sononerf.surface.start.volume import Volume
+from sononerf.version import __version__
 
 FileType = Literal["mat", "h5"]
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sononerf import __version__, locks, storage
+from sononerf import locks, storage
 from sononerf.array_types import Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.recorded_noise import seal_recorded
@@ -31,6 +31,7 @@ from sononerf.report.pictures.spectrogram_picture import pings_png
 from sononerf.run.understand import Understood, understand
 from sononerf.settings.loading import assignments
 from sononerf.settings.schema import HEAD_SECTIONS, CallSettings
+from sononerf.version import __version__
 
 logger = logging.getLogger("sononerf")
 

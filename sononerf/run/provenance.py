@@ -9,9 +9,9 @@ import platform
 from collections.abc import Mapping
 from typing import Any
 
-from sononerf import __version__
 from sononerf.geometry.frame import KEYS
 from sononerf.settings.schema import Settings
+from sononerf.version import __version__
 
 FREE_KEYS = (
     "data.store",

@@ -18,7 +18,7 @@ import trimesh
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from sononerf import __version__, storage
+from sononerf import storage
 from sononerf.callbacks.tensorboard import add_mesh, writing
 from sononerf.errors import InputError, SettingsError
 from sononerf.field.checkpoint_io import model_checksum
@@ -36,6 +36,7 @@ from sononerf.surface.refine.surface_error import error_from_twice
 from sononerf.surface.start.read_out import Method
 from sononerf.surface.start.volume import vti_bytes
 from sononerf.surface.surface import FORMATS, Surface
+from sononerf.version import __version__
 
 logger = logging.getLogger("sononerf")
 

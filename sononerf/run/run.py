@@ -17,13 +17,13 @@ from its last stage. The formulas are in ``docs/method.md``.
 from __future__ import annotations
 
 import html
-import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import trimesh
@@ -34,7 +34,7 @@ from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import IncompatibleError, InputError
 from sononerf.evaluation.numbers import Evaluation
-from sononerf.evaluation.prediction import Prediction, predict
+from sononerf.evaluation.prediction import TRACED, Prediction, predict
 from sononerf.evaluation.traced import Traced, for_single_poses
 from sononerf.field.checkpoint_io import DESCRIPTION_NAME
 from sononerf.field.module import EchoModule
@@ -216,7 +216,7 @@ class Run(Shown):
             echoes=echoes,
         )
         if self._traced is not None:
-            surface.learned.append((weakref.ref(self.model), self._traced))
+            TRACED[surface] = WeakKeyDictionary({self.model: self._traced})
         return surface
 
     @property

@@ -25,6 +25,7 @@ from sononerf.scene.scene import list_scenes, load_scene
 from sononerf.settings import plugins
 from sononerf.settings.schema import Settings
 from sononerf.simulation.simulator import pose_seed
+from sononerf.tables import aligned
 
 
 def describe_scenes() -> list[dict[str, Any]]:
@@ -72,12 +73,7 @@ def scene_table(rows: list[dict[str, Any]]) -> list[str]:
         count = "-" if row["triangles"] is None else str(row["triangles"])
         origin = f"{row['distribution']} {row['version']}"
         table.append([row["name"], origin, size or needs, count, row["summary"]])
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    return [
-        f"{name:{widths[0]}}  {origin:{widths[1]}}  {size:{widths[2]}}  {count:>{widths[3]}}  "
-        f"{summary}".rstrip()
-        for name, origin, size, count, summary in table
-    ]
+    return aligned(table, "<<<><")
 
 
 def describe_scene(name: str) -> dict[str, Any]:
@@ -98,13 +94,11 @@ def describe_scene(name: str) -> dict[str, Any]:
 
 def option_table(scene: dict[str, Any]) -> list[str]:
     """Return a scene's description and its options as lines."""
-    table = [("scene.options.", "default", "allowed")]
+    table = [["scene.options.", "default", "allowed"]]
     for row in scene["options"]:
         default = "needed" if row["needed"] else _plain(row["default"])
-        table.append((row["name"], default, row["allowed"]))
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    lines = [f"{a:{widths[0]}}  {b:{widths[1]}}  {c}".rstrip() for a, b, c in table]
-    return [*scene["description"].splitlines(), "", *lines]
+        table.append([row["name"], default, row["allowed"]])
+    return [*scene["description"].splitlines(), "", *aligned(table, "<<<")]
 
 
 def _plain(value: object) -> str:

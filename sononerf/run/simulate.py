@@ -174,7 +174,6 @@ def write_waveforms(
     settings: Settings,
     folder: Path,
     *,
-    scene: Scene | None = None,
     progress: Progress | None = None,
 ) -> list[Path]:
     """Simulate the sound at the receivers at every pose, and write WAV files with a table.
@@ -184,10 +183,7 @@ def write_waveforms(
     are those of :func:`sononerf.run.simulate.simulate`.
     """
     progress = progress or Progress(quiet=True)
-    if scene is None:
-        if settings.scene is None:
-            raise SettingsError("scene: missing; set scene.name to simulate recordings")
-        scene = load_scene(settings.scene.name, settings.scene.options, source=settings.source)
+    scene = scene_of(settings)
     rate = settings.spectrogram.sampling_rate
     if rate != round(rate):
         raise SettingsError(f"spectrogram.sampling_rate: a WAV file cannot hold {rate} Hz")

@@ -14,6 +14,7 @@ from sononerf.report.key_numbers import run_rows
 from sononerf.run.build import locked
 from sononerf.run.provenance import flat
 from sononerf.run.run import Run
+from sononerf.tables import aligned
 
 
 def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
@@ -42,7 +43,6 @@ def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
     if len(set(names)) < len(names):
         names = [str(run.path) for run in runs]
     rows = [("", *names), *run_rows(found)]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     if csv is not None:
         values = [flat(metrics) for metrics in found]
         keys = sorted({key for one in values for key in one} - {"schema"})
@@ -53,10 +53,4 @@ def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
             writer.writerow([name, *("" if one.get(key) is None else one[key] for key in keys)])
         with locked(runs, csv):
             storage.commit_text(csv, text.getvalue())
-    return [
-        "  ".join(
-            cell.ljust(width) if not column else cell.rjust(width)
-            for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in rows
-    ]
+    return aligned(rows, "<" + ">" * len(runs))

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf import __version__, locks, storage
+from sononerf import locks, storage
 from sononerf.array_types import Floats, Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
@@ -36,6 +36,7 @@ from sononerf.simulation.accuracy import MOST, settle_rays
 from sononerf.simulation.pose_faults import check_aim, check_poses, check_reach, deaf
 from sononerf.simulation.simulator import VERSION, Simulator, pose_seed
 from sononerf.simulation.workers import SeedOf, simulated
+from sononerf.version import __version__
 
 Write = Callable[[int, Singles], None]
 HASHED_SECTIONS = ("simulation", "air", "ears", "call", "noise", "spectrogram")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator
 
 from sononerf.array_types import Floats, Singles
 from sononerf.errors import SonoNerfError
-from sononerf.executor import TaskError, computed
+from sononerf.executor import TaskError, computed, preload
 from sononerf.geometry.poses import Poses
 from sononerf.memory import available_cores
 from sononerf.simulation.simulator import Simulator
@@ -15,6 +15,10 @@ from sononerf.simulation.simulator import Simulator
 MOST_WORKERS = 8
 WORTH_RAYS = 250_000
 """Rays of all poses from which other processes save time: fewer are traced before these start."""
+
+READY = "sononerf.simulation.ready"
+"""What worker processes have imported when they start."""
+preload(READY)
 
 Results = Generator[tuple[int, Singles], None, None]
 SeedOf = Callable[[int], int]

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -54,7 +53,6 @@ class Surface(Shown):
             :class:`~sononerf.surface.refine.refined.Refined`.
         echoes: Echoes of its field; None if unknown.
         reading: Evidence that it was made from; None if there is none.
-        learned: Weights of its echoes beside what a model renders, by model.
 
     Raises:
         InputError: If the mesh has no triangles, or a vertex is not finite.
@@ -73,7 +71,6 @@ class Surface(Shown):
     candidates: Sequence[dict[str, Any]] = ()
     echoes: Echoes | None = field(default=None, repr=False)
     reading: Reading | None = field(default=None, repr=False)
-    learned: list[tuple[weakref.ref[Any], object]] = field(default_factory=list, repr=False)
 
     def __post_init__(self) -> None:
         expect(self.mesh, trimesh.Trimesh, "mesh")
