@@ -38,6 +38,13 @@ STOPPED = tuple(
 Row = dict[str, Any]
 
 
+def append_line(path: Path, text: str) -> None:
+    """Append a line to a file; one that was torn before is ended first."""
+    with path.open("a+b") as file:
+        torn = file.tell() and path.read_bytes()[-1:] != b"\n"
+        file.write((("\n" if torn else "") + text + "\n").encode())
+
+
 @dataclass(frozen=True)
 class Column:
     """One column of the table: how a value is shown, and what makes it a bad one."""

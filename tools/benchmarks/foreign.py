@@ -31,6 +31,7 @@ from tools.benchmarks.experiment import (
     STOPPED,
     Row,
     aligned,
+    append_line,
     ending,
     ensemble_name,
     origin,
@@ -58,7 +59,7 @@ def foreign(arguments: argparse.Namespace) -> str:
             with ending(output):
                 line = storage.to_json({**head, **origin(), **measured(body, settings, output)})
                 storage.make_folder(output)
-                storage.append_line(file, line)
+                append_line(file, line)
                 print(line, file=sys.stderr, flush=True)
     return f"{table(rows_of(file))}\nwrote {file}"
 

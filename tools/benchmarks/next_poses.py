@@ -19,7 +19,7 @@ from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.scene.scene import load_scene
 from sononerf.surface.next_poses import CANDIDATES
-from tools.benchmarks.experiment import Row, aligned, ending, origin
+from tools.benchmarks.experiment import Row, aligned, append_line, ending, origin
 
 WAYS = ("proposed", "farthest", "random")
 FIRST = 12
@@ -47,7 +47,7 @@ def next_poses(arguments: argparse.Namespace) -> str:
                 if any(series.is_end(row) for row in known if _key(row) == (name, seed, way)):
                     continue
                 for row in series.rows(way):  # a series that was interrupted begins again
-                    storage.append_line(file, storage.to_json(row))
+                    append_line(file, storage.to_json(row))
                     known.append(row)
     return f"{table(known, arguments.score)}\nwrote {file}"
 

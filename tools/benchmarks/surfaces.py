@@ -26,6 +26,7 @@ from tools.benchmarks.experiment import (
     Column,
     Row,
     aligned,
+    append_line,
     ending,
     ensemble_name,
     origin,
@@ -146,7 +147,7 @@ class _Lines:
     def add(self, row: Row) -> None:
         line = storage.to_json(row)
         storage.make_folder(self.file.parent)
-        storage.append_line(self.file, line)
+        append_line(self.file, line)
         print(line, file=sys.stderr, flush=True)
 
 
