@@ -24,8 +24,14 @@ from sononerf.run.corrected_store import DECIBELS, write_corrected
 from sononerf.run.run import Run
 from sononerf.settings.schema import SpectrogramSettings
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.recording_errors import KINDS, Calibration, Estimate, Kind
-from sononerf.surface.refine.self_calibration import Calibrator
+from sononerf.surface.refine.self_calibration import (
+    KINDS,
+    Calibration,
+    Calibrator,
+    Estimate,
+    Kind,
+    raised_support,
+)
 from sononerf.surface.refine.support_search import above, find_support, with_support
 
 STEPS = 20
@@ -78,41 +84,31 @@ def calibrate(
         output: The corrected store; the source's own store is left as it is.
         kinds: Errors of :data:`KINDS`.
         progress: Display of progress.
-
-    Raises:
-        SettingsError: If a kind is unknown, or the run was fitted with a support already.
-        InputError: If the run has no surface, or its echoes are not there.
-        IncompatibleError: If there is a store at ``output`` already.
     """
     progress = progress or Progress(quiet=True)
     if output.exists() and any(output.iterdir()):
         raise IncompatibleError(f"{output}: holds something already; choose another --output")
     wanted = kinds_of(kinds)
-    if _is_store(source):
+    if (source / "zarr.json").is_file():
         raise SettingsError(
             f"{source}: a store; {wanted[0]} is found by a surface: fit first, and name the run"
         )
     opened = Run.of(source)
     echoes, mesh = opened.echoes, opened.mesh()
     storage.remove_if_empty(storage.probe_writable(output))
-    if "support" in wanted and echoes.head.plane is not None:
-        raise SettingsError(
-            "support: this run was fitted with one; fit without support.point first, so that the "
-            "surface shows the image"
-        )
     known: dict[str, float] = {}
-    if "support" in wanted:
+    if "support" in wanted and echoes.head.plane is None:
         echoes, mesh, known["support"] = _with_support(echoes, mesh, progress)
     estimate = _estimate(echoes, mesh, [kind for kind in wanted if kind not in known], progress)
     estimate.deviation.update(known)
-    corrected = write_corrected(echoes, output, estimate.calibration, progress)
+    found = estimate.calibration
+    if found.support:
+        head = raised_support(echoes.head, found.support)
+        echoes = Echoes(echoes.store, head, echoes.hull)
+    corrected = write_corrected(echoes, output, found, progress)
     return Calibrated(
         corrected, estimate, *describe(echoes.head, echoes.store, mesh, estimate, wanted)
     )
-
-
-def _is_store(source: Path) -> bool:
-    return (source / "zarr.json").is_file()
 
 
 def _is_turntable(positions: Floats) -> bool:
@@ -143,8 +139,8 @@ def _estimate(
 ) -> Estimate:
     head = echoes.head
     if not kinds:
-        nothing = Calibration.none(len(head.receivers))
-        return Estimate(nothing, {}, [])
+        nothing = np.zeros((len(head.receivers), len(head.frequency)))
+        return Estimate(Calibration(nothing), {}, [])
     work = Calibrator(mesh, echoes, Optics(head), kinds, dependent=dependent_cells(head.analysis))
     with progress.task("calibrating", STEPS * len(work.poses)) as task:
         for _ in range(STEPS):
@@ -178,31 +174,26 @@ def describe(
     distance = np.linalg.norm(away, axis=1)
     lines, warnings = [], []
 
-    def say(kind: str, text: str, warning: str | None = None) -> None:
+    def say(kind: str, text: str, warning: str, *, vague: bool) -> None:
         lines.append(f"{kind.replace('_', ' ') + ':':15s} {text}")
-        if warning:
+        if vague:
             warnings.append(f"{kind}: {warning}")
 
     if error:
-        say("error", f"{error[0]:.2f} dB before, {error[-1]:.2f} dB after {len(error)} steps")
+        change = f"{error[0]:.2f} dB before, {error[-1]:.2f} dB after {len(error)} steps"
+        say("error", change, "", vague=False)
     if "gain" in kinds:
         uncertain = DECIBELS * deviation["gain"]
+        gains = ", ".join(f"{DECIBELS * value:+.2f}" for value in found.gain.mean(axis=1))
+        text = f"{gains} dB in the mean over frequency, each ± {uncertain:.2f} dB"
         vague = uncertain > DETERMINED_DB
-        gains = ", ".join(f"{DECIBELS * value:+.2f}" for value in found.gain)
-        say(
-            "gain",
-            f"{gains} dB, each ± {uncertain:.2f} dB",
-            "the echoes do not determine it" if vague else None,
-        )
+        say("gain", text, "the echoes do not determine it", vague=vague)
     if "range_offset" in kinds:
         uncertain = deviation["range_offset"]
-        say(
-            "range_offset",
-            f"{1e3 * found.range_offset:+.2f} ± {1e3 * uncertain:.2f} mm",
-            "the echoes do not separate it from the size of the object"
-            if uncertain > DETERMINED * head.resolution
-            else None,
-        )
+        text = f"{1e3 * found.range_offset:+.2f} ± {1e3 * uncertain:.2f} mm"
+        vague = uncertain > DETERMINED * head.resolution
+        warning = "the echoes do not separate it from the size of the object"
+        say("range_offset", text, warning, vague=vague)
     if "range_offset" in kinds and _is_turntable(store.positions):
         warnings.append(
             "range_offset: all poses are those of a turntable, where a larger object sounds nearly "
@@ -217,22 +208,16 @@ def describe(
     if "support" in kinds and head.plane is not None:
         height = float(np.dot(head.plane.point, head.plane.normal))
         uncertain = deviation["support"]
-        say(
-            "support",
-            f"{1e3 * height:.1f} ± {1e3 * uncertain:.1f} mm",
-            "the echoes hardly determine it; measure it"
-            if uncertain > DETERMINED_RESOLUTIONS * head.resolution
-            else None,
-        )
+        text = f"{1e3 * height:.1f} ± {1e3 * uncertain:.1f} mm"
+        vague = uncertain > DETERMINED_RESOLUTIONS * head.resolution
+        say("support", text, "the echoes hardly determine it; measure it", vague=vague)
     if "speed_of_sound" in kinds:
         uncertain, speed = deviation["speed_of_sound"], head.speed_of_sound
+        text = f"{speed * math.exp(found.speed_of_sound):.2f} ± {speed * uncertain:.2f} m/s"
         vague = uncertain * distance.mean() > DETERMINED * head.resolution
-        say(
-            "speed_of_sound",
-            f"{speed * math.exp(found.speed_of_sound):.2f} ± {speed * uncertain:.2f} m/s",
+        warning = (
             "all poses are at one distance, so it cannot be separated from the size of the "
             "object; record from several distances"
-            if vague or distance.std() < head.resolution
-            else None,
         )
+        say("speed_of_sound", text, warning, vague=vague or distance.std() < head.resolution)
     return lines, warnings

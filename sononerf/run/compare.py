@@ -69,12 +69,6 @@ def compare_runs(
         folder: With ``comparison.json``; both volumes over their common maximum and their
             difference as VTI; projections of all three; and the difference on the first's true
             surface, where that is known.
-
-    Raises:
-        InputError: If one is no fitted run.
-        SettingsError: If both are the same folder.
-        IncompatibleError: If the two hear differently.
-        NumericalError: If both are silent.
     """
     progress = progress or Progress(quiet=True)
     run = Run(first)

@@ -21,7 +21,7 @@ from sononerf.geometry.poses import Poses
 from sononerf.head.attached import attach
 from sononerf.head.head import Head
 from sononerf.progress import Progress
-from sononerf.surface.refine.recording_errors import Calibration
+from sononerf.surface.refine.self_calibration import Calibration
 
 DECIBELS = 20.0 / math.log(10.0)
 """Decibels of a natural logarithm of magnitude."""
@@ -64,7 +64,7 @@ def write_corrected(
                     **(earlier.get("calibration") or {}),
                     "self_calibration": {
                         "of": str(store.path),
-                        "gain_db": (found.gain * DECIBELS).tolist(),
+                        "gain_db": (found.gain * DECIBELS).round(3).tolist(),
                         "range_offset_m": found.range_offset,
                         "speed_of_sound": speed,
                         "support": sections["support"],
@@ -74,7 +74,7 @@ def write_corrected(
             receivers=store.receivers,
         )
         attach(head, output)
-        factor = np.exp(-found.gain)[:, None, None]
+        factor = np.exp(-found.gain)[:, None]
         with progress.task("writing", len(store)) as task:
             for index in made.missing():
                 heard = moved(store.read_pose(index), np.asarray(store.range), found.range_offset)
@@ -105,7 +105,7 @@ def _fingerprint(found: Calibration, head: Head) -> str:
     plane = head.plane
     values = np.concatenate(
         [
-            found.gain,
+            found.gain.ravel(),
             [found.range_offset, found.speed_of_sound],
             [] if plane is None else [*plane.point, *plane.normal],
         ]

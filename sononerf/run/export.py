@@ -127,12 +127,6 @@ def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName 
 
     Returns:
         output: The file that was written.
-
-    Raises:
-        SettingsError: If the suffix is unknown or does not suit the part.
-        InputError: If the source is neither a store nor a run, or lacks the part.
-        ResourceError: If an array is too large for the format.
-        StorageError: If the file cannot be written.
     """
     suffix = output.suffix.lower()
     if suffix not in (*ARRAYS, *MESHES):

@@ -63,9 +63,6 @@ def finish(
 
     Returns:
         metrics: ``RUN/metrics.json``.
-
-    Raises:
-        NumericalError: If the field has no surface; its predictions are written all the same.
     """
     progress = progress or Progress(quiet=True)
     run = Run.of(run)

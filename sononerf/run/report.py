@@ -66,9 +66,6 @@ def report(
     Returns:
         page: The file. What a run has not come to yet is named with the command that makes it.
 
-    Raises:
-        InputError: If it is no run, or one of its files is damaged.
-
     References:
         .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, figures 4 to 8.
     """

@@ -23,10 +23,6 @@ def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
     Args:
         paths: Runs.
         csv: File for all numbers of ``metrics.json``, one line per run, in its units.
-
-    Raises:
-        InputError: If one is no run, or its numbers are damaged.
-        StorageError: If the CSV file cannot be written.
     """
     runs = [Run(path) for path in paths]
     found = []

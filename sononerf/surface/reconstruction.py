@@ -27,8 +27,7 @@ from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.candidates import number_of_steps
 from sononerf.surface.refine.descent import poses_that_hear
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.refinement import Saved
-from sononerf.surface.refine.refinement import refine as refine_starts
+from sononerf.surface.refine.refinement import Refinement, Saved
 from sononerf.surface.start.read_out import (
     LEVELS,
     StartMethod,
@@ -199,16 +198,16 @@ def refine(
         def after_step(steps: int, mismatch: float) -> None:
             task.advance(steps, f"mismatch {mismatch:.2f} dB")
 
-        refined = refine_starts(
+        refined = Refinement(
             starts,
             echoes,
-            optics=_placed(Optics(echoes.head), accelerator),
+            _placed(Optics(echoes.head), accelerator),
             simulate=partial(Simulator.of_surface, head=echoes.head, options=simulation, rays=RAYS),
             seed=seed,
             saved=saved,
             after_step=after_step,
             after_stage=after_stage,
-        )
+        ).run()
     known = math.isfinite(refined.error_db)
     return finished_surface(
         refined.mesh,

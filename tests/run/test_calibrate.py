@@ -19,7 +19,7 @@ from sononerf.run.calibrate import calibrate, dependent_cells, describe, kinds_o
 from sononerf.run.corrected_store import moved
 from sononerf.run.run import Run
 from sononerf.settings.schema import SpectrogramSettings
-from sononerf.surface.refine.recording_errors import Calibration, Estimate
+from sononerf.surface.refine.self_calibration import Calibration, Estimate
 
 SPHERE = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
 
@@ -43,7 +43,7 @@ def test_a_gain_is_taken_off_a_copy(run, tmp_path, tiny_settings):
     made = found.store
     assert (len(made), made.missing(), made.damaged()) == (len(store), [], [])
     assert np.abs(found.estimate.calibration.gain).max() < 0.2  # the simulator's level
-    factor = np.exp(-found.estimate.calibration.gain)[:, None, None]
+    factor = np.exp(-found.estimate.calibration.gain)[:, None]
     np.testing.assert_allclose(made.read_pose(0), factor * store.read_pose(0), rtol=1e-5)
     np.testing.assert_array_equal(made.positions, store.positions)
     np.testing.assert_array_equal(made.split, store.split)
@@ -75,7 +75,7 @@ def test_what_is_not_determined_is_said(run):
     store = fitted.echoes.store
     kinds = ("gain", "range_offset", "speed_of_sound")
     estimate = Estimate(
-        Calibration.none(2),
+        Calibration(np.zeros((2, 3))),
         {"gain": 0.5, "range_offset": 0.01, "speed_of_sound": 0.1},
         [3.0, 2.9],
     )
@@ -98,7 +98,7 @@ def test_a_turntable_hardly_tells_a_range_offset(run):
         indices=store.indices,
         positions=np.stack([np.cos(angle), np.sin(angle), 0.1 * angle], axis=1),
     )
-    estimate = Estimate(Calibration.none(2), {"range_offset": 1e-4}, [])
+    estimate = Estimate(Calibration(np.zeros((2, 3))), {"range_offset": 1e-4}, [])
     for poses, warned in ((store, False), (turned, True)):
         _, warnings = describe(fitted.head, poses, SPHERE, estimate, ("range_offset",))
         assert any("those of a turntable" in line for line in warnings) == warned

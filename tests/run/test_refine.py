@@ -24,7 +24,7 @@ from sononerf.surface import reconstruction
 from sononerf.surface.refine import comparison as core
 from sononerf.surface.refine import descent as stages
 from sononerf.surface.refine.descent import Stage
-from sononerf.surface.refine.refinement import refine
+from sononerf.surface.refine.refinement import Refinement
 from sononerf.surface.surface import Surface
 
 QUIET = Progress(quiet=True)
@@ -53,7 +53,7 @@ def run(fitted_run, tmp_path, monkeypatch):
     for where, name in ((core, "RAYS"), (reconstruction, "RAYS")):
         monkeypatch.setattr(where, name, 500)
     monkeypatch.setattr(stages, "STAGES", SHORT)
-    monkeypatch.setattr(reconstruction, "refine_starts", partial(refine, stages=SHORT))
+    monkeypatch.setattr(reconstruction, "Refinement", partial(Refinement, stages=SHORT))
     for name in ("mesh_png", "side_by_side_png", "confidence_png"):
         monkeypatch.setattr(reconstruct_module, name, lambda *given: b"")
     path = tmp_path / "run"

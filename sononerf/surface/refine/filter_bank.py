@@ -164,7 +164,28 @@ class _Deposit(torch.autograd.Function):
         for shift, part in zip((-1, 0, 1), parts, strict=True):
             bins.index_add_(0, rows + shift, value * part[:, None])
         ctx.save_for_backward(strength, off, weight, rows)
+        ctx.save_for_forward(strength, off, weight, rows)
+        ctx.bins, ctx.size = bins.shape, size
         return bins.view(*size, -1)
+
+    @staticmethod
+    def jvp(ctx: Any, *tangents: Tensor | None) -> Tensor:
+        strength, off, weight, rows = ctx.saved_tensors
+        to_strength, to_at, to_weight = tangents[:3]
+        value = strength[:, None] * weight
+        moved = torch.zeros_like(value)
+        if to_strength is not None:
+            moved = moved + to_strength[:, None] * weight
+        if to_weight is not None:
+            moved = moved + strength[:, None] * to_weight
+        late = torch.zeros_like(off) if to_at is None else to_at
+        bins = torch.zeros(ctx.bins, dtype=value.dtype, device=value.device)
+        parts = (0.5 * (0.5 - off) ** 2, 0.75 - off**2, 0.5 * (0.5 + off) ** 2)
+        slopes = (off - 0.5, -2.0 * off, off + 0.5)
+        for shift, part, slope in zip((-1, 0, 1), parts, slopes, strict=True):
+            row = moved * part[:, None] + value * (slope * late)[:, None]
+            bins.index_add_(0, rows + shift, row)
+        return bins.view(*ctx.size, -1)
 
     @staticmethod
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor, Tensor, Tensor | None, None, None]:

@@ -62,53 +62,11 @@ Saved = MutableMapping[str, dict[str, Tensor]]
 """Stages that are done, by the names of their candidates and their numbers."""
 
 
-def refine(
-    starts: Mapping[StartMethod, trimesh.Trimesh],
-    echoes: Echoes,
-    *,
-    optics: Optics | None = None,
-    simulate: Simulate,
-    seed: int,
-    stages: tuple[Stage, ...] = STAGES,
-    saved: Saved | None = None,
-    after_step: Callable[[int, float], None] | None = None,
-    after_stage: Callable[[trimesh.Trimesh, float], None] | None = None,
-) -> Refined:
-    """Move start surfaces until physical optics, corrected by the simulator, gives the echoes.
-
-    Every candidate goes through the first stage, and one or two of them through the others, see
-    :func:`~sononerf.surface.refine.candidates.after_first_stage`. Of all surfaces the one that
-    explains the validation poses best is returned.
-
-    Args:
-        starts: Start surfaces, m.
-        echoes, optics, simulate, seed, stages, saved, after_step, after_stage: As in
-            :class:`Refinement`.
-    """
-    work = Refinement(
-        starts,
-        echoes,
-        optics or Optics(echoes.head),
-        simulate=simulate,
-        seed=seed,
-        stages=stages,
-        saved=saved,
-        after_step=after_step,
-        after_stage=after_stage,
-    )
-    work.first_stage()
-    first, *_ = work.candidates
-    for candidate in work.candidates:
-        if candidate is first or not are_alike(candidate, first, work.optics.wavelength):
-            for number in range(1, len(stages)):
-                work.stage(candidate, number)
-    return work.result()
-
-
 class Refinement:
-    """What the stages of a refinement share.
+    """Moves start surfaces until physical optics, corrected by the simulator, gives the echoes.
 
     Args:
+        meshes: Start surfaces, m.
         echoes: Measured spectrograms and onsets; the surface must begin at the onsets. If their
             level is absolute, gains are learned in the last stage alone: a rough surface is too
             faint, and a gain would hide that. Otherwise gains are learned from the first stage on.
@@ -145,6 +103,20 @@ class Refinement:
         self._far = optics.head.resolution
         self._later: tuple[Candidate, LaterBounces] | None = None
         self.candidates = self._begun()
+
+    def run(self) -> Refined:
+        """Return the surface that explains the validation poses best.
+
+        Every candidate goes through the first stage, and one or two of them through the others, see
+        :func:`~sononerf.surface.refine.candidates.after_first_stage`.
+        """
+        self.first_stage()
+        first, *_ = self.candidates
+        for candidate in self.candidates:
+            if candidate is first or not are_alike(candidate, first, self.optics.wavelength):
+                for number in range(1, len(self.stages)):
+                    self.stage(candidate, number)
+        return self.result()
 
     def first_stage(self) -> None:
         """Do the first stage of all candidates, and leave those that lose."""

@@ -2,9 +2,10 @@
 r"""Errors of a recording, estimated from a surface and what was heard of it.
 
 The spectrograms of the surface by physical optics are compared with the measured ones, in
-compressed decibels. The gain of each receiver, the range offset and the speed of sound are found
-together by Gauss-Newton steps [1]_ on an absolute loss. The surface itself is allowed to grow by a
-uniform layer and by a scale, because a surface that was fitted to wrong ranges has taken them up.
+compressed decibels. The gain of each receiver and frequency, the range offset, the speed of sound
+and the height of a support are found together by Gauss-Newton steps [1]_ on an absolute loss; the
+derivatives run through the optics. The surface itself is allowed to grow by a uniform layer and by
+a scale, because a surface that was fitted to wrong ranges has taken them up.
 
 References:
     .. [1] B. Triggs et al., "Bundle adjustment, a modern synthesis", Vision Algorithms, 2000.
@@ -12,27 +13,28 @@ References:
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
+import torch
+import torch.autograd.forward_ad as forward
 import trimesh
 
-from sononerf.array_types import Bools, Floats
+from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.decibels import ACTIVE_DB, compress
+from sononerf.head.head import Head
 from sononerf.surface.refine.objective import FLOOR_DB, TRUST
-from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.recording_errors import Calibration, Estimate, Kind
+from sononerf.surface.refine.optics import Heads, Optics
 from sononerf.surface.refine.still_surface import StillSurface
 
-STEP = 0.02
-"""Length of a finite difference, shortest wavelengths: small against interference, large against
-rounding."""
-LEVEL_POSES = 50
-"""Number of poses from which the first level of a recording is taken, and on which errors are
-compared. Later steps improve the level."""
+Kind = Literal["gain", "range_offset", "speed_of_sound", "support"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
 MOST_POSES = 60
 """Number of poses, at most, that are compared. More poses do not help, because the surface is known
 less well than this number of poses determines the errors."""
@@ -43,20 +45,67 @@ FARTHER = 4
 """Number of times, at most, that a step is doubled while the error falls. Interference makes the
 derivatives of fine cells steep but short, and steps too small."""
 LARGEST_STEP = 0.5
-"""Largest step of the range offset, range resolutions: beyond it the derivatives do not hold."""
+"""Largest step of the range offset and of the support's height, range resolutions: beyond it the
+derivatives do not hold."""
 LEAST_DB = 0.5
 """Difference below which all differences have the same weight, dB: physical optics is no more
 accurate."""
+SMOOTH_DB = 1.0
+"""Standard deviation of the difference of a receiver's gain between neighbouring frequencies, dB.
+Single rows may hold no echo at all."""
 _DB = 20.0 / math.log(10.0)
+
+
+@dataclass(eq=False)
+class Calibration:
+    """Errors of a recording; zero where nothing is wrong.
+
+    Attributes:
+        gain (E, F): Natural logarithm of how much too loud each receiver is.
+        range_offset (m): Excess of all measured ranges.
+        speed_of_sound: Natural logarithm of the true speed over the assumed one.
+        support (m): Height of the true support over the assumed one.
+    """
+
+    gain: Floats
+    range_offset: float = 0.0
+    speed_of_sound: float = 0.0
+    support: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Estimated errors of a recording and their uncertainties.
+
+    Attributes:
+        calibration: The errors.
+        deviation: One standard deviation of each kind, in its own unit.
+        error_db: Mean absolute difference over active cells before each step, and after the last.
+    """
+
+    calibration: Calibration
+    deviation: dict[str, float]
+    error_db: list[float]
+
+
+def raised_support(head: Head, height: float) -> Head:
+    """Return a head whose support is higher, m, along its normal."""
+    plane = head.plane
+    assert plane is not None
+    point = np.asarray(plane.point) + height * np.asarray(plane.normal)
+    standing = head.support.model_copy(update={"point": tuple(point.tolist())})
+    return dataclasses.replace(head, support=standing)
 
 
 class Calibrator:
     """Gauss-Newton steps on the errors of a recording.
 
     Attributes:
-        names: Name of each unknown: ``gain`` once for each ear, ``range_offset`` (m),
-            ``speed_of_sound``, and ``layer`` (m) and ``scale`` of the surface.
-        values (U,): Their present values; gains, speed and scale are natural logarithms.
+        names: Names of the unknowns but for the gains: ``range_offset`` (m), ``speed_of_sound``
+            (natural logarithm), ``support`` (m), and ``layer`` (m) and ``scale`` (natural
+            logarithm) of the surface.
+        values (U,): Their present values.
+        gain (E, F): Natural logarithms.
         change: Length of the last step over one standard deviation, of the unknown that changed
             most.
         stretch: Largest distance that the unknowns went, over the step that the derivatives gave,
@@ -77,65 +126,69 @@ class Calibrator:
         poses = np.concatenate((echoes.training, echoes.validation))
         count = min(MOST_POSES, len(poses))
         self.poses = poses[np.linspace(0, len(poses) - 1, count).round().astype(int)]
-        length = STEP * optics.wavelength
-        reach = float(np.linalg.norm(echoes.positions - mesh.centroid, axis=1).mean())
-        steps: dict[str, list[float]] = {}
-        # The level of recordings is not known, and every other error would take it up.
-        if "gain" in kinds or not echoes.calibrated:
-            steps["gain"] = [0.0] * optics.ears
-        if "range_offset" in kinds:
-            steps["range_offset"] = [length]
-        if "speed_of_sound" in kinds:
-            steps["speed_of_sound"] = [length / reach]
+        self.names: list[str] = [kind for kind in kinds if kind != "gain"]
         if {"range_offset", "speed_of_sound"} & set(kinds):
-            steps |= {"layer": [length], "scale": [length / float(mesh.scale)]}
-        self.names = [name for name, each in steps.items() for _ in each]
-        self._steps = np.array([step for each in steps.values() for step in each])
+            self.names += ["layer", "scale"]
+        # The level of recordings is not known, and every other error would take it up.
+        self.learns_gain = "gain" in kinds or not echoes.calibrated
         self.values: Floats = np.zeros(len(self.names))
-        self._of_gain = np.flatnonzero([name == "gain" for name in self.names])
+        self.gain: Floats = np.zeros((optics.ears, len(optics.frequencies)))
         self.weight = np.ones((optics.ears, 1, len(optics.frequencies)))
         self.error_db: list[float] = []
-        self.deviation: Floats = np.zeros(len(self.names))
+        self._covariance: Floats = np.zeros((len(self.names) + self.gain.size,) * 2)
         self.change = math.inf
         self.stretch = 1.0
 
     def step(self, shown: Callable[[], None] = lambda: None) -> float:
         """Do one step; return the error before it, dB. ``shown`` is called once per pose."""
-        count = len(self.names)
-        bodies = self._bodies(slopes=True)
-        self._begin(bodies[-1])
-        normal, towards, slopes = np.zeros((count, count)), np.zeros(count), []
-        errors, cost, cells = [], 0.0, 0.0
+        body = self._body()
+        self._begin(body)
+        count, size = len(self.names), len(self.names) + self.gain.size * self.learns_gain
+        normal, slopes, errors = np.zeros((size, size)), [], []
+        cost, cells = 0.0, 0.0
         sums = np.zeros((2, *self.weight.shape))
         for number in self.poses.tolist():
-            residual, jacobian, active = self._linear(bodies, number)
+            residual, measured, rendered, columns = self._linear(body, number, slopes=True)
             shown()
-            slopes.append(np.zeros(count))
+            slopes.append(np.zeros(size))
+            active = (measured >= ACTIVE_DB) | (rendered >= ACTIVE_DB)
             if not active.any():
                 continue
-            sums[0] += (np.abs(residual) * active).sum(axis=1, keepdims=True)
-            sums[1] += active.sum(axis=1, keepdims=True)
-            weight = np.broadcast_to(self.weight, active.shape)[active]
-            r, j = residual[active], jacobian[:, active]
-            weight = weight / np.maximum(np.abs(r), LEAST_DB)
-            errors.append(float(np.abs(r).mean()))
-            normal += (j * weight) @ j.T
-            slopes[-1] = (j * weight) @ r
-            towards += slopes[-1]
-            cost += float((weight * r * r).sum())
-            cells += float(len(r))
+            off = np.abs(residual)
+            sums += np.stack([(off * active).sum(1, keepdims=True), active.sum(1, keepdims=True)])
+            weight = self.weight * active / np.maximum(off, LEAST_DB)
+            errors.append(float(off[active].mean()))
+            normal[:count, :count] += np.einsum("uerf,erf,verf->uv", columns, weight, columns)
+            slopes[-1][:count] = np.einsum("uerf,erf,erf->u", columns, weight, residual)
+            if self.learns_gain:
+                of_gain = -_DB * np.expm1(-rendered / _DB)
+                cross = np.einsum("uerf,erf,erf->uef", columns, weight, of_gain)
+                normal[:count, count:] += cross.reshape(count, self.gain.size)
+                own = (of_gain * weight * of_gain).sum(axis=1).ravel()
+                normal[np.arange(count, size), np.arange(count, size)] += own
+                slopes[-1][count:] = (of_gain * weight * residual).sum(axis=1).ravel()
+            cost += float((weight * residual**2).sum())
+            cells += float(active.sum())
+        normal[count:, :count] = normal[:count, count:].T
         self.error_db.append(float(np.mean(errors)) if errors else math.inf)
         noise = cost / max(cells, 1.0) * self.dependent
+        towards = np.sum(slopes, axis=0)
+        if self.learns_gain:
+            rough = self._roughness() * (noise * (_DB / SMOOTH_DB) ** 2)
+            normal[count:, count:] += rough
+            towards[count:] -= rough @ self.gain.ravel()
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))
-        damped = normal / np.outer(scale, scale) + 1e-6 * np.eye(count)
-        covariance = np.linalg.pinv(damped, hermitian=True) / np.outer(scale, scale)
-        step = covariance @ towards
-        unit = np.sqrt(np.maximum(noise * np.diag(covariance), 1e-30))
+        damped = normal / np.outer(scale, scale) + 1e-6 * np.eye(size)
+        inverse = np.linalg.pinv(damped, hermitian=True) / np.outer(scale, scale)
+        step = inverse @ towards
+        unit = np.sqrt(np.maximum(noise * np.diag(inverse), 1e-30))
         self.change = float((np.abs(step) / unit).max(initial=0.0))
-        spread = covariance @ self._scatter(np.stack(slopes)) @ covariance
-        self.deviation = np.sqrt(np.maximum(noise * np.diag(covariance), np.diag(spread)).clip(0.0))
+        grouped = inverse @ self._scatter(np.stack(slopes)) @ inverse
+        larger = np.maximum(np.diag(noise * inverse), np.diag(grouped)).clip(0.0)
+        shrink = np.sqrt(larger / np.maximum(np.diag(grouped), 1e-300))
+        self._covariance = grouped * np.outer(shrink, shrink)
         self._move(step)
-        if count:
+        if size:
             self._go_on(step)
         usual = sums[0] / np.maximum(sums[1], 1.0)
         usual = np.where(sums[1] > 0.0, usual, usual.max())
@@ -144,136 +197,172 @@ class Calibrator:
         return self.error_db[-1]
 
     def error(self) -> float:
-        """Return the absolute difference of some poses over active cells, dB per measured one."""
-        bodies = self._bodies(slopes=False)
-        self._begin(bodies[-1])
+        """Return the absolute difference over active cells, dB per measured one."""
+        body = self._body()
+        self._begin(body)
         total, count = 0.0, 0
-        for number in self._some():
-            residual, measured, active = self._linear(bodies, number)
+        for number in self.poses.tolist():
+            residual, measured, rendered, _ = self._linear(body, number)
+            active = (measured >= ACTIVE_DB) | (rendered >= ACTIVE_DB)
             total += float(np.abs(residual[active]).sum())
             count += int((measured >= ACTIVE_DB).sum())
         return total / count if count else math.inf
 
     def result(self) -> Estimate:
         """Return what was found so far."""
-        calibration = Calibration.none(self.optics.ears)
+        calibration = Calibration(self.gain)
         deviation: dict[str, float] = {}
-        parts = zip(self.names, self.values.tolist(), self.deviation.tolist(), strict=True)
-        for name, value, spread in parts:
-            if name in ("range_offset", "speed_of_sound"):
-                setattr(calibration, name, value)
-            if name not in ("layer", "scale"):
-                deviation[name] = max(deviation.get(name, 0.0), self.stretch * spread)
-        if len(self._of_gain):
-            calibration.gain = self.values[self._of_gain]
+        spread = self.stretch * np.sqrt(np.diag(self._covariance))
+        for index, name in enumerate(self.names):
+            if name in ("range_offset", "speed_of_sound", "support"):
+                setattr(calibration, name, float(self.values[index]))
+                deviation[name] = float(spread[index])
+        if self.learns_gain:
+            # Of the mean over the frequencies.
+            block = self._covariance[len(self.names) :, len(self.names) :]
+            block = block.reshape(self.gain.shape * 2)
+            means = [float(block[ear, :, ear].mean()) for ear in range(len(self.gain))]
+            deviation["gain"] = self.stretch * math.sqrt(max(float(np.mean(means)), 0.0))
         return Estimate(calibration, deviation, list(self.error_db))
 
-    def _some(self) -> list[int]:
-        some: list[int] = self.poses[:: max(len(self.poses) // LEVEL_POSES, 1)].tolist()
-        return some
-
     def _begin(self, body: StillSurface) -> None:
-        """Take the first level of recordings from the energy of some poses."""
-        if self.error_db or self.echoes.calibrated:
+        """Take the first level of recordings from their energy."""
+        if self.error_db or self.echoes.calibrated or self.gain.any():
             return
         energy = np.zeros((2, self.optics.ears))
-        for number in self._some():
+        for number in self.poses.tolist():
             pose = slice(number, number + 1)
             rendered = body.render(self.echoes.positions[pose], self.echoes.rotations[pose])[0]
             for row, magnitude in enumerate((self.echoes.magnitude(number).numpy(), rendered)):
                 energy[row] += np.square(magnitude, dtype=np.float64).sum(axis=(1, 2))
         level = np.log(np.maximum(energy[0], 1e-300) / np.maximum(energy[1], 1e-300)) / 2
-        self.values[self._of_gain] = level
+        self.gain = np.broadcast_to(level[:, None], self.gain.shape).copy()
 
-    def _value(self, name: str, values: Floats) -> float:
-        return float(values[self.names.index(name)]) if name in self.names else 0.0
+    def _value(self, name: str) -> float:
+        return float(self.values[self.names.index(name)]) if name in self.names else 0.0
 
-    def _bodies(self, *, slopes: bool) -> list[StillSurface]:
-        """Return the surface for a change of each unknown, and as it is, last."""
+    def _body(self) -> StillSurface:
         normals, middle = np.array(self.mesh.vertex_normals), self.mesh.centroid
+        scale, layer = math.exp(self._value("scale")), self._value("layer")
+        places = (self.mesh.vertices - middle) * scale + middle + layer * normals
+        optics, height = self.optics, self._value("support")
+        if height:
+            optics = Optics(raised_support(optics.head, height))
+        return StillSurface(trimesh.Trimesh(places, self.mesh.faces, process=False), optics)
 
-        def body(values: Floats) -> StillSurface:
-            layer, scale = (self._value(name, values) for name in ("layer", "scale"))
-            places = (self.mesh.vertices - middle) * math.exp(scale) + middle + layer * normals
-            moved = trimesh.Trimesh(places, self.mesh.faces, process=False)
-            return StillSurface(moved, self.optics)
-
-        now = body(self.values)
-        if not slopes:
-            return [now]
-        changed = [
-            body(self.values + step) if name in ("layer", "scale") else now
-            for name, step in zip(self.names, np.diag(self._steps), strict=True)
-        ]
-        return [*changed, now]
-
-    def _linear(self, bodies: list[StillSurface], number: int) -> tuple[Floats, Floats, Bools]:
-        """Return residual (E, R, F) dB, derivatives (U, E, R, F) and active cells of a pose.
-
-        With one body, what was measured (E, R, F) stands in place of the derivatives.
-        """
+    def _linear(
+        self, body: StillSurface, number: int, *, slopes: bool = False
+    ) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return residual, measured and rendered levels (E, R, F), dB, and slopes (U, E, R, F)."""
         pose = slice(number, number + 1)
-        gain = np.zeros(self.optics.ears)
-        if len(self._of_gain):
-            gain = self.values[self._of_gain]
         measured = self.echoes.magnitude(number).numpy().astype(np.float64)
         reference = max(float(measured.max()) * 10.0 ** (-FLOOR_DB / 20.0), 1e-30)
+        gain = np.exp(self.gain)[:, None]
+        at = self.echoes.positions[pose], self.echoes.rotations[pose]
+        magnitude, changes = self._rendered(body, *at, slopes=slopes)
+        a, b = compress(measured, reference), compress(gain * magnitude, reference)
+        columns = _DB * gain * changes / (reference + gain * magnitude)
+        return a - b, a, b, columns
 
-        def level(body: StillSurface, values: Floats) -> Floats:
-            stretch = math.exp(-self._value("speed_of_sound", values))
-            late = 2.0 * self._value("range_offset", values)
-            at = self.echoes.positions[pose], self.echoes.rotations[pose]
-            magnitude = np.exp(gain)[:, None, None] * body.render(*at, stretch, late)[0]
-            return compress(magnitude, reference)
+    def _rendered(
+        self, body: StillSurface, position: Floats, rotation: Floats, *, slopes: bool
+    ) -> tuple[Floats, Floats]:
+        """Return the magnitude of a pose (E, R, F) and its derivatives (U, E, R, F)."""
+        optics = body.optics
+        shape = (optics.ears, optics.rows, len(optics.frequencies))
+        magnitude = np.zeros(shape)
+        changes = np.zeros((len(self.names) if slopes else 0, *shape))
+        pieces, heads, middle = body.listen(position, rotation)
+        if not len(pieces.pose):
+            return magnitude, changes
+        points, area = (body.vertices - middle).float(), body.area.float()
+        still = torch.zeros_like(points)
+        stretch = points.new_tensor([math.exp(-self._value("speed_of_sound"))])
+        late = points.new_tensor([2.0 * self._value("range_offset")])
+        away = (body.vertices - body.vertices.new_tensor(self.mesh.centroid)).float()
+        tangents = {
+            "range_offset": (still, 0.0, 2.0, 0.0),
+            "speed_of_sound": (still, -1.0, 0.0, 0.0),
+            "layer": (body.normals.float(), 0.0, 0.0, 0.0),
+            "scale": (away, 0.0, 0.0, 0.0),
+            "support": (still, 0.0, 0.0, 1.0),
+        }
+        with torch.no_grad():
+            heard = optics.render(points, area, pieces, heads, stretch=stretch, late=late)
+            power = [heard.power.sqrt()]
+            for name in self.names if slopes else ():
+                velocity, slower, later, raised = tangents[name]
+                with forward.dual_level():
+                    moved = forward.make_dual(points, velocity)
+                    both = optics.render(
+                        moved,
+                        body.operators.areas(moved),
+                        pieces,
+                        self._raised(heads, raised) if raised else heads,
+                        stretch=forward.make_dual(stretch, slower * stretch),
+                        late=forward.make_dual(late, torch.full_like(late, later)),
+                    )
+                    change = forward.unpack_dual(both.power).tangent
+                power.append(0.5 * change / power[0].clamp_min(1e-30))
+        first = int(heard.row[0])
+        low, high = max(first, 0), min(first + power[0].shape[2], optics.rows)
+        if high > low:
+            magnitude[:, low:high] = power[0][0, :, low - first : high - first].numpy()
+            for one, change in zip(changes, power[1:], strict=True):
+                one[:, low:high] = change[0, :, low - first : high - first].numpy()
+        return magnitude, changes
 
-        a, b = compress(measured, reference), level(bodies[-1], self.values)
-        active = (a >= ACTIVE_DB) | (b >= ACTIVE_DB)
-        if len(bodies) == 1:
-            return a - b, a, active
-        slopes = []
-        changes = zip(self._steps, np.diag(self._steps), bodies, strict=False)
-        for index, (step, change, body) in enumerate(changes):
-            if step:
-                slopes.append((level(body, self.values + change) - b) / step)
-                continue
-            slope = -_DB * np.expm1(-b / _DB)  # of a gain
-            slope[np.arange(len(slope)) != np.flatnonzero(self._of_gain == index)] = 0.0
-            slopes.append(slope)
-        return a - b, np.stack(slopes) if slopes else np.zeros((0, *b.shape)), active
+    def _raised(self, heads: Heads, height: float) -> Heads:
+        """Return heads whose images move as the support rises, as dual numbers."""
+        plane = self.optics.plane
+        assert plane is not None
+        moved = 2.0 * height * heads.emitters.new_tensor(plane.normal)
+        mirrored = heads.emitters.new_tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+        emitter, ear = (mirrored[:, side, None] * moved for side in (0, 1))
+        return dataclasses.replace(
+            heads,
+            emitters=forward.make_dual(heads.emitters, emitter),
+            ears=forward.make_dual(heads.ears, ear[:, None].expand_as(heads.ears)),
+        )
+
+    def _roughness(self) -> Floats:
+        """Return the matrix of squared differences of gains between neighbouring frequencies."""
+        step = np.diff(np.eye(self.gain.shape[1]), axis=0)
+        return np.asarray(np.kron(np.eye(len(self.gain)), step.T @ step), dtype=np.float64)
 
     def _scatter(self, slopes: Floats) -> Floats:
-        """Return the covariance of the sums of slopes (P, U) over groups of neighbouring poses.
+        """Return the covariance of the sums of slopes (P, N) over groups of neighbouring poses.
 
         What a surface does not explain is alike at poses that are neighbours, so that their cells
         are no independent measurements.
         """
         away = self.echoes.positions[self.poses] - self.mesh.centroid
         away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-12)
-        _, group = np.unique(
-            (away @ fibonacci_sphere(GROUPS).T).argmax(axis=1), return_inverse=True
-        )
+        nearest = (away @ fibonacci_sphere(GROUPS).T).argmax(axis=1)
+        _, group = np.unique(nearest, return_inverse=True)
         sums = np.zeros((group.max() + 1, slopes.shape[1]))
         np.add.at(sums, group, slopes)
         sums -= sums.mean(axis=0)
         return np.asarray(sums.T @ sums * len(sums) / max(len(sums) - 1, 1))
 
     def _move(self, step: Floats) -> None:
-        bound = np.full(len(step), np.inf)
-        bound[[name == "range_offset" for name in self.names]] = (
-            LARGEST_STEP * self.optics.head.resolution
-        )
-        self.values = self.values + step.clip(-bound, bound)
+        most = LARGEST_STEP * self.optics.head.resolution
+        count = len(self.names)
+        bound = np.where(np.isin(self.names, ("range_offset", "support")), most, np.inf)
+        self.values = self.values + step[:count].clip(-bound, bound)
+        if self.learns_gain:
+            self.gain = self.gain + step[count:].reshape(self.gain.shape)
 
     def _go_on(self, step: Floats) -> None:
         """Repeat a step, each time doubled, as long as the error falls."""
         best, moved, doubled = self.error(), 1.0, 1.0
         for _ in range(FARTHER):
             self.stretch = max(self.stretch, moved)
-            before = self.values
+            before = self.values, self.gain
             self._move(step)
             error = self.error()
             if error >= best:
-                self.values = before
+                self.values, self.gain = before
                 return
             moved += doubled
             best, step, doubled = error, 2.0 * step, 2.0 * doubled

@@ -19,7 +19,8 @@ class StillSurface:
 
     Attributes:
         operators: Operators on the surface.
-        vertices, normals ((V, 3) float64): Places (m) and outward unit normals.
+        vertices, normals, area ((V, 3) float64): Places (m), outward unit normals and vector areas
+            (m²).
         bending ((V, 6), 1/m): Curvature, see :meth:`MeshOperators.bending`.
     """
 
@@ -29,12 +30,12 @@ class StillSurface:
         faces = np.array(mesh.faces, dtype=np.int64)
         self.vertices = torch.as_tensor(np.array(mesh.vertices, dtype=np.float64)).to(like.device)
         self.operators = MeshOperators(torch.as_tensor(faces).to(like.device), len(self.vertices))
-        self._area = self.operators.areas(self.vertices)
-        self.normals = unit(self._area)
+        self.area = self.operators.areas(self.vertices)
+        self.normals = unit(self.area)
         passes = smoothing_passes(optics.wavelength, self.operators.edge_length(self.vertices))
         self.bending = self.operators.bending(self.vertices, self.normals, passes)
         sight = sight_of(optics, self.vertices.cpu().numpy(), faces)
-        self._parts = self.operators, self.vertices, self._area, self.bending, sight
+        self._parts = self.operators, self.vertices, self.area, self.bending, sight
 
     def listen(self, positions: Floats, rotations: Floats) -> tuple[Pieces, Heads, Tensor]:
         """Return the pieces that poses hear, see :func:`~.visibility.listen`.
@@ -64,7 +65,7 @@ class StillSurface:
         pieces, heads, middle = self.listen(positions, rotations)
         if not len(pieces.pose):
             return found
-        points, area = (self.vertices - middle).float(), self._area.float()
+        points, area = (self.vertices - middle).float(), self.area.float()
         factor, more = (points.new_tensor(part).expand(len(found)) for part in (stretch, late))
         heard = optics.render(points, area, pieces, heads, stretch=factor, late=more)
         magnitude = heard.power.sqrt().cpu().numpy()

@@ -28,7 +28,7 @@ from sononerf.surface.refine.candidates import (
 from sononerf.surface.refine.descent import Descent, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.refinement import Refinement, refine
+from sononerf.surface.refine.refinement import Refinement
 from sononerf.surface.refine.remesh import distance_from
 from tests.memory import changed, deaf_hull, echoes_of
 from tests.surface.conftest import RADIUS
@@ -39,15 +39,15 @@ def unasked(mesh):
 
 
 def refined(meshes, echoes, optics, *, simulate=unasked, stages=None, **given):
-    return refine(
+    return Refinement(
         meshes if isinstance(meshes, dict) else {"body": meshes},
         echoes,
-        optics=optics,
+        optics,
         simulate=simulate,
         seed=1,
         stages=stages or SHORT,
         **given,
-    )
+    ).run()
 
 
 def begun(meshes, echoes, optics, **given):
