@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.fft import next_fast_len
+from torch.autograd import forward_ad
 
 from sononerf.head.call import emit
 from sononerf.head.head import Head
@@ -100,6 +101,33 @@ def test_gradients_are_those_of_finite_differences():
                 moved.append(float(torch.log(whole + 0.01 * fixed).double().mean()))
             wanted = (moved[0] - moved[1]) / (2 * step)
             assert float(tensor.grad[number]) == pytest.approx(wanted, rel=0.05, abs=2e-3)
+
+
+def test_derivatives_forward_are_those_backward():
+    bank, _ = bank_of("linear")
+    count, nodes, generator = 3, len(bank.kept_nodes), torch.Generator().manual_seed(0)
+    values = [
+        torch.tensor([1.0, 0.7, -0.4]),
+        torch.tensor([300.2, 306.7, 311.4]),
+        torch.rand(count, nodes, generator=generator) + 0.5,
+    ]
+    of = torch.zeros(count, dtype=torch.int64)
+
+    def total(strength, at, weight):
+        arrivals = Arrivals(strength, at, weight, of)
+        return bank.power({"surface": arrivals}, receivers=1, frames=256).sqrt().sum()
+
+    for index in range(3):
+        leaves = [value.clone().requires_grad_() for value in values]
+        total(*leaves).backward()
+        direction = torch.randn(values[index].shape, generator=generator)
+        with torch.no_grad(), forward_ad.dual_level():
+            duals = list(values)
+            duals[index] = forward_ad.make_dual(values[index], direction)
+            change = forward_ad.unpack_dual(total(*duals)).tangent
+        assert float(change) == pytest.approx(
+            float((leaves[index].grad * direction).sum()), rel=1e-3
+        )
 
 
 def test_the_gradients_of_weights_do_not_change_those_of_strengths():
