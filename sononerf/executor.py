@@ -26,7 +26,7 @@ QUEUED = 4
 """Tasks per worker that are submitted at once: one is computed, the others save waiting."""
 ATTEMPTS = 4
 """Times in a row that workers may be killed before any task is finished."""
-CONNECT_SECONDS = 30
+CONNECT_SECONDS = 10
 """Time to wait for a Dask scheduler, s; across a network it answers in one."""
 _DEAD = ("KilledWorker", "CancelledError", "FutureCancelledError")
 """Names of Dask's errors for a task whose workers, or whose scheduler, are gone."""
@@ -192,6 +192,12 @@ def _without_script() -> Iterator[None]:
             yield
         finally:
             script.update(kept)
+
+
+def reach(scheduler: str) -> None:
+    """Connect to a Dask scheduler once, and raise :class:`ResourceError` if it does not answer."""
+    with _client(scheduler):
+        pass
 
 
 @contextmanager

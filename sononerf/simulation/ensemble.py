@@ -21,6 +21,7 @@ from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
 from sononerf.echoes.splits import split_of
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, expect
+from sononerf.executor import reach
 from sononerf.geometry.poses import Poses
 from sononerf.head.attached import attach
 from sononerf.head.call import call_content
@@ -99,6 +100,8 @@ def simulate(
     path = None if output is None else Path(output)
     if path is not None and (finished := _finished(path, wanted)) is not None:
         return Echoes(finished, head)
+    if scheduler is not None:
+        reach(scheduler)
     warn_of_call(head.call, head.analysis)
     simulator = Simulator(scene, head, settings)
     offsets = np.vstack((head.emitter, head.receivers))

@@ -17,7 +17,7 @@ from sononerf.geometry.poses import Poses, look_at
 from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
-from sononerf.simulation.ensemble import simulate_ensemble
+from sononerf.simulation.ensemble import simulate, simulate_ensemble
 from sononerf.simulation.pose_faults import check_aim, check_poses, check_reach
 from sononerf.simulation.simulator import ensemble_poses, pose_seed
 
@@ -230,12 +230,14 @@ def test_faults_of_the_writer_are_not_blamed_on_a_pose(small):
         simulate_ensemble(*small, [0], full, seed_of=SEED_OF)
 
 
-def test_a_scheduler_that_is_not_there_is_named(small, monkeypatch):
+def test_a_scheduler_that_is_not_there_is_named_first(small, monkeypatch, tmp_path):
     monkeypatch.setattr(executor, "CONNECT_SECONDS", 1)
+    _, poses = small
     with pytest.raises(ResourceError, match=r"tcp://127\.0\.0\.1:9 cannot be reached"):
-        simulate_ensemble(
-            *small, [0], lambda *_: None, seed_of=SEED_OF, scheduler="tcp://127.0.0.1:9"
+        simulate(
+            load_scene("sphere", {}), poses, output=tmp_path / "a", scheduler="tcp://127.0.0.1:9"
         )
+    assert not (tmp_path / "a").exists()
 
 
 class Deadly:
@@ -311,7 +313,7 @@ SCRIPT = """
 import signal
 import subprocess
 import sys
-from sononerf.simulation.ensemble import simulate_ensemble
+from sononerf.simulation.ensemble import simulate, simulate_ensemble
 from tests.simulation.test_ensemble import Deaf, poses_at
 
 found, poses = {}, poses_at([1.0, 0.0, 0.0], [-2.0, 0.0, 0.0])

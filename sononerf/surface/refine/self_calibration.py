@@ -174,7 +174,9 @@ class Calibrator:
         noise = cost / max(cells, 1.0) * self.dependent
         towards = np.sum(slopes, axis=0)
         if self.learns_gain:
-            rough = self._roughness() * (noise * (_DB / SMOOTH_DB) ** 2)
+            steps = np.diff(np.eye(self.gain.shape[1]), axis=0)
+            rough = np.kron(np.eye(len(self.gain)), steps.T @ steps)
+            rough = rough * (noise * (_DB / SMOOTH_DB) ** 2)
             normal[count:, count:] += rough
             towards[count:] -= rough @ self.gain.ravel()
         scale = np.sqrt(np.maximum(np.diag(normal), 1e-30))
@@ -324,11 +326,6 @@ class Calibrator:
             emitters=forward.make_dual(heads.emitters, emitter),
             ears=forward.make_dual(heads.ears, ear[:, None].expand_as(heads.ears)),
         )
-
-    def _roughness(self) -> Floats:
-        """Return the matrix of squared differences of gains between neighbouring frequencies."""
-        step = np.diff(np.eye(self.gain.shape[1]), axis=0)
-        return np.asarray(np.kron(np.eye(len(self.gain)), step.T @ step), dtype=np.float64)
 
     def _scatter(self, slopes: Floats) -> Floats:
         """Return the covariance of the sums of slopes (P, N) over groups of neighbouring poses.
