@@ -42,15 +42,18 @@ def quiet_lightning() -> None:
         warnings.filterwarnings("ignore", message=pattern)
 
 
-def has_accelerator() -> bool:
-    """Return whether there is a GPU that torch can use."""
-    return bool(torch.cuda.is_available() or torch.backends.mps.is_available())
+def usable_accelerator(accelerator: str) -> str:
+    """Return the accelerator for Lightning: for ``auto`` the CPU where there is no CUDA.
 
-
-def require_accelerator(accelerator: str) -> None:
-    """Refuse an accelerator that this machine does not have."""
-    if accelerator == "gpu" and not has_accelerator():
-        raise ResourceError("no GPU that torch can use; take --accelerator cpu, or auto")
+    Apple's GPU has no double precision, which fields need. Raises :class:`ResourceError` for
+    ``gpu`` without CUDA.
+    """
+    there = torch.cuda.is_available()
+    if accelerator == "gpu" and not there:
+        raise ResourceError(
+            "no GPU with double precision that torch can use; take --accelerator cpu, or auto"
+        )
+    return "cpu" if accelerator == "auto" and not there else accelerator
 
 
 def fit(
@@ -91,9 +94,7 @@ def fit(
         NumericalError: If a gradient or a parameter is not finite.
         ResourceError: If ``gpu`` is asked for and there is none.
     """
-    require_accelerator(accelerator)
-    if accelerator == "auto" and not torch.cuda.is_available():
-        accelerator = "cpu"  # Apple's GPU has no double precision, which fields need
+    accelerator = usable_accelerator(accelerator)
     if model is None:
         model = EchoModule.for_echoes(echoes, options=options)
     elif options is not None:
@@ -136,7 +137,7 @@ def render_poses(
         len(model.renderer.frequency),
     )
     quiet_lightning()
-    require_accelerator(accelerator)
+    accelerator = usable_accelerator(accelerator)
     rendered: list[Singles] = []
 
     class Gather(lightning.Callback):

@@ -126,7 +126,7 @@ def _gpu() -> Finding:
         text = f"{count} x {found.name}, {found.total_memory / 1e9:.0f} GB"
         return Finding("gpu", text)
     if torch.backends.mps.is_available():
-        return Finding("gpu", "Apple's, for the fit alone")
+        return Finding("gpu", "Apple's has no double precision; everything runs on the CPU")
     if not DRIVER.is_file():
         return Finding("gpu", "none; everything runs on the CPU")
     driver = DRIVER.read_text(encoding="utf-8", errors="replace").splitlines()[0]

@@ -27,7 +27,7 @@ from sononerf.evaluation.traced import Traced, learn_traced
 from sononerf.field.checkpoint_io import save_weights
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fitting import fit as fit_field
-from sononerf.field.fitting import has_accelerator, require_accelerator
+from sononerf.field.fitting import usable_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.field.step_cost import StepCost, step_cost
 from sononerf.memory import gigabytes, require_memory
@@ -180,7 +180,7 @@ def fit(
     """
     progress = progress or Progress(quiet=True)
     run = Run(path)
-    require_accelerator(accelerator)
+    usable_accelerator(accelerator)
     settings = with_store(settings)
     head = head_of(settings)
     module_for(settings, head, None, 1.0)  # unknown names and options are refused at once
@@ -268,7 +268,7 @@ def _prepared(
     )
     total = data.steps_per_epoch * settings.fit.epochs
     total = min(total, settings.fit.max_steps or total)
-    if hardware["accelerator"] == "cpu" or not has_accelerator():
+    if usable_accelerator(hardware["accelerator"]) == "cpu":
         _announce(step_cost(module, data), echoes, settings, total, progress)
     return _Work(echoes, module, data, total)
 

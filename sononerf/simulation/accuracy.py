@@ -26,8 +26,7 @@ POSES = 8
 """Poses that are simulated twice in a trial, spread evenly over all of them."""
 CONVERGENCE = 0.6
 """The difference is proportional to the number of rays to the power -CONVERGENCE, measured from
-30,000 to
-300,000 rays on ``three_spheres``; on ``ua`` the power is 0.4."""
+30,000 to 300,000 rays on ``three_spheres``; on ``ua`` the power is 0.4."""
 LEAST_DB = 1e-6
 """Difference below which two simulations are the same, dB."""
 STEP = 1.3, 10.0

@@ -18,7 +18,7 @@ from lightning import Fabric
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import InputError, SettingsError, expect
-from sononerf.field.fitting import quiet_lightning, require_accelerator
+from sononerf.field.fitting import quiet_lightning, usable_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.progress import Progress
 from sononerf.settings.loading import checked_section
@@ -189,7 +189,7 @@ def refine(
     progress = progress or Progress()
     expect(surface, Surface, "surface")
     expect(echoes, Echoes, "echoes")
-    require_accelerator(accelerator)
+    accelerator = usable_accelerator(accelerator)
     simulation = checked_section(SimulationSettings, options or {}, "simulation")
     reading = surface.reading
     starts = starts_of(surface)
@@ -236,10 +236,9 @@ def starts_of(surface: Surface) -> dict[StartMethod, trimesh.Trimesh]:
 
 
 def _placed(optics: Optics, accelerator: str) -> Optics:
-    """Return the optics on the device of an accelerator; other GPUs than NVIDIA's do without."""
+    """Return the optics on the device of an accelerator."""
     quiet_lightning()
-    cuda = accelerator != "cpu" and torch.cuda.is_available()
-    Fabric(accelerator="cuda" if cuda else "cpu", devices=1).to_device(optics)
+    Fabric(accelerator=accelerator, devices=1).to_device(optics)
     return optics
 
 

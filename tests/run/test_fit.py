@@ -37,7 +37,7 @@ from sononerf.errors import (
 from sononerf.field import datamodule
 from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import EpochSampler
-from sononerf.field.fitting import require_accelerator
+from sononerf.field.fitting import usable_accelerator
 from sononerf.field.module import EchoModule
 from sononerf.head.directivity.directivity_files import write_sofa
 from sononerf.run import fit as fit_module
@@ -442,13 +442,13 @@ def test_provenance_names_no_people_machines_or_folders(finished):
         assert secret not in text
 
 
-def test_a_gpu_that_is_not_there(tiny, tmp_path, monkeypatch):
+def test_a_gpu_that_is_not_there_or_apples(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     with pytest.raises(ResourceError, match="--accelerator cpu"):
         fit(tiny(), tmp_path / "run", accelerator="gpu")
     assert not (tmp_path / "run").exists()
-    require_accelerator("auto")
+    assert usable_accelerator("auto") == "cpu"
 
 
 @pytest.mark.thorough

@@ -194,11 +194,11 @@ def test_rendering_does_not_look_at_what_was_measured(run, monkeypatch):
     np.testing.assert_array_equal(deaf, rendered)
 
 
-def test_a_gpu_that_is_not_there(run, monkeypatch):
+def test_a_gpu_that_is_not_there_or_apples(run, monkeypatch):
     fitted = Run(run)
     poses = fitted.echoes.poses("val")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     with pytest.raises(ResourceError):
         render_poses(fitted.model, poses, accelerator="gpu", progress=QUIET)
 

@@ -229,8 +229,8 @@ def test_what_cannot_be_predicted_leaves_no_folder(run, change, error, message):
     assert not (run / "prediction").exists()
 
 
-def test_a_gpu_that_is_not_there(run, monkeypatch):
+def test_a_gpu_that_is_not_there_or_apples(run, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: False)
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
     with pytest.raises(ResourceError):
         predict(run, accelerator="gpu")

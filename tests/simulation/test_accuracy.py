@@ -32,10 +32,10 @@ def settings(noise=None, **simulation):
     )
 
 
-def settled(wanted):
+def settled(wanted, progress=QUIET):
     scene = load_scene(wanted.scene.name, wanted.scene.options)
     simulator, poses = simulator_of(scene, wanted), ensemble_poses(wanted.poses)[0]
-    return settle_rays(simulator, poses, wanted.simulation, QUIET), simulator
+    return settle_rays(simulator, poses, wanted.simulation, progress), simulator
 
 
 @pytest.fixture
@@ -72,9 +72,10 @@ def test_a_number_of_rays_is_taken_as_it_is():
     assert rays == simulator.rays.rays == 777
 
 
-def test_no_more_rays_are_taken_than_the_most(few, monkeypatch):
+def test_no_more_rays_are_taken_than_the_most(few, monkeypatch, capsys):
     monkeypatch.setattr(accuracy, "MOST", 900)
-    assert settled(settings(accuracy_db=0.01))[0] == 900
+    assert settled(settings(accuracy_db=0.01), Progress())[0] == 900
+    assert "fewer were less accurate than" in capsys.readouterr().err
 
 
 def test_a_store_records_the_number_and_goes_on_with_it(few, tmp_path, monkeypatch):
