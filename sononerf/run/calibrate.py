@@ -30,7 +30,6 @@ from sononerf.surface.refine.self_calibration import (
     Calibrator,
     Estimate,
     Kind,
-    raised_support,
 )
 from sononerf.surface.refine.support_search import above, find_support, with_support
 
@@ -97,15 +96,16 @@ def calibrate(
     echoes, mesh = opened.echoes, opened.mesh()
     storage.remove_if_empty(storage.probe_writable(output))
     known: dict[str, float] = {}
-    if "support" in wanted and echoes.head.plane is None:
+    if "support" in wanted:
+        if echoes.head.plane is not None:
+            raise SettingsError(
+                "support: this run was fitted with one; fit without support.point first, so that "
+                "the surface shows the image"
+            )
         echoes, mesh, known["support"] = _with_support(echoes, mesh, progress)
     estimate = _estimate(echoes, mesh, [kind for kind in wanted if kind not in known], progress)
     estimate.deviation.update(known)
-    found = estimate.calibration
-    if found.support:
-        head = raised_support(echoes.head, found.support)
-        echoes = Echoes(echoes.store, head, echoes.hull)
-    corrected = write_corrected(echoes, output, found, progress)
+    corrected = write_corrected(echoes, output, estimate.calibration, progress)
     return Calibrated(
         corrected, estimate, *describe(echoes.head, echoes.store, mesh, estimate, wanted)
     )

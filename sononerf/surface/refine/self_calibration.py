@@ -2,10 +2,10 @@
 r"""Errors of a recording, estimated from a surface and what was heard of it.
 
 The spectrograms of the surface by physical optics are compared with the measured ones, in
-compressed decibels. The gain of each receiver and frequency, the range offset, the speed of sound
-and the height of a support are found together by Gauss-Newton steps [1]_ on an absolute loss; the
-derivatives run through the optics. The surface itself is allowed to grow by a uniform layer and by
-a scale, because a surface that was fitted to wrong ranges has taken them up.
+compressed decibels. The gain of each receiver and frequency, the range offset and the speed of
+sound are found together by Gauss-Newton steps [1]_ on an absolute loss. The derivatives run through
+the optics. The surface itself is allowed to grow by a uniform layer and by a scale, because a
+surface that was fitted to wrong ranges has taken them up.
 
 References:
     .. [1] B. Triggs et al., "Bundle adjustment, a modern synthesis", Vision Algorithms, 2000.
@@ -13,7 +13,6 @@ References:
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,9 +27,8 @@ from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.head.decibels import ACTIVE_DB, compress
-from sononerf.head.head import Head
 from sononerf.surface.refine.objective import FLOOR_DB, TRUST
-from sononerf.surface.refine.optics import Heads, Optics
+from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.still_surface import StillSurface
 
 Kind = Literal["gain", "range_offset", "speed_of_sound", "support"]
@@ -45,8 +43,7 @@ FARTHER = 4
 """Number of times, at most, that a step is doubled while the error falls. Interference makes the
 derivatives of fine cells steep but short, and steps too small."""
 LARGEST_STEP = 0.5
-"""Largest step of the range offset and of the support's height, range resolutions: beyond it the
-derivatives do not hold."""
+"""Largest step of the range offset, range resolutions: beyond it the derivatives do not hold."""
 LEAST_DB = 0.5
 """Difference below which all differences have the same weight, dB: physical optics is no more
 accurate."""
@@ -64,13 +61,11 @@ class Calibration:
         gain (E, F): Natural logarithm of how much too loud each receiver is.
         range_offset (m): Excess of all measured ranges.
         speed_of_sound: Natural logarithm of the true speed over the assumed one.
-        support (m): Height of the true support over the assumed one.
     """
 
     gain: Floats
     range_offset: float = 0.0
     speed_of_sound: float = 0.0
-    support: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,22 +83,12 @@ class Estimate:
     error_db: list[float]
 
 
-def raised_support(head: Head, height: float) -> Head:
-    """Return a head whose support is higher, m, along its normal."""
-    plane = head.plane
-    assert plane is not None
-    point = np.asarray(plane.point) + height * np.asarray(plane.normal)
-    standing = head.support.model_copy(update={"point": tuple(point.tolist())})
-    return dataclasses.replace(head, support=standing)
-
-
 class Calibrator:
     """Gauss-Newton steps on the errors of a recording.
 
     Attributes:
         names: Names of the unknowns but for the gains: ``range_offset`` (m), ``speed_of_sound``
-            (natural logarithm), ``support`` (m), and ``layer`` (m) and ``scale`` (natural
-            logarithm) of the surface.
+            (natural logarithm), and ``layer`` (m) and ``scale`` (natural logarithm) of the surface.
         values (U,): Their present values.
         gain (E, F): Natural logarithms.
         change: Length of the last step over one standard deviation, of the unknown that changed
@@ -187,8 +172,8 @@ class Calibrator:
         self.change = float((np.abs(step) / unit).max(initial=0.0))
         grouped = inverse @ self._scatter(np.stack(slopes)) @ inverse
         larger = np.maximum(np.diag(noise * inverse), np.diag(grouped)).clip(0.0)
-        shrink = np.sqrt(larger / np.maximum(np.diag(grouped), 1e-300))
-        self._covariance = grouped * np.outer(shrink, shrink)
+        factor = np.sqrt(larger / np.maximum(np.diag(grouped), 1e-300))
+        self._covariance = grouped * np.outer(factor, factor)
         self._move(step)
         if size:
             self._go_on(step)
@@ -216,7 +201,7 @@ class Calibrator:
         deviation: dict[str, float] = {}
         spread = self.stretch * np.sqrt(np.diag(self._covariance))
         for index, name in enumerate(self.names):
-            if name in ("range_offset", "speed_of_sound", "support"):
+            if name in ("range_offset", "speed_of_sound"):
                 setattr(calibration, name, float(self.values[index]))
                 deviation[name] = float(spread[index])
         if self.learns_gain:
@@ -247,10 +232,7 @@ class Calibrator:
         normals, middle = np.array(self.mesh.vertex_normals), self.mesh.centroid
         scale, layer = math.exp(self._value("scale")), self._value("layer")
         places = (self.mesh.vertices - middle) * scale + middle + layer * normals
-        optics, height = self.optics, self._value("support")
-        if height:
-            optics = Optics(raised_support(optics.head, height))
-        return StillSurface(trimesh.Trimesh(places, self.mesh.faces, process=False), optics)
+        return StillSurface(trimesh.Trimesh(places, self.mesh.faces, process=False), self.optics)
 
     def _linear(
         self, body: StillSurface, number: int, *, slopes: bool = False
@@ -283,24 +265,23 @@ class Calibrator:
         late = points.new_tensor([2.0 * self._value("range_offset")])
         away = (body.vertices - body.vertices.new_tensor(self.mesh.centroid)).float()
         tangents = {
-            "range_offset": (still, 0.0, 2.0, 0.0),
-            "speed_of_sound": (still, -1.0, 0.0, 0.0),
-            "layer": (body.normals.float(), 0.0, 0.0, 0.0),
-            "scale": (away, 0.0, 0.0, 0.0),
-            "support": (still, 0.0, 0.0, 1.0),
+            "range_offset": (still, 0.0, 2.0),
+            "speed_of_sound": (still, -1.0, 0.0),
+            "layer": (body.normals.float(), 0.0, 0.0),
+            "scale": (away, 0.0, 0.0),
         }
         with torch.no_grad():
             heard = optics.render(points, area, pieces, heads, stretch=stretch, late=late)
             power = [heard.power.sqrt()]
             for name in self.names if slopes else ():
-                velocity, slower, later, raised = tangents[name]
+                velocity, slower, later = tangents[name]
                 with forward.dual_level():
                     moved = forward.make_dual(points, velocity)
                     both = optics.render(
                         moved,
                         body.operators.areas(moved),
                         pieces,
-                        self._raised(heads, raised) if raised else heads,
+                        heads,
                         stretch=forward.make_dual(stretch, slower * stretch),
                         late=forward.make_dual(late, torch.full_like(late, later)),
                     )
@@ -313,19 +294,6 @@ class Calibrator:
             for one, change in zip(changes, power[1:], strict=True):
                 one[:, low:high] = change[0, :, low - first : high - first].numpy()
         return magnitude, changes
-
-    def _raised(self, heads: Heads, height: float) -> Heads:
-        """Return heads whose images move as the support rises, as dual numbers."""
-        plane = self.optics.plane
-        assert plane is not None
-        moved = 2.0 * height * heads.emitters.new_tensor(plane.normal)
-        mirrored = heads.emitters.new_tensor([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
-        emitter, ear = (mirrored[:, side, None] * moved for side in (0, 1))
-        return dataclasses.replace(
-            heads,
-            emitters=forward.make_dual(heads.emitters, emitter),
-            ears=forward.make_dual(heads.ears, ear[:, None].expand_as(heads.ears)),
-        )
 
     def _scatter(self, slopes: Floats) -> Floats:
         """Return the covariance of the sums of slopes (P, N) over groups of neighbouring poses.
@@ -345,7 +313,7 @@ class Calibrator:
     def _move(self, step: Floats) -> None:
         most = LARGEST_STEP * self.optics.head.resolution
         count = len(self.names)
-        bound = np.where(np.isin(self.names, ("range_offset", "support")), most, np.inf)
+        bound = np.where(np.isin(self.names, ["range_offset"]), most, np.inf)
         self.values = self.values + step[:count].clip(-bound, bound)
         if self.learns_gain:
             self.gain = self.gain + step[count:].reshape(self.gain.shape)

@@ -7,12 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.self_calibration import Calibrator
 from sononerf.surface.refine.still_surface import StillSurface
-from sononerf.surface.refine.support_search import with_support
 from tests.memory import echoes_of
-from tests.surface.conftest import RADIUS
 
 COUNT = 14
 
@@ -68,13 +65,3 @@ def test_without_errors_nothing_is_found(bumpy, heard, optics):
     estimate = found(bumpy, heard(), optics, "gain", "speed_of_sound", steps=2)
     assert np.abs(estimate.calibration.gain).max() < 1e-3
     assert abs(estimate.calibration.speed_of_sound) < 1e-4
-
-
-def test_the_height_of_the_support_is_found(bumpy, optics, poses):
-    low = Optics(with_support(optics.head, -1.3 * RADIUS))
-    at = poses.positions[:COUNT], poses.rotations[:COUNT]
-    magnitude = StillSurface(bumpy, low).render(*at)
-    stated = Optics(with_support(optics.head, -1.3 * RADIUS + 0.001))
-    echoes = echoes_of(stated.head, *at, lambda pose: magnitude[pose], np.zeros(COUNT, dtype=int))
-    estimate = found(bumpy, echoes, stated, "support", steps=4)
-    assert estimate.calibration.support == pytest.approx(-0.001, abs=1e-4)
