@@ -28,7 +28,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from sononerf import storage
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.field import Field
-from sononerf.field.fitting import quiet_lightning, require_accelerator
+from sononerf.field.fitting import quiet_lightning, usable_accelerator
 from sononerf.field.fourier import FourierField
 from sononerf.field.module import EchoModule
 from sononerf.field.renderer import ShellRenderer
@@ -168,7 +168,7 @@ def step(arguments: argparse.Namespace) -> str:
 
 
 def _step(arguments: argparse.Namespace, output: Path) -> str:
-    require_accelerator(arguments.accelerator)
+    arguments.accelerator = usable_accelerator(arguments.accelerator)
     quiet_lightning()
     if arguments.compare is not None:
         storage.read_json(arguments.compare)  # that it cannot be read is told before minutes pass
