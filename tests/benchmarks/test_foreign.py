@@ -7,6 +7,7 @@ import argparse
 import json
 
 import pytest
+import torch
 import trimesh
 
 from tools.benchmarks import foreign as module
@@ -82,3 +83,22 @@ def test_a_body_is_a_scene_in_metres(tmp_path):
     assert settings[0] == "scene.name=mesh"
     assert {"scene.options.unit=m", "poses.count=25", "fit.seed=1"} <= set(settings)
     assert json.dumps(settings)
+
+
+def test_of_each_start_the_surface_with_the_lowest_objective_counts():
+    def stage(objective, height):
+        corners = torch.tensor([[0.0, 0, height], [1, 0, height], [0, 1, height]])
+        faces = torch.tensor([[0, 1, 2]])
+        return {"vertices": corners, "faces": faces, "objective": torch.tensor(objective)}
+
+    saved = {
+        "open-blurred-0": stage(2.0, 0.0),
+        "open-blurred-1": stage(1.0, 1.0),
+        "levels-planes-0": stage(3.0, 2.0),
+        "levels-blurred-0": stage(4.0, 3.0),
+    }
+    best = foreign.best_of(saved)
+    assert {name: mesh.vertices[0, 2] for name, mesh in best.items()} == {
+        "open": 1.0,
+        "levels": 2.0,
+    }

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import trimesh
+from torch import Tensor
 
 import sononerf
 from sononerf import storage
@@ -25,7 +26,7 @@ from sononerf.evaluation.metrics import geometry_metrics
 from sononerf.evaluation.solid import Solid
 from sononerf.settings.loading import load_settings
 from sononerf.surface.reconstruction import starts_of
-from sononerf.surface.refine.refinement import Refinement
+from sononerf.surface.refine.refinement import Saved
 from tools.benchmarks.experiment import (
     CONFIG,
     STOPPED,
@@ -85,12 +86,10 @@ def measured(body: Path, settings: Sequence[str], output: Path) -> Row:
     model = sononerf.fit(echoes, model, accelerator="cpu")
     fitted = time.monotonic()
     surface = sononerf.reconstruct(model, echoes)
-    kept: list[Refinement] = []
-    found = sononerf.refine(
-        surface, echoes, accelerator="cpu", after_step=lambda work, _: kept.append(work)
-    )
+    saved: Saved = {}
+    found = sononerf.refine(surface, echoes, accelerator="cpu", saved=saved)
     ended = time.monotonic()
-    refined = {one.start: one.meshes[one.best] for one in kept[-1].candidates}
+    refined = best_of(saved)
     return {
         "starts": {name: scores(mesh, truth) for name, mesh in starts_of(surface).items()},
         "refined": {name: scores(mesh, truth) for name, mesh in refined.items()},
@@ -100,6 +99,19 @@ def measured(body: Path, settings: Sequence[str], output: Path) -> Row:
         "candidates": list(found.candidates),
         "fit_s": fitted - begun,
         "surface_s": ended - fitted,
+    }
+
+
+def best_of(saved: Saved) -> dict[str, trimesh.Trimesh]:
+    """Return the refined surface of each start with the lowest objective."""
+    found: dict[str, dict[str, Tensor]] = {}
+    for name, stage in saved.items():
+        start = name.partition("-")[0]
+        if start not in found or stage["objective"] < found[start]["objective"]:
+            found[start] = stage
+    return {
+        start: trimesh.Trimesh(one["vertices"].numpy(), one["faces"].numpy(), process=False)
+        for start, one in found.items()
     }
 
 
