@@ -97,7 +97,7 @@ def test_of_each_start_the_surface_with_the_lowest_objective_counts():
         "levels-planes-0": stage(3.0, 2.0),
         "levels-blurred-0": stage(4.0, 3.0),
     }
-    best = foreign.best_of(saved)
+    best = module.best_of(saved)
     assert {name: mesh.vertices[0, 2] for name, mesh in best.items()} == {
         "open": 1.0,
         "levels": 2.0,
