@@ -209,7 +209,7 @@ def test_a_size_is_blamed_on_options_where_there_are_some(monkeypatch):
     with pytest.raises(SettingsError, match=r"^mine: scene\.options: the mesh is 180 m large"):
         load_scene("composed", {"parts": apart}, source="mine")
     monkeypatch.setattr(plugins, "load", lambda group, name: lambda: Scene(box(200)))
-    with pytest.raises(InputError, match=r"^scene 'sphere' of sononerf [\d.]+: the mesh is 200 m"):
+    with pytest.raises(InputError, match=r"^scene 'sphere' of sononerf \S+: the mesh is 200 m"):
         load_scene("sphere")
 
 
@@ -249,5 +249,5 @@ def unreadable(size: "NoSuchType" = 1):  # noqa: F821
 )
 def test_a_faulty_factory_is_named_with_its_distribution(monkeypatch, factory, match):
     monkeypatch.setattr(plugins, "load", lambda group, name: factory)
-    with pytest.raises(InputError, match=rf"^scene 'sphere' of sononerf 0\.[\d.]+ ?{match}$"):
+    with pytest.raises(InputError, match=rf"^scene 'sphere' of sononerf \S+? ?{match}$"):
         load_scene("sphere")
