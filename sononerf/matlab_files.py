@@ -24,12 +24,7 @@ PLAIN = "save it again with numbers, structs and cells alone"
 
 
 def read_mat(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
-    """Read variables of a MATLAB file.
-
-    Returns:
-        variables: Structs as dicts, cells and arrays of structs as lists, numbers as arrays in
-            MATLAB's shape, text as str.
-    """
+    """Read variables of a MATLAB file."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     with path.open("rb") as file:

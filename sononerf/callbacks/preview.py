@@ -88,9 +88,7 @@ POSES = 3
 class SpectrogramImages(lightning.Callback):
     """Shows validation poses: measured, and predicted by the field.
 
-    Args:
-        poses: The validation poses.
-        range_m, frequency_hz ((R,), (F,) float): Axes.
+    In: range_m, frequency_hz ((R,), (F,) float).
     """
 
     def __init__(

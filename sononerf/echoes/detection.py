@@ -83,9 +83,7 @@ class Levels(NamedTuple):
 def threshold_levels(power: Floats, looks: float) -> Levels:
     """Return the thresholds of noise, and of noise and precursors.
 
-    Args:
-        power (..., R): Power averaged over frequency: of all poses and ears that are compared, over
-            range.
+    In: power (..., R).
     """
     factor = threshold_factor(looks)
     noise = factor * np.quantile(power, RANK, axis=-1, keepdims=True)
@@ -143,15 +141,9 @@ def onsets(
     The range is read where the power has risen to a tenth of the echo's, or to the threshold of
     noise where that is more, and moved by the distance from there to the middle of a point echo.
 
-    Args:
-        power (N, R): Power over range.
-        window ((W,) float or callable): Power of a point echo over range, its own range in the
-            middle; or what gives it for a row and the slice of its echo's greatest power.
-        start (N,): First slice that may hold an echo; the first of all where None.
-
-    Returns:
-        onset (N,): Minus infinity where nothing was heard, or where the first slice cuts an echo
-            that the first whole one does not exceed by the threshold factor.
+    In: power (N, R), window ((W,) or callable: row and slice give it), start (N,), the first slices
+    that may hold an echo. Out: onset (N,), minus infinity where nothing was heard or the first
+    slice cuts an echo.
     """
     found = np.full(len(power), -np.inf)
     start = np.zeros(len(power)) if start is None else start
@@ -213,8 +205,7 @@ class Onsets:
     def chance(self, resolution: float) -> float:
         """Return the probability that noise alone makes at least this number of onsets.
 
-        Args:
-            resolution (m): Range resolution: as many slices as it is long share their noise.
+        In: resolution (m).
         """
         extent = len(self.range) * float(self.range[1] - self.range[0])
         tries = self.first.size * extent / resolution
@@ -232,9 +223,7 @@ def asked_poses(store: Ensemble) -> Ints:
 def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = None) -> Onsets:
     """Detect the echoes of a sealed ensemble's analysed poses.
 
-    Args:
-        nearest ((P, E), m): Least range of a possible echo; earlier sound is clutter. All ranges
-            count where None.
+    In: nearest ((P, E), m).
     """
     poses = asked_poses(store)
     axis = np.asarray(store.range, dtype=np.float64)

@@ -121,14 +121,8 @@ class EchoHull:
     def clearance(self, points: ArrayLike) -> tuple[Floats, NDArray[np.intp]]:
         """Return how far points lie behind the first echoes, and which pose leaves them least.
 
-        Args:
-            points ((N, 3), m): World frame.
-
-        Returns:
-            clearance ((N,), m): Negative where an onset rules the point out, and below the support;
-                plus infinity without evidence. Its slope is at most one. Up to
-                :attr:`undetected` contradicting poses are ignored.
-            pose (N,): The pose with this onset.
+        In: points ((N, 3), m). Out: clearance ((N,), m), negative where an onset rules the point
+        out and below the support, plus infinity without evidence; pose (N,).
         """
         where = np.asarray(points, dtype=np.float64)
         chunk = self.chunk
@@ -191,11 +185,8 @@ def _behind(
 ) -> Floats:
     """Return how far points (N, 3) lie behind first echoes (P, E): (N, P, E), m.
 
-    Args:
-        points ((N, 3), m): World frame.
-        emitters, receivers ((P, 3), (P, E, 3), m): Emitters and receivers of the poses.
-        first ((P, E), m): Ranges.
-        axes (P, 3): Looking directions of the poses.
+    In: points ((N, 3), m), emitters, receivers ((P, 3), (P, E, 3), m), first ((P, E), m), axes (P,
+    3).
     """
     found = np.full((len(points), *first.shape), np.inf)
     for n in range(len(points)):
@@ -224,10 +215,7 @@ def _possible(
 ) -> Bools:
     """Return the cells (N,) that few onsets rule out and that lie at the range of a wanted one.
 
-    Args:
-        cells ((N, 3), m): Their middles.
-        wanted (P, E): Mask of the wanted onsets.
-        reach (m): Half diagonal of a cell.
+    In: cells ((N, 3), m), wanted (P, E), reach (m).
     """
     found = np.zeros(len(cells), np.bool_)
     for n in range(len(cells)):
@@ -278,9 +266,7 @@ def weighted(hull: EchoHull, resolution: float, within: Floats | None = None) ->
     outlier itself. Gross outliers are removed first, on coarse cells of places, so that fewer are
     left for the fine cells.
 
-    Args:
-        resolution (m): Range resolution.
-        within ((2, 3), m): Box that holds the body; found from the onsets where None.
+    In: resolution (m), within ((2, 3), m).
     """
     box, ears = _heard_box(hull) if within is None else within, hull.first.shape[1]
     if box is None:
@@ -356,9 +342,7 @@ def _cells(
 
     They are halved until half their diagonal is the least, m.
 
-    Returns:
-        against (N, P E): True where an onset rules a cell out.
-        meets (N, W): At which wanted onsets' range it lies.
+    Out: against (N, P E), meets (N, W).
     """
     lower, upper = box
     side = float((upper - lower).max()) / COARSE

@@ -169,8 +169,7 @@ def _open_array(
 def read_axes(root: Path, group: Any) -> tuple[dict[str, NDArray[Any]], Any]:
     """Check every array against the layout of :func:`create_arrays`, and read the axes.
 
-    Returns:
-        spectrogram: (P, E, R, F) float32, not read.
+    Out: (P, E, R, F).
     """
     axes = {}
     for name, (dtype, dims, sizes) in AXES.items():

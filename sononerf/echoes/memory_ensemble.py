@@ -124,12 +124,8 @@ def fault_of(spectrogram: Singles) -> str:
 class MemoryEnsemble(Ensemble):
     """An ensemble in memory. At first all its poses are missing.
 
-    Args:
-        positions ((P, 3), m): Places of the head, world frame.
-        rotations (P, 3, 3): Head to world.
-        split (P,): 0 train, 1 validation, 2 test.
-        range ((R,), m): One-way distances of the slices.
-        frequency ((F,), Hz): Frequencies of the bins.
+    In: positions ((P, 3), m), rotations (P, 3, 3), split (P,), range ((R,), m), frequency ((F,),
+    Hz).
     """
 
     def __init__(
@@ -185,8 +181,7 @@ def seal(
 ) -> None:
     """Fix the reported decibels and the noise floor of a complete ensemble, which seals it.
 
-    Args:
-        noise ((E, F) or None): Its root mean square, where it is known.
+    In: noise ((E, F) or None).
     """
     loudest = max(float(ensemble.read_pose(int(i)).max()) for i in ensemble.indices("train"))
     if loudest <= 0.0:

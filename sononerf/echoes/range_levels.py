@@ -62,9 +62,7 @@ class RangeLevels:
     ) -> RangeLevels:
         """Return the levels of spectrograms.
 
-        Args:
-            spectrograms (P of (E, R, F)): Linear magnitudes.
-            first, spacing (m): Range of the first slice, and distance between slices.
+        In: spectrograms (P of (E, R, F)), first, spacing (m).
         """
         step = max(1, round(resolution / spacing / PER_RESOLUTION))
         power = np.array([_banded(one, step) for one in spectrograms])

@@ -51,9 +51,7 @@ def heard_again(magnitude: NDArray[np.floating], noise: Floats, seed: int) -> Si
     Cells above the noise get the difference of two draws of noise. Cells below are noise, and are
     drawn again.
 
-    Args:
-        magnitude (E, R, F): Its spectrogram.
-        noise (E, F): Root mean square.
+    In: magnitude (E, R, F), noise (E, F).
     """
     rng = np.random.default_rng(seed)
     parts = rng.standard_normal((2, *magnitude.shape)) * (noise[:, None] / math.sqrt(2.0))
@@ -71,8 +69,7 @@ def seal_recorded(
     The floor comes from poses that were recorded twice, or else from the noise before the first
     echoes.
 
-    Args:
-        split (P,): Use of each pose: 0 training, 1 validation, 2 test.
+    In: split (P,).
     """
     pairs = repeats(poses, split)
     again = {index: store.read_pose(other) for index, other in pairs.items()}

@@ -41,9 +41,7 @@ ENOUGH = 2  # poses: an echo of one pose alone may come from any place of an ell
 class EchoRegion:
     """Evidence of the poses about places.
 
-    Args:
-        rotations (P, 3, 3): Head to world.
-        resolution (m): Range resolution.
+    In: rotations (P, 3, 3), resolution (m).
     """
 
     def __init__(
@@ -69,9 +67,7 @@ class EchoRegion:
     def possible(self, points: Floats, tolerance: float) -> Bools:
         """Return the places that no pose rules out and that some poses heard, (N,).
 
-        Args:
-            points ((N, 3), m): Places, world frame.
-            tolerance (m): Radius of the surroundings that a place stands for.
+        In: points ((N, 3), m), tolerance (m).
         """
         return self._inside(points, tolerance / 4) & self._energy(points, tolerance)[1]
 
@@ -212,13 +208,7 @@ FEW = 0.02
 def echo_extent(power: Floats, axis: Floats, looks: float, margin: float) -> tuple[float, float]:
     """Return the least and the greatest range (m) that hold echoes, with a margin.
 
-    Args:
-        power (P, E, R): Power averaged over frequency.
-        axis ((R,), m): Ranges of the slices.
-        margin (m): Added on both sides.
-
-    Returns:
-        limits ((float, float), m): Within the axis; all of it where nothing is heard.
+    In: power (P, E, R), axis ((R,), m), margin (m). Out: limits ((float, float), m).
     """
     loud: Bools = power > threshold_levels(power, looks).total
     heard = np.asarray(loud.any(axis=1))  # (P, R)

@@ -32,9 +32,7 @@ def pose_groups(poses: Poses) -> Ints:
 def split_of(poses: Poses, split: ArrayLike | None, *, where: str = "split") -> NDArray[np.int8]:
     """Return what each pose is for, (P,): 0 train, 1 validation, 2 test.
 
-    Args:
-        split (P,): Names (``"train"``, ``"val"``, ``"test"``) or numbers; drawn at random with seed
-            0 where None, see :func:`draw_split`.
+    In: split (P,).
     """
     if split is None:
         return draw_split(poses, where="poses")
@@ -62,12 +60,7 @@ def draw_split(
 ) -> NDArray[np.int8]:
     """Draw at random what each pose is for; repeated pings of one pose stay together.
 
-    Args:
-        validation, heldout: Numbers of poses; a twentieth and a tenth where None, at most 10 and
-            20.
-
-    Returns:
-        split ((P,) int8): 0 train, 1 validation, 2 test.
+    Out: split ((P,) int8).
     """
     groups = pose_groups(poses)
     count = int(groups.max(initial=-1)) + 1

@@ -73,12 +73,8 @@ class EnsembleStore(Ensemble):
 
         The group's own file comes last, so that an unfinished store is not taken for one.
 
-        Args:
-            poses_positions ((P, 3), m): Head positions, world frame.
-            poses_rotations (P, 3, 3): Head to world.
-            split (P,): 0 train, 1 validation, 2 test.
-            range ((R,), m): One-way distances of the slices.
-            frequency ((F,), Hz): Frequencies of the bins.
+        In: poses_positions ((P, 3), m), poses_rotations (P, 3, 3), split (P,), range ((R,), m),
+        frequency ((F,), Hz).
         """
         axes = checked_axes(
             position=poses_positions,
@@ -124,8 +120,7 @@ class EnsembleStore(Ensemble):
     def write_pose(self, index: int, spectrogram: ArrayLike) -> None:
         """Commit one pose.
 
-        Args:
-            spectrogram ((E, R, F) float32): Linear magnitude.
+        In: spectrogram ((E, R, F) float32).
         """
         self._refuse_reading()
         self._spectrogram[index] = self._checked(index, spectrogram)

@@ -39,11 +39,7 @@ def backprojection(
     .. math:: I(x) = \frac{1}{P} \sum_p \sum_e \sum_f
               \left|S_{p,e,f}\right|^2 \left(\frac{|x - x_p| + |x - x_{p,e}|}{2}\right)
 
-    Args:
-        spectrograms (iterable of (E, R, F) float): Linear magnitude, one per pose in order; read
-            one at a time.
-        lower, upper ((3,), m): The box.
-        spacing (m): Voxel size.
+    In: spectrograms (iterable of (E, R, F) float), lower, upper ((3,), m), spacing (m).
     """
     emitters, receivers = head.places(poses.positions, poses.rotations)
     axis = head.range
@@ -64,10 +60,7 @@ def range_profiles(
 ) -> Iterator[Floats]:
     """Yield each pose's energy, summed over frequency, (E, R).
 
-    Args:
-        spectrograms (iterable of (E, R, F) float): Linear magnitude, one per pose; read one at a
-            time.
-        shape (P, E, R): The expected shape.
+    In: spectrograms (iterable of (E, R, F) float), shape (P, E, R).
     """
     poses, ears, slices = shape
     count = 0
@@ -121,11 +114,9 @@ def _spread(
 ) -> None:
     """Add a profile to each voxel of a grid, read at half the way out and back, in place.
 
-    Args:
-        total (X, Y, Z): The grid.
-        profile (R + 3,): From :func:`_padded`; read linearly, zero outside.
-        x_out, y_out, z_out, x_back, y_back, z_back (m²): See :func:`_squares`.
-        start, step (m): Range of the profile's first slice, and from one to the next.
+    In: total (X, Y, Z), profile (R + 3,), zero outside, x_out, y_out, z_out, x_back, y_back, z_back
+    (m²), start,
+    step (m).
     """
     last, scale = len(profile) - 2.0, 0.5 / step
     for i in range(total.shape[0]):
@@ -200,11 +191,6 @@ def voxel_fit(
     180,000 voxels take 7 s on one core. Surfaces come out too far out, as in all that knows no
     directions: a voxel just outside a mirror-like body lies in the shells of more poses than one
     on it does.
-
-    Args:
-        spectrograms, poses, head, lower, upper, spacing: As of
-            :func:`sononerf.evaluation.baseline.backprojection`; the emitter is near the ears
-            against the ranges.
 
     References:
         .. [1] L. B. Lucy, "An iterative technique for the rectification of observed distributions",
@@ -287,11 +273,9 @@ def _sorted(
 
     The ends of the window are zero: the outermost bins, and all that lies beyond, are silent.
 
-    Args:
-        index (X, Y, Z): Overwritten.
-        power (X, Y, Z): Powers of the voxels.
-        x_out, y_out, z_out, x_back, y_back, z_back (m²): See :func:`_squares`.
-        first, step (m): Range of the first bin, and from one to the next.
+    In: index (X, Y, Z), overwritten, power (X, Y, Z), x_out, y_out, z_out, x_back, y_back, z_back
+    (m²), first,
+    step (m).
     """
     total = np.zeros(bins)
     for i in range(power.shape[0]):
@@ -328,8 +312,7 @@ BASELINES = {"backprojection": backprojection, "voxels": voxel_fit}
 def volume_of(store: Ensemble, name: str, numbers: Ints, *given: Any) -> Volume:
     """Return the volume of a baseline; a function that other processes can import.
 
-    Args:
-        numbers (P,): Numbers of the poses.
+    In: numbers (P,).
     """
     heard = (store.read_pose(int(number)) for number in numbers)
     return BASELINES[name](heard, *given)

@@ -149,12 +149,7 @@ gives 39."""
 
 
 def check_truth(found: trimesh.Trimesh, true: trimesh.Trimesh, kind: Kind, name: str) -> None:
-    """Refuse a true surface that is of another size, or elsewhere, before any work.
-
-    Args:
-        kind: Motion that will lay the reconstruction over it: a similarity has any size, and a
-            motion any place.
-    """
+    """Refuse a true surface that is of another size, or elsewhere, before any work."""
     sizes = [float(np.linalg.norm(mesh.extents)) for mesh in (found, true)]
     times = max(sizes) / max(min(sizes), 1e-12)
     if kind != "similarity" and times > MOST_TIMES:
@@ -233,8 +228,7 @@ class Truth:
 def baseline_volume(name: str, echoes: Echoes, lower: Floats, upper: Floats) -> Volume:
     """Compute a baseline: backprojection or a voxel fit of the training poses.
 
-    Args:
-        lower, upper ((3,), m): Corners of the region.
+    In: lower, upper ((3,), m).
     """
     train = echoes.store.indices("train")
     spacing = float((upper - lower).max()) / BASELINE_VOXELS

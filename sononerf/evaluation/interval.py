@@ -34,13 +34,8 @@ def learn_interval(
 ) -> Floats:
     """Return half the width of the interval by class.
 
-    Args:
-        measured_db, predicted_db ((P, E, R, F), dB): Levels of poses that took no part in the fit.
-        active_db (dB): Level from which a cell is active; one number, or one that is broadcast to a
-            spectrogram.
-
-    Returns:
-        half_db ((CLASSES, F), dB): By class of the predicted level, and by frequency.
+    In: measured_db, predicted_db ((P, E, R, F), dB), active_db (dB). Out: half_db ((CLASSES, F),
+    dB).
     """
     measured, predicted = (np.asarray(a, dtype=np.float64) for a in (measured_db, predicted_db))
     error = np.abs(measured - predicted)
@@ -62,9 +57,7 @@ def learn_interval(
 def interval_db(predicted_db: ArrayLike, half_db: Floats) -> Floats:
     """Return half the width of the interval of each cell, dB.
 
-    Args:
-        predicted_db ((..., F), dB): Predicted levels.
-        half_db ((CLASSES, F), dB): From :func:`learn_interval`.
+    In: predicted_db ((..., F), dB), half_db ((CLASSES, F), dB).
     """
     level = level_class(predicted_db)
     found: Floats = half_db[level, np.arange(level.shape[-1])]
@@ -88,10 +81,7 @@ def covered(
 ) -> float | None:
     """Return the fraction of the active cells whose measured level lies within the interval.
 
-    Args:
-        measured_db, predicted_db ((P, E, R, F), dB): Levels.
-        half_db ((P, E, R, F), dB): Half the width of the interval.
-        active_db (dB): As in :func:`learn_interval`.
+    In: measured_db, predicted_db ((P, E, R, F), dB), half_db ((P, E, R, F), dB), active_db (dB).
     """
     measured, predicted = (np.asarray(a, dtype=np.float64) for a in (measured_db, predicted_db))
     active = (measured >= active_db) | (predicted >= active_db)

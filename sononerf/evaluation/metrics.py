@@ -37,27 +37,7 @@ def geometry_metrics(
     reconstruction all surface counts, a wall inside it too. Distances are exact, from area-uniform
     samples of the one surface to the triangles of the other.
 
-    Args:
-        thresholds (tuple of float, m): Distances at which the F-score is taken.
-
-    Returns:
-        metrics:
-            ``chamfer_m``
-                Mean of the two mean distances.
-            ``fscore``
-                Per threshold, as ``"0.005"``: harmonic mean of the shares of the reconstruction
-                near the truth and of the truth near the reconstruction.
-            ``thickness_bias_m``
-                Mean signed distance of the reconstruction from the truth, positive outside; None
-                where the truth is open.
-            ``volume_ratio``, ``iou``
-                Volume over true volume, shared volume over united volume; None where either is
-                open.
-            ``normal_consistency``
-                Mean cosine between the normals, without sign, of each sample and its nearest sample
-                of the other surface, both ways.
-            ``components``, ``components_true``
-                Connected parts with more than 1 % of the largest one's area.
+    In: thresholds (tuple of float, m).
     """
     true = truth if isinstance(truth, Solid) else Solid(truth)
     found = Solid(reconstructed, fill_cavities=False)
@@ -91,15 +71,7 @@ def target_metrics(
     Parts of the reconstruction count if they are nearer to the true target than to the true
     surroundings; else as :func:`geometry_metrics`.
 
-    Args:
-        thresholds (tuple of float, m): Distances at which the F-score is taken.
-
-    Returns:
-        metrics:
-            ``share``
-                The part of the reconstructed surface that counts.
-            ``chamfer_m``, ``fscore``
-                None and 0 where no part of it does.
+    In: thresholds (tuple of float, m).
     """
     true = Solid(target)
     points, face = sample_surface(reconstructed, samples, seed + 1)

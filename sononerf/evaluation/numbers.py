@@ -103,12 +103,7 @@ def evaluate(
 
 
 def compare_prediction(prediction: Prediction, echoes: Echoes) -> Evaluation:
-    """Compare a prediction with the measurement of its poses.
-
-    Returns:
-        evaluation: ``mae_db``, ``rendered_mae_db`` and others, beside ``mean_predictor_mae_db`` and
-            ``noise_floor_mae_db``, see :func:`sononerf.evaluation.prediction.prediction_metrics`.
-    """
+    """Compare a prediction with the measurement of its poses."""
     numbers = echoes.numbers_of(prediction.poses)
     measured = np.stack([echoes.spectrogram(int(number)) for number in numbers])
     return Evaluation(prediction_numbers(prediction, echoes, measured))

@@ -220,8 +220,7 @@ def prediction_numbers(
 def ranked(measured_db: ArrayLike, predicted_db: ArrayLike) -> Ints:
     """Return the order of poses (P,) from the best predicted to the worst, over all cells.
 
-    Args:
-        measured_db, predicted_db ((P, E, R, F), dB): 0 dB is silence.
+    In: measured_db, predicted_db ((P, E, R, F), dB).
     """
     measured, predicted = same_shape(measured_db, predicted_db)
     error_db = np.abs(predicted - measured).mean(axis=(1, 2, 3))
@@ -245,20 +244,7 @@ def prediction_metrics(
 ) -> dict[str, float | None]:
     """Compare predicted spectrograms with measured ones.
 
-    Args:
-        measured_db, predicted_db ((P, E, R, F), dB): 0 dB is silence; arrays mapped from a file are
-            read a few poses at a time.
-        mean_db ((E, R, F), dB): Mean spectrogram of the training poses: the prediction without
-            knowledge of the pose.
-        active_db (dB): A cell is active where the measured or the judged spectrogram reaches this;
-            one number, or one that is broadcast to a spectrogram.
-
-    Returns:
-        metrics: ``mae_db``, ``mae_db_active``, ``mean_predictor_mae_db``,
-            ``mean_predictor_mae_db_active``, ``log_spectral_distance_db`` (root mean square over
-            frequency, mean over the rest), ``psnr_db`` and ``ssim`` (range 60 dB), ``pearson``.
-            None where a figure does not exist: nothing active, a perfect match's PSNR, pictures too
-            small for SSIM, no variation.
+    In: measured_db, predicted_db ((P, E, R, F), dB), mean_db ((E, R, F), dB), active_db (dB).
     """
     measured, predicted = same_shape(measured_db, predicted_db)
     mean = np.asarray(mean_db, dtype=np.float64)

@@ -28,10 +28,6 @@ ROUNDING = 1e-9
 class Solid:
     """The union of the closed bodies of a mesh, and its open sheets.
 
-    Args:
-        fill_cavities: Whether closed cavities count as filled, as for a true surface: no sound
-            reaches them.
-
     Attributes:
         union: The solid; empty if no part is closed.
         sheets: The parts that are open or enclose no volume.
@@ -127,9 +123,7 @@ class Solid:
 def sample_surface(mesh: trimesh.Trimesh, count: int, seed: int) -> tuple[Floats, NDArray[np.intp]]:
     """Draw points uniformly by area.
 
-    Returns:
-        points ((count, 3), m): On the surface.
-        face (count,): The triangles that they lie on.
+    Out: points ((count, 3), m), face (count,).
     """
     if not mesh.area > 0:
         raise NumericalError("the mesh has no area to draw points from")

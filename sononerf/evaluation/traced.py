@@ -75,10 +75,6 @@ def learn_traced(
 
     The gain per ear and frequency comes from training poses, the weight per frequency from one
     regression on the validation poses. Held-out poses take no part.
-
-    Returns:
-        traced: Weight zero where there are no validation poses, or nothing can be traced off the
-            surface; ``fault`` then says why.
     """
     reference, head, store = model.reference, echoes.head, echoes.store
     training, validation = store.indices("train"), store.indices("val")
@@ -162,12 +158,7 @@ lobes and interference."""
 def gain_db(measured_db: ArrayLike, traced_db: ArrayLike) -> Floats:
     """Return the level of the measurement over that of the traced echoes, by ear and frequency.
 
-    Args:
-        measured_db, traced_db ((P, E, R, F), dB): Reported decibels; 0 dB is silence.
-
-    Returns:
-        gain ((E, F), dB): Median over the cells above ``LOUD_DB`` in both; zero where there is
-            none.
+    In: measured_db, traced_db ((P, E, R, F), dB). Out: gain ((E, F), dB).
     """
     measured, traced = (np.asarray(a, dtype=np.float64) for a in (measured_db, traced_db))
     loud = (measured > LOUD_DB) & (traced > LOUD_DB)
@@ -184,12 +175,7 @@ def gain_db(measured_db: ArrayLike, traced_db: ArrayLike) -> Floats:
 def mix(rendered_db: ArrayLike, traced_db: ArrayLike, weight: ArrayLike) -> Floats:
     """Return the weighted mean of two predictions in decibels.
 
-    Args:
-        rendered_db, traced_db ((..., F), dB): Predictions.
-        weight (F,): Weight of the traced one, 0 to 1.
-
-    Returns:
-        mixed_db: (..., F), dB.
+    In: rendered_db, traced_db ((..., F), dB), weight (F,). Out: (..., F).
     """
     first = np.asarray(rendered_db, dtype=np.float64)
     return first + np.asarray(weight) * (np.asarray(traced_db, dtype=np.float64) - first)
@@ -202,12 +188,7 @@ def regress_weight(measured_db: ArrayLike, rendered_db: ArrayLike, traced_db: Ar
     cells of a frequency: least absolute deviations, as the reported error is. With one unknown the
     solution is the median of :math:`(m - r) / (t - r)`, weighted by :math:`|t - r|`.
 
-    Args:
-        measured_db, rendered_db, traced_db ((..., F), dB): Levels of poses that neither prediction
-            was fitted to.
-
-    Returns:
-        weight (F,): 0 to 1; zero where both predictions are equal.
+    In: measured_db, rendered_db, traced_db ((..., F), dB). Out: weight (F,).
     """
     measured, rendered, traced = (
         np.asarray(a, dtype=np.float64) for a in (measured_db, rendered_db, traced_db)

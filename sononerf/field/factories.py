@@ -45,9 +45,7 @@ def make(
 ) -> Made:
     """Return the object itself, or the one that a plugin's factory, or a factory, makes.
 
-    Args:
-        given: Field or renderer; the name of a plugin; or a factory.
-        region ((2, 3), m): Lower and upper corner.
+    In: region ((2, 3), m).
     """
     if isinstance(given, kind):
         return given

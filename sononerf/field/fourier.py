@@ -44,17 +44,7 @@ class FourierField(Field):
     in place of batch normalisation: 546,324 parameters at 47 frequencies. In the code the
     angles are the *sensor's*; renderer ``shell`` passes them with ``direction="sensor"``.
 
-    Args:
-        region ((2, 3), m): Lower and upper corner of the box, world frame.
-        frequency ((F,), Hz): Frequencies of the answer.
-        direction_octaves: Number of sines per component of the direction, of
-            ``inputs="direction"``; as many as for the position where None. Many of them let
-            directions that were never heard from be anything.
-        scale (1/m): Factor of positions before the embedding.
-        spacing (m): Spacing of places that resolves the field; a hundredth of the region's longest
-            side where None, for the network itself has none.
-        precision: Type in which layers multiply; parameters, sums and result are float32 in any
-            case.
+    In: region ((2, 3), m), frequency ((F,), Hz), scale (1/m), spacing (m).
 
     References:
         .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, section 2.

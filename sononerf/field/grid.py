@@ -39,11 +39,8 @@ class _Reading:
     Most places of a lattice lie on vertices of the finest grid and between few of the coarser ones.
     So ten products replace eight per grid, which would be recomputed each time.
 
-    Args:
-        places ((N, 3), m): Kept, to be known again.
-        origin ((3,), m): The grids' first vertex.
-        steps (list of float, m): Vertex spacing of each grid.
-        grids (list of (1, C, Z, Y, X) float): As they will be read.
+    In: places ((N, 3), m), origin ((3,), m), steps (list of float, m), grids (list of (1, C, Z, Y,
+    X) float).
     """
 
     def __init__(
@@ -109,13 +106,7 @@ class _Reading:
 class GridField(LobeField):
     """Lobes on dense grids, read by trilinear interpolation and summed over the levels.
 
-    Args:
-        region ((2, 3), m): Lower and upper corner of the box, world frame.
-        frequency ((F,), Hz): Frequencies of the answer.
-        spacing (m): Vertex spacing of the finest level; found from ``vertices`` where None.
-        finest, coarsest (m): Bounds of the spacing that is found.
-        rank: Number of spectra that places add by coefficients of their own; at most one less than
-            there are frequencies.
+    In: region ((2, 3), m), frequency ((F,), Hz), spacing (m), finest, coarsest (m).
     """
 
     origin: Tensor

@@ -69,11 +69,7 @@ class LobeField(Field):
     the places would move outward to make up for it. A place without a lobe has no axis to be off,
     so the lead fades with the lobe, by :math:`1 - e^{-|m|^2}`, which is seen below :math:`|m| = 2`.
 
-    Args:
-        region ((2, 3), m): Lower and upper corner of the box, world frame.
-        frequency ((F,), Hz): Frequencies of the answer.
-        rank: Number of spectra that places add by coefficients of their own; at most one less than
-            there are frequencies.
+    In: region ((2, 3), m), frequency ((F,), Hz).
     """
 
     learning_rate = 0.05

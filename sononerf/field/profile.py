@@ -40,18 +40,7 @@ class ProfileRenderer(Renderer):
     support each place is also heard by way of the images; the powers of ways of different length
     add up.
 
-    Args:
-        region ((2, 3), m): Lower and upper corner of the box that holds the field.
-        points: Largest number of places that a step evaluates; more are drawn by their running
-            energy.
-        start: Largest number of places of the first lattice. It is as often twice as coarse as the
-            field as that takes, and is refined around what is alive.
-        prune_every: Steps between two looks at which places are alive, and whether the lattice is
-            refined; 0 never does.
-        prune_below: Places weaker than this part of the strongest in their surroundings are
-            dropped.
-        surroundings: Radius of "surroundings", range resolutions: some of them, so that a part has
-            its own strongest place, and not a fraction of one, where all of a blur would stay.
+    In: region ((2, 3), m).
     """
 
     lattice: Tensor
@@ -307,15 +296,7 @@ class ProfileRenderer(Renderer):
         return places, places - 2.0 * ((places - point) @ normal)[:, None] * normal
 
     def _ways(self, emitters: Tensor) -> list[tuple[Tensor, tuple[int, int]]]:
-        """Return the ways of sound from emitters (P, 3) to places and back.
-
-        Returns:
-            ways: Each with the places (P, 3), m, whose directions from a place are the input,
-                and whether out and back go directly (0) or by the support (1). The two ways that
-                meet the support once take the same time from one place to another, so they add up
-                in phase: they stand here once, see :meth:`_paths`. The mirror that sends sound from
-                an emitter to the image of an ear beside it looks at their middle.
-        """
+        """Return the ways of sound from emitters (P, 3) to places and back."""
         if self.support is None:
             return [(emitters, (0, 0))]
         point, normal = self.support
@@ -338,15 +319,7 @@ class ProfileRenderer(Renderer):
     def _paths(self, out: Tensor, back: Tensor, bins: Tensor) -> tuple[Tensor, Tensor]:
         """Return the factor of pressure on the way to places and back.
 
-        Args:
-            out, back ((3, M), m): Places, each in the head of its pose, as the emitter and as the
-                ears hear them: the places or their images. If they differ, sound takes the way
-                where they change roles too, and both add up.
-            bins (B,): Indices of the frequencies.
-
-        Returns:
-            known (E, B, M): By beam, ears, air and spreading.
-            middle ((E, 1, M) or (E, B, M)): The bin of the profile that the echo is heard in.
+        In: out, back ((3, M), m), bins (B,). Out: known (E, B, M), middle ((E, 1, M) or (E, B, M)).
         """
         if out is not back:
             first, last = (self._way(*pair, bins) for pair in ((out, back), (back, out)))

@@ -61,10 +61,7 @@ class PoseReader:
 class SliceStream(Dataset[RangeSlices]):
     """The training batches; item k is batch k, in any process and in any order.
 
-    Args:
-        share (int, int): Index of this device, and number of devices that divide each batch.
-        silent_share: Fraction of the silent slices that is used, drawn once by the seed; single
-            slices alone.
+    In: share (int, int).
     """
 
     def __init__(
@@ -160,10 +157,7 @@ class SliceStream(Dataset[RangeSlices]):
 class WholePoses(Dataset[RangeSlices]):
     """Poses one by one with all ranges and frequencies, for validation, tests and prediction.
 
-    Args:
-        positions ((P, 3), m): Places of the head.
-        rotations (P, 3, 3): Head to world.
-        numbers ((P,) int or None): Numbers of the poses in the store; counted from 0 where None.
+    In: positions ((P, 3), m), rotations (P, 3, 3), numbers ((P,) int or None).
     """
 
     def __init__(

@@ -30,14 +30,8 @@ def look_up(table: Tensor, directions: Tensor) -> Tensor:
 
     Not differentiable in ``directions`` where they are fixed places and poses.
 
-    Args:
-        table ((C, L, A) or (E, C, L, A)): Gains over elevation (-90 to 90 degrees) and azimuth
-            (-180 to 180), both ends included.
-        directions ((..., 3) or (E, ..., 3)): Unit vectors in the head frame (x forward, y left, z
-            up); for each of E tables its own.
-
-    Returns:
-        gains ((..., C) or (E, ..., C)): In memory one channel after the other.
+    In: table ((C, L, A) or (E, C, L, A)), directions ((..., 3) or (E, ..., 3)). Out: gains ((...,
+    C) or (E, ..., C)).
     """
     x, y, z = directions.movedim(-1, 0).contiguous()  # side by side, for the sake of speed
     azimuth = torch.atan2(y, x) / math.pi
@@ -267,11 +261,7 @@ class ShellRenderer(Renderer):
     the published code does. Places outside the field's region are zero
     and are not computed.
 
-    Args:
-        region ((2, 3), m): Lower and upper corner of the box that holds the field.
-        direction: Input of the field: the direction from each place to the head, or, as the
-            published code does, the sensor's own look direction (reversed) for all places of a
-            call.
+    In: region ((2, 3), m).
 
     References:
         .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, equation 17.

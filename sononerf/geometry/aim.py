@@ -19,8 +19,7 @@ as the explanation, rad."""
 def off_axis(poses: Poses, centre: Floats) -> Floats:
     """Return the angles (P,) between where heads look and where a body is, rad.
 
-    Args:
-        centre ((3,), m): Centre of the body.
+    In: centre ((3,), m).
     """
     to_body = centre - poses.positions
     distance = np.linalg.norm(to_body, axis=1)
@@ -31,8 +30,7 @@ def off_axis(poses: Poses, centre: Floats) -> Floats:
 def aim_fault(poses: Poses, centre: Floats) -> str:
     """Return a line if poses look away from a body, and its likely cause; empty otherwise.
 
-    Args:
-        centre ((3,), m): Centre of the body.
+    In: centre ((3,), m).
     """
     if not len(poses):
         return ""

@@ -24,8 +24,7 @@ PATCHES = (64, 128)  # of a cap, over its area and around its axis
 def fibonacci_sphere(count: int) -> Floats:
     """Return unit vectors on a spiral from +z to -z, each standing for the same solid angle.
 
-    Returns:
-        directions (D, 3): Unit vectors.
+    Out: directions (D, 3).
 
     Examples:
         >>> abs(fibonacci_sphere(100).mean(axis=0)).max() < 0.01
@@ -39,15 +38,7 @@ def fibonacci_cap(
 ) -> Floats:
     """Return unit vectors on a spiral that fills the cap around an axis; equal areas, stratified.
 
-    Args:
-        axis (3,): The cap's middle; any length but zero.
-        half_angle (rad): From the axis to the cap's rim, 0 to pi.
-        offset ((2,), 1): Two numbers in [0, 1): the first shifts every direction within its ring's
-            area, the second turns the whole pattern about the axis. (0.5, 0) is the centred
-            pattern.
-
-    Returns:
-        directions (D, 3): Unit vectors.
+    In: axis (3,), half_angle (rad), offset ((2,), 1). Out: directions (D, 3).
     """
     return CapSpiral(count, axis, half_angle, offset).directions()
 
@@ -137,9 +128,7 @@ class CapSpiral:
 
         Others that lie near a cone are among them: whole patches of the cap are left out or not.
 
-        Args:
-            towards (B, 3): Axes of the cones, unit vectors.
-            half_angle ((B,), rad): Half angle of the cones.
+        In: towards (B, 3), half_angle ((B,), rad).
         """
         rows, columns = PATCHES
         edge, turn = np.arange(rows + 1) / rows, (np.arange(columns) + 0.5) / columns
@@ -269,9 +258,7 @@ def spread_points(mesh: trimesh.Trimesh, count: int) -> tuple[Floats, Floats]:
 
     So any first ones of them are spread evenly over the surface, whatever its triangles.
 
-    Returns:
-        points ((N, 3), m): On the triangles.
-        normals (N, 3): Normals of the smooth surface, outward unit vectors.
+    Out: points ((N, 3), m), normals (N, 3).
 
     References:
         .. [1] T. F. Gonzalez, "Clustering to minimize the maximum intercluster distance",

@@ -12,12 +12,7 @@ precision."""
 
 
 def surface_faults(mesh: trimesh.Trimesh) -> list[str]:
-    """Return the faults of a surface.
-
-    Returns:
-        lines: Triangles without area, open edges, triangles that disagree on which side is outside,
-            bodies that are inside out; none where all is well.
-    """
+    """Return the faults of a surface."""
     lines = []
     good = mesh.nondegenerate_faces(height=FLAT * float(mesh.scale))
     if not good.all():

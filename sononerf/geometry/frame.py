@@ -34,12 +34,7 @@ class Frame:
 
     @classmethod
     def of(cls, attributes: Mapping[str, Any], name: FrameName = "auto") -> Frame:
-        """Return a frame that the attributes of a store, or a run's provenance, state.
-
-        Args:
-            attributes: ``to_original`` (4, 4), ``head_to_original`` (3, 3) and ``origin``; each
-                may be missing.
-        """
+        """Return a frame that the attributes of a store, or a run's provenance, state."""
         recorded = attributes.get("origin") == "recorded"
         if name == "world" or (name == "auto" and not recorded):
             return cls()

@@ -75,10 +75,7 @@ def level_surface(
 ) -> trimesh.Trimesh:
     """Return the surface on which a grid takes a level, by marching cubes.
 
-    Args:
-        grid (X, Y, Z): Values; none on the level itself, where triangles have no area.
-        origin ((3,), m): Centre of the first voxel.
-        spacing (m): Between centres.
+    In: grid (X, Y, Z), origin ((3,), m), spacing (m).
     """
     vertices, faces, _, _ = marching_cubes(
         grid.astype(np.float32), level, gradient_direction="ascent", allow_degenerate=False

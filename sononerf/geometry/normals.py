@@ -24,12 +24,7 @@ def corner_normals(mesh: trimesh.Trimesh, *, crease: float = CREASE) -> Floats:
     the crease angle, so a sphere is smooth and a box keeps its edges. The weights are those of
     Max [1]_: exact wherever a vertex and its neighbours lie on one sphere.
 
-    Args:
-        crease (rad): Triangles that meet at a greater angle do not share a normal.
-
-    Returns:
-        normals (T, 3, 3): Unit vectors, outward where the mesh is; of a triangle without area,
-            zero.
+    In: crease (rad). Out: normals (T, 3, 3).
 
     References:
         .. [1] N. Max, "Weights for computing vertex normals from facet normals", Journal of
@@ -55,12 +50,7 @@ def total_curvature(mesh: trimesh.Trimesh, normals: Floats) -> Floats:
     of the map from a step along the surface to the normal's change; the normals at the corners
     give that map, as in Rusinkiewicz [1]_. Edges are no part of it.
 
-    Args:
-        normals (T, 3, 3): From :func:`corner_normals`.
-
-    Returns:
-        curvature ((T,), 1/m): Curvature of a sphere, the square root of 2 over its radius; of a
-            triangle without area, 0.
+    In: normals (T, 3, 3). Out: curvature ((T,), 1/m).
 
     References:
         .. [1] S. Rusinkiewicz, "Estimating curvatures and their derivatives on triangle meshes",
@@ -80,12 +70,7 @@ def weight_gradients(
 ) -> tuple[Floats, Floats]:
     """Gradients of the barycentric weights of a triangle's second and third corner.
 
-    Args:
-        corners ((T, 3, 3), m): Corners of the triangles.
-
-    Returns:
-        second, third ((T, 3), 1/m): Gradients in the triangle's plane; of a triangle without area,
-            zero.
+    In: corners ((T, 3, 3), m). Out: second, third ((T, 3), 1/m).
     """
     ab, ac = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     sides = np.cross(ab, ac)
@@ -125,13 +110,7 @@ def bodies(mesh: trimesh.Trimesh) -> Ints:
 def enclosing_balls(corners: Floats, label: Ints, count: int) -> tuple[Floats, Floats]:
     """Return balls that hold all triangles: one for each body, and more where that is tighter.
 
-    Args:
-        corners ((T, 3, 3), m): Corners of the triangles.
-        label (T,): Index of each triangle's body.
-
-    Returns:
-        centres ((B, 3), m): Centres of the balls.
-        radii ((B,), m): Radii of the balls.
+    In: corners ((T, 3, 3), m), label (T,). Out: centres ((B, 3), m), radii ((B,), m).
     """
     middles = corners.mean(axis=1)
 

@@ -68,9 +68,7 @@ class Plane:
         Faces that lie on the plane are left out: sound reaches none of them. A closed body that
         stands on the plane and its image are then one closed body.
 
-        Returns:
-            kept (T,): True for faces of the mesh that are kept; None if it reaches below the plane
-                and was cut.
+        Out: kept (T,).
         """
         heights = self.height(np.asarray(mesh.vertices))
         least = ON_PLANE * float(np.ptp(np.asarray(mesh.vertices), axis=0).max())

@@ -162,11 +162,7 @@ def _refuse(bad: NDArray[np.bool_], what: str) -> None:
 def rotation_from_euler(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> Floats:
     """Rotation matrices from yaw, pitch and roll.
 
-    Args:
-        yaw, pitch, roll ((...,), rad): Turns about z, y and x; positive pitch looks down.
-
-    Returns:
-        rotations (..., 3, 3): Head to world, ``Rz(yaw) Ry(pitch) Rx(roll)``.
+    In: yaw, pitch, roll ((...,), rad). Out: rotations (..., 3, 3).
 
     Examples:
         >>> down = rotation_from_euler(0.0, math.pi / 6, 0.0)
@@ -190,11 +186,7 @@ def euler_from_rotation(
 ) -> tuple[Floats, Floats, Floats]:
     """Yaw, pitch and roll of rotation matrices; looking straight up or down, yaw is 0.
 
-    Args:
-        rotations (..., 3, 3): Head to world.
-
-    Returns:
-        yaw, pitch, roll ((...,), rad): Pitch from -pi/2 to pi/2.
+    In: rotations (..., 3, 3). Out: yaw, pitch, roll ((...,), rad).
     """
     r = np.asarray(rotations, dtype=np.float64)
     level = np.hypot(r[..., 0, 0], r[..., 1, 0])
@@ -213,12 +205,7 @@ def euler_from_rotation(
 def look_at(positions: ArrayLike, target: ArrayLike) -> Floats:
     """Level rotations that look from positions at a target.
 
-    Args:
-        positions ((..., 3), m): World frame.
-        target ((3,) or (..., 3), m): Point that poses look at.
-
-    Returns:
-        rotations (..., 3, 3): Head to world, roll 0; straight up or down, yaw is 0.
+    In: positions ((..., 3), m), target ((3,) or (..., 3), m). Out: rotations (..., 3, 3).
     """
     forward = np.asarray(target, np.float64) - np.asarray(positions, np.float64)
     length = np.linalg.norm(forward, axis=-1)

@@ -133,12 +133,8 @@ def _hits_of(
 ) -> tuple[Ints, Floats, Floats, Ints, Floats, Floats, Singles]:
     """Return the attributes of :class:`Hits`.
 
-    Args:
-        found (N,): The triangle that each ray hits first, below zero where it hits none.
-        origins ((N, 3) or (1, 3), m), directions (N, 3): Origins of the rays.
-        planes (T, 6): First corner (m) and unit normal of each triangle.
-        smooth ((T, 5, 3) float32): Gradients, and the smooth normal at the first corner.
-        corners ((T, 3, 3), m): Corners of the triangles.
+    In: found (N,), origins ((N, 3) or (1, 3), m), directions (N, 3), planes (T, 6), smooth ((T, 5,
+    3) float32), corners ((T, 3, 3), m).
     """
     ray, count = np.zeros(len(found), np.int64), 0
     for i in range(len(found)):
@@ -200,11 +196,8 @@ def _sight(
 ) -> tuple[Singles, Singles]:
     """Return origins and spans (N, 3), in the engine's coordinates, from lifted points to targets.
 
-    Args:
-        points, normals ((N, 3), m): Starts of the lines of sight, and directions in which they are
-            lifted; no normals (0, 3) lift it towards the targets.
-        targets ((N, 3) or (1, 3), m): Ends of the lines of sight.
-        middle ((3,), m), scale (1/m), lift (m): Attributes of the caster.
+    In: points, normals ((N, 3), m), targets ((N, 3) or (1, 3), m), middle ((3,), m), scale (1/m),
+    lift (m).
     """
     origins = np.zeros((len(points), 3), np.float32)
     spans = np.zeros((len(points), 3), np.float32)
@@ -267,9 +260,7 @@ class RayCaster:
     def first_hit(self, origins: Floats, directions: Floats) -> Hits:
         """Return the first hit of each ray; rays without a hit are left out.
 
-        Args:
-            origins ((N, 3), m): Origins of the rays.
-            directions (N, 3): Unit vectors.
+        In: origins ((N, 3), m), directions (N, 3).
         """
         found = self._engine.first(self._scaled(origins), directions)
         one = len(origins) > 1 and origins.strides[0] == 0
@@ -286,15 +277,7 @@ class RayCaster:
     ) -> Bools:
         """True where nothing stands between points and targets.
 
-        Args:
-            points ((N, 3), m): On the surface or off it.
-            targets ((N, 3) or (3,), m): Places whose visibility is tested.
-            normals (N, 3): For points on the surface: unit normals of their triangles, on the side
-                from which they are seen. The points are lifted along them, or else towards the
-                targets.
-
-        Returns:
-            visible (N,): True where the line is free.
+        In: points ((N, 3), m), targets ((N, 3) or (3,), m), normals (N, 3). Out: visible (N,).
         """
         none = np.zeros((0, 3))
         origins, spans = _sight(
@@ -319,9 +302,7 @@ class RayCaster:
 class Occlusion:
     """Whether anything of a mesh stands between points; quicker to build than a ray caster.
 
-    Args:
-        vertices ((V, 3), m): At least one triangle's.
-        faces (T, 3): Triangles.
+    In: vertices ((V, 3), m), faces (T, 3).
     """
 
     def __init__(self, vertices: Floats, faces: Ints) -> None:
@@ -353,10 +334,7 @@ slip between two triangles. None is parallel to an axis, because many faces are.
 def contains(vertices: ArrayLike, faces: ArrayLike, points: ArrayLike) -> Bools:
     """Return which points lie inside closed bodies: a ray leaves through what it meets first.
 
-    Args:
-        vertices ((V, 3), m): Vertices of the surface.
-        faces (T, 3): Its triangles, counter-clockwise from outside.
-        points ((N, 3), m): The places.
+    In: vertices ((V, 3), m), faces (T, 3), points ((N, 3), m).
     """
     corners, places = np.asarray(vertices, dtype=np.float64), np.asarray(points, dtype=np.float64)
     triangles = np.asarray(faces)

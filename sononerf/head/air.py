@@ -20,11 +20,7 @@ TRIPLE_POINT = 273.16  # K
 def speed_of_sound(temperature_c: float) -> float:
     """Speed of sound in air.
 
-    Args:
-        temperature_c (°C): Air temperature.
-
-    Returns:
-        speed (m/s): ISO 9613-1:1993, equation (A.5); humidity changes it by less than 0.4 %.
+    In: temperature_c (°C). Out: speed (m/s).
 
     Examples:
         >>> round(speed_of_sound(20.0), 1)
@@ -66,14 +62,8 @@ def air_absorption(
 
     A bat hears the echo after a *two-way* path: multiply by ``2 * range``.
 
-    Args:
-        frequency ((...,), Hz): Tone frequencies.
-        temperature_c (°C): Air temperature, -20 to 50 for the stated 10 % accuracy.
-        relative_humidity (1): Relative humidity as a fraction, 0 to 1 (not per cent).
-        pressure (Pa): Ambient pressure.
-
-    Returns:
-        absorption ((...,), dB/m): Same shape as ``frequency``; zero or more.
+    In: frequency ((...,), Hz), temperature_c (°C), relative_humidity (1), pressure (Pa). Out:
+    absorption ((...,), dB/m).
 
     References:
         .. [1] ISO 9613-1:1993, equations (3) to (5), (B.1) to (B.3).

@@ -38,12 +38,7 @@ def call_waveform(settings: CallSettings, sampling_rate: float) -> Floats:
 
     so that a hyperbolic sweep's period runs straight, and it bears Doppler shifts [1]_.
 
-    Args:
-        sampling_rate (Hz): Sampling rate of the waveform.
-
-    Returns:
-        waveform (N,): One sample of height 1 for an impulse; never higher than 1 for a sweep; of a
-            file resampled where the rates differ, with a greatest of 1 before that.
+    In: sampling_rate (Hz). Out: waveform (N,).
 
     References:
         .. [1] J. J. Kroszczynski, "Pulse compression by means of linear-period modulation",
@@ -87,12 +82,7 @@ def _envelope(settings: CallSettings, time: Floats) -> Floats:
 def covered(settings: CallSettings, frequency: ArrayLike) -> Bools:
     """Return which frequencies the call emits.
 
-    Args:
-        frequency ((F,), Hz): Frequencies of the result.
-
-    Returns:
-        covered (F,): True if a harmonic sweeps over it; an impulse covers all, a file those within
-            20 dB of its loudest frequency.
+    In: frequency ((F,), Hz). Out: covered (F,).
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "impulse":
@@ -108,8 +98,7 @@ def has_ghosts(settings: CallSettings, frequency: ArrayLike) -> bool:
     That is so where several harmonics sweep over one of the frequencies, each at a time of its own,
     and has to be expected of a file.
 
-    Args:
-        frequency ((F,), Hz): Frequencies of the rows.
+    In: frequency ((F,), Hz).
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "file":
@@ -156,14 +145,7 @@ def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> Floats:
     The fundamental is at :math:`f` at :math:`T (f - f_0) / (f_1 - f_0)` in a linear sweep and at
     :math:`T (1/f - 1/f_0) / (1/f_1 - 1/f_0)` in a hyperbolic one.
 
-    Args:
-        frequency ((F,), Hz): Above zero.
-
-    Returns:
-        delay ((F,), s): Delay of the first harmonic that sweeps over the frequency, or else of the
-            nearest end of a sweep; zero for an impulse. Other harmonics that sweep over it too are
-            heard farther off, as :func:`sononerf.head.reception.effective_window` has it, so that
-            no echo is heard in front of the first one.
+    In: frequency ((F,), Hz). Out: delay ((F,), s).
 
     Examples:
         >>> sweep = dict(kind="linear", duration=1e-3, frequency_start=90e3, frequency_end=40e3)
@@ -186,12 +168,7 @@ def sweep_rate(settings: CallSettings, frequency: ArrayLike) -> Floats:
     :math:`h |f_1 - f_0| / T` for harmonic :math:`h` of a linear sweep, :math:`|k| f^2 / h` of a
     hyperbolic one.
 
-    Args:
-        frequency ((F,), Hz): Above zero.
-
-    Returns:
-        rate ((F,), Hz/s): Above zero, of the same harmonic as in :func:`sweep_delay`; infinite for
-            an impulse.
+    In: frequency ((F,), Hz). Out: rate ((F,), Hz/s), infinite where nothing is swept.
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "impulse":
@@ -220,12 +197,7 @@ def call_content(settings: CallSettings) -> dict[str, Any]:
 def emit(impulse_responses: ArrayLike, waveform: Floats) -> Floats:
     """Pressure at the ears when the call is emitted in place of an impulse.
 
-    Args:
-        impulse_responses (E, S): Pressure for a call that is one sample of height 1.
-        waveform (N,): The call, at the same sampling rate.
-
-    Returns:
-        echo (E, S + N - 1): The two convolved, from the start of the emission on.
+    In: impulse_responses (E, S), waveform (N,). Out: echo (E, S + N - 1).
     """
     responses = np.asarray(impulse_responses, dtype=np.float64)
     if len(waveform) == 1:
@@ -244,13 +216,7 @@ dB, at which a call counts as covering a frequency."""
 def inverse_filter(recordings: ArrayLike, call: ArrayLike) -> Floats:
     """Replace each echo of a call by that of an impulse.
 
-    Args:
-        recordings (..., S): From the start of the emission on.
-        call (N,): Waveform, at the same sampling rate.
-
-    Returns:
-        compressed (..., S): An echo that is ``g`` times the call has the spectrum ``g`` within the
-            call's band. The last N - 1 samples lack the echoes after the end of the recording.
+    In: recordings (..., S), call (N,). Out: compressed (..., S).
     """
     heard, waveform = (np.asarray(each, dtype=np.float64) for each in (recordings, call))
     if waveform.ndim != 1 or not np.any(waveform):

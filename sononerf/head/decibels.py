@@ -27,11 +27,7 @@ CHUNK_POSES = 8
 def compress(magnitude: ArrayLike, reference: float) -> Floats:
     """Decibels above a soft floor, ``20 log10(1 + magnitude / reference)``.
 
-    Args:
-        magnitude (...,): Linear, zero or more.
-
-    Returns:
-        level_db ((...,), dB): Zero or more.
+    In: magnitude (...,). Out: level_db ((...,), dB).
     """
     if not reference > 0.0:
         raise ValueError(f"reference is {reference}, expected above 0")
@@ -44,9 +40,7 @@ def compress(magnitude: ArrayLike, reference: float) -> Floats:
 def active_level(noise: ArrayLike | None, reference: float) -> float | Floats:
     """Return the level from which a cell is active, dB: one number, or (E, 1, F) above noise.
 
-    Args:
-        noise ((E, F) or None): Root mean square of the magnitude of noise; None where none is
-            known.
+    In: noise ((E, F) or None).
     """
     if noise is None:
         return ACTIVE_DB
@@ -106,13 +100,7 @@ def mae_db(
 ) -> float | None:
     """Mean absolute difference of two sets of spectrograms.
 
-    Args:
-        a, b ((P, ...), dB): Spectrograms.
-        active_db (dB): Level from which a cell is active; one number, or one that is broadcast to a
-            spectrogram.
-
-    Returns:
-        error (dB): None where no cell is active.
+    In: a, b ((P, ...), dB), active_db (dB). Out: error (dB).
     """
     first, second = same_shape(a, b)
     return mae_all_and_active(first, second, active_db)[1 if active else 0]

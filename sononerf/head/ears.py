@@ -41,13 +41,7 @@ def piston(directions: Floats, radius: float, frequency: Floats) -> Floats:
     with the radius a. The first factor is a circular piston in an infinite baffle [1]_; the second
     makes it fade towards its back, as a source without a baffle does.
 
-    Args:
-        directions (L, A, 3): Unit vectors, head frame.
-        radius (m): Radius of the piston; 0 is the same in all directions.
-        frequency ((F,), Hz): Any.
-
-    Returns:
-        gain (F, L, A): 1 straight ahead.
+    In: directions (L, A, 3), radius (m), frequency ((F,), Hz). Out: gain (F, L, A).
 
     References:
         .. [1] L. L. Beranek, T. J. Mellow, Acoustics: Sound Fields and Transducers, 2012, 13.7.
@@ -68,12 +62,7 @@ def ear(directions: Floats, side: float, settings: EarSettings, frequency: Float
     square root of frequency (``width_deg`` at 50 kHz). A spectral notch rises from 30 kHz (straight
     down) over 60 kHz to 90 kHz (straight up), so that the spectrum depends on elevation.
 
-    Args:
-        directions (L, A, 3): Unit vectors, head frame; elevation is that of the row.
-        frequency ((F,), Hz): Above zero.
-
-    Returns:
-        gain (F, L, A): At most 1.
+    In: directions (L, A, 3), frequency ((F,), Hz). Out: gain (F, L, A).
     """
     azimuth, elevation = np.radians(side * settings.azimuth_deg), np.radians(settings.elevation_deg)
     axis = (
@@ -163,12 +152,7 @@ class Ears:
 def ear_tables(settings: EarSettings, frequency: ArrayLike) -> Ears:
     """Tables of the emitter and of the receivers that settings describe.
 
-    Args:
-        settings: Places and directivities; models are those of :mod:`sononerf.head.ears`. Between
-            measured directions and frequencies gains are linear. Below the lowest and above the
-            highest measured frequency they are those at it; outside the measured directions they
-            fade to zero over 10 degrees.
-        frequency ((F,), Hz): Ascending.
+    In: frequency ((F,), Hz).
     """
     f = np.asarray(frequency, dtype=np.float64)
     measured = _measured(settings)
@@ -272,9 +256,7 @@ def analysed_ears(
 
     so that beside a notch an echo seems to come from millimetres nearer or farther.
 
-    Returns:
-        lag ((E, F, L, A) float32 or None, s): Delay of an echo at each ear, beam
-            included; None for an impulse.
+    Out: lag ((E, F, L, A) float32 or None, s).
     """
     return _analysed(settings, call, analysis, directivity_content(settings))
 
@@ -326,11 +308,7 @@ def _analysed(
 def beam_gain(ears: Ears, directions_head: Floats) -> Singles:
     """Gain of the emission towards directions, bilinear between the table's nodes.
 
-    Args:
-        directions_head (N, 3): Unit vectors away from the emitter, head frame.
-
-    Returns:
-        gain ((N, F) float32): Linear, zero or more.
+    In: directions_head (N, 3). Out: gain ((N, F) float32).
     """
     return _look_up(ears, 0, directions_head)
 
@@ -338,11 +316,7 @@ def beam_gain(ears: Ears, directions_head: Floats) -> Singles:
 def ear_gain(ears: Ears, ear: int, directions_head: Floats) -> Singles:
     """Gain of one ear for sound from directions, bilinear between the table's nodes.
 
-    Args:
-        directions_head (N, 3): Unit vectors from the ear to the origin of the sound, head frame.
-
-    Returns:
-        gain ((N, F) float32): Linear, zero or more.
+    In: directions_head (N, 3). Out: gain ((N, F) float32).
     """
     return _look_up(ears, 1 + ear, directions_head)
 
@@ -367,9 +341,7 @@ def _bilinear(
 ) -> Singles:
     """Read a table (D, F) of directions on a grid towards others (N, 3).
 
-    Args:
-        values (D, F): All azimuths of the first elevation, and so on.
-        directions (N, 3): Unit vectors.
+    In: values (D, F), directions (N, 3).
     """
     width, frequencies = azimuth[2], values.shape[1]
     gain = np.zeros((len(directions), frequencies), np.float32)

@@ -29,11 +29,7 @@ NOISE_STREAM = 1  # keeps a pose's noise independent of other draws from its see
 def target_gain(target_strength_db: float, distance: float) -> float:
     """Echo of a small target, as a part of the call's pressure at 1 m.
 
-    Args:
-        target_strength_db (dB): Target strength of the echo at 1 m from the target, over the
-            pressure that falls on it; 20 log10(radius / 2 m) of a rigid sphere that is large
-            against the wavelength [1]_.
-        distance (m): From emitter and ear to the target.
+    In: target_strength_db (dB), distance (m).
 
     References:
         .. [1] R. J. Urick, Principles of Underwater Sound, 3rd edition, 1983, table 9.1.
@@ -48,11 +44,7 @@ def target_gain(target_strength_db: float, distance: float) -> float:
 def loudest_power(echo: Floats, analysis: SpectrogramSettings, samples: int) -> Floats:
     """Mean power within the analysis band over an echo's loudest stretch.
 
-    Args:
-        echo (E, S): Waveforms.
-
-    Returns:
-        power (E,): Square of the echo's unit.
+    In: echo (E, S). Out: power (E,).
     """
     padded = np.pad(echo, ((0, 0), (samples, samples)))
     length = int(scipy.fft.next_fast_len(padded.shape[-1], real=True))
@@ -67,13 +59,7 @@ def loudest_power(echo: Floats, analysis: SpectrogramSettings, samples: int) -> 
 def noise_level(settings: NoiseSettings, power: Floats, analysis: SpectrogramSettings) -> Floats:
     """Set each ear's noise: the standard deviation of its samples.
 
-    Args:
-        power (E,): Power of the reference echo, from :func:`loudest_power`.
-        analysis: Sampling rate and band: of white noise's power, the band holds its share of all
-            frequencies up to half the sampling rate.
-
-    Returns:
-        level (E,): Unit of the echo.
+    In: power (E,). Out: level (E,).
     """
     share = 2.0 * (analysis.frequency_max - analysis.frequency_min) / analysis.sampling_rate
     ratio = 10.0 ** (np.asarray(settings.snr_db, dtype=np.float64) / 10.0)
@@ -84,11 +70,7 @@ def noise_level(settings: NoiseSettings, power: Floats, analysis: SpectrogramSet
 def draw_noise(level: Floats, samples: int, *, seed: int) -> Floats:
     """White Gaussian noise, independent for each ear.
 
-    Args:
-        level (E,): Standard deviations.
-
-    Returns:
-        noise (E, samples): Unit of ``level``.
+    In: level (E,). Out: noise (E, samples).
     """
     generator = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(NOISE_STREAM,)))
     return level[:, None] * generator.standard_normal((len(level), samples))

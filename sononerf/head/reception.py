@@ -46,11 +46,7 @@ def row_duration(call: CallSettings, analysis: SpectrogramSettings, frequency: A
     row is the filter's transform, turned by the sweep's quadratic phase and transformed back; for
     a Gaussian filter and a linear sweep that gives exactly this.
 
-    Args:
-        frequency ((F,), Hz): Frequencies of the rows.
-
-    Returns:
-        duration ((F,), s): Two-way: times ``c / 2`` it is a width in range.
+    In: frequency ((F,), Hz). Out: duration ((F,), s).
     """
     lasts, wide = row_widths(analysis, frequency)
     duration: Floats = np.hypot(lasts, wide / sweep_rate(call, frequency))
@@ -63,10 +59,6 @@ def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
     A short window is wide in frequency, so a slow sweep stays in it for long; a long window is long
     itself. The result minimises the root mean square of :func:`row_duration` over the analysed
     frequencies that the call covers.
-
-    Returns:
-        window: Samples. For an impulse, for which shorter is always better, it is the set window;
-            gammatones need none.
 
     Examples:
         >>> call = CallSettings(kind="linear", duration=3e-3)
@@ -94,12 +86,7 @@ def _heard(call: CallSettings, analysis: SpectrogramSettings) -> Floats:
 def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> Floats:
     """Point echo in each row of the dechirped spectrogram, as a window over the received time.
 
-    Returns:
-        window (F, W): One value per sample; the point's own range is in the middle, where it is 1.
-            For an impulse the rows' envelopes, of a height of almost 1; for a sweep as much longer
-            as the sweep stays in the window's main lobe. For Hamming windows and a sweep it is
-            symmetric (the mean power of both sides). For gammatones it is not, nor if harmonics
-            overlap: it then holds the contribution of another harmonic at other times.
+    Out: window (F, W).
     """
     frequency, filters = frequency_axis(analysis), row_filters(analysis)
     if call.kind == "impulse":

@@ -118,9 +118,7 @@ def fft_bins(settings: SpectrogramSettings) -> tuple[int, int]:
 def band_mean(values: NDArray[Any], frequency: ArrayLike) -> NDArray[Any]:
     """Return the mean over frequency, each row with its part of the band.
 
-    Args:
-        values (..., F): Values of the rows.
-        frequency ((F,), Hz): Ascending; where its steps are equal this is the mean.
+    In: values (..., F), frequency ((F,), Hz).
     """
     part = band_parts(frequency)
     return np.asarray(values.mean(axis=-1) if part is None else values @ part)
@@ -139,12 +137,7 @@ def band_parts(frequency: ArrayLike) -> Floats | None:
 def row_widths(settings: SpectrogramSettings, frequency: ArrayLike) -> tuple[Floats, Floats]:
     """Duration of a row's envelope and bandwidth of its transform, each at half of its height.
 
-    Args:
-        frequency ((F,), Hz): Frequencies of the rows.
-
-    Returns:
-        duration: (F,), s.
-        bandwidth: (F,), Hz.
+    In: frequency ((F,), Hz). Out: (F,), (F,).
     """
     f = np.asarray(frequency, dtype=np.float64)
     if settings.kind == "gammatone":

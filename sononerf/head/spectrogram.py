@@ -23,8 +23,7 @@ def frequency_axis(settings: SpectrogramSettings) -> Floats:
     Of the kind ``stft`` the FFT's bins nearest to the two ends, and all between,
     ``sampling_rate / fft`` apart; of ``gammatone`` equal ratios from one end to the other.
 
-    Returns:
-        frequency ((F,), Hz): Ascending.
+    Out: frequency ((F,), Hz).
 
     Examples:
         >>> axis = frequency_axis(SpectrogramSettings())
@@ -37,11 +36,7 @@ def frequency_axis(settings: SpectrogramSettings) -> Floats:
 def range_axis(settings: SpectrogramSettings, speed_of_sound: float) -> Floats:
     """Ranges of the analysis frames, ``c t / 2`` with t at the centre of the frame's envelopes.
 
-    Args:
-        speed_of_sound (m/s): Speed of the medium.
-
-    Returns:
-        range ((R,), m): Those within ``range_min`` to ``range_max``.
+    In: speed_of_sound (m/s). Out: range ((R,), m).
 
     Examples:
         >>> len(range_axis(SpectrogramSettings(), 343.0))
@@ -72,9 +67,7 @@ def echo_samples(
 ) -> int:
     """Number of samples from the emission on that the last analysis frame needs.
 
-    Args:
-        speed_of_sound (m/s): Speed of the medium.
-        longest_delay (s): The greatest by which a frequency's row is advanced; 0 for an impulse.
+    In: speed_of_sound (m/s), longest_delay (s).
     """
     last = _frames(settings, speed_of_sound)[1]
     reach = row_filters(settings).reach
@@ -98,14 +91,7 @@ def spectrogram(
     with :math:`X(t, f)` the output of the filter whose envelope is centred at :math:`t`, between
     two samples too.
 
-    Args:
-        echo (E, S): Pressure from the emission on, at the sampling rate of the settings.
-        speed_of_sound (m/s): Speed of the medium.
-        delay ((F,), s): Emission time of each frequency, zero or more; all at once where it is left
-            out.
-
-    Returns:
-        magnitude (E, R, F): Linear.
+    In: echo (E, S), speed_of_sound (m/s), delay ((F,), s). Out: magnitude (E, R, F).
 
     References:
         .. [1] W. Jansen and J. Steckel, SonoNERFs, Biomimetics 9(6):321, 2024, equation (16).

@@ -28,9 +28,7 @@ SUFFIXES = (*WAV, *OTHERS)
 def read_audio(path: Path) -> tuple[float, NDArray[Any]]:
     """Read a sound file.
 
-    Returns:
-        sampling_rate (Hz): As the file says.
-        samples (E, S): Integers reach from one end of their type to the other.
+    Out: sampling_rate (Hz), samples (E, S).
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -87,9 +85,7 @@ HEADER = "file,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg,split"
 def wav_bytes(waveform: ArrayLike, sampling_rate: float) -> bytes:
     """Return a WAV file of 32-bit floats, which keeps levels.
 
-    Args:
-        waveform (E, S): One channel per receiver.
-        sampling_rate (Hz): A whole number.
+    In: waveform (E, S), sampling_rate (Hz).
     """
     if sampling_rate != round(sampling_rate):
         raise ValueError(f"a WAV file cannot hold a sampling rate of {sampling_rate} Hz")
@@ -101,8 +97,7 @@ def wav_bytes(waveform: ArrayLike, sampling_rate: float) -> bytes:
 def pose_table(poses: Poses, files: Sequence[str], split: NDArray[np.int8]) -> str:
     """Return the table that the format ``recordings`` reads.
 
-    Args:
-        split ((P,) int8): 0 train, 1 validation, 2 test.
+    In: split ((P,) int8).
     """
     words = {number: word for word, number in SPLITS.items()}
     angles = (np.degrees(angle) for angle in euler_from_rotation(poses.rotations))

@@ -46,8 +46,7 @@ class Channel:
 def channels_of(power: Floats, looks: float) -> list[Channel]:
     """Return the state of each channel.
 
-    Args:
-        power (P, E, R): Averaged over frequency.
+    In: power (P, E, R).
     """
     heard = (power > threshold_levels(power, looks).total).any(axis=-1).sum(axis=0)
     loud = np.median(power.max(axis=-1), axis=0)

@@ -108,9 +108,7 @@ def columns_of(
 ) -> Columns:
     """Bring named columns into SI units.
 
-    Args:
-        given (dict of (P,) float): Columns by name, with or without a unit in it.
-        rotation (P, 3, 3): Rotation matrices, if there are any.
+    In: given (dict of (P,) float), rotation (P, 3, 3).
     """
     values: dict[str, Floats] = {}
     units: dict[str, str] = {}

@@ -61,11 +61,7 @@ def frame_matrices(settings: ImportSettings) -> tuple[Floats, Floats]:
 
 
 def original_frame(columns: Columns, settings: ImportSettings) -> dict[str, Any]:
-    """Return the matrices that lead back from our frame and metres; none for a turntable.
-
-    Returns:
-        attributes: ``to_original`` (4, 4) and ``head_to_original`` (3, 3), plain data.
-    """
+    """Return the matrices that lead back from our frame and metres; none for a turntable."""
     if settings.turntable is not None:
         return {}
     world, head = frame_matrices(settings)
@@ -182,12 +178,7 @@ def _turntable_of(columns: Columns, settings: TurntableSettings) -> Poses:
 def turntable_poses(angle: Floats, height: Floats, *, radius: float, clockwise: bool) -> Poses:
     """Poses of a fixed sensor beside a turning object, seen from the object.
 
-    Args:
-        angle ((P,), rad): Angle of the turntable.
-        height ((P,), m): Height of the sensor; z of the world.
-        radius (m): From the axis to the sensor.
-        clockwise: Whether growing angles turn the object clockwise, seen from above. The sensor
-            then goes about the object counter-clockwise.
+    In: angle ((P,), rad), height ((P,), m), radius (m).
     """
     turn = np.asarray(angle) * (1.0 if clockwise else -1.0)
     level = np.asarray(height, dtype=np.float64)

@@ -61,8 +61,7 @@ def calibrate(
 
     with :math:`d_e, d_r` from emitter and receiver to the surface and G the gains straight ahead.
 
-    Args:
-        echo (E, S): Its echo at the receivers, from the emission on.
+    In: echo (E, S).
 
     References:
         .. [1] R. J. Urick, Principles of Underwater Sound, 3rd edition, 1983, table 9.1.
@@ -163,12 +162,7 @@ def found_ranges(
 ) -> tuple[dict[str, float], Floats]:
     """Find range limits that are left out from the echoes.
 
-    Args:
-        given: Keys of the analysis that are set; limits that are not among them follow from the
-            echoes.
-
-    Returns:
-        power (P, E, R): Powers of some pings over all ranges, averaged over frequency.
+    Out: power (P, E, R).
     """
     analysis, speed = head.analysis, head.speed_of_sound
     rate = analysis.sampling_rate

@@ -34,11 +34,7 @@ anyway."""
 def cut(samples: NDArray[Any], emission: float, count: int, *, first: int = 0) -> Floats:
     """Return samples from the emission on; zeros where the recording had not begun or has ended.
 
-    Args:
-        samples (E, S): As they are on disk.
-
-    Returns:
-        echo: (E, N).
+    In: samples (E, S). Out: (E, N).
     """
     whole = int(np.floor(emission))
     part = emission - whole

@@ -128,8 +128,7 @@ def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]
 def shifted(columns: Columns, pings: Ints, settings: ImportSettings) -> dict[str, Poses]:
     """Return the poses of pings if each ping belongs to the next or to the previous row.
 
-    Args:
-        pings (P,): Rows of the pings that are checked.
+    In: pings (P,).
     """
     last = len(columns) - 1
     return {
@@ -180,11 +179,7 @@ def check_poses(
 ) -> Verdict:
     """Name the convention that explains the first echoes, if it is not the stated one.
 
-    Args:
-        first ((P, E), m): Ranges of the first echoes; not finite without an echo.
-        emitter ((3,), m): Head frame.
-        receivers ((E, 3), m): Head frame.
-        resolution (m): Range resolution; onsets are known to a tenth of it.
+    In: first ((P, E), m), emitter ((3,), m), receivers ((E, 3), m), resolution (m).
     """
     heard = np.flatnonzero(np.isfinite(first).any(axis=1))
     if len(heard) < FEWEST:

@@ -28,11 +28,7 @@ def echo_wav(
     magnitude of the spectrogram over time, and a random phase that is the same in every call. The
     left channel is the left ear.
 
-    Args:
-        magnitude (E, R, F): Linear; of more than two receivers the first two sound.
-        range_m ((R,), m): Range axis.
-        frequency_hz ((F,), Hz): Frequency axis.
-        speed_of_sound (m/s): Speed of the echoes.
+    In: magnitude (E, R, F), range_m ((R,), m), frequency_hz ((F,), Hz), speed_of_sound (m/s).
     """
     heard = np.asarray(magnitude, dtype=np.float64)[:2]
     ranges, frequencies = np.asarray(range_m, dtype=float), np.asarray(frequency_hz, dtype=float)

@@ -47,12 +47,7 @@ def rows_of(thing: object) -> Rows:
 
 @singledispatch
 def png_of(thing: object, **options: Any) -> bytes | None:
-    """Return the picture of an object as a PNG file; None where it has none.
-
-    Args:
-        thing: A scene or a surface, whose mesh is drawn; or echoes or a prediction, of which one
-            spectrogram is drawn.
-    """
+    """Return the picture of an object as a PNG file; None where it has none."""
     del thing, options
     return None
 

@@ -34,10 +34,7 @@ that a page may have. Larger meshes are decimated."""
 class SurfaceViews:
     """Pictures and coloured meshes of a surface.
 
-    Args:
-        confidence ((V,) int32 or None): Number of poses that heard each vertex.
-        error ((V,) float32 or None, m): Error of each vertex, known without the truth.
-        limit (m): Error and distance of the strongest colour.
+    In: confidence ((V,) int32 or None), error ((V,) float32 or None, m), limit (m).
     """
 
     mesh: trimesh.Trimesh

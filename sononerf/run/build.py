@@ -85,8 +85,7 @@ def module_for(
 ) -> EchoModule:
     """Return an unfitted module that settings describe.
 
-    Args:
-        region ((2, 3), m): Lower and upper corner; of a small box where None.
+    In: region ((2, 3), m).
     """
     with faults_of(settings.source):
         return EchoModule(

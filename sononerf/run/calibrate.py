@@ -76,14 +76,7 @@ def kinds_of(names: Sequence[str]) -> tuple[Kind, ...]:
 def calibrate(
     source: Path, output: Path, kinds: Sequence[str], *, progress: Progress | None = None
 ) -> Calibrated:
-    """Estimate errors of the recording behind a run, and write a corrected store.
-
-    Args:
-        source: Folder of a run with a surface.
-        output: The corrected store; the source's own store is left as it is.
-        kinds: Errors of :data:`KINDS`.
-        progress: Display of progress.
-    """
+    """Estimate errors of the recording behind a run, and write a corrected store."""
     progress = progress or Progress(quiet=True)
     if output.exists() and any(output.iterdir()):
         raise IncompatibleError(f"{output}: holds something already; choose another --output")

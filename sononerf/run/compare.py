@@ -58,17 +58,6 @@ def compare_runs(
     flashes of a smooth face do not drown what answers more faintly in all directions. The places
     of the two fields themselves are not compared: two fits of one scene place the same sound some
     millimetres apart.
-
-    Args:
-        first, second: Run runs; the difference is the first without the second.
-        output: Folder of the results; ``FIRST/compare-<name of SECOND>`` where None.
-        accelerator: Device to render on.
-        progress: Display of progress.
-
-    Returns:
-        folder: With ``comparison.json``; both volumes over their common maximum and their
-            difference as VTI; projections of all three; and the difference on the first's true
-            surface, where that is known.
     """
     progress = progress or Progress(quiet=True)
     run = Run(first)

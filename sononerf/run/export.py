@@ -117,16 +117,6 @@ def export(source: Path, output: Path, *, what: What = "auto", frame: FrameName 
     volume      ``.mat .h5``        summed reflectivity on a grid
     mesh        ``.ply .stl .glb``  the surface
     =========== =================== ==========================================
-
-    Args:
-        source: A store, or the folder of a run.
-        output: The file.
-        what: Part to export. ``auto``: echoes of a store; of a run the mesh, where the suffix says
-            so, else the prediction.
-        frame: Frame of places and directions; the original one of recordings for ``auto``.
-
-    Returns:
-        output: The file that was written.
     """
     suffix = output.suffix.lower()
     if suffix not in (*ARRAYS, *MESHES):

@@ -54,16 +54,7 @@ logger = logging.getLogger("sononerf")
 def finish(
     run: Path | Run, *, accelerator: str = "auto", progress: Progress | None = None
 ) -> dict[str, Any]:
-    """Reconstruct, find the weight of the surface's echoes, predict held-out poses, evaluate.
-
-    Args:
-        run: A fitted run.
-        accelerator: Device to render on.
-        progress: Display of progress.
-
-    Returns:
-        metrics: ``RUN/metrics.json``.
-    """
+    """Reconstruct, find the weight of the surface's echoes, predict held-out poses, evaluate."""
     progress = progress or Progress(quiet=True)
     run = Run.of(run)
     shown: dict[str, Any] = {"accelerator": accelerator, "progress": progress}

@@ -31,8 +31,7 @@ SIDE = 8
 def fit_warnings(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:
     """Return warnings about a fit, one line each.
 
-    Args:
-        region ((2, 3), m): Lower and upper corner.
+    In: region ((2, 3), m).
     """
     training = echoes.poses("train")
     found = [_repeated(training)]

@@ -15,12 +15,7 @@ from sononerf.surface.next_poses import Within, next_poses
 def propose(
     run: Path, count: int, candidates: Path | None, within: Within, output: Path | None
 ) -> Path:
-    """Write the poses that would reduce the error of a run's surface most, the best first.
-
-    Returns:
-        file: The table in the frame of the world; ``predict --frame world`` reads it for
-            recordings too.
-    """
+    """Write the poses that would reduce the error of a run's surface most, the best first."""
     opened = open_run(run)
     file = output or opened.path / "next.csv"
     if file.is_dir():

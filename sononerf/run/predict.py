@@ -43,12 +43,7 @@ logger = logging.getLogger("sononerf")
 
 
 def read_poses(run: Run, path: Path, frame: FrameName = "auto") -> Poses:
-    """Read a table of poses.
-
-    Args:
-        path: In the world's frame with the header ``x,y,z,yaw,pitch,roll`` (m, degrees); in the
-            original one of recordings with the columns, units and conventions of their import.
-    """
+    """Read a table of poses."""
     stated = run.provenance.get("poses_as")
     recorded = run.provenance.get("origin") == "recorded"
     if frame == "world" or not stated or (frame == "auto" and not recorded):

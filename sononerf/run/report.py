@@ -53,19 +53,6 @@ def report(
 
     An interrupted fit has a page too, with its results so far.
 
-    Args:
-        path: A run.
-        paper: Whether the counterparts of the paper's figures 4 to 8 are drawn too: the scene with
-            its poses, an iso-surface of the summed reflectivity, and, where the run was compared
-            with others, what was heard in it and not in them.
-        figures: Kind of vector graphics in which curves, projections and spectrograms are also
-            written, into the folder ``figures`` beside the page.
-        output: File of the page; ``RUN/report.html`` where None.
-        progress: Display of progress.
-
-    Returns:
-        page: The file. What a run has not come to yet is named with the command that makes it.
-
     References:
         .. [1] Jansen & Steckel, Biomimetics 9(6):321, 2024, figures 4 to 8.
     """

@@ -29,13 +29,7 @@ from sononerf.tables import aligned
 
 
 def describe_scenes() -> list[dict[str, Any]]:
-    """Return the properties of every scene, built without options.
-
-    Returns:
-        rows: Plain data. ``needs`` are the options without a default; where there are any,
-            ``size_m`` and ``triangles`` are None. A broken scene has its fault as ``summary``, and
-            affects no other.
-    """
+    """Return the properties of every scene, built without options."""
     rows = []
     for plugin in list_scenes():
         row: dict[str, Any] = {
@@ -77,12 +71,7 @@ def scene_table(rows: list[dict[str, Any]]) -> list[str]:
 
 
 def describe_scene(name: str) -> dict[str, Any]:
-    """Return the description of one scene, with its options.
-
-    Returns:
-        scene: ``name``, ``description`` (the docstring without its Returns and Raises), and
-            ``options``, as :func:`sononerf.settings.plugins.describe_options` has them.
-    """
+    """Return the description of one scene, with its options."""
     with _quietly():
         factory = plugins.load(plugins.SCENES, name)
         return {

@@ -74,14 +74,7 @@ def open_ensemble(settings: Settings, path: Path) -> EnsembleStore:
 
 
 def find_ensemble(settings: Settings, echo_hash: str, folder: Path) -> EnsembleStore:
-    """Open the ensemble that a run was fitted to.
-
-    Args:
-        settings: Settings of the run.
-        echo_hash: Hash of its echoes.
-        folder: Its folder. Where the fit was started elsewhere, the store lies relative to one of
-            the folders above it.
-    """
+    """Open the ensemble that a run was fitted to."""
     stated = settings.data.store or default_store(settings, echo_hash)
     places = [stated, *(above / stated for above in folder.absolute().parents)]
     stores = [open_ensemble(settings, one) for one in places if (one / "zarr.json").is_file()]

@@ -18,12 +18,7 @@ from sononerf.tables import aligned
 
 
 def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
-    """Return the numbers of runs as lines: a row per number, a column per run.
-
-    Args:
-        paths: Runs.
-        csv: File for all numbers of ``metrics.json``, one line per run, in its units.
-    """
+    """Return the numbers of runs as lines: a row per number, a column per run."""
     runs = [Run(path) for path in paths]
     found = []
     for run in runs:

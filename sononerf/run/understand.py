@@ -91,12 +91,7 @@ def understand(
     overrides: Iterable[str] = (),
     progress: Progress | None = None,
 ) -> Understood:
-    """Read recordings and settings, and complete each by the other.
-
-    Args:
-        settings_file: Sections ``import``, ``air``, ``ears``, ``call``, ``spectrogram``;
-            ``import.yaml`` beside the recordings where None, if it is there.
-    """
+    """Read recordings and settings, and complete each by the other."""
     if form not in READERS:
         raise SettingsError(f"unknown format {form!r}; known: {', '.join(READERS)}")
     if not source.exists():

@@ -42,8 +42,7 @@ LARGE, SMALL = 5.0, 5e-3  # m, beyond which a mistaken unit is likelier than suc
 class SurfaceSizeError(InputError):
     """A surface far larger or smaller than any scene.
 
-    Args:
-        size (m): Along its longest side.
+    In: size (m).
     """
 
     def __init__(self, size: float) -> None:

@@ -166,10 +166,6 @@ def load_settings(config: Path, overrides: Iterable[str] = ()) -> Settings:
 
     An assignment that names another scene, field or renderer than the file does takes the file's
     options for the old one away.
-
-    Args:
-        config: A file; the name of a shipped one, such as ``three_spheres``; or an assignment,
-            which is laid over the defaults.
     """
     overrides = list(overrides)
     if is_assignment(config):

@@ -108,12 +108,7 @@ def check_options(
 
 
 def describe_options(factory: Callable[..., Any], *, given: int = 0) -> list[dict[str, Any]]:
-    """Return the options of a factory: its keyword arguments.
-
-    Returns:
-        rows: ``name``; ``default``, plain data, or None if there is none; ``needed``, where it
-            has to be set; ``allowed``, in words.
-    """
+    """Return the options of a factory: its keyword arguments."""
     rows = []
     for name, field in _options_model(factory, "options", given).model_fields.items():
         needed = field.is_required()

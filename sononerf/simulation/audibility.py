@@ -82,14 +82,8 @@ def _judge(
 ) -> None:
     """Add one listener to the audible hits (H,) and their doubts (H,).
 
-    Args:
-        audible, doubt (H,): Changed in place.
-        distance, rise, detour, stiffness (H,): Distance, rise, detour and stiffness of
-            :class:`Ways` to the listener.
-        tube ((H,), m²/sr): Tube of the footprint.
-        solid_angle ((H,) or (1,), sr): Solid angle of the cells.
-        k (rad/m), farthest (m): As in :class:`Audibility`.
-        explore (1/m): Weight of a wide bundle, over its level.
+    In: audible, doubt (H,), distance, rise, detour, stiffness (H,), tube ((H,), m²/sr), solid_angle
+    ((H,) or (1,), sr), k (rad/m), farthest (m), explore (1/m).
     """
     for i in range(len(distance)):
         angle = solid_angle[i if len(solid_angle) > 1 else 0]
@@ -139,9 +133,7 @@ class Arrival:
     def shortest(self, emitters: Floats, ears: Floats) -> Floats:
         """Return the shortest way (P, E), m.
 
-        Args:
-            emitters ((P, 3), m): World frame.
-            ears ((P, E, 3), m): World frame.
+        In: emitters ((P, 3), m), ears ((P, E, 3), m).
         """
         found = np.zeros(ears.shape[:2])
         square = np.einsum("nd,nd->n", self._points, self._points)
@@ -162,13 +154,7 @@ def silence_before(echo: Floats, first: Floats, *, sampling_rate: float) -> Floa
     echo. Everything that is more than 26 us earlier than the first possible arrival is set to zero.
     Onsets and free space are then found from sound that has arrived.
 
-    Args:
-        echo (E, S): Pressure from the emission on.
-        first ((E,), s): First possible arrival at each ear.
-        sampling_rate (Hz): Sampling rate of the echo.
-
-    Returns:
-        echo (E, S): Zero up to 26 us before the first arrival, whole from there on.
+    In: echo (E, S), first ((E,), s), sampling_rate (Hz). Out: echo (E, S).
     """
     before = first[:, None] - np.arange(echo.shape[1]) / sampling_rate
     return np.where(before < SILENT, echo, 0.0)

@@ -118,14 +118,8 @@ def wedge_directivity(
     itself is there, fading out over the edge within :math:`1/k` of detour: see
     :meth:`Reflection.heard`. What it brings is taken from the term with that pole.
 
-    Args:
-        inward, normal (N, 3): Unit vectors along one face and out of it, square to the edge.
-        open_angle ((N,), rad): :math:`\theta_w`, of the air around the edge.
-        to_source, to_receiver ((N, 3), m): From the point.
-        fade ((F,), 1/m): Decay over the detour from the mirror's path.
-
-    Returns:
-        directivity (N, F): Finite everywhere.
+    In: inward, normal (N, 3), open_angle ((N,), rad), to_source, to_receiver ((N, 3), m), fade
+    ((F,), 1/m). Out: directivity (N, F).
 
     References:
         .. [1] U. P. Svensson, R. I. Fred and J. Vanderkooy, "An analytic secondary source model of
@@ -207,9 +201,7 @@ class Diffraction:
     ) -> Sound:
         """Return the sound of edges and curved places at the ears of a pose.
 
-        Args:
-            position ((3,), m): Place of the head.
-            rotation (3, 3): Head to world.
+        In: position ((3,), m), rotation (3, 3).
         """
         sound = hearing.silence()
         share = self._end[-1] / points

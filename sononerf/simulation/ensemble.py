@@ -314,10 +314,6 @@ def simulate_ensemble(
     """Simulate poses and hand over each spectrogram as it comes.
 
     The result of a pose depends on its seed alone, not on workers or order.
-
-    Args:
-        workers: Processes on this machine; one means this process. Where None, as many as there are
-            cores, at most 8, if they save time.
     """
     wanted = [int(index) for index in indices]
     results = simulated(simulator, poses, wanted, seed_of, workers=workers, scheduler=scheduler)
@@ -337,9 +333,7 @@ def spectrograms(
 ) -> Singles:
     """Return the spectrograms of poses (P, E, R, F), linear magnitude, with the same rays for each.
 
-    Args:
-        positions ((P, 3), m): Places of the head, world frame.
-        rotations (P, 3, 3): Head to world.
+    In: positions ((P, 3), m), rotations (P, 3, 3).
     """
     found: dict[int, Singles] = {}
 

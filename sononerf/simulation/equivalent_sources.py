@@ -32,12 +32,7 @@ CHECKS = 200
 class Equations:
     """The equations of one frequency, factorised.
 
-    Args:
-        surface: Points (N, 3), m, of which any first ones are spread evenly; normals (N, 3); the
-            body's thickness (N,), m.
-        count: Number of sources.
-        spacing (m): Mean distance between the sources.
-        wavenumber (1/m): Wavenumber of sound in air.
+    In: spacing (m), wavenumber (1/m).
     """
 
     @property

@@ -18,8 +18,7 @@ class Footprint:
 
     Directions at the emitter are turned by u and v (rad) about two axes square to the ray.
 
-    Args:
-        rows ((H, 19) float32): All of the attributes, hit by hit.
+    In: rows ((H, 19) float32).
 
     Attributes:
         shift ((2, 3, H) float32, m/rad): Derivative of the hit point by u and by v.
@@ -104,11 +103,8 @@ def ways_to(
 ) -> tuple[Floats, Floats, Singles]:
     """Return the attributes of :class:`Ways`: distance, cosine, and the rest as (4, H).
 
-    Args:
-        rows ((H, 19) float32): Rows of a footprint.
-        points, flat, mirrored (H, 3): See :class:`Bounce`.
-        listener ((3,), m): Place of the listener.
-        solid_angle ((H,) or (1,), sr): Solid angle of the cells, taken as squares.
+    In: rows ((H, 19) float32), points, flat, mirrored (H, 3), listener ((3,), m), solid_angle ((H,)
+    or (1,), sr).
     """
     count = len(rows)
     distance, cosine = np.zeros(count), np.zeros(count)
@@ -162,9 +158,7 @@ def emit(directions: Floats, length: Floats) -> Singles:
     They are turned at the emitter, not moved there, about two unit vectors that are square to each
     direction and to each other [1]_.
 
-    Args:
-        directions (N, 3): Unit vectors.
-        length ((N,), m): From the emitter.
+    In: directions (N, 3), length ((N,), m).
 
     References:
         .. [1] T. Duff et al., "Building an orthonormal basis, revisited", JCGT 6(1), 2017.
@@ -187,9 +181,7 @@ def emit(directions: Floats, length: Floats) -> Singles:
 def onto(rows: Singles, turned: Singles, further: Ints, distance: Floats) -> Singles:
     """Return mirrored bundles (N, 12) where they are hit next, see :func:`land`.
 
-    Args:
-        further (N,): Indices of those that hit anything.
-        distance ((N,), m): Distance to the hit.
+    In: further (N,), distance ((N,), m).
     """
     bundles = np.zeros((len(further), 12), np.float32)
     for i in range(len(further)):
@@ -211,19 +203,8 @@ def land(
 ) -> tuple[Singles, Singles, Floats, Floats]:
     """Return footprints of bundles on the surface, and the mirrored bundles.
 
-    Args:
-        bundles ((H, 12) float32): Motion of the rays square to themselves over u and v (m/rad), and
-            how their directions turn; three components each.
-        incoming (H, 3): Directions of the rays.
-        normals, flat (H, 3): Normals of the smooth surface and of the triangle, unit vectors on
-            any side.
-        gradients ((H, 4, 3) float32): As in :class:`Hits`.
-
-    Returns:
-        rows ((H, 19) float32): The :class:`Footprint`.
-        turned ((H, 6) float32): Derivatives of the mirrored directions.
-        flat (H, 3): The triangles' normals on the side of the ray.
-        mirrored (H, 3): Unit vectors.
+    In: bundles ((H, 12) float32), incoming (H, 3), normals, flat (H, 3), gradients ((H, 4, 3)
+    float32). Out: rows ((H, 19) float32), turned ((H, 6) float32), flat (H, 3), mirrored (H, 3).
     """
     count = len(bundles)
     rows, turned = np.zeros((count, 19), np.float32), np.zeros((count, 6), np.float32)

@@ -123,16 +123,8 @@ class Hearing:
         the air's loss to the pressure, with :math:`a` its level and :math:`r_2` the way to the
         ear.
 
-        Args:
-            points ((N, 3), m): World frame.
-            length ((N,), m): Path from the emitter to the points.
-            spread ((N,), m): Standard deviation of the whole path's length over a point's patch.
-            level ((N, F) or (N, 1), m): The beam's gain is part of it.
-            position ((3,), m): Place of the head.
-            rotation (3, 3): Head to world.
-            shaded: A second sound, indices (M,) of points that are partly hidden, and what passes
-                of them (M, F). The second sound takes the imaginary part, to be heard a quarter
-                turn later.
+        In: points ((N, 3), m), length ((N,), m), spread ((N,), m), level ((N, F) or (N, 1), m),
+        position ((3,), m), rotation (3, 3).
         """
         place = position + rotation @ self.ears.positions[ear]
         towards = points - place
@@ -152,12 +144,7 @@ class Hearing:
     def echo(self, sound: Sound, basis: Complexes | None = None) -> Floats:
         """Return the pressure at the ears for a call that is one sample of height 1.
 
-        Args:
-            basis ((K, F) complex128): Filters of the synthesis; its ``basis``, for reflections,
-                where not given.
-
-        Returns:
-            echo (E, S): At the sampling rate.
+        In: basis ((K, F) complex128). Out: echo (E, S).
         """
         filters = self.synthesis.basis if basis is None else basis
         return np.stack(

@@ -147,13 +147,7 @@ def between(frequency: Floats, nodes: Floats) -> tuple[Floats, Floats]:
     values are continued as an even function about the upper end, and as an even or an odd one about
     zero. An odd one continued as an even one would jump at zero, and ring on as one over time.
 
-    Args:
-        frequency ((K,), Hz): From zero to the upper end, half a spacing above the last node.
-        nodes ((F,), Hz): Odd multiples of half their spacing.
-
-    Returns:
-        even (K, F): They sum to one for each frequency, within 1e-6.
-        odd (K, F): For values that are odd about zero.
+    In: frequency ((K,), Hz), nodes ((F,), Hz). Out: even (K, F), odd (K, F).
     """
     spacing = 2.0 * nodes[0]
     period = 2.0 * len(nodes) * spacing
@@ -179,10 +173,7 @@ def deposit(
 ) -> None:
     """Lay echoes into time bins, each into the two nearest bins of its two neighbouring levels.
 
-    Args:
-        delay ((N,), s): From the emission; echoes too late for the last frame are left out.
-        spread ((N,), s): Standard deviation of the arrival times of an echo's patch.
-        strength (N, F): Per node.
+    In: delay ((N,), s), spread ((N,), s), strength (N, F).
     """
     kind = bins.values.dtype
     earliest, latest = _lay(
@@ -210,11 +201,7 @@ def _lay(
 ) -> tuple[float, float]:
     """Add echoes to bins in place; return the first and the last place, in bins.
 
-    Args:
-        values (B, F): Values of the bins.
-        start (L + 1,): First row of each level.
-        rate (Hz): Rate of the finest bins.
-        last (bins): Arrival time from which on echoes are left out.
+    In: values (B, F), start (L + 1,), rate (Hz), last (bins).
     """
     earliest, latest = math.inf, -math.inf
     for i in range(len(delay)):
@@ -257,12 +244,7 @@ def synthesise(
 ) -> Floats:
     """Weaken each node's bins by the air, filter them with its part of the spectrum, add up.
 
-    Args:
-        air (B, F): From :func:`air_loss`.
-        basis ((K, F) complex128): The synthesis' ``basis``, or its ``hats``.
-
-    Returns:
-        echo (S,): Pressure for a call that is one sample of height 1, at the sampling rate.
+    In: air (B, F), basis ((K, F) complex128). Out: echo (S,).
     """
     echo = np.zeros(synthesis.samples)
     if bins.last < bins.first:
@@ -297,10 +279,7 @@ def _filter(
 ) -> None:
     """Add one level of bins, filtered, to a spectrum (K / part,), in place.
 
-    Args:
-        spectrum (K / part,): Spectrum of the echo.
-        half (size // 2 + 1, F): Spectra of the bins.
-        basis (K, F): The filters.
+    In: spectrum (K / part,), half (size // 2 + 1, F), basis (K, F).
     """
     finest = OVERSAMPLING * 2.0 * (len(spectrum) - 1)  # bins at the level of the finest
     for k in range(len(spectrum)):

@@ -162,9 +162,6 @@ class LowBand:
     have a large error, and bodies thinner than about three distances between sources cannot be
     solved for; :func:`low_band` leaves both to the rays.
 
-    Args:
-        most: Number of sources at the highest frequency.
-
     Attributes:
         frequency ((K,), Hz): Frequencies that are solved for.
         frequency_full (Hz): Highest frequency at which the response is whole.
@@ -265,10 +262,7 @@ class LowBand:
 
         Poses that are no finite numbers are left out.
 
-        Args:
-            positions ((P, 3), m): Places of the head, world frame.
-            rotations (P, 3, 3): Head to world.
-            done: Called after each frequency.
+        In: positions ((P, 3), m), rotations (P, 3, 3).
         """
         finite = np.isfinite(positions).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
         pairs = zip(positions[finite], rotations[finite], strict=True)
@@ -325,12 +319,7 @@ class LowBand:
     def respond(self, wavenumber: complex, poses: HeadPoses) -> Complexes:
         """Return the scattered pressure at the ears at one frequency.
 
-        Args:
-            wavenumber (1/m): Wavenumber of sound in air; its imaginary part is not positive.
-
-        Returns:
-            pressure ((P, E) complex128): For an emission of pressure 1 at 1 m where the beam's gain
-                is 1, ear's gain included.
+        In: wavenumber (1/m). Out: pressure ((P, E) complex128).
         """
         frequency = wavenumber.real * self.hearing.speed_of_sound / (2.0 * math.pi)
         equations = self._equations_of(frequency, wavenumber)
@@ -402,8 +391,7 @@ def low_band(
 ) -> LowBand | str:
     """Return the low band of a scene, or the reason for its absence.
 
-    Args:
-        frequency_min (Hz): The lowest that is analysed.
+    In: frequency_min (Hz).
     """
     if not all(material.rigid for material in scene.materials):
         return "a material is not rigid"

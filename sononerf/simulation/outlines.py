@@ -58,12 +58,7 @@ class Outlines:
     def seen_from(self, place: Floats) -> tuple[Floats, Floats, Ints, Floats]:
         """Return outline edges as seen from a place.
 
-        Returns:
-            ends ((K, 2, 3), m): The obstacle lies on the left as one goes from the first to the
-                second.
-            away (K, 3): Unit vectors off the surface.
-            body (K,): Body of each edge.
-            radius ((K,), m): Radius of curvature along the way from the place; zero at sharp edges.
+        Out: ends ((K, 2, 3), m), away (K, 3), body (K,), radius ((K,), m).
         """
         return _outline(
             place, self._normals, self._height, self._pairs, self._may, self._rim, self._sharp,
@@ -91,18 +86,9 @@ def _outline(
 ) -> tuple[Floats, Floats, Ints, Floats]:
     """Return the edges between a triangle that faces a place and one that does not, and rims.
 
-    Args:
-        place ((3,), m): The viewpoint.
-        normals (T, 3): Normals of the triangles.
-        height ((T,), m): Height of their planes over the origin.
-        pairs (K, 2): Triangles at each edge; at a rim, twice the same.
-        may, rims, sharp (K,): True if an edge may be an outline, is a rim, has no radius.
-        edges ((K, 2, 3), m): Ends.
-        middles ((T, 3), m): Middles of the triangles.
-        second, third ((T, 3), 1/m): Gradients of the weights of their corners.
-        bend (T, 2, 3): Difference of the smooth normals there from that at the first corner.
-        bodies (T,): Index of each triangle's body.
-        least (1/m): Curvature of an edge that bends the other way.
+    In: place ((3,), m), normals (T, 3), height ((T,), m), pairs (K, 2), may, rims, sharp (K,),
+    edges ((K, 2, 3), m), middles ((T, 3), m), second, third ((T, 3), 1/m), bend (T, 2, 3), bodies
+    (T,), least (1/m).
     """
     front = np.zeros(len(normals), np.bool_)
     for i in range(len(normals)):

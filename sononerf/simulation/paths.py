@@ -117,13 +117,7 @@ def _joined(bounces: list[Bounce]) -> Bounce:
 def aim(emitter: Floats, centre: Floats, radius: float) -> tuple[Floats, float]:
     """Axis and half angle of the cap under which a point sees a ball.
 
-    Args:
-        emitter, centre ((3,), m): The point, and the ball's middle.
-        radius (m): Radius of the ball.
-
-    Returns:
-        axis ((3,), m): Towards the middle, not normalised.
-        half_angle (rad): pi where the point is inside.
+    In: emitter, centre ((3,), m), radius (m). Out: axis ((3,), m), half_angle (rad).
     """
     axis = centre - emitter
     distance = float(np.linalg.norm(axis))
@@ -145,12 +139,7 @@ def trace(
 
     Both sides of a surface are alike: the side that a ray hits is the outside.
 
-    Args:
-        emitter ((3,), m): Origin of all rays.
-        directions (N, 3): Unit vectors.
-        solid_angle (sr): Solid angle of each ray.
-        beyond: Takes the first hits and all directions (N, 3); returns the hits to use instead, and
-            their distance from the emitter (M,), m.
+    In: emitter ((3,), m), directions (N, 3), solid_angle (sr).
     """
     origins = np.broadcast_to(emitter, directions.shape)
     hits = caster.first_hit(origins, directions)
@@ -202,11 +191,7 @@ def echo_paths(
     repeatedly, until no ray is doubtful or the extra rays are used up. This is stratified sampling,
     refined where the integrand is not resolved.
 
-    Args:
-        emitter ((3,), m): Origin of all rays.
-        judge: Takes hits; returns which of them (H,) can be heard at all, and how much of each (H,)
-            may be wrong for the size of its cell, in any unit, zero where it is small enough.
-        index (N,): Index of the first rays, those that may hit anything; all where not given.
+    In: emitter ((3,), m), index (N,).
     """
     rays = np.arange(cap.count) if index is None else index
     directions, parts, count = cap.directions(rays), 1, cap.count

@@ -24,9 +24,7 @@ def check_poses(
 ) -> None:
     """Refuse poses that lie inside the surface, or not above the support.
 
-    Args:
-        offsets ((K, 3), m): Further points of the head that must be outside, such as emitter and
-            ears; head frame.
+    In: offsets ((K, 3), m).
     """
     points = np.zeros((1, 3)) if offsets is None else np.vstack([np.zeros((1, 3)), offsets])
     places = poses.positions[:, None] + np.einsum("pij,kj->pki", poses.rotations, points)
@@ -61,8 +59,7 @@ def check_reach(
 ) -> None:
     """Warn of poses that no echo can reach within the range limits.
 
-    Args:
-        range_min, range_max (m): The limits of the spectrograms.
+    In: range_min, range_max (m).
     """
     lower, upper = np.asarray(scene.mesh.bounds)
     radius = float(np.linalg.norm(upper - lower)) / 2.0

@@ -60,9 +60,7 @@ class Rays:
     ways has a factor, :class:`Shadow`. What lies behind an obstacle is sought by rays that go
     through it. Shadows of later bounces are sharp.
 
-    Args:
-        band (K,): Factor of each frequency of the synthesis; 1 for all where not
-            given.
+    In: band (K,).
     """
 
     def __init__(
@@ -146,10 +144,7 @@ class Rays:
     def echo(self, position: Floats, rotation: Floats, *, seed: int) -> Floats:
         """Return the pressure at the ears (E, S) for a call that is one sample of height 1.
 
-        Args:
-            position ((3,), m): Place of the head, world frame.
-            rotation (3, 3): Head to world.
-            seed: Turns and shifts the pattern of rays as a whole.
+        In: position ((3,), m), rotation (3, 3).
         """
         echo = self._echo(position, rotation, seed=seed)
         if self._of_image is not None:

@@ -69,14 +69,7 @@ class Reflection:
         The echo of a smooth surface fades by :math:`e^{-\epsilon k \delta}` with the detour
         :math:`\delta`; :func:`unfaded` compensates the loss.
 
-        Args:
-            cosine (N,): Cosines of the angle between the mirror direction and that towards the
-                listener.
-            detour ((N,), m): From :meth:`Bounce.detour`.
-            curvature ((N,), 1/m): Total curvature at the hits.
-
-        Returns:
-            gain (N, F): Linear.
+        In: cosine (N,), detour ((N,), m), curvature ((N,), 1/m). Out: gain (N, F).
         """
         strength = self.strength
         share = None
@@ -133,13 +126,8 @@ def unfaded(frequency: Floats, *, speed_of_sound: float) -> tuple[Floats, Comple
     :math:`\int e^{-(\epsilon + j) k \delta} d\delta = 1 / (\epsilon + j) k` in place of
     :math:`1 / j k`, at all curvatures; the factor :math:`1 - j \epsilon` is the same everywhere.
 
-    Args:
-        frequency ((F,), Hz): Zero or more.
-        speed_of_sound (m/s): Speed of the air.
-
-    Returns:
-        fade ((F,), 1/m): :math:`\epsilon k`, over the detour.
-        gain ((F,) complex128, Hz): :math:`j f (1 - j \epsilon)`.
+    In: frequency ((F,), Hz), speed_of_sound (m/s). Out: fade ((F,), 1/m), gain ((F,) complex128,
+    Hz).
     """
     faded = FADE * np.hypot(frequency, FADE_FREQUENCY)
     gain = (1j * frequency + faded).astype(np.complex128)
@@ -154,12 +142,7 @@ def coarse_gain(bend: Singles) -> Singles:
     all places of a mirror point among the cells the slope's spread acts as a further fade by
     :math:`b / 12`, and the bend's as a loss of :math:`e^{-b^2 / 720}`: variances over a square.
 
-    Args:
-        bend ((N, F) float32, rad): Bend of a cell.
-
-    Returns:
-        gain ((N, F) float32): One where cells are fine; no more than that of 10 rad, beyond which
-            there is little left to be made good.
+    In: bend ((N, F) float32, rad). Out: gain ((N, F) float32).
     """
     b = np.minimum(bend, np.float32(COARSEST))
     fade = np.square(np.float32(FADE) + b / np.float32(12.0)) + np.float32(1.0)
@@ -174,15 +157,8 @@ def leave(directions: Floats, flat: Floats, points: Floats, lift: float) -> tupl
 
     A mirror direction about a smooth normal may point into the flat triangle that was hit.
 
-    Args:
-        directions (N, 3): Unit vectors.
-        flat (N, 3): Unit normals of the triangles, on the side of the ray.
-        points ((N, 3), m): On the triangles.
-        lift (m): Height of the rays' origins above them.
-
-    Returns:
-        origins ((N, 3), m): Origins of the rays.
-        directions (N, 3): Unit vectors.
+    In: directions (N, 3), flat (N, 3), points ((N, 3), m), lift (m). Out: origins ((N, 3), m),
+    directions (N, 3).
     """
     origins, onward = np.zeros((len(points), 3)), np.zeros((len(points), 3))
     for i in range(len(points)):
@@ -205,13 +181,7 @@ def leave(directions: Floats, flat: Floats, points: Floats, lift: float) -> tupl
 def lobe_exponent(cosine: Floats, lobe_width: Floats) -> Floats:
     """Logarithm of the lobe, ``-theta**2 / (2 w**2)``.
 
-    Args:
-        cosine (N,): Cosines of the angle theta between the mirror direction and that towards the
-            listener.
-        lobe_width ((F,) or (N, F), rad): Standard deviations.
-
-    Returns:
-        exponent (N, F): Zero in the mirror direction, falling away from it.
+    In: cosine (N,), lobe_width ((F,) or (N, F), rad). Out: exponent (N, F).
     """
     theta = np.arccos(np.clip(cosine, -1.0, 1.0))
     return -0.5 * np.square(theta)[:, None] / np.square(lobe_width)

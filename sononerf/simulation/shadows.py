@@ -70,11 +70,7 @@ class Shadow:
 
     What passes is the same over a cell of the surface, and solved for where it is asked for.
 
-    Args:
-        place ((3,), m): Emitter or ear.
-        wavenumber ((F,), 1/m): At the nodes.
-        speed_of_sound (m/s): Speed of the air.
-        size (m): Size of the scene.
+    In: place ((3,), m), wavenumber ((F,), 1/m), speed_of_sound (m/s), size (m).
 
     References:
         .. [1] A. Rubinowicz, "Thomas Young and the theory of diffraction", Nature 180, 1957.
@@ -176,9 +172,7 @@ class Shadow:
     ) -> tuple[NDArray[np.int32], NDArray[np.complex64]]:
         """Return the row (N,) of each point in a table (C, F) of transmission; -1: no outline near.
 
-        Args:
-            points ((N, 3), m): On the surface.
-            triangle (N,): Triangles that the points lie on.
+        In: points ((N, 3), m), triangle (N,).
         """
         if self._pieces is None or len(points) == 0:
             return np.full(len(points), -1, dtype=np.int32), self._table
@@ -262,17 +256,8 @@ def _lay(
 ) -> tuple[Floats, Ints]:
     """Sort the sound from pieces of an outline to points by its detour.
 
-    Args:
-        points ((N, 3), m): Points that sound reaches.
-        place ((3,), m): Origin of the sound.
-        bodies (N,): Bodies that the points lie on.
-        start (N + 1,): Index of each point's first piece in ``reached``.
-        reached (R,): Pieces whose sound may reach the points.
-        step (m): Width of a bin.
-
-    Returns:
-        laid (4, U, bins): The angle swept, and weights of the powers of Pekeris' function.
-        used (U,): Points that sound of some piece reaches.
+    In: points ((N, 3), m), place ((3,), m), bodies (N,), start (N + 1,), reached (R,), step (m).
+    Out: laid (4, U, bins), used (U,).
     """
     table = np.zeros((4, len(points), bins))
     is_used = np.zeros(len(points), np.bool_)
@@ -360,15 +345,8 @@ def passing(
 ) -> tuple[Bools, Ints, NDArray[np.complex64]]:
     """Return the transmission past obstacles on the ways to points and on from there.
 
-    Args:
-        lit, heard (N,): Rows of each point in the tables, from :meth:`Shadow.passed`.
-        lit_table, heard_table (C, F): Transmission from the emitter, and to the ear.
-        is_seen (N,): True if nothing stands between a point and the ear.
-
-    Returns:
-        passes (N,): True if a point is heard.
-        dim (M,): Indices of the points near an outline among those that are heard.
-        passed (M, F): Transmission to these.
+    In: lit, heard (N,), lit_table, heard_table (C, F), is_seen (N,). Out: passes (N,), dim (M,),
+    passed (M, F).
     """
     frequencies = lit_table.shape[1]
     passes = np.zeros(len(lit), np.bool_)

@@ -56,12 +56,7 @@ class Simulator:
     """
 
     def __init__(self, scene: Scene, head: Head, options: SimulationSettings) -> None:
-        """Prepare a scene for a head.
-
-        Args:
-            head: The head. Of a scene on its support the part above it is ensonified together
-                with its image: a rigid plane is exactly that.
-        """
+        """Prepare a scene for a head."""
         self.head, hearing, analysis = head, hearing_of(head), head.analysis
         if head.plane is not None:
             scene = scene.with_image(head.plane)
@@ -115,9 +110,7 @@ class Simulator:
     def prepare(self, positions: Floats, rotations: Floats, progress: Progress) -> None:
         """Solve for the low band of all poses at once, and show how far it is.
 
-        Args:
-            positions ((P, 3), m): Places of the head, world frame.
-            rotations (P, 3, 3): Head to world.
+        In: positions ((P, 3), m), rotations (P, 3, 3).
         """
         if len(positions) and self.low is not None:
             with progress.task("solving", len(self.low.frequency)) as task:
@@ -134,9 +127,7 @@ class Simulator:
 
         It is silent before sound can arrive, see :func:`silence_before`.
 
-        Args:
-            position ((3,), m): Place of the head, world frame.
-            rotation (3, 3): Head to world.
+        In: position ((3,), m), rotation (3, 3).
         """
         if not (np.isfinite(position).all() and np.isfinite(rotation).all()):
             raise ValueError("the pose is no finite number")
@@ -151,17 +142,14 @@ class Simulator:
     def spectrogram(self, position: Floats, rotation: Floats, *, seed: int) -> Singles:
         """Return the magnitude at both ears, over range and frequency.
 
-        Returns:
-            magnitude ((E, R, F) float32): Linear.
+        Out: magnitude ((E, R, F) float32).
         """
         return self.receive(position, rotation, seed=seed)[1].astype(np.float32)
 
     def receive(self, position: Floats, rotation: Floats, *, seed: int) -> tuple[Floats, Floats]:
         """Return the sound at both ears for the call, noise included, and its spectrogram.
 
-        Returns:
-            waveform (E, S): Pressure from the start of the emission on.
-            magnitude (E, R, F): Linear; dechirped where the call is a sweep.
+        Out: waveform (E, S), magnitude (E, R, F).
         """
         echo = self.echo(position, rotation, seed=seed)
         return self.head.receive(echo, seed=seed)
@@ -183,8 +171,7 @@ def ensemble_poses(wanted: PoseSettings) -> tuple[Poses, NDArray[np.int8]]:
     Each set draws from a generator of its own, so that the number of one does not move another.
     The poses of a path stay in the order of its table.
 
-    Returns:
-        split ((P,) int8): 0 train, 1 validation, 2 test.
+    Out: split ((P,) int8).
     """
     if wanted.path is not None:
         return _path_poses(wanted, wanted.path)

@@ -39,12 +39,7 @@ def simulated(
     workers: int | None = None,
     scheduler: str | None = None,
 ) -> Results:
-    """Yield indices and spectrograms of poses, in any order.
-
-    Args:
-        workers: Processes on this machine; one means this process. Where None, as many as there are
-            cores, at most 8, if they save time.
-    """
+    """Yield indices and spectrograms of poses, in any order."""
     if workers is None:
         workers = useful_workers(len(indices), simulator.rays.rays)
     if simulator.low is not None:

@@ -30,9 +30,7 @@ def mesh_bytes(
     themselves, as the vertices' property ``poses``, their error (m) as the property ``error``, and
     always their normals. STL knows none of them.
 
-    Args:
-        confidence (V,): Number of poses that heard the surface around each vertex.
-        error ((V,), m): Error of each vertex.
+    In: confidence (V,), error ((V,), m).
     """
     if file_type not in ("ply", "stl", "glb"):
         raise ValueError(f"file_type: {file_type!r}, expected 'ply', 'stl' or 'glb'")
@@ -105,11 +103,7 @@ def confidence_colours(poses: ArrayLike) -> Floats:
     Steps are even to the eye (a straight line in OKLab [1]_) over the logarithm of one plus the
     number, and the ends are the same for every mesh, so that pictures can be compared.
 
-    Args:
-        poses (N,): Zero or more.
-
-    Returns:
-        colours (N, 3): sRGB, 0 to 1.
+    In: poses (N,). Out: colours (N, 3).
 
     References:
         .. [1] B. Ottosson, "A perceptual color space for image processing", 2020.

@@ -100,11 +100,7 @@ def _greedy(
 ) -> list[int]:
     """Return the rows of ``added`` (P, B) that reduce the sum of weight / sqrt(known) most.
 
-    Args:
-        weight, known (B,): Error before a pose is added, and the curvature.
-        added (P, B): Curvature that each candidate adds.
-        ways, heard ((P, 3), (H, 3)): Directions of the candidates, and of the poses so far, from
-            the surface. Only candidates with ``SPREAD`` of the greatest gap are chosen.
+    In: weight, known (B,), added (P, B), ways, heard ((P, 3), (H, 3)).
     """
     chosen: list[int] = []
     error = weight * np.sqrt(known)  # error = weight where nothing is added

@@ -115,10 +115,7 @@ def finished_surface(
 
     An open surface also ends where the evidence for it ends.
 
-    Args:
-        confidence ((V,) int32): Number of poses that heard each vertex; counted in the evidence of
-            a field where None.
-        error ((V,) float32, m): As in :class:`Surface`.
+    In: confidence ((V,) int32), error ((V,) float32, m).
     """
     known: dict[str, Any] = {"echoes": echoes, "reading": reading}
     known |= {"refined": refined, "error_db": error_db, "faults": faults}
@@ -208,9 +205,7 @@ def judge_openness(
     A support mirrors sound, so that poses also hear from their images. A triangle that stands on
     the support counts as seen: no pose hears it, but the support gives its place.
 
-    Args:
-        sources ((P, 3), m): Places of the poses.
-        resolution (m): Range resolution of the analysis.
+    In: sources ((P, 3), m), resolution (m).
     """
     middles = np.asarray(mesh.triangles_center, dtype=np.float64)
     normals = np.asarray(mesh.face_normals, dtype=np.float64)
@@ -261,13 +256,7 @@ def known_part(
     it lies within one range resolution behind an onset. Between means in their convex hull, or as
     little out of it as one smooth surface may be.
 
-    Args:
-        heard ((V,) int32): Number of poses that heard the surface around each vertex, see
-            :func:`~sononerf.surface.start.evidence.poses_that_heard`.
-        resolution (m): Range resolution of the analysis.
-
-    Returns:
-        known: (T,).
+    In: heard ((V,) int32), resolution (m). Out: (T,).
     """
     middles = np.asarray(mesh.triangles_center, dtype=np.float64)
     bounded = hull.clearance(middles)[0] < resolution

@@ -223,11 +223,7 @@ def _sofar() -> Any:
 
 
 def read_sofa(path: Path) -> Directivity:
-    """Read a SOFA file, leniently: what is odd is logged, what is missing has its default.
-
-    Returns:
-        directivity: In the listener's frame (of a transducer, the source's): its view is ahead.
-    """
+    """Read a SOFA file, leniently: what is odd is logged, what is missing has its default."""
     sofar = _sofar()
     with tempfile.TemporaryDirectory() as folder:
         named = path.absolute()

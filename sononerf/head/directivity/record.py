@@ -36,13 +36,7 @@ def interpolation(known: Floats, wanted: Floats) -> csr_array:
     directions are reproduced exactly. Beyond the measured area the value of the nearest measured
     direction is faded to zero.
 
-    Args:
-        known (M, 3): Unit vectors, at least one. Equal ones are averaged.
-        wanted (N, 3): Unit vectors.
-
-    Returns:
-        weights ((N, M) sparse float64): Rows sum to 1 in the measured area, to 0 farther than
-            :data:`FADE` from it.
+    In: known (M, 3), wanted (N, 3). Out: weights ((N, M) sparse float64).
     """
     cells = np.round(known / SAME).astype(np.int64)
     _, first, same = np.unique(cells, axis=0, return_index=True, return_inverse=True)

@@ -63,19 +63,9 @@ def echo_png(
 
     Of more than three receivers three are drawn.
 
-    Args:
-        points ((N, 3), m): Points that reflect sound towards the ears, world frame; none is
-            allowed.
-        level_db ((N,), dB): Level of each; drawn relative to the loudest.
-        position ((3,), m): Place of the head, world frame.
-        rotation (3, 3): Head to world.
-        echo (E, S): Pressure at the receivers from the emission on, over that of the call at 1 m.
-            Two of them are the left and the right ear.
-        sampling_rate (Hz): Sampling rate of the echo.
-        spectrogram_db ((E, R, F), dB): 0 dB is silence.
-        range_m ((R,), m): Range axis, ascending; drawn only around what sounds.
-        frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
-        speed_of_sound (m/s): Puts the echo on the range axis.
+    In: points ((N, 3), m), level_db ((N,), dB), position ((3,), m), rotation (3, 3), echo (E, S),
+    sampling_rate (Hz), spectrogram_db ((E, R, F), dB), range_m ((R,), m), frequency_hz ((F,), Hz),
+    speed_of_sound (m/s).
     """
     ranges, frequencies = (np.asarray(axis, dtype=np.float64) for axis in (range_m, frequency_hz))
     hits = np.asarray(points, dtype=np.float64).reshape(-1, 3)
@@ -204,12 +194,7 @@ def visible_hits(
 ) -> Ints:
     """Return the numbers of the hits that a camera sees, the loudest last.
 
-    Args:
-        points ((N, 3), m): World frame.
-        relative_db ((N,), dB): Their levels below the loudest, zero at most; the faintest are left
-            out.
-        nearness ((H, W), m): Depth of the surface at each pixel of the camera.
-        depth (m): Tolerance: a surface may differ by it from the middle of its pixel.
+    In: points ((N, 3), m), relative_db ((N,), dB), nearness ((H, W), m), depth (m).
     """
     places, near = camera.project(points)
     column, row = np.floor(places).astype(np.int64).T

@@ -40,10 +40,7 @@ def mesh_png(
 ) -> bytes:
     """Draw a mesh in parallel projection, shaded, with a scale bar.
 
-    Args:
-        size (int, int): Width and height in pixels.
-        view (3,): Direction from the mesh to the camera, world frame; z is up.
-        colours ((3,) or (V, 3)): Colour in 0 to 1, one for all or one per vertex.
+    In: size (int, int), view (3,), colours ((3,) or (V, 3)).
     """
     _require_drawable(mesh, "the mesh")
     camera = camera_for(mesh.vertices, size=size, view=view)
@@ -60,10 +57,7 @@ def side_by_side_png(
 ) -> bytes:
     """Draw two meshes next to each other through the same camera.
 
-    Args:
-        titles (str, str): One line above each.
-        size (int, int): Width and height of each half in pixels.
-        view (3,): Direction to the camera, world frame.
+    In: titles (str, str), size (int, int), view (3,).
     """
     for mesh, title in zip((left, right), titles, strict=True):
         _require_drawable(mesh, title or "a mesh")
@@ -87,10 +81,7 @@ def confidence_png(
 ) -> bytes:
     """Draw a mesh in the colours of its confidence, with a legend.
 
-    Args:
-        counts (V,): Number of poses that heard the surface around each vertex.
-        size (int, int): Width and height in pixels.
-        view (3,): Direction from the mesh to the camera, world frame; z is up.
+    In: counts (V,), size (int, int), view (3,).
     """
     _require_drawable(mesh, "the mesh")
     camera = camera_for(mesh.vertices, size=size, view=view, fill=0.74)
@@ -160,8 +151,7 @@ def sides_png(
 ) -> bytes:
     """Draw meshes from four sides through the same cameras, one mesh per row.
 
-    Args:
-        size (int, int): Width and height of each view in pixels.
+    In: size (int, int).
     """
     for title, mesh, *_ in rows:
         _require_drawable(mesh, title)

@@ -65,11 +65,7 @@ def mip_picture(
 ) -> bytes:
     """Draw one projection in millimetres.
 
-    Args:
-        projection (A, B): Greatest energy along the axis that is missing.
-        extents (((low, high), (low, high)), m): Outer edges of the first (to the right) and the
-            second axis (upwards).
-        labels (str, str): Names of the two axes.
+    In: projection (A, B), extents (((low, high), (low, high)), m), labels (str, str).
     """
     values = _scaled(projection, scale)
     low, high = _limits(values, scale)
@@ -170,12 +166,7 @@ def _draw(axes: Any, values: Floats, extents: Extents, limits: tuple[float, floa
 
 
 def maximum_intensity_projections(volume: Volume) -> dict[str, NDArray[np.floating]]:
-    """Return the greatest value along each axis.
-
-    Returns:
-        projections: ``"x"`` (Y, Z), ``"y"`` (X, Z) and ``"z"`` (X, Y), named by the axis looked
-            along.
-    """
+    """Return the greatest value along each axis."""
     require_finite(volume)
     return {name: volume.values.max(axis=axis) for axis, name in enumerate("xyz")}
 
@@ -191,11 +182,7 @@ def difference_pngs(
 ) -> dict[str, bytes]:
     """Draw two volumes and their difference along each axis: ``"x"``, ``"y"``, ``"z"``.
 
-    Args:
-        comparison: The comparison to draw; a ring marks the strongest difference, where there is
-            one.
-        titles (str, str): Names of the two.
-        truth ((3,), m): Place of the object that was truly added; a cross marks it.
+    In: titles (str, str), truth ((3,), m).
     """
     volumes = (comparison.first, comparison.second, comparison.difference)
     projections = [maximum_intensity_projections(volume) for volume in volumes[:2]]
@@ -255,8 +242,7 @@ def overlay_png(
 ) -> bytes:
     """Draw a mesh coloured by the difference next to its surface: red where the first has more.
 
-    Args:
-        view (3,): Direction to the camera.
+    In: view (3,).
     """
     from matplotlib import colormaps
     from scipy.ndimage import map_coordinates

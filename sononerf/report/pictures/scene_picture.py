@@ -45,14 +45,8 @@ def scene_png(
 ) -> bytes:
     """Draw a scene with where the calls come from and where they go.
 
-    Args:
-        poses_positions ((P, 3), m): Heads, drawn as dots; paler the further away.
-        poses_forward (P, 3): Directions of look, drawn as strokes.
-        region_box (((3,), (3,)), m): Opposite corners of the box that is fitted.
-        split (P,): Use of each pose: 0 train, 1 validation, 2 test; each has a colour of its
-            own.
-        size (int, int): Width and height in pixels.
-        view (3,): Direction to the camera, world frame.
+    In: poses_positions ((P, 3), m), poses_forward (P, 3), region_box (((3,), (3,)), m), split (P,),
+    size (int, int), view (3,).
     """
     heads = np.asarray(poses_positions, dtype=np.float64).reshape(-1, 3)
     looks = np.asarray(poses_forward, dtype=np.float64).reshape(-1, 3)

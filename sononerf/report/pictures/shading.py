@@ -27,9 +27,7 @@ AMBIENT = 0.27
 class Camera:
     """A parallel projection.
 
-    Args:
-        axes (3, 3): Rows: towards the camera, to the right, upwards; orthonormal.
-        centre ((3,), m): Point in the middle of the picture.
+    In: axes (3, 3), centre ((3,), m).
     """
 
     axes: Floats
@@ -97,12 +95,8 @@ def draw_mesh(
 ) -> Floats:
     """Draw a mesh over pixels, in place.
 
-    Args:
-        pixels (H, W, 3): Colours in 0 to 1.
-        colour ((3,) or (V, 3)): Colour in 0 to 1, one for all or one per vertex.
-
-    Returns:
-        nearness ((H, W), m): Nearness of the drawn surface; minus infinity where nothing was.
+    In: pixels (H, W, 3), colour ((3,) or (V, 3)). Out: nearness ((H, W), m), minus infinity where
+    nothing is drawn.
     """
     height, width = pixels.shape[:2]
     local = (np.asarray(mesh.vertices) - camera.centre) @ camera.axes.T

@@ -39,11 +39,8 @@ def spectrogram_picture(
 ) -> bytes:
     """Draw one pose's spectrograms, one row per receiver, of eight at most.
 
-    Args:
-        measured_db, predicted_db ((E, R, F) or None, dB): 0 dB is silence; where one is None, the
-            other is drawn alone.
-        range_m ((R,), m): Range axis, ascending; drawn only around what sounds.
-        frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
+    In: measured_db, predicted_db ((E, R, F) or None, dB), range_m ((R,), m), frequency_hz ((F,),
+    Hz).
     """
     given = (measured_db, predicted_db, range_m, frequency_hz)
     with _drawn(*given, title, 130) as drawn:
@@ -76,10 +73,7 @@ def quick_image(
     A row per receiver, of four at most; a column per kind of level, and of two the second minus the
     first; of the axes the ends alone.
 
-    Args:
-        levels_db ((E, R, F), dB): By their names; 0 dB is silence.
-        range_m ((R,), m): Range axis, ascending.
-        frequency_hz ((F,), Hz): Frequency axis, ascending; drawn in kHz.
+    In: levels_db ((E, R, F), dB), range_m ((R,), m), frequency_hz ((F,), Hz).
     """
     from matplotlib import colormaps
     from PIL import Image, ImageDraw, ImageFont
@@ -260,12 +254,8 @@ def pings_png(
 ) -> bytes:
     """Draw the first pings of an import, so that a wrong convention can be seen.
 
-    Args:
-        waveforms (sequence of (E, S) float): From the emission on.
-        spectrograms (sequence of (E, R, F) float): Linear magnitude.
-        sampling_rate (Hz): Sampling rate of the waveforms.
-        range_m ((R,), m): Ascending.
-        frequency_hz ((F,), Hz): Ascending.
+    In: waveforms (sequence of (E, S) float), spectrograms (sequence of (E, R, F) float),
+    sampling_rate (Hz), range_m ((R,), m), frequency_hz ((F,), Hz).
     """
     rows = len(labels)
     with figure(10.5, 3.4 + 2.2 * rows, 100, layout="constrained") as drawn:

@@ -113,13 +113,7 @@ def below(state: dict[str, Tensor], name: str) -> dict[str, Tensor]:
 def planned(
     starts: Mapping[StartMethod, float], *, flat: bool = False
 ) -> list[tuple[StartMethod, Way]]:
-    """Return the start and the way of each candidate.
-
-    Returns:
-        plans: ``fuller`` and the best of the others go both ways, ``levels`` is not blurred beside
-            ``fuller``, and a sheet has its own way. What is flat has edges, which blur would wear
-            away: nothing is blurred then.
-    """
+    """Return the start and the way of each candidate."""
     others = [name for name in starts if name not in (*LEVELS, "sheet")]
     chosen: list[StartMethod] = [name for name in LEVELS if name in starts]
     chosen += sorted(others, key=lambda name: starts[name])[:1]

@@ -33,8 +33,7 @@ from sononerf.surface.refine.still_surface import StillSurface
 class Correction:
     """Simulated and rendered echoes of one surface, for some poses.
 
-    Args:
-        numbers (N,): Numbers of the poses.
+    In: numbers (N,).
     """
 
     def __init__(
@@ -64,8 +63,7 @@ class Correction:
     def magnitudes(self, numbers: list[int], heard: Heard) -> tuple[Tensor, Tensor]:
         """Return simulated and rendered echoes of the surface.
 
-        Returns:
-            simulated, rendered ((P, E, W, F) float32): Linear; zero beyond the axis.
+        Out: simulated, rendered ((P, E, W, F) float32).
         """
         for number in numbers:
             if number not in self._kept:

@@ -52,10 +52,7 @@ NEAR = 0.5
 class Descent:
     """Preconditioned descent on one connectivity.
 
-    Args:
-        smoothing (m): Length over which steps are smoothed.
-        rate: Length of the first steps over the smoothing length; it bounds the tilt of the
-            surface.
+    In: smoothing (m).
     """
 
     def __init__(
@@ -103,8 +100,7 @@ class Descent:
     def step(self, number: int, part: float) -> float:
         """Do one step.
 
-        Returns:
-            mismatch (dB): Mean over the poses, before the step.
+        Out: mismatch (dB).
         """
         normals = unit(self.operators.areas(self.vertices))
         gradient, error = self._gradient(number, normals)
@@ -134,9 +130,7 @@ class Descent:
     def render(self, numbers: list[int]) -> tuple[Heard | None, Tensor, Tensor]:
         """Render poses of the present surface.
 
-        Returns:
-            points, areas ((V, 3) float32): Leaves of the gradients, relative to the middle of the
-                surface.
+        Out: points, areas ((V, 3) float32).
         """
         area = self.operators.areas(self.vertices)
         bending = self.operators.bending(self.vertices, unit(area), self.passes)
@@ -207,8 +201,7 @@ _AROUND = 16  # number of vertices among which the opposite one is searched for
 class Sides:
     """Opposite vertices of a sheet; those of the rim have no partner.
 
-    Args:
-        least (m): Thickness that is kept.
+    In: least (m).
     """
 
     def __init__(self, mesh: trimesh.Trimesh, least: float) -> None:
@@ -223,9 +216,7 @@ class Sides:
     def apart(self, vertices: Tensor, normals: Tensor) -> Tensor:
         """Return the vertices (V, 3), moved outward where the sides are too close.
 
-        Args:
-            vertices ((V, 3), m): Present places.
-            normals (V, 3): Outward unit vectors.
+        In: vertices ((V, 3), m), normals (V, 3).
         """
         one, other = (part.to(vertices.device) for part in (self._vertex, self._other))
         gap = ((vertices[one] - vertices[other]) * normals[one]).sum(1, keepdim=True)

@@ -31,11 +31,7 @@ casting, less than anything that is heard."""
 class Edges:
     """Edges of a mesh between faces on different planes.
 
-    Args:
-        faces (T, 3): Triangles.
-        plane (T,): Number of the plane that each triangle lies on.
-        adjacency (K, 2): Neighbouring triangles, each pair once.
-        ends (K, 2): The vertices that they share.
+    In: faces (T, 3), plane (T,), adjacency (K, 2), ends (K, 2).
 
     Attributes:
         ends (K', 2): Vertices of the edges; the first plane lies to their left.
@@ -57,9 +53,7 @@ class Edges:
 
         Those count that are convex and sharper than a crease, as in the simulator.
 
-        Args:
-            vertices ((V, 3) float64, m): Gradients run to them,
-            normals ((K', 2, 3) float64): and to the outward unit normals of both sides.
+        In: vertices ((V, 3) float64, m), normals ((K', 2, 3) float64).
         """
         places, upright = (part.detach().cpu().numpy() for part in (vertices, normals))
         first, second = upright[:, 0], upright[:, 1]

@@ -52,9 +52,7 @@ class Arrivals:
 class FilterBank:
     """Filters of one call and analysis, computed at the first use of a length.
 
-    Args:
-        nodes ((N,), Hz): Nodes of the synthesis: odd multiples of half their spacing.
-        soft (Hz): Frequency below which the fade of smooth surfaces falls no further.
+    In: nodes ((N,), Hz), soft (Hz).
 
     Attributes:
         kept_nodes (N',): Indices of the nodes that the analysed band needs.
@@ -77,8 +75,7 @@ class FilterBank:
     def power(self, arrivals: Mapping[Source, Arrivals], *, receivers: int, frames: int) -> Tensor:
         """Power of echoes in each frame and row.
 
-        Returns:
-            power ((receivers, frames, F) float32): Gradients run to strength, time and weight.
+        Out: power ((receivers, frames, F) float32).
         """
         length = frames * self.analysis.hop * self.finer
         spectra = []

@@ -25,8 +25,7 @@ reach it."""
 class MeshOperators:
     """Operators of one connectivity, on the device of its tensors.
 
-    Args:
-        faces (T, 3): Triangles.
+    In: faces (T, 3).
 
     Attributes:
         faces (T, 3): Triangles.
@@ -78,12 +77,7 @@ class MeshOperators:
 
         On an even mesh of edge h it smooths over the length :math:`h \sqrt{1.5 \lambda}`.
 
-        Args:
-            values (V, K): Per vertex.
-            strength (1): :math:`\lambda`.
-
-        Returns:
-            smoothed (V, K): By conjugate gradients.
+        In: values (V, K), strength (1). Out: smoothed (V, K).
         """
         diagonal = 1.0 + strength * self.degree[:, None]
 
@@ -118,12 +112,7 @@ class MeshOperators:
     def bending(self, vertices: Tensor, normals: Tensor, passes: int) -> Tensor:
         """Curvature tensors, 1/m, positive where the surface is convex.
 
-        Args:
-            vertices, normals (V, 3): Places (m) and outward unit normals.
-
-        Returns:
-            bending ((V, 6), 1/m): Components xx, yy, zz, xy, xz, yz of the symmetric tensor that
-                gives the change of the normal along a way on the surface.
+        In: vertices, normals (V, 3). Out: bending ((V, 6), 1/m).
         """
         a, b, c = vertices[self.faces].unbind(1)
         na, nb, nc = normals[self.faces].unbind(1)

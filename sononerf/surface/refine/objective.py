@@ -77,10 +77,7 @@ class Level:
 def measured(echoes: Echoes, numbers: list[int], heard: Heard) -> tuple[Tensor, Tensor, Tensor]:
     """Return the measurement of poses on the rendered rows.
 
-    Returns:
-        magnitude ((P, E, W, F) float32): Zero beyond the axis.
-        inside (P, 1, W, 1): Rows on the axis.
-        loudest ((P,) float32): Loudest level of each whole pose.
+    Out: magnitude ((P, E, W, F) float32), inside (P, 1, W, 1), loudest ((P,) float32).
     """
     wholes = [echoes.magnitude(number) for number in numbers]
     width, count = heard.power.shape[2], wholes[0].shape[1]
@@ -107,15 +104,8 @@ def differences(
 ) -> tuple[Tensor, Tensor]:
     """Return the measured levels less the rendered ones, by cells.
 
-    Args:
-        later ((P, E, W, F) float32): Power of the later bounces.
-        corrected (simulated, rendered, both (P, E, W, F) float32): Echoes of a surface nearby:
-            their difference in decibels is added to what is rendered. Cells count less, the larger
-            it is; the frequencies' weights are not needed then.
-
-    Returns:
-        difference ((P, E, W, F) float32, reported dB): Gradients flow through it.
-        weight (P, E, W, F): Weights of the active cells; those of a pose add up to 1.
+    In: later ((P, E, W, F) float32), corrected (simulated, rendered, both (P, E, W, F) float32).
+    Out: difference ((P, E, W, F) float32, reported dB), weight (P, E, W, F).
     """
     magnitude, inside, loudest = found
     power = heard.power if later is None else heard.power + later
@@ -187,13 +177,8 @@ def _learn(
 def on_rows(wholes: list[Tensor], row: Tensor, like: Tensor) -> Tensor:
     """Return range slices of whole spectrograms, from given first rows on.
 
-    Args:
-        wholes (list of (E, R, F) float32): One per pose.
-        row (P,): First row of each pose; may lie before the axis.
-        like ((P, E, W, F) Tensor): A tensor with the wanted width and device.
-
-    Returns:
-        parts ((P, E, W, F) float32): Zero beyond the axis.
+    In: wholes (list of (E, R, F) float32), row (P,), like ((P, E, W, F) Tensor). Out: parts ((P, E,
+    W, F) float32).
     """
     width = like.shape[2]
     parts = []
@@ -222,8 +207,7 @@ class OnsetRanges:
 
     Up to ``SCALE`` the misfit is quadratic, beyond it is linear (Huber's loss).
 
-    Args:
-        resolution (m): Range resolution of the analysis.
+    In: resolution (m).
     """
 
     def __init__(self, hull: EchoHull, resolution: float, seed: int) -> None:
@@ -255,9 +239,7 @@ class OnsetRanges:
     def misfit(self, vertices: Tensor, late: float = 0.0) -> float:
         """Return the mean Huber loss of the least range; no unit; 0 without onsets.
 
-        Args:
-            vertices ((V, 3), m): Places on the surface.
-            late (m): Range by which all onsets may come late, at most.
+        In: vertices ((V, 3), m), late (m).
         """
         if not len(self):
             return 0.0

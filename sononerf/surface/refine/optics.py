@@ -195,16 +195,8 @@ class Optics(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """Return which pieces send sound towards an ear, and their attenuation.
 
-        Args:
-            points, area (..., 3): Places (m) and vector areas (m²).
-            bending ((..., 6), 1/m): Bending of the smooth surface.
-            emitters, ears ((..., 3), m): Places of emitters and ears.
-
-        Returns:
-            facing (...,): Both are above the surface.
-            spread, detour, path, exponent (...,): Variance of the path's length (m²), detour (m),
-                path (m), and what fade and spread together have as exponent at the lowest analysed
-                frequency.
+        In: points, area (..., 3), bending ((..., 6), 1/m), emitters, ears ((..., 3), m). Out:
+        facing (...,), spread, detour, path, exponent (...,).
         """
         size = area.norm(dim=-1)
         normal = area / size.clamp_min(1e-18)[..., None]  # squares of less are zero in float32
@@ -275,10 +267,8 @@ class Optics(nn.Module):
     ) -> Pieces:
         """Return pieces with their weights: all factors of the sum but path, obliquity and area.
 
-        Args:
-            points, area, bending ((V, 3), (V, 3), (V, 6) float32): The surface.
-            pose, vertex (Q,): Way of a pose, and the vertex that it hears.
-            visible ((Q, E) float32): Visibility from emitter and ear, 0 to 1.
+        In: points, area, bending ((V, 3), (V, 3), (V, 6) float32), pose, vertex (Q,), visible ((Q,
+        E) float32).
         """
         emitters, ears = heads.emitters, heads.ears
         place, normal, bent = points[vertex], area[vertex], bending[vertex]
@@ -368,10 +358,7 @@ class Optics(nn.Module):
     ) -> Tensor:
         """Power (P, E, W, F) of single echoes, on the rows of others.
 
-        Args:
-            pose, ear (N,): Indices of pose and ear.
-            delay ((N,), s): From the emission.
-            weight ((N, N') float32): At the nodes.
+        In: pose, ear (N,), delay ((N,), s), weight ((N, N') float32).
         """
         poses, _, frames, _ = like.power.shape
         start = ((like.row + self._first) * self.analysis.hop).to(delay.dtype)

@@ -90,9 +90,7 @@ class Patches:
 def patches_of(mesh: trimesh.Trimesh, part: Ints, tolerance: float, *, bent: bool) -> Patches:
     """Return the patches of parts; what is far off them, such as a rounded edge, counts little.
 
-    Args:
-        part (T,): Number of each triangle's part.
-        tolerance (m): Distance at which a triangle has half the weight.
+    In: part (T,), tolerance (m).
     """
     normal, offset = planes_of(mesh, part, tolerance)
     count, area = len(normal), np.asarray(mesh.area_faces)
@@ -118,10 +116,7 @@ def on_patches(
 ) -> trimesh.Trimesh:
     """Return a mesh with each part on its patch, and sharp edges where patches meet.
 
-    Args:
-        part (T,): Number of each triangle's patch.
-        home ((V, 3), m): Places from which vertices go no farther than
-        far (m): this; where patches are nearly parallel they meet anywhere.
+    In: part (T,), home ((V, 3), m), far (m).
     """
     vertex, patch = members(np.asarray(mesh.faces), part)
     count = len(mesh.vertices)
@@ -164,13 +159,7 @@ def on_patches(
 def motions(vertices: Floats, faces: Ints, part: Ints, patches: Patches, terms: int) -> csr_array:
     """Return how the vertices move with the numbers of their patches.
 
-    Args:
-        vertices ((V, 3), m): On their patches.
-        faces (T, 3): Triangles.
-        part (T,): Numbers of their patches.
-
-    Returns:
-        motion (3 V, K N): Motions of the vertices, m, by one metre of each number.
+    In: vertices ((V, 3), m), faces (T, 3), part (T,). Out: motion (3 V, K N).
     """
     vertex, patch = members(faces, part)
     upright = patches.normals(patch, vertices[vertex])

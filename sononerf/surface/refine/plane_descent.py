@@ -53,8 +53,7 @@ def flattened(
 ) -> tuple[trimesh.Trimesh, Ints, Patches]:
     """Return a mesh with its parts on patches, the part of each triangle (T,), and the patches.
 
-    Args:
-        wavelength (m): The shortest.
+    In: wavelength (m).
     """
     tolerance = TOLERANCE * wavelength
     part = flat_parts(mesh, tolerance, (LEAST * wavelength) ** 2)
@@ -150,8 +149,7 @@ class PlaneDescent:
     def render(self, numbers: list[int], vertices: Tensor) -> Heard | None:
         """Render poses; None where none of them hears anything.
 
-        Args:
-            vertices ((V, 3) float64, m): Present places; gradients run to them.
+        In: vertices ((V, 3) float64, m).
         """
         positions, rotations = (
             torch.as_tensor(part[numbers]).to(vertices)
@@ -178,9 +176,7 @@ class PlaneDescent:
     def _at_edges(self, vertices: Tensor, means: Tensor) -> Tensor:
         """Return the normals (K, 2, 3) of the patches that meet at edges.
 
-        Args:
-            vertices ((V, 3), m): Present places.
-            means (N, 3): Mean normals of the patches; gradients run to them.
+        In: vertices ((V, 3), m), means (N, 3).
         """
         middle = vertices.detach().cpu().numpy()[self.edges.ends].mean(axis=1)
         patches = self.patches

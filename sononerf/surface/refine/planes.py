@@ -32,9 +32,7 @@ SWEEPS = 15
 def flat_parts(mesh: trimesh.Trimesh, tolerance: float, least: float) -> Ints:
     """Return the number of the flat part (T,) that each triangle belongs to.
 
-    Args:
-        tolerance (m): Standard deviation of a part from its plane, at most.
-        least (m²): Parts with a smaller area are given to their neighbours.
+    In: tolerance (m), least (m²).
     """
     corners = np.asarray(mesh.triangles, dtype=np.float64)
     pairs = np.asarray(mesh.face_adjacency, dtype=np.int64)
@@ -55,13 +53,7 @@ def flat_parts(mesh: trimesh.Trimesh, tolerance: float, least: float) -> Ints:
 def planes_of(mesh: trimesh.Trimesh, part: Ints, tolerance: float) -> tuple[Floats, Floats]:
     """Return the planes of parts; what is far off them, such as a rounded edge, counts little.
 
-    Args:
-        part (T,): Number of each triangle's part.
-        tolerance (m): Distance from the plane at which a triangle has half the weight.
-
-    Returns:
-        normal (N, 3): Outward unit normals.
-        offset ((N,), m): Distances of the planes from the origin along them.
+    In: part (T,), tolerance (m). Out: normal (N, 3), offset ((N,), m).
     """
     middle, area = np.asarray(mesh.triangles_center), np.asarray(mesh.area_faces)
     upright = np.asarray(mesh.face_normals)

@@ -65,18 +65,6 @@ Saved = MutableMapping[str, dict[str, Tensor]]
 class Refinement:
     """Moves start surfaces until physical optics, corrected by the simulator, gives the echoes.
 
-    Args:
-        meshes: Start surfaces, m.
-        echoes: Measured spectrograms and onsets; the surface must begin at the onsets. If their
-            level is absolute, gains are learned in the last stage alone: a rough surface is too
-            faint, and a gain would hide that. Otherwise gains are learned from the first stage on.
-        optics: The head; its device is that of the computation.
-        simulate: Makes the simulator of a surface, for the stages that are corrected by it.
-        seed: Seed of the order of poses and of traced rays.
-        saved: Stages that are done, which are not done again; each finished one is added.
-        after_step: Called with a number of finished steps and the mismatch of the last one, dB.
-        after_stage: Called with the surface of a finished stage and its objective, dB.
-
     Attributes:
         candidates: All of them; after the first stage, those that go on.
         history: As in :class:`Refined`, so far.

@@ -45,10 +45,7 @@ def remesh(
 ) -> trimesh.Trimesh | None:
     """Return a surface with even triangles.
 
-    Args:
-        edge (m): Mean length of the edges.
-        blur (m): Standard deviation of a Gaussian over the signed distance; it removes dents, bumps
-            and necks of this size.
+    In: edge (m), blur (m).
     """
     if not mesh.is_watertight or not len(mesh.faces):
         return None
@@ -101,14 +98,7 @@ def finer(
     Each triangle becomes four. The middle of an edge is put where a curve runs that is square to
     the normals at both ends [1]_.
 
-    Args:
-        values (V, ...): Per vertex; new ones get the mean of both ends.
-        wavelength (m): The shortest.
-
-    Returns:
-        finer: The mesh itself where its edges' middles lie deep by less than :data:`CHORD` on
-            average.
-        values (V', ...): Values of its vertices.
+    In: values (V, ...), wavelength (m). Out: values (V', ...).
 
     References:
         .. [1] A. Vlachos et al., "Curved PN triangles", I3D 2001.
@@ -141,13 +131,7 @@ def signed_distance(
 ) -> tuple[Floats, Singles]:
     """Signed distance near closed bodies on a lattice, positive outside of all of them.
 
-    Args:
-        spacing (m): Spacing of the lattice.
-
-    Returns:
-        lower ((3,), m): The lattice's first place.
-        distance ((X, Y, Z) float32, m): Exact near the surface, elsewhere no more than the width of
-            the band.
+    In: spacing (m). Out: lower ((3,), m), distance ((X, Y, Z) float32, m).
     """
     bounds = np.asarray(mesh.bounds)
     lower = bounds[0] - margin * spacing
@@ -194,8 +178,7 @@ def _of_body(
 def distance_from(mesh: trimesh.Trimesh, places: Floats, spacing: float) -> Floats:
     """Return the distance (N,), m, of places (N, 3), m, from a mesh.
 
-    Args:
-        spacing (m): Distances of much less than this are less exact.
+    In: spacing (m).
     """
     return np.abs(_heights(places, *_samples(mesh, 0.5 * spacing), spacing))
 

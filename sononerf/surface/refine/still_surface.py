@@ -40,8 +40,7 @@ class StillSurface:
     def listen(self, positions: Floats, rotations: Floats) -> tuple[Pieces, Heads, Tensor]:
         """Return the pieces that poses hear, see :func:`~.visibility.listen`.
 
-        Args:
-            positions, rotations ((P, 3), (P, 3, 3)): Places (m) and rotations of the heads.
+        In: positions, rotations ((P, 3), (P, 3, 3)).
         """
         places, turns = (torch.as_tensor(part).to(self.vertices) for part in (positions, rotations))
         return listen(self.optics, *self._parts, places, turns)
@@ -56,8 +55,7 @@ class StillSurface:
     ) -> Singles:
         """Return magnitudes on the whole axis, (P, E, R, F).
 
-        Args:
-            positions, rotations ((P, 3), (P, 3, 3)): Places (m) and rotations of the heads.
+        In: positions, rotations ((P, 3), (P, 3, 3)).
         """
         optics = self.optics
         shape = (len(positions), optics.ears, optics.rows, len(optics.frequencies))

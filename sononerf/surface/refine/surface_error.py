@@ -110,12 +110,7 @@ def surface_error(
     validation_db: float,
     seed: int,
 ) -> SurfaceError:
-    """Return the error of a surface.
-
-    Args:
-        validation_db: Objective of the surface on validation poses, see
-            :class:`~sononerf.surface.refine.comparison.Comparison`.
-    """
+    """Return the error of a surface."""
     bumps, wavelength = Bumps(mesh, optics), optics.wavelength
     misfit = Misfit(bumps, echoes, seed)
     points = bumps.vertices.cpu().numpy()
@@ -135,9 +130,7 @@ def surface_error(
 def error_from_twice(error: float, wavelength: float) -> float:
     """Return the error that a surface would have from twice as many poses, m.
 
-    Args:
-        error (m): Median error of its vertices that were heard.
-        wavelength (m): The shortest.
+    In: error (m), wavelength (m).
     """
     at_one, slope = TWICE
     return error * min(1.0, math.exp(at_one + slope * math.log(error / wavelength)))
@@ -173,12 +166,7 @@ class Bumps:
     def render(self, positions: Floats, rotations: Floats) -> tuple[Heard | None, Tensor]:
         """Render poses.
 
-        Args:
-            positions, rotations ((P, 3), (P, 3, 3)): Poses.
-
-        Returns:
-            moves ((P, B) float64): Heights of the bumps, 0 m, one row for each pose; gradients
-                flow to them.
+        In: positions, rotations ((P, 3), (P, 3, 3)). Out: moves ((P, B) float64).
         """
         moves = torch.zeros(len(positions), len(self.centres), dtype=torch.float64)
         moves = moves.to(self.vertices).requires_grad_(True)
@@ -238,8 +226,7 @@ class Misfit:
     def of_poses(self, positions: Floats, rotations: Floats) -> Floats:
         """Return the curvature that poses would add if they heard the surface, (P, B).
 
-        Args:
-            positions, rotations ((P, 3), (P, 3, 3)): A few poses, such as ``POSES``.
+        In: positions, rotations ((P, 3), (P, 3, 3)).
         """
         heard, moves = self.bumps.render(positions, rotations)
         if heard is None:

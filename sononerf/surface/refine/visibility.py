@@ -21,9 +21,7 @@ it."""
 def seen(sight: Occlusion, points: Floats, target: Floats, *, free: float) -> Bools:
     """Return which points (N, 3) on the surface are seen from targets (N, 3), m.
 
-    Args:
-        points, target ((N, 3), m): World frame.
-        free (m): Length of the way, from the point on, that cannot be blocked.
+    In: points, target ((N, 3), m), free (m).
     """
     span = target - points
     distance = np.sqrt(np.einsum("nd,nd->n", span, span))[:, None]
@@ -34,9 +32,7 @@ def seen(sight: Occlusion, points: Floats, target: Floats, *, free: float) -> Bo
 def sight_of(optics: Optics, vertices: Floats, faces: Ints) -> Occlusion:
     """Return the search structure of a surface, on a support with its image.
 
-    Args:
-        vertices ((V, 3), m): Vertices of the surface.
-        faces (T, 3): Its triangles.
+    In: vertices ((V, 3), m), faces (T, 3).
     """
     if optics.plane is None:
         return Occlusion(vertices, faces)
@@ -56,15 +52,8 @@ def listen(
 ) -> tuple[Pieces, Heads, Tensor]:
     """Return the pieces of a surface that poses hear.
 
-    Args:
-        vertices, area, bending ((V, 3), (V, 3), (V, 6) float64): Places, vector areas and
-            curvature.
-        sight: Search structure of the same surface, or of one a little earlier; see
-            :func:`sight_of`.
-        positions, rotations ((P, 3), (P, 3, 3) float64): Places and rotations of the heads.
-
-    Returns:
-        middle ((3,), m): To be taken off the vertices before they are rendered.
+    In: vertices, area, bending ((V, 3), (V, 3), (V, 6) float64), positions, rotations ((P, 3), (P,
+    3, 3) float64). Out: middle ((3,), m).
     """
     middle = 0.5 * (vertices.amin(0) + vertices.amax(0))
     far = optics.heads(positions, rotations)

@@ -68,10 +68,7 @@ def locate_sound(
 ) -> Evidence:
     """Return the places from which poses hear a field, as points at the ranges of its sound.
 
-    Args:
-        places ((N, 3), m): Places that are not silent.
-        sources ((P, 3), m): Half way between emitter and ears of each pose.
-        resolution (m): Range resolution; points of one pose in one cube of this side become one.
+    In: places ((N, 3), m), sources ((P, 3), m), resolution (m).
     """
     bands = torch.arange(_BANDS, device=places.device) * (len(field.frequency) - 1) // (_BANDS - 1)
     where = places.cpu().double().numpy()
@@ -153,14 +150,8 @@ def signed_distance(
 ) -> Singles:
     """Return the signed distance, positive outside.
 
-    Args:
-        weight (X, Y, Z): Weight of the targets, from 0 to 1.
-        target ((X, Y, Z), voxels): Signed distance by the evidence.
-        bound ((X, Y, Z), voxels): Lower bound of the distance.
-        empty (X, Y, Z): Weight with which a place is outside.
-
-    Returns:
-        distance: (X, Y, Z), voxels.
+    In: weight (X, Y, Z), target ((X, Y, Z), voxels), bound ((X, Y, Z), voxels), empty (X, Y, Z).
+    Out: (X, Y, Z).
     """
     if min(weight.shape) >= 2 * _COARSEST:
         coarse = _halved(weight)
@@ -251,8 +242,7 @@ def reliability(evidence: Evidence, hull: EchoHull, resolution: float) -> Floats
     point nearest to it. Later bounces and results of interference appear at other places for each
     pose.
 
-    Args:
-        resolution (m): Range resolution.
+    In: resolution (m).
     """
     if not len(evidence.points):
         return np.zeros(0)
@@ -307,11 +297,7 @@ def poses_that_heard(
     A pose counts where a point of its evidence lies within two range resolutions of the vertex,
     looks the same way within 60 degrees, and lies on one smooth surface with it.
 
-    Args:
-        resolution (m): Range resolution.
-
-    Returns:
-        poses: (V,) int32.
+    In: resolution (m). Out: (V,).
     """
     counts = np.zeros(len(mesh.vertices), np.int32)
     if not len(evidence.points):

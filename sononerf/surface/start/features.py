@@ -60,18 +60,10 @@ def pooled(
     place is at the onset, and that times a; whether it lies in free space; a times the tilt of the
     spectrum; and 1.
 
-    Args:
-        places ((N, 3), m): World frame.
-        emitters, receivers ((P, 3), (P, E, 3), m): World frame.
-        onsets ((P, E), m): Ranges; minus infinity without an onset.
-        table (P, E, R, 4): From :meth:`RangeLevels.table`.
-        first, spacing, resolution (m): As in :class:`RangeLevels`.
-
-    Returns:
-        means (N, KINDS, HARMONICS): Mean over all pairs of the quantities times the harmonics of
-            the direction to the middle between emitter and ear.
-        behind ((N, 4), m): The least distances behind onsets, in order.
-        direction (N, 3): Direction of the pair with the least one.
+    In: places ((N, 3), m), emitters, receivers ((P, 3), (P, E, 3), m), onsets ((P, E), m), minus
+    infinity without an onset, table
+    (P, E, R, 4), first, spacing, resolution (m). Out: means (N, KINDS, HARMONICS), behind ((N, 4),
+    m), direction (N, 3).
     """
     f32 = np.float32
     means = np.zeros((len(places), KINDS, HARMONICS), f32)
@@ -164,9 +156,7 @@ class PlaceFeatures:
     def turned(self, order: tuple[int, ...], signs: tuple[int, ...]) -> tuple[Singles, Singles]:
         """Return the input of the network in a turned or mirrored frame.
 
-        Returns:
-            features (FEATURES, X, Y, Z): No unit.
-            bound ((X, Y, Z), voxels): Distance in front of all onsets but one.
+        Out: features (FEATURES, X, Y, Z), bound ((X, Y, Z), voxels).
         """
         back = tuple(axis for axis, sign in enumerate(signs) if sign < 0)
 
@@ -216,9 +206,7 @@ def features_of(
 ) -> PlaceFeatures:
     """Return the features of the places of a lattice, each of which stands for 2 x 2 x 2 voxels.
 
-    Args:
-        some (N,): Poses of the levels that are used.
-        free (X, Y, Z): Places well in front of the onsets, from :func:`free_places`.
+    In: some (N,), free (X, Y, Z).
     """
     spacing, unit = lattice.spacing, 4 * lattice.spacing
     half = halved(lattice)

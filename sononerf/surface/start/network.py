@@ -79,9 +79,7 @@ _ROOM = 1.0  # distance in front of the onsets that the lattice covers, steps of
 def lattice_of(hull: EchoHull, box: Floats, resolution: float) -> Lattice | None:
     """Return the lattice over all places that the onsets leave; None if they leave none.
 
-    Args:
-        box ((2, 3), m): Lower and upper corner of the region.
-        resolution (m): Range resolution.
+    In: box ((2, 3), m), resolution (m).
     """
     step = max(resolution, float(np.prod(box[1] - box[0]) / LARGEST) ** (1 / 3))
     coarse = Lattice.over(box[0], box[1], step)
@@ -137,9 +135,7 @@ class StartNetwork(nn.Module):
     def forward(self, features: Tensor, bound: Tensor) -> Tensor:
         """Return the signed distance, voxels, positive outside, (B, 2X, 2Y, 2Z).
 
-        Args:
-            features (B, FEATURES, X, Y, Z): All sides are multiples of 8.
-            bound ((B, X, Y, Z), voxels): Distance in front of the onsets.
+        In: features (B, FEATURES, X, Y, Z), bound ((B, X, Y, Z), voxels).
         """
         batch, _, x, y, z = features.shape
         values = self.enter(features.contiguous(memory_format=torch.channels_last_3d))
@@ -173,8 +169,7 @@ def expected_level(distance: Singles) -> float:
     A wire whose place is known less exactly than it is thick is nowhere likelier than air, so that
     the level 0 would lose it.
 
-    Args:
-        distance ((X, Y, Z), voxels): Signed distance; some of it is below ``SURE``.
+    In: distance ((X, Y, Z), voxels).
     """
     near = distance[distance < SURE].astype(np.float64)
     expected = int((1 / (1 + np.exp(near / LOGIT))).sum())
@@ -217,9 +212,7 @@ def levels_surfaces(
 ) -> tuple[trimesh.Trimesh, trimesh.Trimesh]:
     """Return the closed surface of the body by the network, and a fuller one, m, normals outward.
 
-    Args:
-        box ((2, 3), m): Region that holds the body.
-        resolution (m): Range resolution.
+    In: box ((2, 3), m), resolution (m).
     """
     if levels is None:
         raise NumericalError("the start levels needs the echoes; their free space is not enough")

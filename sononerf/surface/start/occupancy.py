@@ -45,12 +45,7 @@ def thinness(lattice: Lattice, points: Floats, normals: Floats, weight: Floats) 
     At such places the blurred normals are short relative to the blurred weights, or are reversed
     behind a point. In a narrow gap they are reversed in front of it.
 
-    Args:
-        points, normals (G, 3): Oriented points, m and unit vectors.
-        weight (G,): Their weights.
-
-    Returns:
-        thin: (X, Y, Z).
+    In: points, normals (G, 3), weight (G,). Out: (X, Y, Z).
     """
     if not len(points):
         return np.zeros(lattice.shape, np.float32)
@@ -78,14 +73,7 @@ def planes(
 ) -> tuple[Singles, Singles]:
     """Return the weight of the evidence at voxels near points, and their distance to its planes.
 
-    Args:
-        points, normals (G, 3): Oriented points, m and unit vectors.
-        weight (G,): Their weights.
-
-    Returns:
-        known (X, Y, Z): From 0 to 1.
-        target ((X, Y, Z), voxels): Mean distance to the planes of the points around, positive on
-            the side of the normals.
+    In: points, normals (G, 3), weight (G,). Out: known (X, Y, Z), target ((X, Y, Z), voxels).
     """
     size = int(np.prod(lattice.shape))
     total, moment = np.zeros(size), np.zeros(size)
@@ -109,14 +97,8 @@ def planes(
 def winding_of(lattice: Lattice, points: Floats, normals: Floats, weight: Floats) -> Singles:
     """Return the winding number of oriented points; each part of the surface counts once.
 
-    Args:
-        points, normals (G, 3): Oriented points, m and unit vectors; at least one.
-        weight (G,): Their power. It is divided by the power around, so that loud places count no
-            more than others.
-
-    Returns:
-        winding (X, Y, Z): About 1 inside of a body, 0 outside, negative where mostly backs of
-            surfaces are seen.
+    In: points, normals (G, 3), weight (G,). Out: winding (X, Y, Z), about 1 inside of a body, 0
+    outside, negative behind backs.
     """
     around = lattice.spread(points, weight, _LOCAL)
     # A plane of density 1 has this value at its points when it is blurred.
@@ -135,12 +117,7 @@ _AIR = 0.25  # fraction of the longest side, empty on each side: periodic images
 def winding_number(flux: Sequence[Singles]) -> Singles:
     """Return the winding number of a density of surface.
 
-    Args:
-        flux (three (X, Y, Z) float, 1/voxel): Area per volume along outward normals: across a
-            surface it adds up to one.
-
-    Returns:
-        winding (X, Y, Z): Zero far away.
+    In: flux (three (X, Y, Z) float, 1/voxel). Out: winding (X, Y, Z).
     """
     shape = flux[0].shape
     air = 2 * round(_AIR * max(shape))
@@ -231,11 +208,7 @@ def gather_evidence(
 ) -> Gathered:
     """Return the evidence of field and onsets about a region.
 
-    Args:
-        places ((N, 3), m): Places that are not silent.
-        lower, upper ((3,), m): The region.
-        spacing (m): Spacing of the voxels.
-        resolution (m): Range resolution of the analysis.
+    In: places ((N, 3), m), lower, upper ((3,), m), spacing (m), resolution (m).
     """
     evidence = locate_sound(field, places, hull.sources, resolution=resolution)
     evidence = evidence.where(evidence.weight > QUIET)
@@ -321,8 +294,7 @@ def without_hollows(distance: Singles) -> Singles:
 def without_parts(distance: Singles, lattice: Lattice, known: Gathered | None) -> Singles:
     """Leave out parts that the lattice does not resolve and, by the evidence, unheard ones.
 
-    Args:
-        distance ((X, Y, Z), voxels): Signed distance.
+    In: distance ((X, Y, Z), voxels).
     """
     labels, count = ndimage.label(distance < 0)
     if not count:
@@ -357,10 +329,7 @@ _COARSER = 4  # voxels between the places of the first look; only saves time
 def clearance_grid(hull: EchoHull, lattice: Lattice) -> Floats:
     """Return the distance of each voxel behind the onsets, (X, Y, Z) m; exact near zero.
 
-    Returns:
-        clearance ((X, Y, Z), m): Its slope is at most one, so voxels that a coarse pass finds far
-            from zero need no second one. At most the diagonal of the lattice, where there is no
-            evidence.
+    Out: clearance ((X, Y, Z), m).
     """
     far = lattice.spacing * float(np.linalg.norm(lattice.shape))
     coarse = [np.unique(np.append(np.arange(0, n, _COARSER), n - 1)) for n in lattice.shape]

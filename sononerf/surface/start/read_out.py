@@ -89,9 +89,7 @@ def read_field(
 ) -> Reading:
     """Read volume and evidence out of a field.
 
-    Args:
-        resolution (m): Range resolution of the analysis.
-        spacing (m): Voxel size; half of the field's own resolution where None.
+    In: resolution (m), spacing (m).
     """
     lower, upper, step = _grid_of(field, spacing)
     energy = _energy(field, directions)
@@ -102,12 +100,7 @@ def read_field(
 
 
 def read_echoes(echoes: Echoes) -> Reading:
-    """Return what start surfaces are made of where there is no field.
-
-    Args:
-        echoes: Measured echoes; their region is the box that they are known to come from, or else
-            the one that they leave possible.
-    """
+    """Return what start surfaces are made of where there is no field."""
     box = echoes.region.box() if echoes.box is None else echoes.box
     return Reading(echoes.hull, box, echoes.head.resolution, echoes.levels, methods=LEVELS)
 
@@ -155,9 +148,7 @@ def read_isosurface(
 ) -> tuple[trimesh.Trimesh, Volume, float]:
     """Return an iso-surface of a field's loudness, the volume it lies in, and its level.
 
-    Args:
-        smoothing (m): Side of a box over which the volume is averaged first, an odd number of
-            voxels; the published code of the paper takes 9 of 5 mm.
+    In: smoothing (m).
     """
     lower, upper, step = _grid_of(field, spacing)
     loudness = _loudness(field, directions)
@@ -187,8 +178,7 @@ def _grid_of(field: Field, spacing: float | None) -> tuple[Floats, Floats, float
 def energy_volume(field: Field, spacing: float, directions: int) -> Volume:
     """Return the energy of a field on a grid over its region.
 
-    Args:
-        spacing (m): Voxel size.
+    In: spacing (m).
     """
     lower, upper = (corner.cpu().double().numpy() for corner in field.region)
     return volume_from_function(_energy(field, directions), lower, upper, spacing, chunk=_CHUNK)

@@ -24,10 +24,7 @@ BYTES_PER_VOXEL = 80
 class Volume:
     """Values on a regular grid.
 
-    Args:
-        values (X, Y, Z): One value per voxel.
-        origin ((3,), m): Centre of voxel [0, 0, 0], world frame.
-        spacing (m): Distance between the centres of neighbouring voxels, equal on all axes.
+    In: values (X, Y, Z), origin ((3,), m), spacing (m).
     """
 
     values: NDArray[np.floating]
@@ -71,9 +68,7 @@ def _centres(axes: tuple[Floats, ...], start: int, stop: int) -> Floats:
 def grid_over(lower: ArrayLike, upper: ArrayLike, spacing: float) -> Volume:
     """Return a volume of zeros whose voxel centres cover a box, centred on it.
 
-    Args:
-        lower, upper ((3,), m): Opposite corners of the box.
-        spacing (m): Distance between voxel centres.
+    In: lower, upper ((3,), m), spacing (m).
     """
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
     # The small number keeps 0.3 / 0.1 from asking for a fourth interval.
@@ -101,9 +96,7 @@ def volume_from_function(
     A position does not depend on the chunk that it falls into, so that a function of the position
     alone gives the same volume whatever ``chunk`` is.
 
-    Args:
-        lower, upper ((3,), m): Opposite corners of the box.
-        spacing (m): Distance between voxel centres.
+    In: lower, upper ((3,), m), spacing (m).
     """
     volume = grid_over(lower, upper, spacing)
     axes, flat, total = volume.axes(), volume.values.reshape(-1), volume.values.size
