@@ -11,13 +11,12 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from sononerf.shown import show_by
+from sononerf.display import show_by
 from sononerf.version import __version__
 
 if TYPE_CHECKING:
     from sononerf.echoes.echoes import Echoes
-    from sononerf.evaluation.difference import Comparison
-    from sononerf.evaluation.numbers import Evaluation, evaluate
+    from sononerf.evaluation.numbers import Comparison, Evaluation, evaluate
     from sononerf.evaluation.prediction import Prediction, predict
     from sononerf.field.datamodule import EchoDataModule
     from sononerf.field.field import Field
@@ -65,7 +64,7 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Comparison": "evaluation.difference",
+    "Comparison": "evaluation.numbers",
     "EchoDataModule": "field.datamodule",
     "EchoModule": "field.module",
     "Echoes": "echoes.echoes",

@@ -13,8 +13,8 @@ import numpy as np
 import scipy.io
 from numpy.typing import NDArray
 
-from sononerf.array_types import Floats
 from sononerf.errors import InputError
+from sononerf.numerics import Floats
 
 NUMERIC = {"double", "single", "logical", "char"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)

@@ -18,15 +18,12 @@ ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "sononerf"
 
 FLOORS = (
-    ("errors", "array_types", "compiled", "progress", "memory", "executor"),
+    ("errors", "numerics", "progress", "memory", "executor"),
     (
         "version",
         "storage",
-        "locks",
-        "input_files",
         "matlab_files",
-        "shown",
-        "tables",
+        "display",
         "settings",
         "geometry",
     ),

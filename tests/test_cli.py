@@ -27,8 +27,7 @@ import typer
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sononerf import __version__, locks
-from sononerf.callbacks import preview
+from sononerf import __version__, callbacks, storage
 from sononerf.cli import entry, start
 from sononerf.evaluation import baseline
 from sononerf.evaluation import geometry as geometry_module
@@ -362,7 +361,7 @@ def fit_alone(monkeypatch):
     monkeypatch.setattr(
         fit_module, "finish", lambda run, *, accelerator, progress: called.append(run) or {}
     )
-    monkeypatch.setattr(preview.SpectrogramImages, "on_train_epoch_end", lambda *given: None)
+    monkeypatch.setattr(callbacks.SpectrogramImages, "on_train_epoch_end", lambda *given: None)
     return called
 
 
@@ -392,7 +391,11 @@ def test_a_plugins_scene_goes_the_whole_way(plugin, quick, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     listed = {row["name"]: row for row in json.loads(done("scenes", "--json").out)["scenes"]}
     assert listed["fixture_bar"]["distribution"] == "sononerf-fixture"
-    overrides = ["scene.name=fixture_bar", "scene.options={length: 0.05}", "preview.every_epochs=9"]
+    overrides = [
+        "scene.name=fixture_bar",
+        "scene.options={length: 0.05}",
+        "preview.every_epochs=9",
+    ]
     done("fit", SMOKE, *overrides, "--accelerator", "cpu", "--output", "bar")
     metrics = json.loads((tmp_path / "bar" / "metrics.json").read_text())
     assert metrics["geometry"]["chamfer_m"] < 0.01
@@ -605,7 +608,7 @@ def test_a_folder_that_is_no_run(clean):
 
 
 def test_a_folder_in_use(clean):
-    with locks.lock(Path("run")):
+    with storage.lock(Path("run")):
         message = refused(7, "fit", SMOKE, "--output", "run")
         assert "in use by another process" in message
         assert "in use" in refused(7, "fit", SMOKE, "--output", "run", "--overwrite")
@@ -920,14 +923,14 @@ def test_sigterm_stops_a_fit_in_time_and_the_same_command_goes_on(clean, fit_alo
     assert 10 <= stopped < 200
     for noise in ("Traceback", "LeafSpec", "\x1b"):
         assert noise not in err
-    assert not locks.is_held(clean / "run")
+    assert not storage.is_held(clean / "run")
 
     steps = []
 
     def count(self, trainer, pl_module, *rest):
         steps.append(pl_module.global_step)
 
-    monkeypatch.setattr(preview.PreviewCallback, "on_train_batch_end", count)
+    monkeypatch.setattr(callbacks.PreviewCallback, "on_train_batch_end", count)
     done(*arguments)
     assert steps == list(range(stopped + 1, 201))
     assert json.loads((clean / "run" / "metrics.json").read_text())["cost"]["steps"] == 200

@@ -40,7 +40,7 @@ def test_a_compiled_function_calls_compiled_ones_of_its_own_file_alone(name):
 def test_where_no_folder_may_be_written_functions_are_compiled_in_each_process(tmp_path):
     source = tmp_path / "doubling.py"
     source.write_text(
-        "from sononerf.compiled import compiled\n\n\n@compiled\ndef double(x):\n    return 2 * x\n"
+        "from sononerf.numerics import compiled\n\n\n@compiled\ndef double(x):\n    return 2 * x\n"
     )
     nowhere = tmp_path / "file"
     nowhere.touch()

@@ -13,7 +13,7 @@ import pytest
 import sononerf as sn
 from sononerf import testing
 from sononerf.field.fitting import quiet_lightning
-from sononerf.run.new_plugin import TEMPLATES
+from sononerf.run.scenes import TEMPLATES
 
 PAGE = (Path(__file__).resolve().parent.parent / "docs" / "extending.md").read_text()
 FIELD, RENDERER = (

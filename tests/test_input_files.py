@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.input_files import require_regular, require_whole_wav
+from sononerf.storage import require_regular, require_whole_wav
 
 SETTINGS = str(Path(__file__).resolve().parent.parent / "configs" / "smoke.yaml")
 

@@ -9,7 +9,7 @@ import time
 
 import pytest
 
-from sononerf import locks, storage
+from sononerf import storage
 from sononerf.errors import LockedError, StorageError
 
 
@@ -30,18 +30,18 @@ def fork(work):
 
 
 def test_lock_refuses_the_second_until_the_first_is_done(tmp_path):
-    with locks.lock(tmp_path):
-        assert locks.is_held(tmp_path)
-        with pytest.raises(LockedError, match="in use by another process"), locks.lock(tmp_path):
+    with storage.lock(tmp_path):
+        assert storage.is_held(tmp_path)
+        with pytest.raises(LockedError, match="in use by another process"), storage.lock(tmp_path):
             pass
-    assert not locks.is_held(tmp_path)
-    with locks.lock(tmp_path):
+    assert not storage.is_held(tmp_path)
+    with storage.lock(tmp_path):
         pass
 
 
 def test_a_leftover_of_a_dead_process_is_removed(tmp_path):
     (tmp_path / ".metrics.json.999999.tmp").write_text("half")
-    with locks.lock(tmp_path):
+    with storage.lock(tmp_path):
         assert names(tmp_path) == [".lock"]
 
 
@@ -50,20 +50,20 @@ def test_lock_dies_with_its_process(tmp_path):
     ready = tmp_path / "ready"
 
     def hold():
-        with locks.lock(tmp_path):
+        with storage.lock(tmp_path):
             storage.commit_bytes(ready, b"")
             time.sleep(60)
 
     pid = fork(hold)
     while not ready.exists():
         time.sleep(0.005)
-    with pytest.raises(LockedError), locks.lock(tmp_path):
+    with pytest.raises(LockedError), storage.lock(tmp_path):
         pass
-    assert locks.is_held(tmp_path)
+    assert storage.is_held(tmp_path)
     os.kill(pid, signal.SIGKILL)
     os.waitpid(pid, 0)
-    assert not locks.is_held(tmp_path)
-    with locks.lock(tmp_path):
+    assert not storage.is_held(tmp_path)
+    with storage.lock(tmp_path):
         pass
 
 
@@ -74,7 +74,7 @@ def test_of_many_at_once_one_holds_the_lock_at_a_time(tmp_path):
         for _ in range(10):
             while True:
                 try:
-                    with locks.lock(tmp_path):
+                    with storage.lock(tmp_path):
                         descriptor = os.open(tmp_path / "inside", os.O_CREAT | os.O_EXCL)
                         os.close(descriptor)
                         os.unlink(tmp_path / "inside")  # noqa: PTH108
@@ -99,7 +99,7 @@ def test_a_folder_with_links_is_not_held(tmp_path, name, kind):
     (run / name).parent.mkdir(parents=True)
     (run / name).symlink_to(outside)
     with pytest.raises(StorageError, match=f"{name}: .*is a link.*; put the file"):
-        with locks.lock(run):
+        with storage.lock(run):
             pass
     assert outside.exists() == (kind != "nothing")
     assert kind != "file" or outside.read_text() == "precious"
@@ -109,10 +109,10 @@ def test_a_folder_with_links_is_not_held(tmp_path, name, kind):
 def test_a_folder_that_is_a_link_itself_is_held(tmp_path):
     (tmp_path / "disk").mkdir()
     (tmp_path / "run").symlink_to(tmp_path / "disk")
-    with locks.lock(tmp_path / "run"):
+    with storage.lock(tmp_path / "run"):
         assert names(tmp_path / "disk") == [".lock"]
 
 
 def test_a_folder_that_is_missing_is_made_to_be_locked(tmp_path):
-    with locks.lock(tmp_path / "new" / "run"):
-        assert locks.is_held(tmp_path / "new" / "run")
+    with storage.lock(tmp_path / "new" / "run"):
+        assert storage.is_held(tmp_path / "new" / "run")

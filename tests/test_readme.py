@@ -11,7 +11,7 @@ import pytest
 import typer
 
 from sononerf.cli.entry import app
-from sononerf.run.new_plugin import new_plugin
+from sononerf.run.scenes import new_plugin
 from sononerf.settings.loading import load_settings
 from sononerf.settings.plugins import SCENES as GROUP
 from sononerf.settings.plugins import check_options, load, registered

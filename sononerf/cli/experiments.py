@@ -137,7 +137,7 @@ def fit(
 
     folder = output or Path("runs") / _name(settings, config)
     if tensorboard and not follows():
-        from sononerf.callbacks.tensorboard import serve
+        from sononerf.callbacks import serve
 
         say(f"TensorBoard until the end of this command: {serve(folder)}")
     done = RunOnDisk(folder).fit(
@@ -400,7 +400,7 @@ def table(
     ] = None,
 ) -> None:
     """Print the numbers of runs beside one another."""
-    from sononerf.run.table import table as table_of_runs
+    from sononerf.run.compare import table as table_of_runs
 
     for line in table_of_runs(runs, csv=csv):
         typer.echo(line)

@@ -48,7 +48,7 @@ def next_(
     """Propose the poses that would reduce the error of a run's surface most."""
     if within is not None and candidates is not None:
         raise SettingsError("--within and --candidates exclude each other; give one")
-    from sononerf.run.next import propose
+    from sononerf.run.predict import propose
 
     say(f"wrote {propose(run, count, candidates, within or 'sphere', output)}")
 
@@ -109,7 +109,7 @@ def new_plugin(
     """Write a scene, field or renderer of one's own to start from: two files, and their test."""
     import shlex
 
-    from sononerf.run.new_plugin import new_plugin as write
+    from sononerf.run.scenes import new_plugin as write
 
     written = write(kind, name, output)
     for path in written:

@@ -14,23 +14,27 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from sononerf import locks, storage
-from sononerf.array_types import Floats, Ints, Singles
-from sononerf.echoes.detection import Onsets, asked_poses, find_onsets
+from sononerf import storage
+from sononerf.display import Picture, Shown, picture_of
+from sononerf.echoes.detection import Onsets, asked_poses, find_onsets, seal_recorded
 from sononerf.echoes.free_space import EchoHull, weighted
-from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
+from sononerf.echoes.memory_ensemble import (
+    Ensemble,
+    MemoryEnsemble,
+    repeats,
+    seal,
+    split_of,
+)
 from sononerf.echoes.range_levels import RangeLevels, evenly_chosen
-from sononerf.echoes.recorded_noise import seal_recorded
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
-from sononerf.echoes.splits import repeats, split_of
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, SettingsError, expect
 from sononerf.geometry.poses import Poses
-from sononerf.head.attached import attach, attached
+from sononerf.head.call_file import attach, attached
 from sononerf.head.decibels import active_level
 from sononerf.head.head import Head
+from sononerf.numerics import Floats, Ints, Singles
 from sononerf.settings.schema import HEAD_SECTIONS
-from sononerf.shown import Picture, Shown, picture_of
 
 if TYPE_CHECKING:  # simulation starts without it
     from torch import Tensor
@@ -188,7 +192,7 @@ class Echoes(Shown):
         """
         path, mine = Path(path), self.store
         storage.probe_writable(path)
-        with locks.lock(path):
+        with storage.lock(path):
             written = EnsembleStore.create(
                 path,
                 poses_positions=mine.positions,

@@ -21,9 +21,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from sononerf.array_types import Bools, Floats
-from sononerf.compiled import compiled
 from sononerf.geometry.plane import Plane
+from sononerf.numerics import Bools, Floats, compiled
 
 UNDETECTED = 0.05
 """Fraction of the onsets that may be wrong together where a place is judged, no unit; also the

@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from sononerf.array_types import Floats, Ints, Singles
 from sononerf.geometry.plane import Plane
+from sononerf.numerics import Floats, Ints, Singles
 
 BANDS = 3
 """Number of bands of equally many frequencies; the mean power is that of their levels."""

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial.distance import cdist
 
-from sononerf.array_types import Bools, Floats, Ints
 from sononerf.echoes.detection import FALSE_ALARMS, Onsets, threshold_levels
 from sononerf.echoes.free_space import ACCURACY, EchoHull
 from sononerf.errors import NumericalError
 from sononerf.head.ears import Ears
+from sononerf.numerics import Bools, Floats, Ints
 
 WITNESS_GAIN = 0.1
 """A pose is a witness of the places towards which its gain is at least this fraction of the best,

@@ -11,14 +11,13 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Floats, Ints, Singles
-from sononerf.compiled import compiled
 from sononerf.echoes.memory_ensemble import Ensemble
 from sononerf.errors import NumericalError
 from sononerf.evaluation.solid import Nearest, Solid, sample_surface
+from sononerf.geometry.lattice import Volume, grid_over, isosurface
 from sononerf.geometry.poses import Poses
 from sononerf.head.head import Head
-from sononerf.surface.start.volume import Volume, grid_over, isosurface
+from sononerf.numerics import Floats, Ints, Singles, compiled
 
 # Levels tried by `best_level_surface`, as fractions of the voxels above them, and the score.
 LEVEL_SHARES = np.geomspace(0.002, 0.5, 12)

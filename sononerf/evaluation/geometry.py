@@ -12,16 +12,16 @@ import trimesh
 from scipy.spatial import cKDTree
 from trimesh.registration import procrustes
 
-from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError, NumericalError
 from sononerf.evaluation.baseline import best_level_surface, volume_of
 from sononerf.evaluation.metrics import geometry_metrics, target_metrics
 from sononerf.evaluation.solid import Solid
 from sononerf.executor import computed
+from sononerf.geometry.lattice import Volume
 from sononerf.geometry.poses import Poses
+from sononerf.numerics import Floats
 from sononerf.scene.scene import Scene
-from sononerf.surface.start.volume import Volume
 
 MANY = 64
 """Number of training poses from which a process of its own saves time."""

@@ -10,10 +10,10 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sononerf.array_types import Floats
 from sononerf.evaluation.prediction import prediction_metrics
 from sononerf.evaluation.solid import Nearest, Solid, sample_surface
 from sononerf.head.decibels import mae_db
+from sononerf.numerics import Floats
 
 __all__ = [
     "geometry_metrics",

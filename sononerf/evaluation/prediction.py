@@ -12,11 +12,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Floats, Ints, Singles
+from sononerf.display import Shown
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError, expect
-from sononerf.evaluation.interval import covered, interval_db
-from sononerf.evaluation.traced import Traced, learn_traced, mix, trace_poses
+from sononerf.evaluation.traced import Traced, covered, interval_db, learn_traced, mix, trace_poses
 from sononerf.field.fitting import render_poses
 from sononerf.field.module import EchoModule
 from sononerf.geometry.poses import Poses
@@ -29,10 +28,10 @@ from sononerf.head.decibels import (
     pose_chunks,
     same_shape,
 )
+from sononerf.numerics import Floats, Ints, Singles
 from sononerf.progress import Progress
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import SimulationSettings
-from sononerf.shown import Shown
 from sononerf.surface.surface import Surface
 
 logger = logging.getLogger("sononerf")

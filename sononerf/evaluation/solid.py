@@ -13,9 +13,9 @@ from manifold3d import Manifold, OpType
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sononerf.array_types import Bools, Floats
 from sononerf.errors import NumericalError
 from sononerf.geometry.raycast import contains
+from sononerf.numerics import Bools, Floats
 
 Samples = tuple[Floats, Floats]
 

@@ -3,9 +3,12 @@
 
 from __future__ import annotations
 
+import copy
 import logging
+import time
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +16,79 @@ import lightning
 import numpy as np
 import torch
 from lightning.pytorch.loggers import Logger
+from torch import Tensor
 
-from sononerf.array_types import Singles
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import NumericalError, ResourceError, SettingsError
 from sononerf.field.checkpoint_io import DurableCheckpointIO
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.module import EchoModule
-from sononerf.field.range_slices import WholePoses, one_by_one
+from sononerf.field.range_slices import RangeSlices, WholePoses, one_by_one
 from sononerf.geometry.poses import Poses
+from sononerf.numerics import Singles
 from sononerf.progress import Progress
 from sononerf.settings.schema import FitSettings
+
+STATES = 4
+"""Numbers kept per parameter, no unit: its value, its gradient, and Adam's two averages."""
+WORKSPACE = 2.0
+"""Memory of a backward pass over the memory of the values it needs, no unit: gradients are as large
+as values."""
+
+
+@dataclass(frozen=True)
+class StepCost:
+    """Cost of one training step.
+
+    Attributes:
+        memory: Bytes of parameters and of the backward pass's values.
+        seconds: Duration on this machine's CPU.
+    """
+
+    memory: float
+    seconds: float
+
+
+def step_cost(module: EchoModule, data: EchoDataModule) -> StepCost:
+    """Measure one item of a batch, and scale it to the whole batch.
+
+    The module's random numbers, parameters and buffers stay as they are; a copy is used.
+    """
+    batch = data.stream()[0]
+    part = RangeSlices(
+        batch.pose[:1],
+        batch.position[:1],
+        batch.rotation[:1],
+        batch.rows[:1],
+        batch.bins,
+        batch.spectrum[:1],
+    )
+    trial = copy.deepcopy(module)
+    parameters = [each for each in trial.parameters() if each.requires_grad]
+    sizes: dict[int, int] = {}
+
+    def count(values: Tensor) -> Tensor:
+        storage = values.untyped_storage()
+        sizes[storage.data_ptr()] = storage.nbytes()
+        return values
+
+    seconds = 0.0
+    with torch.random.fork_rng([]):
+        trial.field.advance(0, 1)
+        trial.renderer.advance(0, 1)
+        trial.renderer.prepare(trial.field, trial.possible, 0)
+        for _ in range(2):  # the first pass includes compiling
+            sizes.clear()
+            begun = time.monotonic()
+            with torch.autograd.graph.saved_tensors_hooks(count, lambda values: values):
+                predicted = trial(part)
+            torch.autograd.grad(predicted.sum(), parameters, allow_unused=True)
+            seconds = time.monotonic() - begun
+    own = {each.untyped_storage().data_ptr() for each in parameters}
+    saved = sum(size for place, size in sizes.items() if place not in own)
+    fixed = STATES * sum(each.numel() * each.element_size() for each in parameters)
+    items = len(batch.pose)
+    return StepCost(fixed + WORKSPACE * items * saved, items * seconds)
 
 
 def quiet_lightning() -> None:

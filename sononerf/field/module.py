@@ -16,7 +16,6 @@ from torch import Tensor
 from torch.nn.utils import clip_grads_with_norm_, get_total_norm
 from torchmetrics import MeanMetric
 
-from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import IncompatibleError, NumericalError, SettingsError, expect
 from sononerf.field.checkpoint_io import DurableCheckpointIO
@@ -31,6 +30,7 @@ from sononerf.field.range_slices import RangeSlices, seed_of
 from sononerf.field.renderer import Possible, Renderer
 from sononerf.head.decibels import ACTIVE_DB, RANGE_DB
 from sononerf.head.head import Head
+from sononerf.numerics import Floats
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import (
     FieldSettings,

@@ -12,9 +12,8 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Bools, Floats, Ints
-from sononerf.compiled import compiled
-from sononerf.geometry.normals import corner_normals
+from sononerf.geometry.meshes import corner_normals
+from sononerf.numerics import Bools, Floats, Ints, compiled
 
 # Turning by the golden section of a circle never lets two neighbouring rings line up.
 GOLDEN_TURN = (math.sqrt(5.0) - 1.0) / 2.0

@@ -11,8 +11,8 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from sononerf.array_types import Floats
 from sononerf.errors import InputError
+from sononerf.numerics import Floats
 
 FrameName = Literal["auto", "world", "original"]
 KEYS = ("to_original", "head_to_original")

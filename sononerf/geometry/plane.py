@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 import trimesh
 
-from sononerf.array_types import Bools, Floats
 from sononerf.errors import InputError
+from sononerf.numerics import Bools, Floats
 
 if TYPE_CHECKING:
     from torch import Tensor

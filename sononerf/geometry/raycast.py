@@ -10,9 +10,8 @@ from typing import Any, Protocol, TypeAlias
 import numpy as np
 import trimesh
 
-from sononerf.array_types import Bools, Floats, Ints, Singles
-from sononerf.compiled import compiled
-from sononerf.geometry.normals import corner_normals, total_curvature, weight_gradients
+from sononerf.geometry.meshes import corner_normals, total_curvature, weight_gradients
+from sononerf.numerics import Bools, Floats, Ints, Singles, compiled
 
 try:
     from embreex.mesh_construction import TriangleMesh

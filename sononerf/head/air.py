@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sononerf.array_types import Floats
+from sononerf.numerics import Floats
 from sononerf.settings.schema import AirSettings
 
 DEFAULT_SPEED = 343.0  # m/s

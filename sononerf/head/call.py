@@ -11,8 +11,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import ArrayLike
 
-from sononerf.array_types import Bools, Floats
 from sononerf.head.call_file import CallFile, contents, load_call
+from sononerf.numerics import Bools, Floats
 from sononerf.settings.schema import CallSettings
 
 LOUD = 0.25

@@ -1,13 +1,5 @@
 # SPDX-License-Identifier: MIT
-r"""A call from a WAV file: its waveform, when it emits each frequency, and which it covers.
-
-The call is looked at through Hamming windows of the length that resolves a sweep of its duration
-and bandwidth best. At each frequency the output is loud when the frequency is emitted: the
-*delay* is the centroid of the power's top about that time. Where several harmonics pass a frequency
-it is the first one's that is not 12 dB fainter than another, so that no echo is heard in front of
-the first one. *Covered* is what lies within
-20 dB of the loudest frequency, gaps narrower than a window's bandwidth included.
-"""
+"""A call or a directivity from a file, and the copies of such files beside a run or a store."""
 
 from __future__ import annotations
 
@@ -16,15 +8,18 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import lru_cache
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import scipy.fft
 import scipy.ndimage
 
-from sononerf.array_types import Bools, Floats
+from sononerf import storage
 from sononerf.errors import InputError
 from sononerf.head.row_filters import WINDOW_BANDWIDTH, WINDOW_DURATION
-from sononerf.input_files import read_wav
+from sononerf.numerics import Bools, Floats
+from sononerf.settings.schema import FILE_SECTIONS, CallSettings, EarSettings
+from sononerf.storage import read_wav
 
 LONGEST = 0.1  # s, as the settings' longest sweep
 SHORTEST = 8  # samples
@@ -196,3 +191,47 @@ def contents(path: Path) -> bytes:
     """Return all that a call depends on, for hashes: its samples and its sampling rate."""
     call = load_call(path)
     return np.float64(call.sampling_rate).tobytes() + call.waveform.astype("<f8").tobytes()
+
+
+FOLDER = "attached"
+"""Name of the folder of the copies, within that of the run or the store."""
+
+
+class NamesFiles(Protocol):
+    """A head, or settings."""
+
+    @property
+    def ears(self) -> EarSettings:
+        """May name the file of a directivity."""
+
+    @property
+    def call(self) -> CallSettings:
+        """May name the file of a call."""
+
+
+def attach(head: NamesFiles, folder: Path) -> None:
+    """Copy the files that a head names into a folder, if they are not there yet."""
+    for section in FILE_SECTIONS:
+        file = getattr(head, section).file
+        if file is None or (copy := _copy_of(file, section, folder)).is_file():
+            continue
+        try:
+            content = file.read_bytes()
+        except OSError as error:
+            raise InputError(f"{file}: cannot be read ({error.strerror})") from None
+        storage.make_folder(copy.parent)
+        storage.commit_bytes(copy, content)
+
+
+def attached(head: NamesFiles, folder: Path) -> dict[str, Any]:
+    """Return the sections, by name, whose file has a copy in a folder; ``file`` is the copy."""
+    found = {}
+    for section in FILE_SECTIONS:
+        own = getattr(head, section)
+        if own.file is not None and (copy := _copy_of(own.file, section, folder)).is_file():
+            found[section] = own.model_copy(update={"file": copy})
+    return found
+
+
+def _copy_of(file: Path, section: str, folder: Path) -> Path:
+    return folder / FOLDER / f"{section}{file.suffix}"

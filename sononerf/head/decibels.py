@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
+from sononerf.numerics import Floats
 
 RANGE_DB = 60.0
 """Level of the loudest cell above the reference, dB; also the scale of PSNR and SSIM."""

@@ -18,12 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import j1
 
-from sononerf.array_types import Floats, Singles
-from sononerf.compiled import compiled
 from sononerf.errors import SettingsError
 from sononerf.head.directivity.directivity_files import content_hash, read_directivity
 from sononerf.head.directivity.record import Directivity, unit_vectors
 from sononerf.head.spectrogram import frequency_axis, smearing
+from sononerf.numerics import Floats, Singles, compiled
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 
 SPEED = 343.0  # m/s; the beam's width follows it so weakly that temperature is left out

@@ -17,17 +17,24 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Floats, Singles
+from sononerf.display import Shown
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.plane import Plane
 from sononerf.head.air import absorption_in, speed_in
 from sononerf.head.call import call_waveform, covered, emit, sweep_delay
 from sononerf.head.call_file import load_call
 from sononerf.head.ears import Ears, analysed_ears, ear_tables, receiver_places
-from sononerf.head.noise import draw_noise, loudest_power, noise_level, target_gain
-from sononerf.head.reception import effective_window, within_band
+from sononerf.head.reception import (
+    draw_noise,
+    effective_window,
+    loudest_power,
+    noise_level,
+    target_gain,
+    within_band,
+)
 from sononerf.head.row_filters import RowFilters, band_mean, band_parts, row_filters
 from sononerf.head.spectrogram import echo_samples, frequency_axis, range_axis, spectrogram
+from sononerf.numerics import Floats, Singles
 from sononerf.settings.loading import checked_section
 from sononerf.settings.scene_schema import SupportSettings
 from sononerf.settings.schema import (
@@ -38,7 +45,6 @@ from sononerf.settings.schema import (
     SpectrogramSettings,
     check_call,
 )
-from sononerf.shown import Shown
 
 
 @dataclass(frozen=True, eq=False)

@@ -39,7 +39,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Floats
+from sononerf.numerics import Floats
 from sononerf.settings.schema import SpectrogramSettings
 
 WINDOW_DURATION = 0.528  # of a Hamming window's length, where it is above half its height

@@ -11,9 +11,9 @@ import scipy.fft
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import ArrayLike
 
-from sononerf.array_types import Complexes, Floats, Ints
 from sononerf.head.call import call_waveform, sweep_delay
 from sononerf.head.row_filters import BANDWIDTH, SKIRT, fft_bins, row_filters, row_frequencies
+from sononerf.numerics import Complexes, Floats, Ints
 from sononerf.settings.schema import CallSettings, SpectrogramSettings
 
 

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.io import wavfile
 
-from sononerf.array_types import Floats
 from sononerf.echoes.layout import SPLITS
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses, euler_from_rotation
-from sononerf.input_files import read_wav
-from sononerf.recordings.columns import Columns
+from sononerf.numerics import Floats
+from sononerf.recordings.pose_tables import Columns
+from sononerf.storage import read_wav
 
 WAV, OTHERS = (".wav",), (".flac", ".ogg", ".aiff", ".aif", ".w64", ".caf")
 SUFFIXES = (*WAV, *OTHERS)

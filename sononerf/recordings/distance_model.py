@@ -19,7 +19,7 @@ from itertools import combinations_with_replacement
 import numpy as np
 from scipy.optimize import least_squares
 
-from sononerf.array_types import Floats
+from sononerf.numerics import Floats
 
 DEGREE = 4
 """Largest degree of the polynomials, no unit: it separates parts of a body 45 degrees apart."""

@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.array_types import Floats
 from sononerf.errors import InputError
-from sononerf.recordings import arrays, audio
+from sononerf.numerics import Floats
+from sononerf.recordings import audio, readers
 from sononerf.recordings.audio import Recording
-from sononerf.recordings.columns import Columns, read_table
+from sononerf.recordings.pose_tables import Columns, read_table
 from sononerf.settings.import_schema import ImportSettings
 
-SUFFIXES = (*audio.SUFFIXES, *arrays.SUFFIXES)
+SUFFIXES = (*audio.SUFFIXES, *readers.SUFFIXES)
 
 
 def read_sound(path: Path, settings: ImportSettings) -> tuple[float, NDArray[Any]]:
@@ -34,9 +34,9 @@ def read_sound(path: Path, settings: ImportSettings) -> tuple[float, NDArray[Any
         wanted = settings.sampling_rate
         # Recorders of ultrasound often write a tenth of their rate, so that it can be heard.
         return (rate if wanted is None else wanted), samples
-    if suffix not in arrays.SUFFIXES:
+    if suffix not in readers.SUFFIXES:
         raise InputError(f"{path}: unknown kind of file; known: {', '.join(SUFFIXES)}")
-    rate, samples = arrays.waveform_of(path, arrays.read_arrays(path), settings)
+    rate, samples = readers.waveform_of(path, readers.read_arrays(path), settings)
     samples = samples[None] if samples.ndim == 1 else samples
     if samples.ndim != 2 or not samples.size:
         raise InputError(

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.array_types import Floats
 from sononerf.echoes.detection import MOST_POSES
 from sononerf.echoes.region import echo_extent
 from sononerf.errors import InputError
@@ -22,6 +21,7 @@ from sononerf.head.ears import beam_gain, ear_gain
 from sononerf.head.head import Head
 from sononerf.head.spectrogram import frequency_axis, range_axis, spectrogram
 from sononerf.memory import require_memory
+from sononerf.numerics import Floats
 from sononerf.progress import Progress
 from sononerf.recordings.audio import Recording
 from sononerf.recordings.folder import read_sound

@@ -28,12 +28,10 @@ from itertools import combinations
 
 import numpy as np
 
-from sononerf.array_types import Floats, Ints
-from sononerf.geometry.aim import off_axis
-from sononerf.geometry.poses import Poses
-from sononerf.recordings.columns import EULER, PLACE, QUATERNION, Columns
-from sononerf.recordings.conventions import to_poses
+from sononerf.geometry.poses import Poses, off_axis
+from sononerf.numerics import Floats, Ints
 from sononerf.recordings.distance_model import Prediction, predict
+from sononerf.recordings.pose_tables import EULER, PLACE, QUATERNION, Columns, to_poses
 from sononerf.settings.import_schema import ImportSettings
 
 FEWEST = 12

@@ -11,8 +11,8 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sononerf.array_types import Floats
 from sononerf.evaluation.geometry import signed_error
+from sononerf.numerics import Floats
 from sononerf.report.pictures.mesh_picture import (
     CLAY,
     STEEL,

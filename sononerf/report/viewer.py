@@ -15,21 +15,20 @@ import numpy as np
 import torch
 import trimesh
 
-from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import NumericalError, ResourceError
 from sononerf.evaluation.prediction import Prediction
 from sononerf.field.module import EchoModule, decibels
 from sononerf.field.range_slices import RangeSlices
-from sononerf.geometry.lattice import level_surface
+from sononerf.geometry.lattice import Volume, isosurface, level_surface
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
-from sononerf.report.echo_sound import STRETCH, echo_wav
+from sononerf.numerics import Floats
+from sononerf.report.notebook import STRETCH, echo_wav
 from sononerf.report.pictures.mesh_picture import CLAY, STEEL
 from sononerf.report.pictures.shading import DEFAULT_VIEW
 from sononerf.report.pictures.spectrogram_picture import quick_image, spectrogram_image
 from sononerf.report.surface_views import SurfaceViews
-from sononerf.surface.start.volume import Volume, isosurface
 
 HOST = "127.0.0.1"
 """Address of the page: only browsers on this machine reach it."""

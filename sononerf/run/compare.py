@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: MIT
-"""Comparison of two runs: the echoes of one that the other lacks."""
+"""Runs beside one another: their numbers, and the echoes of one that the other lacks."""
 
 from __future__ import annotations
 
+import csv as csv_format
+import io
 import logging
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import overload
@@ -12,24 +15,55 @@ import numpy as np
 import trimesh
 
 from sononerf import storage
-from sononerf.array_types import Floats
+from sononerf.display import aligned
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.splits import TRAIN
+from sononerf.echoes.memory_ensemble import TRAIN
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.evaluation.baseline import backprojection
-from sononerf.evaluation.difference import Comparison, added_part
-from sononerf.evaluation.difference import compare as compare_volumes
-from sononerf.evaluation.numbers import Evaluation, compare_prediction
+from sononerf.evaluation.numbers import Comparison, Evaluation, added_part, compare_prediction
+from sononerf.evaluation.numbers import compare as compare_volumes
 from sononerf.evaluation.prediction import Prediction
 from sononerf.field.fitting import render_poses
+from sononerf.geometry.lattice import Volume, vti_bytes
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import compress
+from sononerf.numerics import Floats
 from sononerf.progress import Progress
+from sononerf.report.page import run_rows
 from sononerf.report.pictures.mip_picture import difference_pngs, overlay_png
-from sononerf.run.build import results_folder, true_mesh
-from sononerf.run.provenance import differing_keys
+from sononerf.run.build import differing_keys, flat, locked, results_folder, true_mesh
 from sononerf.run.run import Run
-from sononerf.surface.start.volume import Volume, vti_bytes
+
+
+def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
+    """Return the numbers of runs as lines: a row per number, a column per run."""
+    runs = [Run(path) for path in paths]
+    found = []
+    for run in runs:
+        run.open()
+        found.append(run.read_metrics())
+        try:
+            run_rows(found[-1:])
+        except (TypeError, ValueError, AttributeError) as error:
+            raise InputError(
+                f"{run.metrics_file}: damaged ({error}); remove it and evaluate again"
+            ) from None
+    names = [run.path.resolve().name for run in runs]
+    if len(set(names)) < len(names):
+        names = [str(run.path) for run in runs]
+    rows = [("", *names), *run_rows(found)]
+    if csv is not None:
+        values = [flat(metrics) for metrics in found]
+        keys = sorted({key for one in values for key in one} - {"schema"})
+        text = io.StringIO()
+        writer = csv_format.writer(text, lineterminator="\n")
+        writer.writerow(["run", *keys])
+        for name, one in zip(names, values, strict=True):
+            writer.writerow([name, *("" if one.get(key) is None else one[key] for key in keys)])
+        with locked(runs, csv):
+            storage.commit_text(csv, text.getvalue())
+    return aligned(rows, "<" + ">" * len(runs))
+
 
 logger = logging.getLogger("sononerf")
 

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from sononerf import locks, storage
+from sononerf import storage
 from sononerf.errors import SonoNerfError
 from sononerf.memory import available_cores, available_memory
 from sononerf.version import __version__
@@ -154,7 +154,7 @@ def _disk(folder: Path) -> Finding:
     if free < ENOUGH_DISK:
         return Finding("disk", text, False, "make room, or give another --output")
     try:
-        with tempfile.TemporaryDirectory(dir=folder) as place, locks.lock(Path(place)):
+        with tempfile.TemporaryDirectory(dir=folder) as place, storage.lock(Path(place)):
             storage.commit_text(Path(place) / "probe", "probe")
     except (OSError, SonoNerfError) as error:
         return Finding(

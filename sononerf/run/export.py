@@ -21,10 +21,10 @@ from sononerf.echoes.echoes import complete_store
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError, ResourceError, SettingsError
 from sononerf.geometry.frame import Frame, FrameName
+from sononerf.geometry.lattice import Volume
 from sononerf.run.build import locked
 from sononerf.run.run import Run
 from sononerf.surface.mesh_files import MeshFormat, confidence_of, error_of, mesh_bytes
-from sononerf.surface.start.volume import Volume
 from sononerf.version import __version__
 
 FileType = Literal["mat", "h5"]

@@ -16,27 +16,30 @@ import numpy as np
 import torch
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 
-from sononerf import locks, storage
-from sononerf.callbacks.epoch import CheckpointCallback, ProgressCallback
-from sononerf.callbacks.preview import PreviewCallback, SpectrogramImages
-from sononerf.callbacks.tensorboard import RunLogger, log_results
+from sononerf import storage
+from sononerf.callbacks import (
+    CheckpointCallback,
+    PreviewCallback,
+    ProgressCallback,
+    RunLogger,
+    SpectrogramImages,
+    log_results,
+)
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import NumericalError, ResourceError, StoppedError
 from sononerf.evaluation.traced import Traced, learn_traced
 from sononerf.field.checkpoint_io import save_weights
 from sononerf.field.datamodule import EchoDataModule
+from sononerf.field.fitting import StepCost, step_cost, usable_accelerator
 from sononerf.field.fitting import fit as fit_field
-from sononerf.field.fitting import usable_accelerator
 from sononerf.field.module import EchoModule
-from sononerf.field.step_cost import StepCost, step_cost
 from sononerf.memory import gigabytes, require_memory
 from sononerf.progress import Progress, duration
-from sononerf.run.build import head_of, module_for, with_store
+from sononerf.run.build import flat, head_of, module_for, stated_frame, with_store
 from sononerf.run.evaluate import evaluate
 from sononerf.run.fit_warnings import fit_warnings
 from sononerf.run.predict import predict
-from sononerf.run.provenance import flat, stated_frame
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run import Run
 from sononerf.run.simulate import (
@@ -118,7 +121,7 @@ def _wait_for_store(settings: Settings, folder: Path) -> EnsembleStore:
     background = background_path(settings)
     last_held = time.monotonic()
     while not all(_is_sealed(part) for part in (path, background) if part is not None):
-        if locks.is_held(folder):
+        if storage.is_held(folder):
             last_held = time.monotonic()
         if time.monotonic() - last_held > PATIENCE_SECONDS:
             raise ResourceError(

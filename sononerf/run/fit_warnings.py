@@ -5,10 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sononerf.array_types import Floats
 from sononerf.echoes.echoes import SAME, Echoes
-from sononerf.geometry.aim import aim_fault
-from sononerf.geometry.poses import Poses
+from sononerf.geometry.poses import Poses, aim_fault
+from sononerf.numerics import Floats
 
 LINE = (
     "all training poses lie on a straight line: the echoes do not tell the angle around it, so the "

@@ -15,18 +15,18 @@ from typing import Any
 
 import numpy as np
 
-from sononerf import locks, storage
-from sononerf.array_types import Singles
+from sononerf import storage
+from sononerf.echoes.detection import seal_recorded
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.recorded_noise import seal_recorded
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError
-from sononerf.head.attached import attach
+from sononerf.head.call_file import attach
 from sononerf.head.reception import warn_of_call
+from sononerf.numerics import Singles
 from sononerf.progress import Progress, duration
-from sononerf.recordings.channel_check import Channel, faults_of_channels
-from sononerf.recordings.conventions import original_frame
+from sononerf.recordings.pings import Channel, faults_of_channels
 from sononerf.recordings.pose_check import MOST, Verdict, alternatives, check_poses, shifted
+from sononerf.recordings.pose_tables import original_frame
 from sononerf.report.pictures.spectrogram_picture import pings_png
 from sononerf.run.understand import Understood, understand
 from sononerf.settings.loading import assignments
@@ -137,7 +137,7 @@ def import_understood(
     warn_of_call(known.settings.call, known.settings.spectrogram)
     poses = known.poses[known.pings]
     storage.probe_writable(output)
-    with locks.lock(output):
+    with storage.lock(output):
         store = EnsembleStore.create(
             output,
             poses_positions=poses.positions,

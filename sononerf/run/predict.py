@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""Prediction of spectrograms at any poses, with a comparison where they were measured."""
+"""Prediction of spectrograms at any poses, compared where measured; proposal of the next poses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf import storage
-from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.echoes import Split
 from sononerf.errors import InputError
 from sononerf.evaluation.prediction import (
@@ -26,18 +25,41 @@ from sononerf.evaluation.prediction import (
 )
 from sononerf.evaluation.prediction import predict as predict_poses
 from sononerf.evaluation.traced import Traced
-from sononerf.geometry.aim import aim_fault
 from sononerf.geometry.frame import FrameName
-from sononerf.geometry.poses import Poses
+from sononerf.geometry.poses import Poses, aim_fault
 from sononerf.head.decibels import compress
+from sononerf.numerics import Floats, Ints, Singles
 from sononerf.progress import Progress
-from sononerf.recordings.columns import read_table
-from sononerf.recordings.conventions import to_poses
+from sononerf.recordings.pose_tables import read_table, to_poses
 from sononerf.report.pictures.spectrogram_picture import spectrogram_picture
 from sononerf.run.build import results_folder
-from sononerf.run.run import Run
-from sononerf.run.traced_file import NAME as TRACED_NAME
+from sononerf.run.model_files import NAME as TRACED_NAME
+from sononerf.run.run import Run, open_run
 from sononerf.settings.import_schema import read_import_settings
+from sononerf.surface.next_poses import Within, next_poses
+
+
+def propose(
+    run: Path, count: int, candidates: Path | None, within: Within, output: Path | None
+) -> Path:
+    """Write the poses that would reduce the error of a run's surface most, the best first."""
+    opened = open_run(run)
+    file = output or opened.path / "next.csv"
+    if file.is_dir():
+        raise InputError(f"{file}: is a folder; give --output the name of a file")
+    given = None if candidates is None else read_poses(opened, candidates)
+    with opened.locked(file.parent):
+        found = next_poses(
+            opened.surface,
+            opened.echoes,
+            count,
+            candidates=given,
+            within=within,
+            seed=opened.settings.fit.seed,
+        )
+        storage.commit_bytes(file, found.table().encode())
+    return file
+
 
 logger = logging.getLogger("sononerf")
 

@@ -19,10 +19,11 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from sononerf import storage
-from sononerf.callbacks.tensorboard import add_mesh, writing
+from sononerf.callbacks import add_mesh, writing
 from sononerf.errors import InputError, SettingsError
 from sononerf.field.checkpoint_io import model_checksum
 from sononerf.geometry.frame import Frame
+from sononerf.geometry.lattice import vti_bytes
 from sononerf.progress import Progress
 from sononerf.report.pictures.mesh_picture import confidence_png, mesh_png, side_by_side_png
 from sononerf.report.pictures.mip_picture import mip_pictures
@@ -34,7 +35,6 @@ from sononerf.surface.reconstruction import refine, starts_of
 from sononerf.surface.refine import descent
 from sononerf.surface.refine.surface_error import error_from_twice
 from sononerf.surface.start.read_out import Method
-from sononerf.surface.start.volume import vti_bytes
 from sononerf.surface.surface import FORMATS, Surface
 from sononerf.version import __version__
 

@@ -16,22 +16,20 @@ import torch
 import trimesh
 
 from sononerf import storage
-from sononerf.array_types import Floats, Ints
 from sononerf.errors import InputError, NumericalError, SonoNerfError
 from sononerf.evaluation.prediction import evenly, ranked
 from sononerf.head.decibels import compress, mae_db
+from sononerf.numerics import Floats, Ints
 from sononerf.progress import Progress
-from sononerf.report.key_numbers import NONE, run_rows
-from sononerf.report.page import Page
-from sononerf.report.pictures.curve_picture import curves_picture
+from sononerf.report.page import NONE, Page, run_rows
+from sononerf.report.pictures.figure import curves_picture
 from sononerf.report.pictures.mesh_picture import mesh_png
 from sononerf.report.pictures.mip_picture import mip_pictures
 from sononerf.report.pictures.scene_picture import scene_png
 from sononerf.report.pictures.spectrogram_picture import spectrogram_picture
 from sononerf.report.surface_views import SurfaceViews
-from sononerf.run.build import true_mesh
+from sononerf.run.build import flat, true_mesh
 from sononerf.run.export import read_volume
-from sononerf.run.provenance import flat
 from sononerf.run.run import Run
 from sononerf.settings.loading import dump_yaml
 from sononerf.settings.schema import Settings

@@ -29,7 +29,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sononerf import locks, storage
+from sononerf import storage
+from sononerf.display import Shown
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import IncompatibleError, InputError
@@ -40,16 +41,14 @@ from sononerf.field.checkpoint_io import DESCRIPTION_NAME
 from sononerf.field.module import EchoModule
 from sononerf.geometry.frame import Frame, FrameName
 from sononerf.geometry.poses import Poses
-from sononerf.head.attached import attach
+from sononerf.head.call_file import attach
 from sononerf.head.head import Head
 from sononerf.progress import Progress
-from sononerf.run.model_files import Model, read_mesh, read_model
-from sononerf.run.provenance import differing_keys, versions
+from sononerf.run import model_files
+from sononerf.run.build import differing_keys, versions
 from sononerf.run.simulate import find_ensemble
-from sononerf.run.traced_file import load_traced, same_mesh, save_traced
 from sononerf.settings.loading import dump_yaml, read_yaml, validate_settings
 from sononerf.settings.schema import Settings
-from sononerf.shown import Shown
 from sononerf.simulation.simulator import ensemble_poses
 from sononerf.surface.mesh_files import confidence_of, error_of
 from sononerf.surface.surface import Surface
@@ -95,7 +94,7 @@ class Run(Shown):
         if self._locks or elsewhere:
             yield
             return
-        with locks.lock(self.path):
+        with storage.lock(self.path):
             self._locks += 1
             try:
                 yield
@@ -105,8 +104,8 @@ class Run(Shown):
     # What its stages left.
 
     @cached_property
-    def _model(self) -> Model:
-        return read_model(self.path)
+    def _model(self) -> model_files.Model:
+        return model_files.read_model(self.path)
 
     @property
     def model(self) -> EchoModule:
@@ -178,7 +177,9 @@ class Run(Shown):
 
     def mesh(self) -> trimesh.Trimesh:
         """Read the reconstructed surface."""
-        return read_mesh(self.reconstruction / "mesh.ply", f"sononerf reconstruct {self.path}")
+        return model_files.read_mesh(
+            self.reconstruction / "mesh.ply", f"sononerf reconstruct {self.path}"
+        )
 
     @property
     def read_out(self) -> dict[str, Any]:
@@ -233,14 +234,14 @@ class Run(Shown):
 
     def traced(self) -> Traced | None:
         """Return the surface that echoes are traced off, and their weight; None without them."""
-        found, kept = load_traced(self.path), self._kept
-        if found is None or kept is None or not same_mesh(found.mesh, kept.mesh):
+        found, kept = model_files.load_traced(self.path), self._kept
+        if found is None or kept is None or not model_files.same_mesh(found.mesh, kept.mesh):
             return found
         return replace(found, simulator=kept.simulator)
 
     def keep_traced(self, traced: Traced) -> None:
         """Write the traced surface, with its gain and weight."""
-        save_traced(self.path, traced)
+        model_files.save_traced(self.path, traced)
         self._kept = traced
 
     def _traces_its_mesh(self) -> bool:
@@ -249,7 +250,7 @@ class Run(Shown):
             traced, mesh = self.traced(), self.mesh()
         except InputError:
             return False
-        return traced is not None and same_mesh(traced.mesh, mesh)
+        return traced is not None and model_files.same_mesh(traced.mesh, mesh)
 
     def predict(
         self,
@@ -397,7 +398,7 @@ class Run(Shown):
             number += 1
         if not self.config.is_file():
             self.refuse_foreign()
-        with locks.lock(path):
+        with storage.lock(path):
             try:
                 path.rename(aside)
             except OSError as error:

@@ -1,31 +1,57 @@
 # SPDX-License-Identifier: MIT
-"""List of the installed scenes, and their pictures."""
+"""List of the installed scenes, and their pictures; copies of the templates of plugins."""
 
 from __future__ import annotations
 
 import inspect
 import json
 import logging
+import re
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from sononerf import storage
+from sononerf.display import aligned
 from sononerf.echoes.memory_ensemble import Ensemble
-from sononerf.errors import InputError, SonoNerfError
+from sononerf.errors import InputError, SettingsError, SonoNerfError
 from sononerf.head.decibels import compress
-from sononerf.report.pictures.echo_picture import echo_png
 from sononerf.report.pictures.mesh_picture import mesh_png
-from sononerf.report.pictures.scene_picture import scene_png
+from sononerf.report.pictures.scene_picture import echo_png, scene_png
 from sononerf.run.build import simulator_of
 from sononerf.run.simulate import scene_of
 from sononerf.scene.scene import list_scenes, load_scene
 from sononerf.settings import plugins
 from sononerf.settings.schema import Settings
 from sononerf.simulation.simulator import pose_seed
-from sononerf.tables import aligned
+
+Kind = Literal["scene", "field", "renderer"]
+TEMPLATES = Path(__file__).resolve().parent.parent / "templates"
+"""Folder of the packages, one per kind; each is called ``my-KIND``, its module ``my_KIND``."""
+
+
+def new_plugin(kind: Kind, name: str, folder: Path | None = None) -> list[Path]:
+    """Write a plugin with one scene, field or renderer: two files that install, and their test."""
+    module = name.replace("-", "_")
+    if not re.fullmatch(r"[A-Za-z]([A-Za-z0-9_-]*[A-Za-z0-9])?", name):
+        raise SettingsError(
+            f"NAME: found {name!r}; give letters, digits, _ and -, a letter first and no _ or - "
+            "last, e.g. my_bar"
+        )
+    if any(plugin.name == module for plugin in plugins.registered(f"sononerf.{kind}s")):
+        raise SettingsError(f"NAME: there is a {kind} {module!r}; choose another, e.g. my_{module}")
+    folder = Path(name) if folder is None else folder
+    if folder.is_dir() and any(folder.iterdir()):
+        raise SettingsError(f"{folder}: is not empty; choose another folder with --output")
+    written = []
+    for file in sorted((TEMPLATES / kind).glob("*.*"), key=lambda file: file.name):
+        text = file.read_text(encoding="utf-8")
+        text = text.replace(f"my-{kind}", name).replace(f"my_{kind}", module)
+        written.append(folder / file.name.replace(f"my_{kind}", module))
+        storage.commit_text(written[-1], text)
+    return sorted(written, key=lambda file: (file.suffix != ".toml", file.name.startswith("test_")))
 
 
 def describe_scenes() -> list[dict[str, Any]]:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from sononerf import storage
 from sononerf.echoes.echoes import Echoes, complete_store
-from sononerf.echoes.store import EnsembleStore
-from sononerf.echoes.subtracted import SubtractedStore
+from sononerf.echoes.store import EnsembleStore, SubtractedStore
 from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.progress import Progress
 from sononerf.recordings.audio import pose_table, wav_bytes

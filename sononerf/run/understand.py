@@ -11,24 +11,34 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.array_types import Ints
-from sononerf.echoes.splits import draw_split, split_of
+from sononerf.echoes.memory_ensemble import draw_split, split_of
 from sononerf.errors import InputError, NumericalError, SettingsError
 from sononerf.geometry.poses import Poses
 from sononerf.head.call import call_content, call_waveform
 from sononerf.head.head import Head
 from sononerf.head.reception import warn_of_band
 from sononerf.head.spectrogram import echo_samples
+from sononerf.numerics import Ints
 from sononerf.progress import Progress
-from sononerf.recordings.airsas import read_airsas
-from sononerf.recordings.arrays import read_numpy
 from sononerf.recordings.audio import Recording
-from sononerf.recordings.channel_check import Channel, channels_of, check_channels
-from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.folder import read_folder
 from sononerf.recordings.import_ranges import calibrated, found_ranges
-from sononerf.recordings.pings import Cutter, check_numbers, clipped_pings, mix
-from sononerf.recordings.sonotrace import read_sononerf_matlab, read_sonotracelab
+from sononerf.recordings.pings import (
+    Channel,
+    Cutter,
+    channels_of,
+    check_channels,
+    check_numbers,
+    clipped_pings,
+    mix,
+)
+from sononerf.recordings.pose_tables import to_poses
+from sononerf.recordings.readers import (
+    read_airsas,
+    read_numpy,
+    read_sononerf_matlab,
+    read_sonotracelab,
+)
 from sononerf.run.build import head_of
 from sononerf.settings.import_schema import ImportSettings, read_import_settings
 from sononerf.settings.loading import apply_override, read_yaml, validate_settings

@@ -12,9 +12,9 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from sononerf.array_types import Bools, Floats, Ints
 from sononerf.errors import SettingsError
 from sononerf.geometry.raycast import RayCaster
+from sononerf.numerics import Bools, Floats, Ints
 from sononerf.scene.material import Material
 from sononerf.scene.scene import Scene
 

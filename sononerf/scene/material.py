@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sononerf.array_types import Floats
 from sononerf.errors import InputError
+from sononerf.numerics import Floats
 
 Curve = tuple[float, ...]
 BOUNDS = {

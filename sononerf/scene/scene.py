@@ -12,14 +12,14 @@ from typing import Any, Literal
 import numpy as np
 import trimesh
 
-from sononerf.array_types import Bools, Floats, Ints
+from sononerf.display import Shown
 from sononerf.errors import InputError, SettingsError, expect
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 from sononerf.geometry.plane import Plane
+from sononerf.numerics import Bools, Floats, Ints
 from sononerf.scene.material import MATERIALS, RIGID, Material, MaterialName
 from sononerf.settings import plugins
 from sononerf.settings.loading import faults_of
-from sononerf.shown import Shown
 
 __all__ = [
     "MATERIALS",

@@ -20,8 +20,8 @@ from ruamel.yaml.error import YAMLError
 from ruamel.yaml.events import AliasEvent
 
 from sononerf.errors import SettingsError
-from sononerf.input_files import require_regular
 from sononerf.settings.schema import Settings
+from sononerf.storage import require_regular
 
 MAX_SETTINGS_BYTES = 1_000_000
 SectionT = TypeVar("SectionT", bound=BaseModel)

@@ -227,7 +227,7 @@ def check_call(call: CallSettings, analysis: SpectrogramSettings) -> None:
 
 
 class NoiseSettings(Section):
-    """White noise of the ears; ``sononerf.head.noise`` defines the ratio."""
+    """White noise of the ears; ``sononerf.head.reception`` defines the ratio."""
 
     snr_db: Decibels | tuple[Decibels, Decibels] | None = None  # none, both ears, (left, right)
     relative_to: Literal["target", "pose"] = "target"

@@ -8,9 +8,9 @@ from contextlib import closing
 
 import numpy as np
 
-from sononerf.array_types import Singles
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import RANGE_DB, compress, mae_db
+from sononerf.numerics import Singles
 from sononerf.progress import Progress, Task
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.simulator import Simulator

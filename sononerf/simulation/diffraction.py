@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from sononerf.array_types import Bools, Floats, Ints
 from sononerf.geometry.directions import GOLDEN_TURN
-from sononerf.geometry.normals import CREASE
+from sononerf.geometry.meshes import CREASE
 from sononerf.geometry.raycast import RayCaster
+from sononerf.numerics import Bools, Floats, Ints
 from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing, Sound
 from sononerf.simulation.reflection import Reflection

@@ -14,21 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf import locks, storage
-from sononerf.array_types import Floats, Singles
+from sononerf import storage
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal
-from sononerf.echoes.splits import split_of
+from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, seal, split_of
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, expect
 from sononerf.executor import reach
 from sononerf.geometry.poses import Poses
-from sononerf.head.attached import attach
 from sononerf.head.call import call_content
+from sononerf.head.call_file import attach
 from sononerf.head.ears import directivity_content
 from sononerf.head.head import Head
 from sononerf.head.reception import warn_of_call
 from sononerf.memory import require_disk
+from sononerf.numerics import Floats, Singles
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
 from sononerf.settings.loading import checked_section
@@ -137,7 +136,7 @@ def simulate(
         kept = MemoryEnsemble(positions=poses.positions, rotations=poses.rotations, **given)
         _fill(kept, simulator, poses, settings, **how)
         return Echoes(kept, head)
-    with locks.lock(path):
+    with storage.lock(path):
         store = EnsembleStore.create(
             path, poses_positions=poses.positions, poses_rotations=poses.rotations, **given
         )

@@ -9,8 +9,8 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
+from sononerf.numerics import Floats
 
 POINTS = 1.5
 """Points of the surface per source where the boundary condition holds; 2 gave the same error."""

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sononerf.array_types import Floats, Ints, Singles
-from sononerf.compiled import compiled
+from sononerf.numerics import Floats, Ints, Singles, compiled
 
 
 @dataclass(frozen=True, eq=False)

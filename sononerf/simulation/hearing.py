@@ -1,27 +1,176 @@
 # SPDX-License-Identifier: MIT
-"""Reception of sound from points: beam, ears, air, and arrival times."""
+"""Reception of sound from points: which hits are heard, by ears and beam, and when."""
 
 from __future__ import annotations
 
 import copy
 import math
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import Any, Protocol
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
-from sononerf.array_types import Complexes, Floats, Ints, Singles
 from sononerf.geometry.plane import Plane
 from sononerf.head.ears import beam_gain, ear_gain
 from sononerf.head.head import Head
+from sononerf.numerics import Bools, Complexes, Floats, Ints, Singles, compiled
+from sononerf.scene.scene import Scene
 from sononerf.simulation.impulse_response import (
+    NODE_SPACING,
     Synthesis,
     air_loss,
     deposit,
     plan_synthesis,
     synthesise,
 )
+from sononerf.simulation.paths import Bounce
+
+RESOLVED_FREQUENCY = 80e3
+"""Frequency at which bundles of rays and shadows resolve the surface, Hz; near the top of the
+default band, 100 kHz."""
+RESOLVED = 1.0
+"""Bend of the path over a bundle up to which a mirror point in it is resolved, rad."""
+NEAR = 4.0
+"""Phase from a bundle to a mirror point up to which the point counts, rad; it has e^-4 there."""
+REACHED = 1.0
+"""Distance from the middle of a bundle to a mirror point of its own, sides of the bundle."""
+WIDE = 5e-4
+"""Width of a bundle, m, above which it may hold a mirror point of the next bounce that its ray does
+not show."""
+EXPLORE = 0.1
+"""Weight of such a bundle, as a fraction of that of one with a mirror point."""
+EARS_APART = 0.03
+"""Distance between receivers, m, up to which the middle between them stands for each of them."""
+
+
+@dataclass(frozen=True)
+class Audibility:
+    """Test of the hits of a bounce for audibility.
+
+    Attributes:
+        wavenumber (rad/m): At the frequency that bundles must resolve.
+        farthest (m): Longest detour that is heard.
+        radius (m): Radius of the scene.
+        bounces: Largest number of hits of a ray.
+    """
+
+    wavenumber: float
+    farthest: float
+    radius: float
+    bounces: int
+
+    def judge(self, bounce: Bounce, listeners: Floats) -> tuple[Bools, Floats]:
+        """Return which hits some listener can hear (H,), and the possible error of each (H,)."""
+        count = len(bounce.ray)
+        audible, doubt = np.zeros(count, dtype=np.bool_), np.zeros(count)
+        # Sound that continues from here may be heard, whatever the view from the head.
+        explore = EXPLORE / self.radius if 1 < bounce.number < self.bounces else 0.0
+        angle = np.atleast_1d(np.asarray(bounce.solid_angle, dtype=np.float64))
+        tube = np.ascontiguousarray(bounce.footprint.tube)
+        for place in listeners:
+            ways = bounce.ways_to(place)
+            _judge(
+                audible, doubt, ways.distance, ways.rise, ways.detour, ways.stiffness, tube, angle,
+                self.wavenumber, self.farthest, explore,
+            )  # fmt: skip
+        return audible, doubt
+
+
+@compiled
+def _judge(
+    audible: Bools,
+    doubt: Floats,
+    distance: Floats,
+    rise: Singles,
+    detour: Singles,
+    stiffness: Singles,
+    tube: Singles,
+    solid_angle: Floats,
+    k: float,
+    farthest: float,
+    explore: float,
+) -> None:
+    """Add one listener to the audible hits (H,) and their doubts (H,).
+
+    In: audible, doubt (H,), distance, rise, detour, stiffness (H,), tube ((H,), m²/sr), solid_angle
+    ((H,) or (1,), sr), k (rad/m), farthest (m), explore (1/m).
+    """
+    for i in range(len(distance)):
+        angle = solid_angle[i if len(solid_angle) > 1 else 0]
+        side, width = math.sqrt(angle), math.sqrt(tube[i])
+        level = angle * width
+        # Seen from an ear either may be somewhat different from the middle between the ears.
+        facing = rise[i] * distance[i] > -EARS_APART
+        if facing and detour[i] < 1.25 * farthest:
+            audible[i] = True
+        # Counted in turns of the ray at the emitter, the mirror point is this far from the cell.
+        off = math.sqrt(2.0 * detour[i] / max(stiffness[i], 1e-12)) - REACHED * side
+        least = 0.5 * stiffness[i] * max(off, 0.0) ** 2
+        turns = k * stiffness[i] * angle
+        if facing and turns > RESOLVED and k * least < NEAR:
+            found = level / distance[i] * math.exp(-k * least) * min(turns, 10.0)
+            doubt[i] = max(doubt[i], found)
+        if side * width > WIDE:
+            doubt[i] = max(doubt[i], explore * level)
+
+
+FINE = 0.05
+"""Distance between points at which the first arrival is sought, in radii of a sphere around the
+scene. The path is then at most 0.1 % of that radius too long."""
+SILENT = 0.21 / NODE_SPACING
+"""Time before the first arrival up to which the echo is zero, s (26 us). With half an analysis
+window of 32 us nothing is heard more than 10 mm before the nearest point."""
+
+
+class Arrival:
+    """The shortest ways from an emitter over the surface of a scene to an ear.
+
+    Attributes:
+        radius (m): Radius of a sphere around the scene.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        corners = np.asarray(scene.mesh.vertices, dtype=np.float64)[np.asarray(scene.mesh.faces)]
+        corners = corners.reshape(-1, 3)
+        self._middle = (corners.min(axis=0) + corners.max(axis=0)) / 2.0
+        self.radius = float(np.linalg.norm(corners - self._middle, axis=1).max())
+        vertices, faces = trimesh.remesh.subdivide_to_size(
+            scene.mesh.vertices, scene.mesh.faces, FINE * self.radius, max_iter=20
+        )
+        used = np.asarray(vertices, dtype=np.float64)[np.unique(faces)]
+        self._points: Floats = np.unique(used, axis=0) - self._middle
+
+    def shortest(self, emitters: Floats, ears: Floats) -> Floats:
+        """Return the shortest way (P, E), m.
+
+        In: emitters ((P, 3), m), ears ((P, E, 3), m).
+        """
+        found = np.zeros(ears.shape[:2])
+        square = np.einsum("nd,nd->n", self._points, self._points)
+        for pose, heads in enumerate(np.concatenate([emitters[:, None], ears], axis=1)):
+            heads = heads - self._middle
+            # Products suffice: coordinates count from the middle of the scene.
+            way = square - 2.0 * heads @ self._points.T
+            way += np.einsum("hd,hd->h", heads, heads)[:, None]
+            np.sqrt(np.maximum(way, 0.0, out=way), out=way)
+            found[pose] = (way[:1] + way[1:]).min(axis=1)
+        return found
+
+
+def silence_before(echo: Floats, first: Floats, *, sampling_rate: float) -> Floats:
+    """Set the echo before the first possible arrival to zero.
+
+    The gains of beam and ears are real, so their responses are even in time: one half precedes the
+    echo. Everything that is more than 26 us earlier than the first possible arrival is set to zero.
+    Onsets and free space are then found from sound that has arrived.
+
+    In: echo (E, S), first ((E,), s), sampling_rate (Hz). Out: echo (E, S).
+    """
+    before = first[:, None] - np.arange(echo.shape[1]) / sampling_rate
+    return np.where(before < SILENT, echo, 0.0)
 
 
 class Listener(Protocol):

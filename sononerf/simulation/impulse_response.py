@@ -27,9 +27,8 @@ import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
 
-from sononerf.array_types import Complexes, Floats, Ints
-from sononerf.compiled import compiled
 from sononerf.head.ears import NOTCH_WIDTH
+from sononerf.numerics import Complexes, Floats, Ints, compiled
 from sononerf.settings.schema import SpectrogramSettings
 
 HIGHEST = 150e3

@@ -21,15 +21,14 @@ import scipy.fft
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from sononerf.array_types import Complexes, Floats, Ints
 from sononerf.errors import ResourceError
 from sononerf.geometry.directions import spread_points
 from sononerf.geometry.plane import Plane
 from sononerf.geometry.raycast import RayCaster
 from sononerf.head.ears import Ears, beam_gain, ear_gain
 from sononerf.memory import available_cores, available_memory
+from sononerf.numerics import Complexes, Floats, Ints
 from sononerf.scene.scene import Scene
-from sononerf.simulation.audibility import Arrival
 from sononerf.simulation.equivalent_sources import (
     CHECKS,
     INSIDE,
@@ -38,7 +37,7 @@ from sononerf.simulation.equivalent_sources import (
     arriving,
     waves,
 )
-from sononerf.simulation.hearing import Hearing
+from sononerf.simulation.hearing import Arrival, Hearing
 
 FALL = 1.3
 """Highest frequency of the low band over the one from which it gives way to the rays. A wider

@@ -8,9 +8,8 @@ import math
 import numpy as np
 import trimesh
 
-from sononerf.array_types import Bools, Floats, Ints
-from sononerf.compiled import compiled
-from sononerf.geometry.normals import CREASE, bodies, corner_normals, weight_gradients
+from sononerf.geometry.meshes import CREASE, bodies, corner_normals, weight_gradients
+from sononerf.numerics import Bools, Floats, Ints, compiled
 
 
 class Outlines:

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.array_types import Bools, Floats, Ints
 from sononerf.geometry.directions import CapSpiral, Cells
 from sononerf.geometry.raycast import Hits, RayCaster
+from sononerf.numerics import Bools, Floats, Ints
 from sononerf.simulation.footprint import Footprint, Ways, emit, land, onto, ways_to
 from sononerf.simulation.reflection import leave
 

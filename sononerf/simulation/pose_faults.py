@@ -8,12 +8,11 @@ import logging
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sononerf.array_types import Bools, Floats
 from sononerf.errors import InputError, NumericalError
-from sononerf.geometry.aim import aim_fault
 from sononerf.geometry.plane import Plane
-from sononerf.geometry.poses import Poses
+from sononerf.geometry.poses import Poses, aim_fault
 from sononerf.geometry.raycast import contains
+from sononerf.numerics import Bools, Floats
 from sononerf.scene.scene import Scene
 
 logger = logging.getLogger("sononerf")

@@ -12,14 +12,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sononerf.array_types import Bools, Floats, Ints, Singles
 from sononerf.geometry.directions import CapSpiral
-from sononerf.geometry.normals import bodies, enclosing_balls
+from sononerf.geometry.meshes import bodies, enclosing_balls
 from sononerf.geometry.raycast import Hits, RayCaster
+from sononerf.numerics import Bools, Floats, Ints, Singles
 from sononerf.scene.scene import Scene
-from sononerf.simulation.audibility import EARS_APART, RESOLVED_FREQUENCY, Audibility
 from sononerf.simulation.diffraction import Diffraction
-from sononerf.simulation.hearing import Hearing, Listener
+from sononerf.simulation.hearing import (
+    EARS_APART,
+    RESOLVED_FREQUENCY,
+    Audibility,
+    Hearing,
+    Listener,
+)
 from sononerf.simulation.outlines import Outlines
 from sononerf.simulation.paths import Bounce, aim, echo_paths, gathered
 from sononerf.simulation.reflection import Reflection, coarse_gain, reflection, unfaded

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Complexes, Floats, Singles
-from sononerf.compiled import compiled
+from sononerf.numerics import Complexes, Floats, Singles, compiled
 from sononerf.scene.material import Material
 
 COARSEST = 10.0  # rad

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from sononerf.array_types import Bools, Complexes, Floats, Ints
-from sononerf.compiled import compiled
 from sononerf.geometry.raycast import Hits, RayCaster
-from sononerf.simulation.audibility import RESOLVED_FREQUENCY
+from sononerf.numerics import Bools, Complexes, Floats, Ints, compiled
+from sononerf.simulation.hearing import RESOLVED_FREQUENCY
 from sononerf.simulation.impulse_response import NODE_SPACING
 from sononerf.simulation.outlines import Outlines
 

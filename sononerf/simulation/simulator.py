@@ -14,8 +14,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sononerf.array_types import Floats, Singles
-from sononerf.echoes.splits import TEST, TRAIN, VALIDATION
+from sononerf.echoes.memory_ensemble import TEST, TRAIN, VALIDATION
 from sononerf.errors import InputError
 from sononerf.geometry.poses import (
     Poses,
@@ -27,12 +26,12 @@ from sononerf.geometry.poses import (
 )
 from sononerf.head.head import Head
 from sononerf.memory import require_memory
+from sononerf.numerics import Floats, Singles
 from sononerf.progress import Progress
 from sononerf.scene.scene import Scene
 from sononerf.settings.scene_schema import PoseSettings
 from sononerf.settings.schema import SimulationSettings
-from sononerf.simulation.audibility import RESOLVED_FREQUENCY, Arrival, silence_before
-from sononerf.simulation.hearing import hearing_of
+from sononerf.simulation.hearing import RESOLVED_FREQUENCY, Arrival, hearing_of, silence_before
 from sononerf.simulation.low_band import LowBand, low_band
 from sononerf.simulation.rays import Rays
 

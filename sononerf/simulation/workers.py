@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 
-from sononerf.array_types import Floats, Singles
 from sononerf.errors import SonoNerfError
 from sononerf.executor import TaskError, computed, preload
 from sononerf.geometry.poses import Poses
 from sononerf.memory import available_cores
+from sononerf.numerics import Floats, Singles
 from sononerf.simulation.simulator import Simulator
 
 MOST_WORKERS = 8

@@ -9,8 +9,8 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
+from sononerf.numerics import Floats
 
 MeshFormat = Literal["ply", "stl", "glb"]
 

@@ -9,11 +9,11 @@ from typing import Literal, get_args
 import numpy as np
 from scipy.spatial import cKDTree
 
-from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError, expect
 from sononerf.geometry.directions import fibonacci_cap, fibonacci_sphere
 from sononerf.geometry.poses import Poses
+from sononerf.numerics import Floats
 from sononerf.progress import Progress
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.surface_error import POSES, Bumps, Misfit

@@ -14,20 +14,20 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from sononerf import storage
-from sononerf.array_types import Bools, Floats
+from sononerf.display import Shown
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.region import ENOUGH
 from sononerf.errors import InputError, expect
+from sononerf.geometry.lattice import Volume
 from sononerf.geometry.plane import Plane
 from sononerf.geometry.raycast import RayCaster
-from sononerf.shown import Shown
+from sononerf.numerics import Bools, Floats
 from sononerf.surface.mesh_files import MeshFormat, mesh_bytes
 from sononerf.surface.start.evidence import ALIGNED, poses_that_heard
 from sononerf.surface.start.occupancy import QUIET
 from sononerf.surface.start.read_out import Method, Reading
 from sononerf.surface.start.sheet import THIN
-from sononerf.surface.start.volume import Volume
 
 FORMATS: tuple[MeshFormat, ...] = get_args(MeshFormat)
 """Kinds of mesh files that are written."""
@@ -50,7 +50,7 @@ class Surface(Shown):
         error_db (dB): Objective of the refinement on validation poses; None without a refinement.
         faults: Faults of the refinement, one line each.
         candidates: The starts of the refinement with their objectives, see
-            :class:`~sononerf.surface.refine.refined.Refined`.
+            :class:`~sononerf.surface.refine.refinement.Refined`.
         echoes: Echoes of its field; None if unknown.
         reading: Evidence that it was made from; None if there is none.
 

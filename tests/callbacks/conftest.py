@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import lightning
 import pytest
 
-from sononerf.callbacks.tensorboard import RunLogger
+from sononerf.callbacks import RunLogger
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.field.checkpoint_io import DurableCheckpointIO

@@ -10,7 +10,7 @@ import threading
 import lightning
 import pytest
 
-from sononerf.callbacks.epoch import CheckpointCallback
+from sononerf.callbacks import CheckpointCallback
 from sononerf.errors import StoppedError
 from sononerf.field.checkpoint_io import DurableCheckpointIO
 

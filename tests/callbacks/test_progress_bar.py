@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import lightning
 
-from sononerf.callbacks.epoch import ProgressCallback
+from sononerf.callbacks import ProgressCallback
 
 
 class Task:

@@ -6,8 +6,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sononerf.echoes.detection import heard_again
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.recorded_noise import heard_again
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import ACTIVE_DB, active_level, compress
 from sononerf.head.head import Head

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sononerf.echoes.splits import draw_split, pose_groups, repeats, split_of
+from sononerf.echoes.memory_ensemble import draw_split, pose_groups, repeats, split_of
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses
 

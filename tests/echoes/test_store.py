@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import zarr
 
-from sononerf import locks
+from sononerf import storage
 from sononerf.echoes.memory_ensemble import seal
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, NumericalError, StorageError
@@ -153,7 +153,7 @@ def test_poses_of_another_process_are_found(tmp_path):
 
 
 def test_a_folder_that_is_locked_is_no_foreign_one(tmp_path):
-    with locks.lock(tmp_path / "s"):
+    with storage.lock(tmp_path / "s"):
         assert len(filled(tmp_path / "s")) == POSES
 
 
@@ -283,7 +283,7 @@ KILL_POSES, KILL_SHAPE = 30, (2, 40, 16)
 
 def simulate(path, told=lambda: None):
     """What a worker does: open, add what is missing, seal."""
-    with locks.lock(path):
+    with storage.lock(path):
         store = EnsembleStore.create(
             path,
             poses_positions=np.zeros((KILL_POSES, 3)),

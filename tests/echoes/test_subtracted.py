@@ -8,8 +8,7 @@ import pickle
 import numpy as np
 import pytest
 
-from sononerf.echoes.store import EnsembleStore
-from sononerf.echoes.subtracted import SubtractedStore
+from sononerf.echoes.store import EnsembleStore, SubtractedStore
 from sononerf.errors import IncompatibleError, InputError, NumericalError
 from tests.echoes.test_store import POSES, axes, spectrogram
 

@@ -10,8 +10,8 @@ from sononerf.evaluation.baseline import (
     backprojection,
     best_level_surface,
 )
+from sononerf.geometry.lattice import grid_over, volume_from_function
 from sononerf.geometry.poses import Poses
-from sononerf.surface.start.volume import grid_over, volume_from_function
 
 EMITTER = np.array([0.0, 0.0, -0.01])
 EARS = np.array([[-0.01, 0.01, 0.005], [-0.01, -0.01, 0.005]])

@@ -4,8 +4,8 @@ import pytest
 import trimesh
 
 from sononerf.errors import NumericalError
-from sononerf.evaluation.difference import added_part, compare
-from sononerf.surface.start.volume import Volume, grid_over
+from sononerf.evaluation.numbers import added_part, compare
+from sononerf.geometry.lattice import Volume, grid_over
 
 GRID = grid_over([-0.03] * 3, [0.03] * 3, 0.005)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sononerf.evaluation.interval import covered, interval_db, learn_interval
+from sononerf.evaluation.traced import covered, interval_db, learn_interval
 from sononerf.head.decibels import RANGE_DB
 
 

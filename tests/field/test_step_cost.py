@@ -8,8 +8,8 @@ import torch
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.field.datamodule import EchoDataModule
+from sononerf.field.fitting import step_cost
 from sononerf.field.module import EchoModule
-from sononerf.field.step_cost import step_cost
 from sononerf.geometry.poses import Poses
 from sononerf.head.head import Head
 from sononerf.settings.schema import SpectrogramSettings

@@ -6,8 +6,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sononerf.geometry.aim import aim_fault, off_axis
-from sononerf.geometry.poses import Poses, euler_from_rotation, rotation_from_euler
+from sononerf.geometry.poses import (
+    Poses,
+    aim_fault,
+    euler_from_rotation,
+    off_axis,
+    rotation_from_euler,
+)
 
 CENTRE = np.array([0.03, -0.02, 0.01])
 RIGHT = Poses.looking_at(

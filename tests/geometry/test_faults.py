@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 
 BOX = trimesh.creation.box((1.0, 1.0, 1.0))
 

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from sononerf.errors import InputError
 from sononerf.geometry.frame import Frame
-from sononerf.recordings.columns import read_table
-from sononerf.recordings.conventions import original_frame, to_poses
+from sononerf.recordings.pose_tables import original_frame, read_table, to_poses
 from sononerf.settings.import_schema import ImportSettings
 
 FRAMES = {

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.geometry.normals import (
+from sononerf.geometry.meshes import (
     bodies,
     corner_normals,
     enclosing_balls,

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from sononerf.head.noise import draw_noise, loudest_power, noise_level, target_gain
+from sononerf.head.reception import draw_noise, loudest_power, noise_level, target_gain
 from sononerf.settings.schema import NoiseSettings, SpectrogramSettings
 
 ANALYSIS = SpectrogramSettings()

@@ -6,8 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from sononerf.geometry.poses import Poses, cap_poses, euler_from_rotation, random_poses
-from sononerf.recordings.columns import Columns
-from sononerf.recordings.conventions import turntable_poses
+from sononerf.recordings.pose_tables import Columns, turntable_poses
 
 EMITTER = np.array([0.0, 0.0, -0.010])
 EARS = np.array([[-0.010, 0.010, 0.005], [-0.010, -0.010, 0.005]])

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.recordings.airsas import read_airsas
-from sononerf.recordings.conventions import to_poses
+from sononerf.recordings.pose_tables import to_poses
+from sononerf.recordings.readers import read_airsas
 from sononerf.settings.import_schema import ImportSettings
 
 COUNT, SAMPLES = 5, 80

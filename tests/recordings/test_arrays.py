@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.recordings.arrays import read_numpy
-from sononerf.recordings.conventions import to_poses
+from sononerf.recordings.pose_tables import to_poses
+from sononerf.recordings.readers import read_numpy
 from sononerf.settings.import_schema import ImportSettings
 
 COUNT, RECEIVERS, SAMPLES = 4, 2, 50

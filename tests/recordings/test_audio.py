@@ -13,8 +13,8 @@ from scipy.io import wavfile
 from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses
 from sononerf.recordings.audio import as_float, pose_table, read_audio, wav_bytes
-from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.folder import read_folder
+from sononerf.recordings.pose_tables import to_poses
 from sononerf.settings.import_schema import ImportSettings
 
 RATE = 250_000

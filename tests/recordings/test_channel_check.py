@@ -10,8 +10,8 @@ import pytest
 
 from sononerf.errors import InputError
 from sononerf.recordings.audio import Recording
-from sononerf.recordings.channel_check import channels_of, check_channels, faults_of_channels
-from sononerf.recordings.columns import Columns
+from sononerf.recordings.pings import channels_of, check_channels, faults_of_channels
+from sononerf.recordings.pose_tables import Columns
 
 LOOKS = 6.0
 

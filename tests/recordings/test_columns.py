@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.recordings.columns import columns_of, read_table
+from sononerf.recordings.pose_tables import columns_of, read_table
 from sononerf.settings.import_schema import ImportSettings
 
 PLAIN = ImportSettings()

@@ -9,8 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from sononerf.errors import InputError, SettingsError
 from sononerf.geometry.poses import rotation_from_euler
-from sononerf.recordings.columns import columns_of
-from sononerf.recordings.conventions import frame_matrices, to_poses, turntable_poses
+from sononerf.recordings.pose_tables import columns_of, frame_matrices, to_poses, turntable_poses
 from sononerf.settings.import_schema import ImportSettings
 
 # A head at 1 m east, 2 m north, 3 m up that looks north and 30 degrees down, right ear down a bit.

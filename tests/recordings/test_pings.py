@@ -10,8 +10,8 @@ import pytest
 
 from sononerf.errors import InputError
 from sononerf.recordings.audio import Recording
-from sononerf.recordings.columns import Columns
 from sononerf.recordings.pings import Clipping, Cutter, check_numbers, clipped_pings, cut, mix
+from sononerf.recordings.pose_tables import Columns
 
 RATE = 1e5
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from sononerf.geometry.poses import Poses
-from sononerf.recordings.columns import Columns
-from sononerf.recordings.conventions import to_poses
 from sononerf.recordings.pose_check import alternatives, check_poses, mirrored, shifted
+from sononerf.recordings.pose_tables import Columns, to_poses
 from sononerf.settings.import_schema import ImportSettings
 from tests.recordings.bodies import EARS, EMITTER, body, first_echoes, poses_of, table
 

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from sononerf.errors import NumericalError
+from sononerf.geometry.lattice import Volume
 from sononerf.report.pictures.mip_picture import maximum_intensity_projections
-from sononerf.surface.start.volume import Volume
 
 
 def test_each_projection_looks_along_its_axis():

@@ -8,7 +8,7 @@ import shutil
 
 import pytest
 
-from sononerf.callbacks import preview
+from sononerf import callbacks
 from sononerf.head import head as head_module
 from sononerf.run import reconstruct as reconstruct_module
 from sononerf.run.fit import fit
@@ -63,7 +63,7 @@ def without_pictures():
     """Spectrograms and ears take most of a tiny fit and have tests of their own."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(head_module, "analysed_ears", functools.cache(head_module.analysed_ears))
-        patch.setattr(preview, "writer_of", lambda trainer: None)
+        patch.setattr(callbacks, "writer_of", lambda trainer: None)
         yield
 
 
@@ -72,7 +72,7 @@ def fitted_run(tiny_settings, tmp_path_factory):
     """The tiny experiment, fitted; for reading alone."""
     path = tmp_path_factory.mktemp("fitted") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(preview, "writer_of", lambda trainer: None)
+        patch.setattr(callbacks, "writer_of", lambda trainer: None)
         fit(tiny_settings(), path, accelerator="cpu", workers=1)
     return path
 
@@ -82,7 +82,7 @@ def fitted(tiny_settings, tmp_path_factory):
     """The tiny experiment with a longer fit; for reading alone."""
     path = tmp_path_factory.mktemp("fitted") / "run"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(preview, "writer_of", lambda trainer: None)
+        patch.setattr(callbacks, "writer_of", lambda trainer: None)
         fit(tiny_settings(fit={"epochs": 10}), path, accelerator="cpu", workers=1)
     return path
 

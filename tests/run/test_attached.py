@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sononerf.errors import InputError
-from sononerf.head.attached import attach
+from sononerf.head.call_file import attach
 from sononerf.run.build import with_attached
 from sononerf.settings.loading import validate_settings
 

@@ -15,8 +15,7 @@ from sononerf.errors import IncompatibleError, InputError, SettingsError
 from sononerf.head.spectrogram import range_axis
 from sononerf.run import calibrate as module
 from sononerf.run.build import with_store
-from sononerf.run.calibrate import calibrate, dependent_cells, describe, kinds_of
-from sononerf.run.corrected_store import moved
+from sononerf.run.calibrate import calibrate, dependent_cells, describe, kinds_of, moved
 from sononerf.run.run import Run
 from sononerf.settings.schema import SpectrogramSettings
 from sononerf.surface.refine.self_calibration import Calibration, Estimate

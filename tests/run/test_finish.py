@@ -11,7 +11,7 @@ import pytest
 import safetensors.torch
 import trimesh
 
-from sononerf import locks, storage
+from sononerf import storage
 from sononerf.errors import LockedError, NumericalError, ResourceError
 from sononerf.evaluation import baseline
 from sononerf.evaluation import geometry as geometry_module
@@ -21,10 +21,10 @@ from sononerf.run import fit as finish_module
 from sononerf.run import run as run_module
 from sononerf.run.evaluate import evaluate
 from sononerf.run.fit import finish
+from sononerf.run.model_files import NAME
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run import STAGES, Run
-from sononerf.run.traced_file import NAME
 
 SPHERE = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
 
@@ -214,7 +214,7 @@ def test_a_run_in_use_is_left_alone(run, command):
             command(run)
         caught.append(error.value)
 
-    with locks.lock(run):
+    with storage.lock(run):
         other = threading.Thread(target=elsewhere)
         other.start()
         other.join()

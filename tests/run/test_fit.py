@@ -20,9 +20,8 @@ import torch
 import trimesh
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 
-from sononerf import locks, memory
-from sononerf.callbacks.epoch import SIGNALS, CheckpointCallback, ProgressCallback
-from sononerf.callbacks.preview import PreviewCallback
+from sononerf import memory, storage
+from sononerf.callbacks import SIGNALS, CheckpointCallback, PreviewCallback, ProgressCallback
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.store import EnsembleStore
@@ -305,7 +304,7 @@ def test_overwrite_moves_aside_and_loses_nothing(tiny, tmp_path):
 def test_overwrite_leaves_a_run_at_work_and_other_peoples_folders_alone(tiny, tmp_path):
     path = tmp_path / "run"
     run(tiny(fit={"max_steps": 1}), path)
-    with locks.lock(path), pytest.raises(LockedError, match="in use"):
+    with storage.lock(path), pytest.raises(LockedError, match="in use"):
         run(tiny(fit={"max_steps": 2}), path, overwrite=True)
     assert (path / "model.json").is_file()
     thesis = tmp_path / "thesis"
@@ -457,7 +456,7 @@ def test_a_process_does_not_wait_for_a_first_one_that_does_not_run(tiny, tmp_pat
     monkeypatch.setattr(fit_module, "PATIENCE_SECONDS", 1.0)
     settings = tiny(data={"store": str(tmp_path / "never")})
     began = time.monotonic()
-    with locks.lock(tmp_path / "run"), ThreadPoolExecutor() as pool:
+    with storage.lock(tmp_path / "run"), ThreadPoolExecutor() as pool:
         waiting = pool.submit(fit, settings, tmp_path / "run", accelerator="cpu")
         time.sleep(2.0)
         assert not waiting.done()

@@ -15,9 +15,9 @@ from sononerf.errors import (
     NumericalError,
     SettingsError,
 )
-from sononerf.locks import lock
 from sononerf.run.import_recordings import check_before, describe, draw, import_understood
 from sononerf.run.understand import understand
+from sononerf.storage import lock
 from tests.recordings.recorded import SETTINGS, TARGET, arrays, waveforms
 
 GIVEN = (*SETTINGS, "import.source=by formula", "import.licence=CC0")

@@ -10,7 +10,7 @@ import sys
 import pytest
 
 from sononerf.errors import SettingsError, StorageError
-from sononerf.run.new_plugin import new_plugin
+from sononerf.run.scenes import new_plugin
 
 
 def lines(path):

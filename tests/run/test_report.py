@@ -20,8 +20,8 @@ from PIL import Image
 from sononerf.errors import InputError, NumericalError
 from sononerf.report.surface_views import SurfaceViews
 from sononerf.run import report as report_module
+from sononerf.run.compare import table
 from sononerf.run.report import report as write_report
-from sononerf.run.table import table
 from sononerf.surface.mesh_files import mesh_bytes
 from tests.browser import CHROMIUM, browser
 

@@ -8,7 +8,7 @@ import json
 import pytest
 
 from sononerf.errors import IncompatibleError, InputError, SettingsError
-from sononerf.run.provenance import differing_keys
+from sononerf.run.build import differing_keys
 from sononerf.run.run import Run
 from sononerf.settings.loading import dump_yaml, load_settings
 

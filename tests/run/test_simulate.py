@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.echoes.store import EnsembleStore
-from sononerf.echoes.subtracted import SubtractedStore
+from sononerf.echoes.store import EnsembleStore, SubtractedStore
 from sononerf.errors import (
     IncompatibleError,
     InputError,
@@ -25,7 +24,6 @@ from sononerf.errors import (
 )
 from sononerf.head.decibels import compress
 from sononerf.head.directivity.directivity_files import write_sofa
-from sononerf.locks import lock
 from sononerf.run import simulate as run_module
 from sononerf.run.import_recordings import read_recordings
 from sononerf.run.simulate import (
@@ -39,6 +37,7 @@ from sononerf.run.simulate import (
 from sononerf.scene.material import LEAF, RIGID
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.simulation import ensemble as simulate_module
+from sononerf.storage import lock
 from tests.head.directivity.patterns import pair
 
 

@@ -27,9 +27,9 @@ from sononerf.run import fit as finish_module
 from sononerf.run import predict as predict_module
 from sononerf.run import run as run_module
 from sononerf.run.build import head_of, simulator_of
+from sononerf.run.model_files import NAME, load_traced
 from sononerf.run.predict import predict
 from sononerf.run.run import Run
-from sononerf.run.traced_file import NAME, load_traced
 from sononerf.scene.scene import Scene
 from sononerf.simulation.simulator import Simulator
 

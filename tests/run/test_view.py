@@ -18,11 +18,11 @@ import pytest
 import trimesh
 
 from sononerf.errors import InputError
-from sononerf.report.echo_sound import RATE, STRETCH, echo_wav
+from sononerf.geometry.lattice import Volume, vti_bytes
+from sononerf.report.notebook import RATE, STRETCH, echo_wav
 from sononerf.run.run import Run
 from sononerf.run.view import View
 from sononerf.surface.mesh_files import mesh_bytes
-from sononerf.surface.start.volume import Volume, vti_bytes
 from tests.browser import CHROMIUM, browser
 
 pytestmark = pytest.mark.thorough

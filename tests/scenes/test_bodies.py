@@ -4,7 +4,7 @@ import pytest
 from scipy.special import ellipe
 from sononerf_scenes.bodies import EDGE, SIDE, ball, placed, tube
 
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 
 RADIUS = 0.008
 

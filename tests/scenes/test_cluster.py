@@ -7,7 +7,7 @@ from sononerf_scenes.bodies import EDGE
 from sononerf_scenes.cluster import GAP
 
 from sononerf.errors import SettingsError
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 from sononerf.scene.scene import load_scene
 
 

@@ -5,7 +5,7 @@ import trimesh
 from sononerf_scenes.bodies import EDGE
 
 from sononerf.errors import SettingsError
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 from sononerf.scene.composition import surfaces_cross
 from sononerf.scene.scene import MATERIALS, load_scene
 

@@ -6,7 +6,7 @@ from sononerf_scenes.bodies import EDGE
 from sononerf_scenes.dragonfly import WING_CLEARANCE, Seat, dragonfly_on
 
 from sononerf.errors import SettingsError
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 
 
 def blade(curl=0.0, bend=0.0, undulation=0.0, width=0.1):

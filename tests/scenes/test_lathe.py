@@ -4,7 +4,7 @@ import pytest
 from sononerf_scenes.bodies import EDGE, SIDE
 from sononerf_scenes.lathe import lathe
 
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 
 CYLINDER = [(0.0, 0.0), (0.02, 0.0), (0.02, 0.03), (0.0, 0.03)]
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import SettingsError
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 from sononerf.scene.scene import MATERIALS, load_scene
 
 LEAF = {"seed": 3, "curl": 40.0, "bend": 50.0, "length": 0.16, "yaw": 25.0, "roll": 10.0}

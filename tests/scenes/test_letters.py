@@ -8,7 +8,7 @@ from sononerf_scenes.bodies import EDGE, SIDE, _even
 from sononerf_scenes.letters import FONT, SPACING, THINNER
 
 from sononerf.errors import SettingsError
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 from sononerf.scene.scene import load_scene
 
 THICKEST = 0.12 / (1.0 - 2 * 0.12)  # radius of a stroke in the font's units

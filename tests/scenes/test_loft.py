@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from sononerf_scenes.loft import evenly, loft
 
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 
 
 def test_a_straight_loft_is_a_body_of_revolution():

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import SettingsError
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 from sononerf.scene.scene import MATERIALS, load_scene
 
 

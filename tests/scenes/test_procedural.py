@@ -6,7 +6,7 @@ from sononerf_scenes.cluster import GAP
 from sononerf_scenes.procedural import KINDS
 
 from sononerf.errors import SettingsError
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 from sononerf.scene.material import MATERIALS
 from sononerf.scene.scene import load_scene
 

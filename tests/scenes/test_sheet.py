@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from sononerf_scenes.sheet import Outline, filled, two_sided
 
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 
 SPACING = 0.001
 

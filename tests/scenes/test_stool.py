@@ -5,7 +5,7 @@ from sononerf_scenes.bodies import EDGE, SIDE
 from sononerf_scenes.stool import OUT
 
 from sononerf.errors import SettingsError
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 from sononerf.scene.scene import load_scene
 
 

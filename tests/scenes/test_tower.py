@@ -4,7 +4,7 @@ import pytest
 from sononerf_scenes.bodies import EDGE
 
 from sononerf.errors import SettingsError
-from sononerf.geometry.faults import surface_faults
+from sononerf.geometry.meshes import surface_faults
 from sononerf.scene.scene import load_scene
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
-from sononerf.simulation.audibility import Arrival, silence_before
+from sononerf.simulation.hearing import Arrival, silence_before
 from tests.simulation.listening import ball, wall
 
 

@@ -10,7 +10,7 @@ from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
 from sononerf.simulation import low_band as module
-from sononerf.simulation.audibility import Arrival
+from sononerf.simulation.hearing import Arrival
 from sononerf.simulation.low_band import (
     HeadPoses,
     LowBand,

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from sononerf import open_run, reconstruct
-from sononerf.array_types import Floats
 from sononerf.evaluation.geometry import signed_error
+from sononerf.numerics import Floats
 from sononerf.run.build import true_mesh
 from sononerf.run.run import Run
 from sononerf.surface.reconstruction import starts_of

@@ -14,9 +14,9 @@ import numpy as np
 
 import sononerf as sn
 from sononerf import storage
-from sononerf.array_types import Floats, Singles
 from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.numerics import Floats, Singles
 from sononerf.scene.scene import load_scene
 from sononerf.surface.next_poses import CANDIDATES
 from tools.benchmarks.experiment import Row, aligned, append_line, ending, origin

@@ -31,11 +31,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sononerf import storage
-from sononerf.array_types import Floats
 from sononerf.errors import InputError
 from sononerf.head.directivity.record import MOST_RECEIVERS, Directivity, unit_vectors
-from sononerf.input_files import require_regular
 from sononerf.matlab_files import read_mat
+from sononerf.numerics import Floats
+from sononerf.storage import require_regular
 
 logger = logging.getLogger("sononerf")
 

@@ -10,9 +10,9 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from sononerf.array_types import Floats, Ints
 from sononerf.errors import InputError
 from sononerf.geometry.directions import fibonacci_sphere
+from sononerf.numerics import Floats, Ints
 
 FADE = math.radians(10.0)
 """Angle outside the measured area over which the gain falls to zero, rad."""

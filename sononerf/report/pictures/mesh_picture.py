@@ -13,8 +13,8 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
+from sononerf.numerics import Floats
 from sononerf.report.pictures.figure import figure, picture_bytes, png_from_pixels
 from sononerf.report.pictures.shading import (
     DEFAULT_VIEW,

@@ -11,9 +11,10 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import zoom
 
-from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
-from sononerf.evaluation.difference import Comparison
+from sononerf.evaluation.numbers import Comparison
+from sononerf.geometry.lattice import Volume, require_finite
+from sononerf.numerics import Floats
 from sononerf.report.pictures.figure import (
     PictureFormat,
     figure,
@@ -22,7 +23,6 @@ from sononerf.report.pictures.figure import (
 )
 from sononerf.report.pictures.mesh_picture import mesh_png, round_length
 from sononerf.report.pictures.shading import DEFAULT_VIEW
-from sononerf.surface.start.volume import Volume, require_finite
 
 # Reflectivity spans decades; values farther below the maximum are drawn black.
 RANGE_DB = 40.0

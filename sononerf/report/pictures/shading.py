@@ -10,9 +10,9 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from sononerf.array_types import Floats
 from sononerf.errors import NumericalError
 from sononerf.geometry.raycast import RayCaster
+from sononerf.numerics import Floats
 
 # From the scene's front (+x), a little from the right and from above; z is up.
 DEFAULT_VIEW = (1.0, 0.42, 0.34)

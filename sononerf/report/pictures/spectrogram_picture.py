@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sononerf.array_types import Floats, Ints
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import ACTIVE_DB
+from sononerf.numerics import Floats, Ints
 from sononerf.report.pictures.figure import (
     PictureFormat,
     figure,

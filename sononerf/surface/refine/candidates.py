@@ -12,8 +12,8 @@ import numpy as np
 import trimesh
 from torch import Tensor
 
-from sononerf.array_types import Floats
 from sononerf.echoes.free_space import EchoHull
+from sononerf.numerics import Floats
 from sononerf.surface.refine.descent import STAGES, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.remesh import distance_from

@@ -15,19 +15,21 @@ from torch import Tensor
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.geometry.raycast import Occlusion
-from sononerf.surface.refine.correction import Correction
-from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.mesh_operators import MeshOperators, smoothing_passes, unit
-from sononerf.surface.refine.objective import Level, OnsetRanges, differences, measured, mismatch
+from sononerf.surface.refine.objective import (
+    ONSETS,
+    Level,
+    OnsetRanges,
+    differences,
+    measured,
+    mismatch,
+)
 from sononerf.surface.refine.optics import Heard, Optics
-from sononerf.surface.refine.still_surface import StillSurface
-from sononerf.surface.refine.visibility import listen, sight_of
+from sononerf.surface.refine.tracer import Correction, LaterBounces
+from sononerf.surface.refine.visibility import StillSurface, listen, sight_of
 
 POSES = 8
 """Number of training poses per step."""
-ONSETS = 3.0
-"""Weight of the misfit of onsets beside the mismatch, dB. Without it the edges of a box are cut
-off; with 30 the surface follows the errors of the onsets."""
 LAST = 0.2
 """Final step length over the initial one, no unit; cosine decay in between."""
 MOMENTUM = 0.8
@@ -240,7 +242,7 @@ class Stage:
             range.
         beyond: Addition to the first bounce by physical optics: nothing; the power of later
             bounces, traced off the initial surface of the stage, or those that were traced last; or
-            the correction by the simulator, see :mod:`sononerf.surface.refine.correction`.
+            the correction by the simulator, see :mod:`sononerf.surface.refine.tracer`.
     """
 
     smoothing: float

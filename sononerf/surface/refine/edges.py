@@ -15,9 +15,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from sononerf.array_types import Bools, Floats, Ints
-from sononerf.geometry.normals import CREASE
+from sononerf.geometry.meshes import CREASE
 from sononerf.geometry.raycast import Occlusion
+from sononerf.numerics import Bools, Floats, Ints
 from sononerf.simulation.diffraction import wedge_directivity
 from sononerf.surface.refine.mesh_operators import unit
 from sononerf.surface.refine.optics import Heads, Optics, Paths

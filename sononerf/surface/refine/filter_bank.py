@@ -20,8 +20,8 @@ import scipy.fft
 import torch
 from torch import Tensor, nn
 
-from sononerf.array_types import Floats, Ints
 from sononerf.head.head import Head
+from sononerf.numerics import Floats, Ints
 from sononerf.simulation.impulse_response import between
 
 FINE = 5.0

@@ -10,7 +10,7 @@ import torch
 from scipy.sparse import coo_array, csr_array
 from torch import Tensor
 
-from sononerf.array_types import Ints
+from sononerf.numerics import Ints
 
 BENDING = 0.5
 """Length over which curvature is averaged, shortest wavelengths."""

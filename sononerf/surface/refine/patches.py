@@ -17,7 +17,7 @@ import numpy as np
 import trimesh
 from scipy.sparse import csr_array
 
-from sononerf.array_types import Floats, Ints
+from sononerf.numerics import Floats, Ints
 from sononerf.surface.refine.planes import planes_of, summed
 
 PARALLEL = 0.05

@@ -12,16 +12,16 @@ import torch
 import trimesh
 from torch import Tensor
 
-from sononerf.array_types import Floats, Ints
 from sononerf.echoes.echoes import Echoes
+from sononerf.numerics import Floats, Ints
 from sononerf.surface.refine.descent import LAST, MEMORY, MOMENTUM
 from sononerf.surface.refine.edges import Edges
-from sononerf.surface.refine.later_bounces import LaterBounces
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
 from sononerf.surface.refine.objective import Level, differences, measured, mismatch
 from sononerf.surface.refine.optics import Heard, Optics
 from sononerf.surface.refine.patches import Patches, motions, on_patches, patches_of
 from sononerf.surface.refine.planes import flat_parts
+from sononerf.surface.refine.tracer import LaterBounces
 from sononerf.surface.refine.visibility import listen, sight_of
 
 TOLERANCE = 0.3

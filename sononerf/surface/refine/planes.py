@@ -14,8 +14,7 @@ import math
 import numpy as np
 import trimesh
 
-from sononerf.array_types import Floats, Ints
-from sononerf.compiled import compiled
+from sononerf.numerics import Floats, Ints, compiled
 
 COHERENT = 0.9
 """Least length of the mean of a part's unit normals, no unit. The two sides of a thin plate have a

@@ -7,6 +7,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Mapping, MutableMapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from torch import Tensor
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import SonoNerfError
+from sononerf.numerics import Floats
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine.candidates import (
     Candidate,
@@ -28,8 +30,6 @@ from sononerf.surface.refine.candidates import (
     planned,
     without_twin,
 )
-from sononerf.surface.refine.comparison import Comparison
-from sononerf.surface.refine.correction import Correction
 from sononerf.surface.refine.descent import (
     POSES,
     SHARP,
@@ -38,15 +38,49 @@ from sononerf.surface.refine.descent import (
     Stage,
     poses_that_hear,
 )
-from sononerf.surface.refine.later_bounces import LaterBounces
-from sononerf.surface.refine.objective import Level, OnsetRanges
+from sononerf.surface.refine.objective import Comparison, Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.plane_descent import POSES as PLANE_POSES
 from sononerf.surface.refine.plane_descent import PlaneDescent, flattest
-from sononerf.surface.refine.refined import Refined
 from sononerf.surface.refine.remesh import finer, remesh
 from sononerf.surface.refine.surface_error import surface_error
+from sononerf.surface.refine.tracer import Correction, LaterBounces
 from sononerf.surface.start.read_out import LEVELS, StartMethod
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A refined surface.
+
+    Attributes:
+        mesh: m.
+        gain (E, F): Factor of rendered magnitudes, learned on training poses.
+        confidence (V,): Number of training poses that see each vertex near the direction of a
+            mirror; 0 where echoes do not bound its place.
+        error ((V,), m): See :mod:`sononerf.surface.refine.surface_error`.
+        start: Name of the start that was refined.
+        kept: True where the refined surface explains the validation poses about as well as the
+            start, or better.
+        error_db: Objective on validation poses, see
+            :class:`~sononerf.surface.refine.objective.Comparison`.
+        history: Per stage: its number, start, way, last mismatch, and objective after it.
+        candidates: Per start: its name, its objective, that of its best surface (None where it
+            did not get beyond the first stage), and whether it was chosen.
+        faults: Faults of the refinement, one line each: a surface that could not be traced and
+            counted as the worst, or a stage that went without the simulator's correction.
+    """
+
+    mesh: trimesh.Trimesh
+    gain: Floats
+    confidence: Floats
+    error: Floats
+    start: StartMethod
+    kept: bool
+    error_db: float
+    history: list[dict[str, Any]]
+    faults: list[str]
+    candidates: list[dict[str, Any]]
+
 
 logger = logging.getLogger("sononerf")
 

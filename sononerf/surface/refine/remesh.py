@@ -9,10 +9,10 @@ import trimesh
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from sononerf.array_types import Floats, Singles
 from sononerf.geometry.lattice import level_surface, signed_volume
 from sononerf.geometry.plane import Plane
 from sononerf.geometry.raycast import contains
+from sononerf.numerics import Floats, Singles
 from sononerf.surface.refine.mesh_operators import MeshOperators, unit
 
 CELL = 1.1

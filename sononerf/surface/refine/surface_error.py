@@ -44,13 +44,15 @@ from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sononerf.array_types import Bools, Floats, Ints
 from sononerf.echoes.echoes import Echoes
-from sononerf.surface.refine.mesh_operators import sparse_tensor
+from sononerf.numerics import Bools, Floats, Ints
+from sononerf.surface.refine.mesh_operators import (
+    sparse_tensor,
+)
 from sononerf.surface.refine.objective import Level, differences, measured
 from sononerf.surface.refine.optics import Heard, Optics
 from sononerf.surface.refine.remesh import distance_from
-from sononerf.surface.refine.still_surface import StillSurface
+from sononerf.surface.refine.visibility import StillSurface
 
 ASKED = 48
 """Number of training poses, at most, that are rendered: 3 seconds for three spheres."""

@@ -1,20 +1,28 @@
 # SPDX-License-Identifier: MIT
-"""The simulator's rays on the current surface; without torch, which workers need not import."""
+"""What the simulator adds to physical optics: later bounces, traced or kept, and a correction."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 import trimesh
 from numpy.typing import NDArray
+from torch import Tensor
 
-from sononerf.array_types import Floats, Ints, Singles
+from sononerf.echoes.echoes import Echoes
+from sononerf.executor import computed
+from sononerf.numerics import Floats, Ints, Singles
 from sononerf.scene.scene import Scene
 from sononerf.settings.schema import SimulationSettings
 from sononerf.simulation.ensemble import spectrograms
 from sononerf.simulation.simulator import Simulator
+from sononerf.simulation.workers import useful_workers
+from sononerf.surface.refine.optics import Heard, Optics
+from sononerf.surface.refine.visibility import StillSurface
 
 if TYPE_CHECKING:
     from sononerf.surface.refine.optics import Optics
@@ -108,3 +116,105 @@ class _Collected:
         loud = weight.max(axis=1)
         kept = loud > FAINT * loud.max(initial=0.0)
         return Later(ear[kept], delay[kept], weight[kept])
+
+
+class LaterBounces:
+    """Later bounces off one surface."""
+
+    def __init__(self, optics: Optics, mesh: trimesh.Trimesh, echoes: Echoes, *, seed: int) -> None:
+        self._optics, self._echoes = optics, echoes
+        self._tracer = Tracer(optics, mesh, rays=LATER_RAYS, seed=seed)
+        self._kept: dict[int, Later] = {}
+
+    def trace(self, numbers: Iterable[int]) -> None:
+        """Trace those of some poses that were not traced before; many at a time go faster."""
+        positions, rotations = self._echoes.positions, self._echoes.rotations
+        left = {n: (positions[n], rotations[n]) for n in numbers if n not in self._kept}
+        workers = useful_workers(len(left), LATER_RAYS)
+        if workers > 1:
+            self._kept.update(computed(Tracer.later, self._tracer, left, workers))
+        else:
+            self._kept.update({n: self._tracer.later(*pose) for n, pose in left.items()})
+
+    def power(self, numbers: list[int], heard: Heard) -> Tensor:
+        """Power (P, E, W, F) of poses, on the rows that were rendered."""
+        self.trace(numbers)
+        found = [self._kept[number] for number in numbers]
+        pose = np.repeat(np.arange(len(found)), [len(one.ear) for one in found])
+        ear, delay, weight = (
+            torch.as_tensor(np.concatenate([getattr(one, name) for one in found]))
+            for name in ("ear", "delay", "weight")
+        )
+        like = heard.power
+        return self._optics.later_power(
+            torch.as_tensor(pose).to(like.device),
+            ear.to(like.device),
+            delay.to(like.device),
+            weight.to(like.device),
+            heard,
+        )
+
+
+class Correction:
+    """Simulated and rendered echoes of one surface, for some poses.
+
+    In: numbers (N,).
+    """
+
+    def __init__(
+        self,
+        optics: Optics,
+        mesh: trimesh.Trimesh,
+        simulator: Simulator,
+        echoes: Echoes,
+        numbers: Ints,
+        *,
+        seed: int,
+    ) -> None:
+        self.numbers = numbers
+        self._echoes = echoes
+        self._surface = StillSurface(mesh, optics)
+        self._kept: dict[int, tuple[Tensor, Tensor]] = {}
+        places = np.asarray(echoes.positions[numbers], dtype=np.float64)
+        turns = np.asarray(echoes.rotations[numbers], dtype=np.float64)
+        heard = spectrograms(simulator, places, turns, seed=seed)
+        self._simulated = dict(zip(numbers.tolist(), torch.as_tensor(heard), strict=True))
+
+    def batch(self, seed: int, step: int, size: int) -> Ints:
+        """Return the poses of a step, drawn from the seed and the step's number."""
+        rng = np.random.default_rng([seed, step])
+        return rng.choice(self.numbers, min(size, len(self.numbers)), replace=False)
+
+    def magnitudes(self, numbers: list[int], heard: Heard) -> tuple[Tensor, Tensor]:
+        """Return simulated and rendered echoes of the surface.
+
+        Out: simulated, rendered ((P, E, W, F) float32).
+        """
+        for number in numbers:
+            if number not in self._kept:
+                at = slice(number, number + 1)
+                echoes = self._echoes.positions[at], self._echoes.rotations[at]
+                rendered = torch.as_tensor(self._surface.render(*echoes)[0])
+                self._kept[number] = self._simulated[number], rendered
+        first, second = (
+            on_rows([self._kept[number][part] for number in numbers], heard.row, heard.power)
+            for part in (0, 1)
+        )
+        return first, second
+
+
+def on_rows(wholes: list[Tensor], row: Tensor, like: Tensor) -> Tensor:
+    """Return range slices of whole spectrograms, from given first rows on.
+
+    In: wholes (list of (E, R, F) float32), row (P,), like ((P, E, W, F) Tensor). Out: parts ((P, E,
+    W, F) float32).
+    """
+    width = like.shape[2]
+    parts = []
+    for whole, start in zip(wholes, row.tolist(), strict=True):
+        first, last = max(start, 0), min(start + width, whole.shape[1])
+        part = torch.zeros(whole.shape[0], width, whole.shape[2])
+        if last > first:
+            part[:, first - start : last - start] = whole[:, first:last]
+        parts.append(part)
+    return torch.stack(parts).to(like.device)

@@ -20,9 +20,9 @@ from scipy import ndimage, sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from sononerf.array_types import Bools, Floats, Ints, Singles
 from sononerf.echoes.free_space import EchoHull
 from sononerf.field.field import Field
+from sononerf.numerics import Bools, Floats, Ints, Singles
 
 SHARED = 1.6
 """Standard deviation, in range resolutions, of the Gaussian over which the sound is averaged. With

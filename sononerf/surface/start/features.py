@@ -16,11 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sononerf.array_types import Bools, Floats, Ints, Singles
-from sononerf.compiled import compiled
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.range_levels import RangeLevels
 from sononerf.geometry.lattice import Lattice
+from sononerf.numerics import Bools, Floats, Ints, Singles, compiled
 from sononerf.surface.start.occupancy import clearance_grid
 
 HARMONICS = 9

@@ -29,11 +29,11 @@ import trimesh
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from sononerf.array_types import Floats, Ints, Singles
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.range_levels import RangeLevels
 from sononerf.errors import NumericalError
 from sononerf.geometry.lattice import MARGIN, Lattice
+from sononerf.numerics import Floats, Ints, Singles
 from sononerf.surface.start.features import FEATURES, PlaceFeatures, features_of, free_places
 from sononerf.surface.start.occupancy import (
     clearance_grid,

@@ -26,11 +26,11 @@ import torch
 import trimesh
 from scipy import fft, ndimage
 
-from sononerf.array_types import Floats, Singles
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError
 from sononerf.field.field import Field
 from sononerf.geometry.lattice import MARGIN, Lattice, level_surface
+from sononerf.numerics import Floats, Singles
 from sononerf.surface.start.evidence import Evidence, locate_sound, reliability, signed_distance
 
 _DENSE = 0.2  # density, over the median at the points, at which a plane has half of its full weight

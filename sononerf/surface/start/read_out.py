@@ -13,22 +13,22 @@ import trimesh
 from scipy.ndimage import uniform_filter
 from torch import Tensor
 
-from sononerf.array_types import Floats
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.range_levels import RangeLevels
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field
-from sononerf.surface.start.network import levels_surfaces
-from sononerf.surface.start.occupancy import Gathered, estimate_occupancy, gather_evidence
-from sononerf.surface.start.sheet import fit_sheet
-from sononerf.surface.start.volume import (
+from sononerf.geometry.lattice import (
     Volume,
     automatic_level,
     grid_over,
     isosurface,
     volume_from_function,
 )
+from sononerf.numerics import Floats
+from sononerf.surface.start.network import levels_surfaces
+from sononerf.surface.start.occupancy import Gathered, estimate_occupancy, gather_evidence
+from sononerf.surface.start.sheet import fit_sheet
 
 _FAINTEST = (
     1e-7  # fraction of the loudest place's energy; quieter places are left out, to save time

@@ -27,9 +27,9 @@ import trimesh
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import spsolve
 
-from sononerf.array_types import Bools, Floats
 from sononerf.errors import NumericalError
 from sononerf.geometry.lattice import level_surface
+from sononerf.numerics import Bools, Floats
 from sononerf.surface.start.evidence import ALIGNED
 from sononerf.surface.start.occupancy import Gathered
 

@@ -7,10 +7,10 @@ import pytest
 import trimesh
 from PIL import Image
 
-from sononerf.evaluation.difference import compare
+from sononerf.evaluation.numbers import compare
+from sononerf.geometry.lattice import grid_over
 from sononerf.report.pictures import mip_picture as difference_module
 from sononerf.report.pictures.mip_picture import SILENT, difference_pngs, overlay_png
-from sononerf.surface.start.volume import grid_over
 
 GRID = grid_over([-0.03, -0.02, -0.05], [0.03, 0.02, 0.05], 0.005)
 MORE, LESS = np.array([0.02, -0.01, 0.03]), np.array([-0.02, 0.01, -0.03])

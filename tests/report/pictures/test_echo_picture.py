@@ -9,7 +9,7 @@ from PIL import Image
 from sononerf.errors import NumericalError
 from sononerf.geometry.poses import look_at
 from sononerf.report.pictures import echo_picture as echo
-from sononerf.report.pictures.echo_picture import EARS, echo_png, visible_hits
+from sononerf.report.pictures.scene_picture import EARS, echo_png, visible_hits
 from sononerf.report.pictures.shading import background, camera_for, draw_mesh
 
 RANGE = np.linspace(0.15, 0.75, 121)

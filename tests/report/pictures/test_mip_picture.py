@@ -6,8 +6,8 @@ import pytest
 from PIL import Image
 
 from sononerf.errors import NumericalError
+from sononerf.geometry.lattice import Volume
 from sononerf.report.pictures.mip_picture import mip_image, mip_picture, mip_pictures, mips_image
-from sononerf.surface.start.volume import Volume
 
 EXTENTS = ((-0.05, 0.05), (0.0, 0.06))
 

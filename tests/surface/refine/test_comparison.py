@@ -7,8 +7,7 @@ import trimesh
 
 from sononerf.errors import SonoNerfError
 from sononerf.surface.refine import comparison as module
-from sononerf.surface.refine.comparison import Comparison
-from sononerf.surface.refine.objective import Level, OnsetRanges
+from sononerf.surface.refine.objective import Comparison, Level, OnsetRanges
 from tests.memory import changed, deaf_hull
 from tests.surface.conftest import RADIUS
 from tests.surface.refine.test_objective import heard

@@ -9,10 +9,10 @@ import torch
 
 from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene
-from sononerf.surface.refine.correction import Correction
 from sononerf.surface.refine.descent import Descent
 from sononerf.surface.refine.objective import Level, differences, measured, mismatch
 from sononerf.surface.refine.remesh import remesh
+from sononerf.surface.refine.tracer import Correction
 from tests.memory import changed
 from tests.surface.conftest import RADIUS
 

@@ -10,7 +10,7 @@ from sononerf.run.build import head_of
 from sononerf.simulation.hearing import hearing_of
 from sononerf.surface.refine.mesh_operators import unit
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.still_surface import StillSurface
+from sononerf.surface.refine.visibility import StillSurface
 from tests.surface.conftest import RADIUS, given
 
 

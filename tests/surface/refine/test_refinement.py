@@ -16,7 +16,7 @@ from sononerf.run.build import head_of
 from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine import comparison
+from sononerf.surface.refine import objective
 from sononerf.surface.refine import refinement as module
 from sononerf.surface.refine.candidates import (
     Candidate,
@@ -76,7 +76,7 @@ def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, e
 
 @pytest.fixture(autouse=True)
 def few_rays(monkeypatch):
-    monkeypatch.setattr(comparison, "RAYS", 4000)
+    monkeypatch.setattr(objective, "RAYS", 4000)
 
 
 @pytest.fixture(scope="module")
@@ -358,7 +358,7 @@ def test_levels_and_the_best_other_start_stay_until_they_lose(
     first = dict(zip(PLANS, objectives, strict=True))
     history = []
 
-    def objective(comparison, mesh, *given, **named):
+    def objective(objective, mesh, *given, **named):
         factor = np.ptp(mesh.vertices[:, 0]) / np.ptp(bumpy.vertices[:, 0])
         if any(len(mesh.vertices) == len(one.vertices) for one in starts.values()):
             return 9.0 + abs(factor - 1.0)
@@ -367,7 +367,7 @@ def test_levels_and_the_best_other_start_stay_until_they_lose(
         return last[order[0] if len(history) == 4 else order[1]]
 
     order = sorted(last, key=lambda name: min(v for k, v in first.items() if k[0] == name))
-    monkeypatch.setattr(comparison.Comparison, "objective", objective)
+    monkeypatch.setattr(objective.Comparison, "objective", objective)
     saved = {}
     for _ in range(2):  # the second time all stages are saved
         history.clear()

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 
 from sononerf.surface.refine.self_calibration import Calibrator
-from sononerf.surface.refine.still_surface import StillSurface
+from sononerf.surface.refine.visibility import StillSurface
 from tests.memory import echoes_of
 
 COUNT = 14

@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sononerf.surface.refine.still_surface import StillSurface
+from sononerf.surface.refine.visibility import StillSurface
 
 
 @pytest.mark.parametrize(("stretch", "late"), [(1.0, 0.02), (1.03, 0.0)])

@@ -10,8 +10,8 @@ import trimesh
 from sononerf.errors import InputError
 from sononerf.geometry.poses import cylinder_poses
 from sononerf.surface.refine.optics import Optics
-from sononerf.surface.refine.still_surface import StillSurface
-from sononerf.surface.refine.support_search import find_support, least, with_support
+from sononerf.surface.refine.self_calibration import find_support, least, with_support
+from sononerf.surface.refine.visibility import StillSurface
 from tests.memory import echoes_of
 from tests.surface.conftest import RADIUS
 

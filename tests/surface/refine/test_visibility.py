@@ -5,8 +5,7 @@ import numpy as np
 import trimesh
 
 from sononerf.geometry.raycast import Occlusion
-from sononerf.surface.refine.still_surface import StillSurface
-from sononerf.surface.refine.visibility import FREE, seen
+from sononerf.surface.refine.visibility import FREE, StillSurface, seen
 
 
 def test_what_stands_before_a_point_hides_it_but_not_what_touches_it():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from sononerf.errors import NumericalError, ResourceError
-from sononerf.surface.start.volume import (
+from sononerf.geometry.lattice import (
     Volume,
     automatic_level,
     grid_over,

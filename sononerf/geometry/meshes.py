@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: MIT
-"""The surface between the vertices: normals that know a round body from an edge."""
+"""Triangle meshes: smooth normals that know a round body from an edge, bodies, and faults."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from trimesh.grouping import group_rows
 
-from sononerf.array_types import Floats, Ints
+from sononerf.numerics import Floats, Ints
 
 CREASE = math.radians(30.0)
 TIGHTER = 0.95  # radius of balls around halves, over that around the whole, that is worth it
@@ -136,3 +137,38 @@ def enclosing_balls(corners: Floats, label: Ints, count: int) -> tuple[Floats, F
             done.append(whole)
     found = open_ + done
     return np.stack([centre for centre, _, _ in found]), np.array([r for _, r, _ in found])
+
+
+FLAT = 1e-7
+"""Height of a triangle over the size of the surface below which it has no area in single
+precision."""
+
+
+def surface_faults(mesh: trimesh.Trimesh) -> list[str]:
+    """Return the faults of a surface."""
+    lines = []
+    good = mesh.nondegenerate_faces(height=FLAT * float(mesh.scale))
+    if not good.all():
+        lines.append(
+            f"the mesh has {_count((~good).sum(), 'triangle')} without area; nothing is heard there"
+        )
+    whole = trimesh.Trimesh(mesh.vertices, mesh.faces[good], process=False)
+    if not whole.is_watertight:
+        alone = len(group_rows(whole.edges_sorted, require_count=1))
+        said = f"the mesh is open ({_count(alone, 'edge')} of one triangle alone"
+        if not alone:
+            said = "the mesh is open (edges are shared by more than two triangles"
+        merged = whole.copy()
+        merged.merge_vertices()
+        if merged.is_watertight:
+            said += "; vertices are there twice, merging them would close it"
+        lines.append(f"{said}); volumes will not be measured")
+    elif not whole.is_winding_consistent:
+        lines.append("the mesh's triangles do not agree on which side is outside")
+    elif whole.volume < 0.0:
+        lines.append("the mesh is inside out; echoes do not mind, volumes do")
+    return lines
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}{'' if number == 1 else 's'}"

@@ -1,12 +1,21 @@
 # SPDX-License-Identifier: MIT
-"""Loops over rays and echoes as machine code, compiled when first called and then kept on disk."""
+"""Array types, and numerical loops that are compiled."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, TypeAlias, TypeVar
 
 import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Floats: TypeAlias = NDArray[np.float64]
+Singles: TypeAlias = NDArray[np.float32]
+Ints: TypeAlias = NDArray[np.int64]
+Bools: TypeAlias = NDArray[np.bool_]
+Complexes: TypeAlias = NDArray[np.complex128]
+
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")

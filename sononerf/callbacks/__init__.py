@@ -1,2 +1,0 @@
-# SPDX-License-Identifier: MIT
-"""Callbacks of the fit: previews, pictures, progress, checkpoints."""

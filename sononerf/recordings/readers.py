@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: MIT
+"""Readers: NumPy arrays, SonoTraceLab, the SonoNeRF code in MATLAB, AirSAS."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sononerf import matlab_files as hdf5
+from sononerf.echoes.layout import SPLITS
+from sononerf.errors import InputError
+from sononerf.matlab_files import as_list, read_mat, vector
+from sononerf.numerics import Floats
+from sononerf.recordings.audio import Recording
+from sononerf.recordings.pose_tables import EULER, PLACE, Columns, columns_of
+from sononerf.settings.import_schema import ImportSettings
+
+HDF5 = (".h5", ".hdf5", ".hdf")
+SUFFIXES = (".npz", *HDF5)
+SOUND = ("waveform", "sampling_rate", "start", "split")
+WHOLE = {"position": PLACE, "euler": EULER}
+
+
+def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
+    """Read all arrays of an ``.npz``, or of the root of an HDF5 file."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    stamp = path.stat()
+    return _read(path, stamp.st_mtime_ns, stamp.st_size)
+
+
+@lru_cache(maxsize=2)  # one file holds many pings
+def _read(path: Path, *stamp: int) -> dict[str, NDArray[Any]]:
+    """Read a file as it was at a time and of a size."""
+    del stamp
+    if path.suffix.lower() in HDF5:
+        with hdf5.opened(path) as file:
+            found = {name: hdf5.numbers(file, name) for name in file}
+        return {name: values for name, values in found.items() if values is not None}
+    try:
+        with path.open("rb") as file:
+            found = np.load(file, allow_pickle=False)
+            if isinstance(found, np.ndarray):
+                raise InputError(f"{path}: one array only; save arrays by name with numpy.savez")
+            arrays = {name: np.asarray(found[name]) for name in found.files}
+    except InputError:
+        raise
+    except Exception as error:  # the error of a damaged file depends on the parser
+        said = " ".join(str(error).split())
+        raise InputError(f"{path}: damaged, truncated, or no .npz of numbers ({said})") from None
+    odd = [name for name, values in arrays.items() if values.dtype.kind not in "biuf"]
+    if odd:
+        raise InputError(f"{path}: {odd[0]} holds {arrays[odd[0]].dtype}, expected numbers")
+    return arrays
+
+
+def waveform_of(
+    path: Path, arrays: dict[str, NDArray[Any]], settings: ImportSettings
+) -> tuple[float, NDArray[Any]]:
+    """Return the sampling rate (Hz) and the unchanged array ``waveform``."""
+    if "waveform" not in arrays:
+        listed = ", ".join(sorted(arrays)) or "nothing"
+        raise InputError(f"{path}: holds no array waveform; it holds {listed}")
+    rate = arrays.get("sampling_rate")
+    if rate is None and settings.sampling_rate is None:
+        raise InputError(f"{path}: holds no sampling_rate; add it, or set import.sampling_rate")
+    if rate is not None and (rate.size != 1 or not float(rate.reshape(-1)[0]) > 0.0):
+        raise InputError(f"{path}: sampling_rate is {rate}, expected one number above 0")
+    chosen = settings.sampling_rate if rate is None else float(rate.reshape(-1)[0])
+    assert chosen is not None
+    return chosen, arrays["waveform"]
+
+
+def read_numpy(path: Path, settings: ImportSettings) -> Recording:
+    """Read the format ``numpy``; see the module."""
+    arrays = read_arrays(path)
+    rate, waveform = waveform_of(path, arrays, settings)
+    if waveform.ndim == 2:
+        waveform = waveform[:, None]
+    if waveform.ndim != 3 or not waveform.size:
+        raise InputError(
+            f"{path}: waveform has shape {waveform.shape}, expected (pings, receivers, samples)"
+        )
+    columns = _columns(path, arrays, settings)
+    count = len(waveform)
+    if len(columns) != count:
+        raise InputError(f"{path}: {count} pings and {len(columns)} poses")
+    start = np.asarray(arrays.get("start", 0.0), dtype=np.float64).reshape(-1)
+    if len(start) not in (1, count) or not np.isfinite(start).all():
+        raise InputError(f"{path}: start has {len(start)} values, expected 1 or {count} numbers")
+
+    def read(index: int) -> NDArray[Any]:
+        return waveform[index]
+
+    return Recording(
+        path=path,
+        sampling_rate=rate,
+        labels=tuple(f"ping {index}" for index in range(count)),
+        emission=np.broadcast_to(-start, count).copy(),
+        read=read,
+        columns=columns,
+    )
+
+
+def _columns(path: Path, arrays: dict[str, NDArray[Any]], settings: ImportSettings) -> Columns:
+    """Return the poses among arrays, one name per column."""
+    given: dict[str, Any] = {}
+    rotation = None
+    sizes = {}
+    for name, values in arrays.items():
+        if name in SOUND:
+            continue
+        base, _, unit = name.partition("_")
+        if name == "rotation":
+            _shaped(path, name, values, (3, 3))
+            rotation = values
+        elif base in WHOLE:
+            _shaped(path, name, values, (3,))
+            suffix = f"_{unit}" if unit else ""
+            given |= {f"{part}{suffix}": values[:, i] for i, part in enumerate(WHOLE[base])}
+        elif name == "quaternion":
+            _shaped(path, name, values, (4,))
+            if settings.quaternion is None:
+                raise InputError(
+                    f"{path}: quaternion: set import.quaternion to its order, wxyz or xyzw"
+                )
+            given |= {f"q{part}": values[:, i] for i, part in enumerate(settings.quaternion)}
+        else:
+            _shaped(path, name, values, ())
+            given[name] = values
+        sizes[name] = len(values)
+    if len(set(sizes.values())) > 1:
+        listed = ", ".join(f"{name} {size}" for name, size in sizes.items())
+        raise InputError(f"{path}: arrays of poses differ in length: {listed}")
+    texts = {}
+    if "split" in arrays:
+        words = {number: word for word, number in SPLITS.items()}
+        texts["split"] = [words.get(int(i), str(i)) for i in arrays["split"].reshape(-1)]
+    return columns_of(str(path), given, settings, texts=texts, rotation=rotation)
+
+
+def _shaped(path: Path, name: str, values: NDArray[Any], rest: tuple[int, ...]) -> None:
+    if values.ndim != 1 + len(rest) or values.shape[1:] != rest:
+        expected = ", ".join(["pings", *map(str, rest)])
+        raise InputError(f"{path}: {name} has shape {values.shape}, expected ({expected})")
+    if not np.isfinite(values).all():
+        raise InputError(f"{path}: {name} holds values that are not finite")
+
+
+SONONERF_RATE, SONONERF_SPEED = 1e6, 343.0  # Hz, m/s: of its first script
+
+
+def read_sononerf_matlab(path: Path, settings: ImportSettings) -> Recording:
+    """Read the format ``sononerf-matlab``; see the module."""
+    stored = read_mat(path, ("dataStorageMatrix",)).get("dataStorageMatrix")
+    if stored is None:
+        raise InputError(f"{path}: holds no dataStorageMatrix; is it of the format sonotracelab?")
+    pings = as_list(stored)
+    rate = settings.sampling_rate or SONONERF_RATE
+    sensors = [_field(path, ping, "sensorInfo") for ping in pings]
+    return _recording(
+        path,
+        responses=[_field(path, ping, "impulseResponse") for ping in pings],
+        sensors=sensors,
+        rate=rate,
+        speed=SONONERF_SPEED,
+    )
+
+
+def read_sonotracelab(path: Path, settings: ImportSettings) -> Recording:
+    """Read the format ``sonotracelab``; see the module."""
+    names = ("structSensor", "structSimulationResult", "structSimulationParameters")
+    found = read_mat(path, names)
+    missing = [name for name in names[:2] if name not in found]
+    if missing:
+        raise InputError(f"{path}: holds no {missing[0]}; is it of the format sononerf-matlab?")
+    sensors, results = (as_list(found[name]) for name in names[:2])
+    if len(sensors) != len(results):
+        raise InputError(f"{path}: {len(results)} pings and {len(sensors)} poses (structSensor)")
+    said = as_list(found.get(names[2], {}))[0]
+    rate = settings.sampling_rate
+    if rate is None:
+        rate = float(vector(path, said, "sampleRateImpresp", 1)[0])
+    has_speed = isinstance(said, dict) and "speedOfSound" in said
+    return _recording(
+        path,
+        responses=[_field(path, result, "impulseResponse") for result in results],
+        sensors=sensors,
+        rate=rate,
+        speed=float(vector(path, said, "speedOfSound", 1)[0]) if has_speed else None,
+    )
+
+
+def _field(path: Path, where: Any, name: str) -> Any:
+    if not isinstance(where, dict) or name not in where:
+        raise InputError(f"{path}: a ping has no {name}; expected a struct with it")
+    return where[name]
+
+
+def _recording(
+    path: Path, *, responses: list[Any], sensors: list[Any], rate: float, speed: float | None
+) -> Recording:
+    if not responses:
+        raise InputError(f"{path}: holds no pings")
+    position = np.stack([vector(path, sensor, "position", 3) for sensor in sensors])
+    turns = np.radians(np.stack([vector(path, one, "orientation", 3) for one in sensors]))
+    receivers = np.asarray(_field(path, sensors[0], "coordsReceivers"), dtype=np.float64)
+    receivers = receivers.reshape(-1, receivers.shape[-1] if receivers.ndim else 1)
+    if receivers.shape[1:] != (3,):
+        raise InputError(f"{path}: coordsReceivers has shape {receivers.shape}, expected (E, 3)")
+    emitter = vector(path, sensors[0], "coordsEmitter", 3)
+    shapes = {np.shape(one) for one in responses}
+    if len(shapes) > 1 or len(next(iter(shapes))) != 2:
+        listed = ", ".join(map(str, sorted(shapes)[:3]))
+        raise InputError(f"{path}: impulseResponse has shapes {listed}, expected one (S, E)")
+    if next(iter(shapes))[1] != len(receivers):
+        raise InputError(
+            f"{path}: impulseResponse has {next(iter(shapes))[1]} channels, coordsReceivers "
+            f"{len(receivers)} places"
+        )
+    roll, pitch, yaw = turns.T
+    values = dict(zip(("x", "y", "z"), position.T, strict=True))
+    columns = Columns(
+        str(path),
+        {**values, "yaw": yaw, "pitch": pitch, "roll": roll},
+        {},
+        None,
+        {"x": "m", "yaw": "deg"},
+    )
+    read: Callable[[int], NDArray[Any]] = lambda index: responses[index].T  # noqa: E731
+    heard: dict[str, dict[str, Any]] = {
+        "ears": {
+            "receivers": receivers.tolist(),
+            "emitter": emitter.tolist(),
+            "directivity": "omnidirectional",
+            "beam_radius": 0.0,
+        }
+    }
+    if speed is not None:
+        heard["air"] = {"speed_of_sound": speed}
+    return Recording(
+        path=path,
+        sampling_rate=rate,
+        labels=tuple(f"ping {index}" for index in range(len(responses))),
+        emission=np.zeros(len(responses)),
+        read=read,
+        columns=columns,
+        settings=heard,
+    )
+
+
+ACROSS = np.pi / 2  # yaw of a head that looks to positive y, rad
+
+
+def read_airsas(path: Path, settings: ImportSettings) -> Recording:
+    """Read the format ``airsas``; see the module."""
+    if settings.sampling_rate is None:
+        raise InputError(
+            f"{path}: the format does not say its sampling rate; set import.sampling_rate"
+        )
+    with hdf5.opened(path) as file:
+        names = sorted(
+            (name for name in file if re.fullmatch(r"ch\d+", name)), key=lambda name: int(name[2:])
+        )
+        series = {name: hdf5.numbers(file, f"{name}/ts") for name in names}
+        position = hdf5.numbers(file, "na/position")
+        temperature = hdf5.numbers(file, "na/temperature")
+    channels = {name: values for name, values in series.items() if values is not None}
+    if not channels:
+        raise InputError(f"{path}: holds no /ch1/ts; no file of the format airsas")
+    if position is None:
+        raise InputError(f"{path}: holds no /na/position; no file of the format airsas")
+    places = _places(path, np.asarray(position, dtype=np.float64))
+    waveform = {name: _by_ping(path, name, ts, len(places)) for name, ts in channels.items()}
+    if len({ts.shape for ts in waveform.values()}) > 1:
+        raise InputError(f"{path}: channels differ in length")
+    values = dict(zip(PLACE, places.T, strict=True))
+    if settings.look_at is None and settings.turntable is None:
+        turned = np.full(len(places), ACROSS)
+        values |= {"yaw": turned, "pitch": 0.0 * turned, "roll": 0.0 * turned}
+    air: dict[str, Any] = {}
+    if temperature is not None and temperature.size and np.isfinite(temperature).all():
+        air = {"air": {"temperature_c": round(float(np.mean(temperature)), 3)}}
+
+    def read(index: int) -> NDArray[Any]:
+        return np.stack([ts[index] for ts in waveform.values()])
+
+    return Recording(
+        path=path,
+        sampling_rate=settings.sampling_rate,
+        labels=tuple(f"ping {index}" for index in range(len(places))),
+        emission=np.zeros(len(places)),
+        read=read,
+        columns=Columns(str(path), values, {}, None, {"x": "m"}),
+        settings=air,
+        notes=(f"channels {', '.join(waveform)}",),
+    )
+
+
+def _places(path: Path, position: Floats) -> Floats:
+    if not np.isfinite(position).all():
+        raise InputError(f"{path}: /na/position holds values that are not finite")
+    if position.ndim == 2 and 3 in position.shape and position.size > 3:
+        return position if position.shape[1] == 3 else position.T
+    if position.size == max(position.shape, default=0):
+        along = position.reshape(-1)
+        return np.stack([along, 0.0 * along, 0.0 * along], axis=1)
+    raise InputError(f"{path}: /na/position has shape {position.shape}, expected (P,) or (P, 3)")
+
+
+def _by_ping(path: Path, name: str, ts: NDArray[Any], count: int) -> NDArray[Any]:
+    """Return one channel's samples, (P, S): MATLAB and Python lay them out in two ways."""
+    if ts.ndim == 2 and ts.shape[0] == count:
+        return ts
+    if ts.ndim == 2 and ts.shape[1] == count:
+        return ts.T
+    raise InputError(
+        f"{path}: /{name}/ts has shape {ts.shape}, and there are {count} poses in /na/position"
+    )
