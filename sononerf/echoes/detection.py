@@ -190,20 +190,13 @@ memory. Further poses add less to the free space than the accuracy of an onset."
 
 @dataclass(frozen=True, eq=False)
 class Onsets:
-    """First echoes of the poses.
+    """First echoes of the poses."""
 
-    Attributes:
-        poses (P,): Their numbers in the store, ascending.
-        range ((R,), m): Range of the slices.
-        power (P, E, R): Power, averaged over the band.
-        heard (P, E, R): True for slices with an echo.
-        first ((P, E), m): Range of the first echo; minus infinity without an echo, or if it is cut.
-    """
-
-    poses: Ints
-    range: Floats
-    power: Floats
-    heard: Bools
+    poses: Ints  # (P,): Their numbers in the store, ascending
+    range: Floats  # (R,), m: Range of the slices
+    power: Floats  # (P, E, R): Power, averaged over the band
+    heard: Bools  # (P, E, R): True for slices with an echo
+    # (P, E), m: Range of the first echo; minus infinity without an echo, or if it is cut
     first: Floats
 
     def chance(self, resolution: float) -> float:

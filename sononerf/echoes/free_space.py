@@ -40,26 +40,19 @@ AT_ONCE = 6_400_000
 
 @dataclass(frozen=True, eq=False)
 class EchoHull:
-    """Places that the first echoes leave: the complement of the free space.
+    """Places that the first echoes leave: the complement of the free space."""
 
-    Attributes:
-        emitters ((P, 3), m): Places of the emitter at each pose, world frame.
-        receivers ((P, E, 3), m): Places of the ears.
-        first ((P, E), m): Range of the first echo that each ear heard: half of the way out and
-            back; minus infinity without evidence.
-        axes (P, 3): Looking directions of the heads, unit vectors.
-        within: Least cosine between a pose's axis and the direction to a place that its onset can
-            rule out.
-        weight ((P, E) or None): Weight of each first echo, from 0 (outlier) to 1; all 1 where None.
-        plane: The support, below which there is no body; None if there is no support.
-    """
-
-    emitters: Floats
-    receivers: Floats
+    emitters: Floats  # (P, 3), m: Places of the emitter at each pose, world frame
+    receivers: Floats  # (P, E, 3), m: Places of the ears
+    # (P, E), m: Range of the first echo that each ear heard: half of the way out and back; minus
+    # infinity without evidence
     first: Floats
-    axes: Floats
+    axes: Floats  # (P, 3): Looking directions of the heads, unit vectors
+    # Least cosine between a pose's axis and the direction to a place that its onset can rule out
     within: float = -1.0
+    # (P, E) or None: Weight of each first echo, from 0 (outlier) to 1; all 1 where None
     weight: Floats | None = None
+    # The support, below which there is no body; None if there is no support
     plane: Plane | None = None
 
     ARRAYS: ClassVar = ("emitters", "receivers", "first", "axes", "within", "weight")

@@ -27,26 +27,17 @@ _OFF = 12.0  # dB below the loudest level around that are counted, at most
 
 @dataclass(frozen=True, eq=False)
 class RangeLevels:
-    """Levels of the echoes of poses over range.
+    """Levels of the echoes of poses over range."""
 
-    Attributes:
-        poses (P,): Numbers of the poses among those that have onsets.
-        emitters ((P, 3), m): World frame.
-        receivers ((P, E, 3), m): World frame.
-        level ((P, E, R, 3), dB): Levels of the lowest band, of the highest band, and of all
-            frequencies; 0 dB is the loudest level of all.
-        first (m): Range of the first level: half of the way out and back.
-        spacing (m): Distance between levels.
-        resolution (m): Range resolution.
-    """
-
-    poses: Ints
-    emitters: Floats
-    receivers: Floats
+    poses: Ints  # (P,): Numbers of the poses among those that have onsets
+    emitters: Floats  # (P, 3), m: World frame
+    receivers: Floats  # (P, E, 3), m: World frame
+    # (P, E, R, 3), dB: Levels of the lowest band, of the highest band, and of all frequencies; 0 dB
+    # is the loudest level of all
     level: Singles
-    first: float
-    spacing: float
-    resolution: float
+    first: float  # m: Range of the first level: half of the way out and back
+    spacing: float  # m: Distance between levels
+    resolution: float  # m: Range resolution
 
     @classmethod
     def of(

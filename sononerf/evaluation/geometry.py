@@ -42,15 +42,10 @@ SETTLED = 1e-5
 
 @dataclass(frozen=True, eq=False)
 class Registration:
-    """A rigid motion or similarity.
+    """A rigid motion or similarity."""
 
-    Attributes:
-        matrix (4, 4): From the reconstruction's frame to the true one, lengths in m.
-        scale: Scale of lengths; 1 for a rigid motion.
-    """
-
-    matrix: Floats
-    scale: float
+    matrix: Floats  # (4, 4): From the reconstruction's frame to the true one, lengths in m
+    scale: float  # Scale of lengths; 1 for a rigid motion
 
     def inverse(self) -> Registration:
         """Return the motion from the true frame to that of the reconstruction."""

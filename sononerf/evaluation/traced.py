@@ -114,23 +114,16 @@ GAIN_POSES = 12
 
 @dataclass(frozen=True, eq=False)
 class Traced:
-    """A surface to trace echoes off, and the weight of these echoes in the prediction.
+    """A surface to trace echoes off, and the weight of these echoes in the prediction."""
 
-    Attributes:
-        mesh: The surface, m.
-        gain_db ((E, F), dB): Level that is added to the traced echoes.
-        weight (F,): Weight of the traced echoes in the mean with the rendered ones, 0 to 1.
-        fault: The reason why no echoes can be traced off the surface; empty where they can.
-        half_db ((L, F), dB): Half the width of the prediction's interval, see
-            :mod:`sononerf.evaluation.traced`; None where it is unknown.
-        simulator: Simulator of the surface, with what it has solved for; made anew where None.
-    """
-
-    mesh: trimesh.Trimesh
-    gain_db: Floats
-    weight: Floats
-    fault: str = ""
+    mesh: trimesh.Trimesh  # The surface, m
+    gain_db: Floats  # (E, F), dB: Level that is added to the traced echoes
+    weight: Floats  # (F,): Weight of the traced echoes in the mean with the rendered ones, 0 to 1
+    fault: str = ""  # The reason why no echoes can be traced off the surface; empty where they can
+    # (L, F), dB: Half the width of the prediction's interval, see
+    # :mod:`sononerf.evaluation.traced`; None where it is unknown
     half_db: Floats | None = None
+    # Simulator of the surface, with what it has solved for; made anew where None
     simulator: Simulator | None = None
 
     @classmethod

@@ -38,15 +38,10 @@ as values."""
 
 @dataclass(frozen=True)
 class StepCost:
-    """Cost of one training step.
+    """Cost of one training step."""
 
-    Attributes:
-        memory: Bytes of parameters and of the backward pass's values.
-        seconds: Duration on this machine's CPU.
-    """
-
-    memory: float
-    seconds: float
+    memory: float  # Bytes of parameters and of the backward pass's values
+    seconds: float  # Duration on this machine's CPU
 
 
 def step_cost(module: EchoModule, data: EchoDataModule) -> StepCost:

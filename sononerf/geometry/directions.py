@@ -53,17 +53,11 @@ def usual_gap(count: int) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """Parallelograms on the plane of (share of a cap's area, turn about its axis).
+    """Parallelograms on the plane of (share of a cap's area, turn about its axis)."""
 
-    Attributes:
-        middles (2, N): Share and turn.
-        sides (2, 2, N): Two sides, each in share and turn.
-        parts: Number of them in one cell of the spiral.
-    """
-
-    middles: Floats
-    sides: Floats
-    parts: int
+    middles: Floats  # (2, N): Share and turn
+    sides: Floats  # (2, 2, N): Two sides, each in share and turn
+    parts: int  # Number of them in one cell of the spiral
 
     def __getitem__(self, chosen: NDArray[Any]) -> Cells:
         """Return the chosen cells."""
@@ -86,20 +80,14 @@ class CapSpiral:
 
     In the coordinates (share of the cap's area, turn about the axis) the spiral is a lattice, so
     the parallelogram between neighbours is a cell of it, and cells can be divided evenly.
-
-    Attributes:
-        count: Number of directions.
-        axis (3,): The cap's middle; any length but zero.
-        half_angle (rad): From the axis to the cap's rim, 0 to pi.
-        offset ((2,), 1): Shift within the ring's area, and turn of the whole pattern.
-        rotation (3, 3): Turns the finished pattern, the axis with it.
     """
 
-    count: int
-    axis: ArrayLike
-    half_angle: float
+    count: int  # Number of directions
+    axis: ArrayLike  # (3,): The cap's middle; any length but zero
+    half_angle: float  # rad: From the axis to the cap's rim, 0 to pi
+    # (2,), 1: Shift within the ring's area, and turn of the whole pattern
     offset: tuple[float, float]
-    rotation: Floats | None = None
+    rotation: Floats | None = None  # (3, 3): Turns the finished pattern, the axis with it
 
     def __post_init__(self) -> None:
         if self.count < 1:

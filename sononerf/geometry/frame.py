@@ -22,14 +22,11 @@ UNITS = {1.0: "m", 0.01: "cm", 0.001: "mm"}
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A frame beside the world's (m, right-handed, z up; the head's x forward, y left, z up).
+    """A frame beside the world's (m, right-handed, z up; the head's x forward, y left, z up)."""
 
-    Attributes:
-        matrix (4, 4): From the world's frame and metres to this frame and its unit.
-        head (3, 3): From our axes of the head to this frame's.
-    """
-
+    # (4, 4): From the world's frame and metres to this frame and its unit
     matrix: Floats = field(default_factory=lambda: np.eye(4))
+    # (3, 3): From our axes of the head to this frame's
     head: Floats = field(default_factory=lambda: np.eye(3))
 
     @classmethod

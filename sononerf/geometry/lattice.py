@@ -23,17 +23,11 @@ MARGIN = 3
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """Places of voxels.
+    """Places of voxels."""
 
-    Attributes:
-        origin ((3,), m): Centre of the first voxel.
-        spacing (m): Between centres.
-        shape: Voxels along x, y and z.
-    """
-
-    origin: Floats
-    spacing: float
-    shape: tuple[int, int, int]
+    origin: Floats  # (3,), m: Centre of the first voxel
+    spacing: float  # m: Between centres
+    shape: tuple[int, int, int]  # Voxels along x, y and z
 
     @classmethod
     def over(cls, lower: Floats, upper: Floats, spacing: float) -> Lattice:

@@ -22,15 +22,10 @@ times the rounding of single precision, in which mesh files are written."""
 
 @dataclass(frozen=True)
 class Plane:
-    """A rigid plane.
+    """A rigid plane."""
 
-    Attributes:
-        point ((3,), m): On the plane, world frame.
-        normal (3,): Unit vector towards the side of the body.
-    """
-
-    point: tuple[float, float, float]
-    normal: tuple[float, float, float]
+    point: tuple[float, float, float]  # (3,), m: On the plane, world frame
+    normal: tuple[float, float, float]  # (3,): Unit vector towards the side of the body
 
     @classmethod
     def through(cls, point: Floats, normal: Floats) -> Plane:

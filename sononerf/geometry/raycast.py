@@ -29,26 +29,17 @@ Reals: TypeAlias = Floats | Singles
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """First hits of rays, one row per ray that hits anything.
+    """First hits of rays, one row per ray that hits anything."""
 
-    Attributes:
-        ray (H,): Index of the ray, ascending.
-        points ((H, 3), m): On the triangle.
-        normals (H, 3): Smooth unit normals, as the mesh is oriented.
-        triangle (H,): Index of the triangle.
-        distance ((H,), m): Along the ray.
-        flat (H, 3): Unit normals of the flat triangles.
-        gradients ((H, 4, 3) float32): Changes of the smooth normal along the triangle: gradients of
-            the second and third corner's weight (1/m), and by how much the normals there differ
-            from that at the first.
-    """
-
-    ray: Ints
-    points: Floats
-    normals: Floats
-    triangle: Ints
-    distance: Floats
-    flat: Floats
+    ray: Ints  # (H,): Index of the ray, ascending
+    points: Floats  # (H, 3), m: On the triangle
+    normals: Floats  # (H, 3): Smooth unit normals, as the mesh is oriented
+    triangle: Ints  # (H,): Index of the triangle
+    distance: Floats  # (H,), m: Along the ray
+    flat: Floats  # (H, 3): Unit normals of the flat triangles
+    # (H, 4, 3) float32: Changes of the smooth normal along the triangle: gradients of the second
+    # and third corner's weight (1/m), and by how much the normals there differ from that at the
+    # first
     gradients: Singles
 
 

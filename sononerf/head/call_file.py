@@ -35,24 +35,15 @@ ROWS = 200  # frequencies that the delay is read at
 
 @dataclass(frozen=True, eq=False)
 class CallFile:
-    """A recorded or computed call.
+    """A recorded or computed call."""
 
-    Attributes:
-        waveform (N,): From the file's first sample on, which is the start of the emission; its
-            greatest is 1.
-        sampling_rate (Hz): Sampling rate of the file.
-        frequency ((K,), Hz): Ascending.
-        delay ((K,), s): Time of emission of each.
-        is_covered (K,): Whether it is emitted.
-        bandwidth (Hz): Bandwidth of the window that it was looked at through.
-    """
-
+    # (N,): From the file's first sample on, which is the start of the emission; its greatest is 1
     waveform: Floats
-    sampling_rate: float
-    frequency: Floats
-    delay: Floats
-    is_covered: Bools
-    bandwidth: float
+    sampling_rate: float  # (Hz): Sampling rate of the file
+    frequency: Floats  # (K,), Hz: Ascending
+    delay: Floats  # (K,), s: Time of emission of each
+    is_covered: Bools  # (K,): Whether it is emitted
+    bandwidth: float  # (Hz): Bandwidth of the window that it was looked at through
 
     @property
     def bands(self) -> list[tuple[float, float]]:

@@ -84,26 +84,16 @@ GRID_DEG = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Ears:
-    """Real, non-negative gains of the beam and of each receiver, and where they are.
+    """Real, non-negative gains of the beam and of each receiver, and where they are."""
 
-    Attributes:
-        azimuth ((A,), rad): Uniform from -pi to pi, both included.
-        elevation ((L,), rad): Uniform from -pi/2 to pi/2, both included.
-        frequency ((F,), Hz): Ascending.
-        beam ((F, L, A) float32): Gain of the emission.
-        ears ((E, F, L, A) float32): Gain of each receiver; all of them may share one table in
-            memory.
-        emitter ((3,), m): Head frame.
-        positions ((E, 3), m): Places of the receivers, head frame.
-    """
-
-    azimuth: Floats
-    elevation: Floats
-    frequency: Floats
-    beam: Singles
+    azimuth: Floats  # (A,), rad: Uniform from -pi to pi, both included
+    elevation: Floats  # (L,), rad: Uniform from -pi/2 to pi/2, both included
+    frequency: Floats  # (F,), Hz: Ascending
+    beam: Singles  # (F, L, A) float32: Gain of the emission
+    # (E, F, L, A) float32: Gain of each receiver; all of them may share one table in memory
     ears: Singles
-    emitter: Floats
-    positions: Floats
+    emitter: Floats  # (3,), m: Head frame
+    positions: Floats  # (E, 3), m: Places of the receivers, head frame
 
     def __post_init__(self) -> None:
         grid = (len(self.frequency), len(self.elevation), len(self.azimuth))

@@ -49,20 +49,14 @@ from sononerf.settings.schema import (
 
 @dataclass(frozen=True, eq=False)
 class PointEcho:
-    """Spectrogram of the echo of one point.
+    """Spectrogram of the echo of one point."""
 
-    Attributes:
-        window (W,): Its power over range, averaged over the part of the band that the call has.
-        spacing (m): Between these values.
-        looks: Number of independent values among the frequencies.
-        rows ((F, W) or None): The same of each row, which the window is the sum of; None where all
-            rows are about alike. If low rows swell more slowly, an echo without high frequencies
-            does so too.
-    """
-
+    # (W,): Its power over range, averaged over the part of the band that the call has
     window: Floats
-    spacing: float
-    looks: float
+    spacing: float  # m: Between these values
+    looks: float  # Number of independent values among the frequencies
+    # (F, W) or None: The same of each row, which the window is the sum of; None where all rows are
+    # about alike. If low rows swell more slowly, an echo without high frequencies does so too
     rows: Floats | None = None
 
     @classmethod

@@ -60,26 +60,16 @@ range."""
 
 @dataclass(frozen=True, eq=False)
 class RowFilters:
-    """The filters of an analysis.
+    """The filters of an analysis."""
 
-    Attributes:
-        frequency ((F,), Hz): Frequencies of the rows, ascending.
-        envelope (F, W): Over the samples that a frame reads, 1 at its greatest or almost.
-        origin: First of these samples, from the frame's start; the ones before the emission are
-            silent.
-        centre: Centre of the envelopes, samples from the frame's start: the frame's time.
-        length: Length of the Hamming window that is as wide as the mean over the band, samples.
-        band ((float, float), Hz): Pass band of the rows.
-        looks: Number of independent values of noise in a mean over the band.
-    """
-
-    frequency: Floats
-    envelope: Floats
+    frequency: Floats  # (F,), Hz: Frequencies of the rows, ascending
+    envelope: Floats  # (F, W): Over the samples that a frame reads, 1 at its greatest or almost
+    # First of these samples, from the frame's start; the ones before the emission are silent
     origin: int
-    centre: float
-    length: int
-    band: tuple[float, float]
-    looks: float
+    centre: float  # Centre of the envelopes, samples from the frame's start: the frame's time
+    length: int  # Length of the Hamming window that is as wide as the mean over the band, samples
+    band: tuple[float, float]  # (float, float), Hz: Pass band of the rows
+    looks: float  # Number of independent values of noise in a mean over the band
 
     @property
     def reach(self) -> int:

@@ -151,20 +151,15 @@ centre frequency."""
 
 
 class Smearing(NamedTuple):
-    """Response of the rows to fine frequencies.
+    """Response of the rows to fine frequencies."""
 
-    Attributes:
-        frequency ((N,), Hz): The fine ones, ascending.
-        rows (F, K): Indices of those that each row hears.
-        weight ((F, K) float64 or complex128): Weights: of a sound's pressure for an impulse, of its
-            power for a sweep. The sum is 1, for complex weights its magnitude.
-        later ((F, K) or None, s): The weight times how much later than the row's own frequency each
-            one is emitted; None for an impulse.
-    """
-
-    frequency: Floats
-    rows: Ints
+    frequency: Floats  # (N,), Hz: The fine ones, ascending
+    rows: Ints  # (F, K): Indices of those that each row hears
+    # (F, K) float64 or complex128: Weights: of a sound's pressure for an impulse, of its power for
+    # a sweep. The sum is 1, for complex weights its magnitude
     weight: Floats | Complexes
+    # (F, K) or None, s: The weight times how much later than the row's own frequency each one is
+    # emitted; None for an impulse
     later: Floats | None
 
 

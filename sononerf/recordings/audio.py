@@ -111,32 +111,23 @@ def pose_table(poses: Poses, files: Sequence[str], split: NDArray[np.int8]) -> s
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """Recorded pings, and the table of their poses.
+    """Recorded pings, and the table of their poses."""
 
-    Attributes:
-        path: Path of the source, for messages.
-        sampling_rate: Hz.
-        labels: Name of each of the P pings in messages.
-        emission ((P,), s): Time of emission of each ping's call, counted from the first sample that
-            :attr:`read` gives. Negative where the recording began later.
-        until ((P,) or None, s): Time of emission of the next call in the same file; infinite where
-            there is none. None if each file holds one call.
-        read: Takes the number of a ping and returns its samples (E, S) as they are on disk:
-            integers reach from one end of their type to the other, floats have the user's unit.
-        columns: Poses as in the table, in its own frame.
-        settings: Statements of the source about ``air``, ``ears`` and ``call``: plain data by
-            section.
-        notes: Interpretations that may surprise, one line each.
-    """
-
-    path: Path
-    sampling_rate: float
-    labels: tuple[str, ...]
+    path: Path  # Path of the source, for messages
+    sampling_rate: float  # Hz
+    labels: tuple[str, ...]  # Name of each of the P pings in messages
+    # (P,), s: Time of emission of each ping's call, counted from the first sample that :attr:`read`
+    # gives. Negative where the recording began later
     emission: Floats
+    # Takes the number of a ping and returns its samples (E, S) as they are on disk: integers reach
+    # from one end of their type to the other, floats have the user's unit
     read: Callable[[int], NDArray[Any]]
-    columns: Columns
+    columns: Columns  # Poses as in the table, in its own frame
+    # Statements of the source about ``air``, ``ears`` and ``call``: plain data by section
     settings: dict[str, dict[str, Any]] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # Interpretations that may surprise, one line each
+    # (P,) or None, s: Time of emission of the next call in the same file; infinite where there is
+    # none. None if each file holds one call
     until: Floats | None = None
 
     def __len__(self) -> int:

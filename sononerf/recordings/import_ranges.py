@@ -35,15 +35,10 @@ SEARCH = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """Calibration from the echo of the reference target.
+    """Calibration from the echo of the reference target."""
 
-    Attributes:
-        gain (E,): Factor that brings each receiver to the call's pressure at 1 m.
-        range_offset (m): To be added to every range.
-    """
-
-    gain: Floats
-    range_offset: float
+    gain: Floats  # (E,): Factor that brings each receiver to the call's pressure at 1 m
+    range_offset: float  # m: To be added to every range
 
 
 def calibrate(

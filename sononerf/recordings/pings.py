@@ -34,20 +34,14 @@ LOOKED_AT = 16
 
 @dataclass(frozen=True)
 class Channel:
-    """State of one channel, over the pings that were checked.
+    """State of one channel, over the pings that were checked."""
 
-    Attributes:
-        level_db (dB): Its loudest echo over that of the loudest channel; the median of the pings.
-            Minus infinity if the channel is silent.
-        noise_db (dB): The quietest tenth of its ranges over its own loudest echo; the median.
-        heard: In how many pings it heard an echo.
-        asked: Number of pings that were checked.
-    """
-
+    # dB: Its loudest echo over that of the loudest channel; the median of the pings. Minus infinity
+    # if the channel is silent
     level_db: float
-    noise_db: float
-    heard: int
-    asked: int
+    noise_db: float  # dB: The quietest tenth of its ranges over its own loudest echo; the median
+    heard: int  # In how many pings it heard an echo
+    asked: int  # Number of pings that were checked
 
 
 def channels_of(power: Floats, looks: float) -> list[Channel]:
@@ -162,24 +156,15 @@ def mix(samples: NDArray[Any], channels: Channels | None) -> NDArray[Any]:
 
 @dataclass(frozen=True, eq=False)
 class Cutter:
-    """Cuts pings out of a recording.
+    """Cuts pings out of a recording."""
 
-    Attributes:
-        recording: All pings.
-        channels: Channels that become receivers; see :func:`mix`.
-        delay (s): Added to the time of every emission.
-        gain (E,): Factor of each receiver.
-        background ((E, S) or None): Echoes of the surroundings alone, from the emission on, before
-            the factors.
-        call ((N,) or None): Waveform whose echoes become those of an impulse; None leaves them as
-            they are.
-    """
-
-    recording: Recording
-    channels: Channels | None = None
-    delay: float = 0.0
-    gain: ArrayLike = 1.0
+    recording: Recording  # All pings
+    channels: Channels | None = None  # Channels that become receivers; see :func:`mix`
+    delay: float = 0.0  # s: Added to the time of every emission
+    gain: ArrayLike = 1.0  # (E,): Factor of each receiver
+    # (E, S) or None: Echoes of the surroundings alone, from the emission on, before the factors
     background: Floats | None = None
+    # (N,) or None: Waveform whose echoes become those of an impulse; None leaves them as they are
     call: Floats | None = None
 
     def samples(self, index: int) -> int:
@@ -241,17 +226,11 @@ class Cutter:
 
 @dataclass(frozen=True, eq=False)
 class Clipping:
-    """The greatest value of each channel of a ping, and of its negative, and how often it stays.
+    """The greatest value of each channel of a ping, and of its negative, and how often it stays."""
 
-    Attributes:
-        peak (2 E,): As a fraction of full scale, or in the unit of the recording.
-        stays (2 E,): Number of samples of that value beside another one.
-        step: Between two numbers of the recording; 0 of floats.
-    """
-
-    peak: Floats
-    stays: Ints
-    step: float
+    peak: Floats  # 2 E,: As a fraction of full scale, or in the unit of the recording
+    stays: Ints  # 2 E,: Number of samples of that value beside another one
+    step: float  # Between two numbers of the recording; 0 of floats
 
     @classmethod
     def of(cls, samples: Floats, step: float) -> Clipping:

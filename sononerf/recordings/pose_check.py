@@ -73,17 +73,12 @@ around."""
 
 @dataclass(frozen=True)
 class Verdict:
-    """Faults of the poses, if there are any.
+    """Faults of the poses, if there are any."""
 
-    Attributes:
-        name: Name of the convention that explains the echoes best; empty if it is the stated one.
-        message: One line for the user; empty if nothing is wrong.
-        gain: Gain in log-likelihood.
-    """
-
+    # Name of the convention that explains the echoes best; empty if it is the stated one
     name: str = ""
-    message: str = ""
-    gain: float = 0.0
+    message: str = ""  # One line for the user; empty if nothing is wrong
+    gain: float = 0.0  # Gain in log-likelihood
 
 
 def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]:
@@ -270,32 +265,20 @@ def _order(head: Consistency, poses: Poses, ranges: Floats, own: Misfit) -> Verd
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """Misfit between poses and first echoes.
+    """Misfit between poses and first echoes."""
 
-    Attributes:
-        total: Sum of the logarithms of the scales of errors; less is better.
-        count: Number of errors in the sum.
-        prediction: Prediction of each ping by the others.
-    """
-
-    total: float
-    count: float
-    prediction: Prediction
+    total: float  # Sum of the logarithms of the scales of errors; less is better
+    count: float  # Number of errors in the sum
+    prediction: Prediction  # Prediction of each ping by the others
 
 
 @dataclass(frozen=True, eq=False)
 class Consistency:
-    """Consistency of poses with the first echoes of a head.
+    """Consistency of poses with the first echoes of a head."""
 
-    Attributes:
-        emitter ((3,), m): Head frame.
-        receivers ((E, 3), m): Head frame.
-        resolution (m): Range resolution.
-    """
-
-    emitter: Floats
-    receivers: Floats
-    resolution: float
+    emitter: Floats  # (3,), m: Head frame
+    receivers: Floats  # (E, 3), m: Head frame
+    resolution: float  # m: Range resolution
 
     def misfit(self, poses: Poses, first: Floats) -> Misfit:
         """Return the sum of logarithms of error scales of pings (P, E)."""

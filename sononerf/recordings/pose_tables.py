@@ -34,21 +34,14 @@ UNITS = {"length": LENGTHS, "angle": ANGLES, "time": TIMES}
 
 @dataclass(frozen=True, eq=False)
 class Columns:
-    """One table, in SI units and radians, in its own frame.
+    """One table, in SI units and radians, in its own frame."""
 
-    Attributes:
-        where: The table, for messages.
-        values: Numbers by name, each (P,).
-        texts: Text by name, each of P.
-        rotation ((P, 3, 3) or None): Head to world as matrices, where the source has them.
-        units: The unit that each length and angle was given in.
-    """
-
-    where: str
-    values: dict[str, Floats]
-    texts: dict[str, list[str]]
+    where: str  # The table, for messages
+    values: dict[str, Floats]  # Numbers by name, each (P,)
+    texts: dict[str, list[str]]  # Text by name, each of P
+    # (P, 3, 3) or None: Head to world as matrices, where the source has them
     rotation: Floats | None
-    units: dict[str, str]
+    units: dict[str, str]  # The unit that each length and angle was given in
 
     def __len__(self) -> int:
         for column in self.values.values():

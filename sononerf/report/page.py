@@ -26,19 +26,12 @@ NONE = "-"
 
 @dataclass(frozen=True)
 class KeyNumber:
-    """A number of ``metrics.json``.
+    """A number of ``metrics.json``."""
 
-    Attributes:
-        label: Its name, with its unit.
-        key: Its keys in the file, from the outside in, separated by slashes.
-        factor: From the file's unit to the label's.
-        form: Format of the number.
-    """
-
-    label: str
-    key: str
-    factor: float = 1.0
-    form: str = ".2f"
+    label: str  # Its name, with its unit
+    key: str  # Its keys in the file, from the outside in, separated by slashes
+    factor: float = 1.0  # From the file's unit to the label's
+    form: str = ".2f"  # Format of the number
 
     def text(self, metrics: Mapping[str, Any]) -> str:
         """Return the number of a run as text."""

@@ -146,19 +146,12 @@ ON_CYLINDER = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Calibrated:
-    """A corrected store.
+    """A corrected store."""
 
-    Attributes:
-        store: Complete; opened for reading.
-        estimate: The errors that were removed.
-        lines: Results, one line each.
-        warnings: Errors that the echoes do not determine.
-    """
-
-    store: EnsembleStore
-    estimate: Estimate
-    lines: list[str]
-    warnings: list[str]
+    store: EnsembleStore  # Complete; opened for reading
+    estimate: Estimate  # The errors that were removed
+    lines: list[str]  # Results, one line each
+    warnings: list[str]  # Errors that the echoes do not determine
 
 
 def kinds_of(names: Sequence[str]) -> tuple[Kind, ...]:

@@ -41,19 +41,12 @@ with their runs take less than 1 GB."""
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of one check.
+    """Result of one check."""
 
-    Attributes:
-        name: Its name.
-        found: The finding.
-        good: True if there is no problem.
-        remedy: Advice on how to get a missing item; empty if nothing is missing.
-    """
-
-    name: str
-    found: str
-    good: bool = True
-    remedy: str = ""
+    name: str  # Its name
+    found: str  # The finding
+    good: bool = True  # True if there is no problem
+    remedy: str = ""  # Advice on how to get a missing item; empty if nothing is missing
 
 
 def examine(folder: Path | None = None) -> list[Finding]:

@@ -37,20 +37,13 @@ HEAD = "MATLAB 5.0 MAT-file, written by sononerf"
 
 @dataclass(frozen=True, eq=False)
 class Named:
-    """An array with its description.
+    """An array with its description."""
 
-    Attributes:
-        values: Any shape.
-        axes: Name of each dimension. A one-dimensional array of the same name holds its
-            coordinates.
-        units: Such as ``m``; empty for a plain number.
-        meaning: A few words.
-    """
-
-    values: NDArray[Any]
+    values: NDArray[Any]  # Any shape
+    # Name of each dimension. A one-dimensional array of the same name holds its coordinates
     axes: tuple[str, ...]
-    units: str
-    meaning: str
+    units: str  # Such as ``m``; empty for a plain number
+    meaning: str  # A few words
 
 
 def file_bytes(

@@ -57,39 +57,22 @@ OWN_SETTINGS = "import.yaml"
 
 @dataclass(frozen=True, eq=False)
 class Understood:
-    """All that an import knows.
+    """All that an import knows."""
 
-    Attributes:
-        form: Format of the source.
-        recording: All pings that were read.
-        settings: Air, ears, call and analysis, complete.
-        wanted: Settings of the import.
-        cutter: Cuts and calibrates pings.
-        head: Head of these settings.
-        pings (P,): Numbers of the pings that are kept.
-        poses: Poses of all pings of the recording.
-        split ((P,) int8): Split of the kept pings.
-        clipped: Number of rejected pings.
-        channels: State of each receiver's channel.
-        lengths ((N,), s): Shortest and longest ping, from the emission on.
-        calibration: The applied calibration, as plain data.
-        notes: Interpretations that may surprise.
-    """
-
-    form: str
-    recording: Recording
-    settings: Settings
-    wanted: ImportSettings
-    cutter: Cutter
-    head: Head
-    pings: Ints
-    poses: Poses
-    split: NDArray[np.int8]
-    clipped: int
-    channels: list[Channel]
-    lengths: tuple[float, float]
-    calibration: dict[str, Any]
-    notes: tuple[str, ...]
+    form: str  # Format of the source
+    recording: Recording  # All pings that were read
+    settings: Settings  # Air, ears, call and analysis, complete
+    wanted: ImportSettings  # Settings of the import
+    cutter: Cutter  # Cuts and calibrates pings
+    head: Head  # Head of these settings
+    pings: Ints  # (P,): Numbers of the pings that are kept
+    poses: Poses  # Poses of all pings of the recording
+    split: NDArray[np.int8]  # (P,) int8: Split of the kept pings
+    clipped: int  # Number of rejected pings
+    channels: list[Channel]  # State of each receiver's channel
+    lengths: tuple[float, float]  # (N,), s: Shortest and longest ping, from the emission on
+    calibration: dict[str, Any]  # The applied calibration, as plain data
+    notes: tuple[str, ...]  # Interpretations that may surprise
 
 
 def understand(

@@ -50,7 +50,12 @@ class Part:
 
 
 def compose(parts: Sequence[Part], *, may_cross: bool = False) -> Scene:
-    """Put scenes together into one."""
+    """Put scenes together into one.
+
+    Args:
+        may_cross: Whether it is meant that parts cut through one another. Otherwise it is warned
+            of.
+    """
     if not parts:
         raise SettingsError("parts: found none; give at least one")
     meshes = [_placed(part, f"parts.{number}") for number, part in enumerate(parts)]
@@ -150,6 +155,10 @@ def surfaces_cross(one: trimesh.Trimesh, other: trimesh.Trimesh) -> bool:
 
     Where triangles meet, an edge of one of them passes through the other; so all edges of each
     surface are tried against the other one.
+
+    Returns:
+        cross: False also where one lies wholly inside the other. Surfaces that touch may be taken
+            for either, as single precision has it.
     """
     low = np.maximum(one.bounds[0], other.bounds[0])
     high = np.minimum(one.bounds[1], other.bounds[1])

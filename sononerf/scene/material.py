@@ -111,7 +111,8 @@ def roughened(material: Material, height: float) -> Material:
     A surface whose height has the standard deviation :math:`\sigma` sends back the fraction
     :math:`e^{-2 (k \sigma)^2}` of the pressure in step.
 
-    In: height (m).
+    Args:
+        height (m): Standard deviation of the height.
 
     References:
         .. [1] P. Beckmann and A. Spizzichino, "The Scattering of Electromagnetic Waves from Rough

@@ -14,17 +14,11 @@ from typing import Any
 
 @dataclass(frozen=True)
 class CallPreset:
-    """A call.
+    """A call."""
 
-    Attributes:
-        keys: Keys of the section ``call``, with their values.
-        about: One line: whose call, and when it is emitted.
-        source: Publications, and which numbers are typical values only.
-    """
-
-    keys: dict[str, Any]
-    about: str
-    source: str
+    keys: dict[str, Any]  # Keys of the section ``call``, with their values
+    about: str  # One line: whose call, and when it is emitted
+    source: str  # Publications, and which numbers are typical values only
 
 
 CALL_PRESETS = {

@@ -25,24 +25,15 @@ _LEAST = 1e-12  # keeps divisions and roots, and their gradients, finite
 
 @dataclass(frozen=True, eq=False)
 class Edges:
-    """Edges at which a surface turns outwards, or ends.
+    """Edges at which a surface turns outwards, or ends."""
 
-    Attributes:
-        ends ((K, 2, 3), m): World frame.
-        away (K, 3): Unit vectors off the surface.
-        inward (K, 3): Unit vectors from the edge along one of its faces.
-        normal (K, 3): Outward normals of that face.
-        open_angle ((K,), rad): Angle of the air around the edge: pi for a plane, 2 pi where a
-            sheet ends.
-        triangle (K,): Index of that face.
-    """
-
-    ends: Floats
-    away: Floats
-    inward: Floats
-    normal: Floats
+    ends: Floats  # (K, 2, 3), m: World frame
+    away: Floats  # (K, 3): Unit vectors off the surface
+    inward: Floats  # (K, 3): Unit vectors from the edge along one of its faces
+    normal: Floats  # (K, 3): Outward normals of that face
+    # (K,), rad: Angle of the air around the edge: pi for a plane, 2 pi where a sheet ends
     open_angle: Floats
-    triangle: Ints
+    triangle: Ints  # (K,): Index of that face
 
     @property
     def length(self) -> Floats:

@@ -73,22 +73,16 @@ class Ways:
     To second order, the path's length over u and v has the slope :math:`g` and the Hessian
     :math:`H`; the path by the mirror point is shorter (or longer) by
     :math:`g^T |H|^{-1} g / 2`.
-
-    Attributes:
-        distance ((H,), m): From the hits to the listener.
-        cosine (H,): Cosines of the angle between the mirrored ray and the way to the listener.
-        rise ((H,) float32): Cosine between that way and the outward normal.
-        detour ((H,) float32, m): Excess of the path over that by the mirror point; zero or more.
-        spread ((H,) float32, m): Standard deviation of the path's length over the cell.
-        stiffness ((H,) float32, m/rad²): The greater eigenvalue of :math:`|H|`.
     """
 
-    distance: Floats
+    distance: Floats  # (H,), m: From the hits to the listener
+    # (H,): Cosines of the angle between the mirrored ray and the way to the listener
     cosine: Floats
-    rise: Singles
+    rise: Singles  # (H,) float32: Cosine between that way and the outward normal
+    # (H,) float32, m: Excess of the path over that by the mirror point; zero or more
     detour: Singles
-    spread: Singles
-    stiffness: Singles
+    spread: Singles  # (H,) float32, m: Standard deviation of the path's length over the cell
+    stiffness: Singles  # (H,) float32, m/rad²: The greater eigenvalue of :math:`|H|`
 
 
 @compiled

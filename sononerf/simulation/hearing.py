@@ -48,19 +48,12 @@ EARS_APART = 0.03
 
 @dataclass(frozen=True)
 class Audibility:
-    """Test of the hits of a bounce for audibility.
+    """Test of the hits of a bounce for audibility."""
 
-    Attributes:
-        wavenumber (rad/m): At the frequency that bundles must resolve.
-        farthest (m): Longest detour that is heard.
-        radius (m): Radius of the scene.
-        bounces: Largest number of hits of a ray.
-    """
-
-    wavenumber: float
-    farthest: float
-    radius: float
-    bounces: int
+    wavenumber: float  # rad/m: At the frequency that bundles must resolve
+    farthest: float  # m: Longest detour that is heard
+    radius: float  # m: Radius of the scene
+    bounces: int  # Largest number of hits of a ray
 
     def judge(self, bounce: Bounce, listeners: Floats) -> tuple[Bools, Floats]:
         """Return which hits some listener can hear (H,), and the possible error of each (H,)."""

@@ -52,26 +52,17 @@ LEVEL_VARIANCE = 1.0 / 3.0
 
 @dataclass(frozen=True, eq=False)
 class Synthesis:
-    """Time bins, frequency nodes and the filters that join them.
+    """Time bins, frequency nodes and the filters that join them."""
 
-    Attributes:
-        nodes ((F,), Hz): Frequencies of the strengths.
-        hats ((K, F) complex128): Spectrum that each node stands for.
-        basis ((K, F) complex128): The same times ``j f`` in Hz, for reflections.
-        odd_hats ((K, F) complex128): As ``hats``, for strengths that are odd functions of
-            frequency, as imaginary parts are.
-        sampling_rate (Hz): Sampling rate of the echo.
-        samples: Length of the echo, S.
-        length: Length of the transform, at the sampling rate.
-    """
-
-    nodes: Floats
-    hats: Complexes
-    basis: Complexes
+    nodes: Floats  # (F,), Hz: Frequencies of the strengths
+    hats: Complexes  # (K, F) complex128: Spectrum that each node stands for
+    basis: Complexes  # (K, F) complex128: The same times ``j f`` in Hz, for reflections
+    # (K, F) complex128: As ``hats``, for strengths that are odd functions of frequency, as
+    # imaginary parts are
     odd_hats: Complexes
-    sampling_rate: float
-    samples: int
-    length: int
+    sampling_rate: float  # (Hz): Sampling rate of the echo
+    samples: int  # Length of the echo, S
+    length: int  # Length of the transform, at the sampling rate
 
     @property
     def sizes(self) -> tuple[int, ...]:
@@ -90,15 +81,10 @@ class Synthesis:
 
 @dataclass(eq=False)
 class Bins:
-    """Time bins that echoes are laid into.
+    """Time bins that echoes are laid into."""
 
-    Attributes:
-        values (B, F): All levels, one after the other.
-        first, last (samples): All echoes lie between these two; the last is below the first where
-            there is none.
-    """
-
-    values: NDArray[Any]
+    values: NDArray[Any]  # (B, F): All levels, one after the other
+    # samples: All echoes lie between these two; the last is below the first where there is none
     first: float = math.inf
     last: float = -math.inf
 

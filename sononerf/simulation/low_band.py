@@ -83,21 +83,13 @@ MOST_THREADS = 8
 
 @dataclass(frozen=True, eq=False)
 class HeadPoses:
-    """All poses of a head at one frequency.
+    """All poses of a head at one frequency."""
 
-    Attributes:
-        emitters ((P, 3), m): World frame.
-        ears ((P, E, 3), m): World frame.
-        rotations (P, 3, 3): Head to world.
-        emitting (P, 3, 3): Emitter to world; that of an image also mirrors.
-        gains: Tables of one frequency.
-    """
-
-    emitters: Floats
-    ears: Floats
-    rotations: Floats
-    emitting: Floats
-    gains: Ears
+    emitters: Floats  # (P, 3), m: World frame
+    ears: Floats  # (P, E, 3), m: World frame
+    rotations: Floats  # (P, 3, 3): Head to world
+    emitting: Floats  # (P, 3, 3): Emitter to world; that of an image also mirrors
+    gains: Ears  # Tables of one frequency
 
     def __len__(self) -> int:
         """Number of poses, P."""

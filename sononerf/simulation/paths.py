@@ -27,33 +27,19 @@ Beyond = Callable[[Hits, Floats], tuple[Hits, Floats]]
 
 @dataclass(frozen=True, eq=False)
 class Bounce:
-    """Rays that hit the surface for the n-th time.
+    """Rays that hit the surface for the n-th time."""
 
-    Attributes:
-        number: n, the first hit being 1.
-        solid_angle (float or (H,) float64, sr): Solid angle of each ray.
-        ray (H,): Index of the emitted ray.
-        emitted (H, 3): Their directions from the emitter.
-        points ((H, 3), m): Hit points.
-        flat (H, 3): Normals of the triangles, on the side of the ray.
-        mirrored (H, 3): Mirror directions.
-        length ((H,), m): From the emitter along the path.
-        footprint: Footprint of the bundles.
-        triangles (H, n): Indices of the triangles hit so far, this one last.
-        hidden: Whether the rays went through an obstacle as if it were not there.
-    """
-
-    number: int
-    solid_angle: float | Floats
-    ray: Ints
-    emitted: Floats
-    points: Floats
-    flat: Floats
-    mirrored: Floats
-    length: Floats
-    footprint: Footprint
-    triangles: Ints
-    hidden: bool = False
+    number: int  # n, the first hit being 1
+    solid_angle: float | Floats  # float or (H,) float64, sr: Solid angle of each ray
+    ray: Ints  # (H,): Index of the emitted ray
+    emitted: Floats  # (H, 3): Their directions from the emitter
+    points: Floats  # (H, 3), m: Hit points
+    flat: Floats  # (H, 3): Normals of the triangles, on the side of the ray
+    mirrored: Floats  # (H, 3): Mirror directions
+    length: Floats  # (H,), m: From the emitter along the path
+    footprint: Footprint  # Footprint of the bundles
+    triangles: Ints  # (H, n): Indices of the triangles hit so far, this one last
+    hidden: bool = False  # Whether the rays went through an obstacle as if it were not there
 
     def ways_to(self, listener: Floats) -> Ways:
         """Compare the ways of all hits to a listener (3,), m, with those of a mirror."""

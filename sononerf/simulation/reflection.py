@@ -29,26 +29,17 @@ FADE_FREQUENCY = 25e3  # Hz
 
 @dataclass(frozen=True, eq=False)
 class Reflection:
-    """A material at the frequencies of a simulation.
+    """A material at the frequencies of a simulation."""
 
-    Attributes:
-        fade ((F,), 1/m): Decay of a smooth surface over the detour from the mirror's path.
-        lobe_width ((F,), rad): Standard deviation of the lobe; of a smooth surface, not used.
-        strength ((F,), 1): Strengths of what is heard of a hit.
-        kept ((F,), 1): Pressure after a bounce, over that before it.
-        curved_lobe_width, curved_strength (F,): The same where the surface is strongly curved.
-        diffraction ((F,), 1): Strength of edges and strongly curved places as sources of their own.
-        material: Material of these values.
-    """
-
-    fade: Floats
-    lobe_width: Floats
-    strength: Floats
-    kept: Floats
-    curved_lobe_width: Floats
+    fade: Floats  # (F,), 1/m: Decay of a smooth surface over the detour from the mirror's path
+    lobe_width: Floats  # (F,), rad: Standard deviation of the lobe; of a smooth surface, not used
+    strength: Floats  # (F,), 1: Strengths of what is heard of a hit
+    kept: Floats  # (F,), 1: Pressure after a bounce, over that before it
+    curved_lobe_width: Floats  # (F,): The same where the surface is strongly curved
     curved_strength: Floats
+    # (F,), 1: Strength of edges and strongly curved places as sources of their own
     diffraction: Floats
-    material: Material
+    material: Material  # Material of these values
 
     def curved_share(self, curvature: Floats) -> Floats:
         """Return how curved places are, 0 to 1, by their total curvature (N,) in 1/m."""

@@ -161,16 +161,11 @@ _CHUNK = 4096  # triangles at a time; it bounds the memory
 
 @dataclass(frozen=True)
 class Openness:
-    """Kind of a surface: closed, one-sided or a sheet.
+    """Kind of a surface: closed, one-sided or a sheet."""
 
-    Attributes:
-        unseen (T,): The triangles that no pose can have heard, or that are unknown, see
-            :func:`known_part`.
-        unseen_share, thin_share: Fractions of the area: of these triangles; that has the other side
-            close behind it.
-    """
-
+    # (T,): The triangles that no pose can have heard, or that are unknown, see :func:`known_part`
     unseen: Bools
+    # Fractions of the area: of these triangles; that has the other side close behind it
     unseen_share: float
     thin_share: float
 

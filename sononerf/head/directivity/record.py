@@ -117,24 +117,15 @@ Elevations of a few degrees with azimuths all around are such a set."""
 
 @dataclass(frozen=True, eq=False)
 class Directivity:
-    """Linear gains in the head frame (x forward, y left, z up).
+    """Linear gains in the head frame (x forward, y left, z up)."""
 
-    Attributes:
-        source: Name of the source, for messages.
-        directions (M, 3): Unit vectors from the head to where sound comes from or goes to, in any
-            order.
-        frequency ((F,), Hz): Ascending.
-        gains (E, M, F): Gains of each receiver, zero or more.
-        beam ((M, F) or None): Beam of the emitter; None where the file has none.
-        places ((E, 3) or None, m): Places of the receivers; None where the file does not state
-            them.
-    """
-
-    source: str
+    source: str  # Name of the source, for messages
+    # (M, 3): Unit vectors from the head to where sound comes from or goes to, in any order
     directions: Floats
-    frequency: Floats
-    gains: Floats
-    beam: Floats | None = None
+    frequency: Floats  # (F,), Hz: Ascending
+    gains: Floats  # (E, M, F): Gains of each receiver, zero or more
+    beam: Floats | None = None  # (M, F) or None: Beam of the emitter; None where the file has none
+    # (E, 3) or None, m: Places of the receivers; None where the file does not state them
     places: Floats | None = None
 
     def __post_init__(self) -> None:

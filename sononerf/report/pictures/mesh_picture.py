@@ -91,16 +91,11 @@ def confidence_png(
 
 @dataclass(frozen=True, eq=False)
 class ColourScale:
-    """Colours of values on a mesh, and their legend.
+    """Colours of values on a mesh, and their legend."""
 
-    Attributes:
-        label: Quantity and unit.
-        mappable: Norm and colour map of matplotlib.
-        ticks: Values that the legend names; chosen by matplotlib where None.
-    """
-
-    label: str
-    mappable: Any
+    label: str  # Quantity and unit
+    mappable: Any  # Norm and colour map of matplotlib
+    # Values that the legend names; chosen by matplotlib where None
     ticks: Sequence[float] | None = None
 
     def __call__(self, values: ArrayLike) -> Floats:

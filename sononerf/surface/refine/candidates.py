@@ -48,26 +48,18 @@ parts move as planes, and are found anew in each stage."""
 
 @dataclass(eq=False)
 class Candidate:
-    """A start that goes through the stages in one way.
+    """A start that goes through the stages in one way."""
 
-    Attributes:
-        way: The way.
-        start: Name of the start.
-        level: Its gains and errors.
-        meshes: The start, and the surface after each stage so far, m.
-        objectives: Objectives of these on the validation poses; NaN for a start that was not
-            compared.
-        drawn: Number of its steps so far; it determines their poses, so that a candidate does not
-            depend on the others.
-        far (m): Range resolution. A surface that is farther from its start at the median is torn.
-    """
-
-    way: Way
-    start: StartMethod
-    level: Level
-    meshes: list[trimesh.Trimesh]
+    way: Way  # The way
+    start: StartMethod  # Name of the start
+    level: Level  # Its gains and errors
+    meshes: list[trimesh.Trimesh]  # The start, and the surface after each stage so far, m
+    # Objectives of these on the validation poses; NaN for a start that was not compared
     objectives: list[float]
+    # m: Range resolution. A surface that is farther from its start at the median is torn
     far: float = math.inf
+    # Number of its steps so far; it determines their poses, so that a candidate does not depend on
+    # the others
     drawn: int = 0
     _torn: dict[int, bool] = field(default_factory=dict, repr=False)
 

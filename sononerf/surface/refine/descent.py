@@ -228,29 +228,20 @@ class Sides:
 
 @dataclass(frozen=True)
 class Stage:
-    """One stage; lengths in the shortest wavelength of the analysed band.
+    """One stage; lengths in the shortest wavelength of the analysed band."""
 
-    Attributes:
-        smoothing: Length over which steps are smoothed.
-        edge: Edge of the triangles.
-        blur: Blur of the signed distance before the stage.
-        rate: Length of the first steps, smoothing lengths.
-        steps: Steps of descent.
-        band: Fraction of the frequencies over which power is averaged before the comparison, 0 to
-            1. The interference of a surface that is off by more than a fraction of a wavelength
-            differs from that of the true one; the average shows how much power comes from each
-            range.
-        beyond: Addition to the first bounce by physical optics: nothing; the power of later
-            bounces, traced off the initial surface of the stage, or those that were traced last; or
-            the correction by the simulator, see :mod:`sononerf.surface.refine.tracer`.
-    """
-
-    smoothing: float
-    edge: float
-    blur: float
-    rate: float
-    steps: int
+    smoothing: float  # Length over which steps are smoothed
+    edge: float  # Edge of the triangles
+    blur: float  # Blur of the signed distance before the stage
+    rate: float  # Length of the first steps, smoothing lengths
+    steps: int  # Steps of descent
+    # Addition to the first bounce by physical optics: nothing; the power of later bounces, traced
+    # off the initial surface of the stage, or those that were traced last; or the correction by the
+    # simulator, see :mod:`sononerf.surface.refine.tracer`
     beyond: Literal["none", "trace", "keep", "simulate"]
+    # Fraction of the frequencies over which power is averaged before the comparison, 0 to 1. The
+    # interference of a surface that is off by more than a fraction of a wavelength differs from
+    # that of the true one; the average shows how much power comes from each range
     band: float = 0.0
 
 

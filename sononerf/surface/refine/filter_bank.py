@@ -34,19 +34,12 @@ Source = Literal["surface", "edge"]
 
 @dataclass(frozen=True, eq=False)
 class Arrivals:
-    """Echoes, one row each.
+    """Echoes, one row each."""
 
-    Attributes:
-        strength ((Q,) float32): Strengths.
-        at ((Q,) float32): Arrival times, in samples from the start of the first frame.
-        weight ((Q, N') float32): Factors at the kept nodes.
-        receiver (Q,): Index of the receiver.
-    """
-
-    strength: Tensor
-    at: Tensor
-    weight: Tensor
-    receiver: Tensor
+    strength: Tensor  # (Q,) float32: Strengths
+    at: Tensor  # (Q,) float32: Arrival times, in samples from the start of the first frame
+    weight: Tensor  # (Q, N') float32: Factors at the kept nodes
+    receiver: Tensor  # (Q,): Index of the receiver
 
 
 class FilterBank:

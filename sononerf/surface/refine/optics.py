@@ -43,15 +43,10 @@ triangle."""
 
 @dataclass(frozen=True, eq=False)
 class Heard:
-    """Rendered spectrograms of some poses, over the ranges that hold echoes.
+    """Rendered spectrograms of some poses, over the ranges that hold echoes."""
 
-    Attributes:
-        power ((P, E, W, F) float32): Squared magnitude; gradients flow through it.
-        row (P,): Index of the first range slice on the store's axis; may be below zero.
-    """
-
-    power: Tensor
-    row: Tensor
+    power: Tensor  # (P, E, W, F) float32: Squared magnitude; gradients flow through it
+    row: Tensor  # (P,): Index of the first range slice on the store's axis; may be below zero
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,19 +55,13 @@ class Heads:
 
     Without a support there is one way, from the emitter to the ears. On a support there are four:
     emitter and ears stand for themselves or are mirrored.
-
-    Attributes:
-        emitters ((W P, 3), m): Their places.
-        ears ((W P, E, 3), m): Places of the ears.
-        emitting, hearing (W P, 3, 3): Head to world, of emitter and ears; those of images mirror.
-        poses: P.
     """
 
-    emitters: Tensor
-    ears: Tensor
-    emitting: Tensor
+    emitters: Tensor  # (W P, 3), m: Their places
+    ears: Tensor  # (W P, E, 3), m: Places of the ears
+    emitting: Tensor  # W P, 3, 3: Head to world, of emitter and ears; those of images mirror
     hearing: Tensor
-    poses: int
+    poses: int  # P
 
     def about(self, middle: Tensor) -> Heads:
         """Return them in single precision, counted from a place (3,), m."""
@@ -82,36 +71,23 @@ class Heads:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """Echoes of surface pieces at some poses, one row per way of a pose and vertex.
+    """Echoes of surface pieces at some poses, one row per way of a pose and vertex."""
 
-    Attributes:
-        pose, vertex (Q,): Row of :class:`Heads`, one for each way of a pose; vertex.
-        weight ((Q, E, N) float32): Gains, absorption, spread, fade and visibility at the nodes.
-        reach ((Q, E) float32): Fade and spread at the lowest analysed frequency, 0 to 1; 1 at a
-            mirror point.
-    """
-
-    pose: Tensor
+    pose: Tensor  # (Q,): Row of :class:`Heads`, one for each way of a pose; vertex
     vertex: Tensor
-    weight: Tensor
+    weight: Tensor  # (Q, E, N) float32: Gains, absorption, spread, fade and visibility at the nodes
+    # (Q, E) float32: Fade and spread at the lowest analysed frequency, 0 to 1; 1 at a mirror point
     reach: Tensor
 
 
 @dataclass(frozen=True, eq=False)
 class Paths:
-    """Ways of the sound of a pose by a place to its ears.
+    """Ways of the sound of a pose by a place to its ears."""
 
-    Attributes:
-        pose (Q,): Row of :class:`Heads`.
-        strength ((Q, E) float32): Gradients run to it, to the length and to the weight.
-        length ((Q, E) float32, m): From the emitter to the ear.
-        weight ((Q, E, N) float32): Factors at the nodes.
-    """
-
-    pose: Tensor
-    strength: Tensor
-    length: Tensor
-    weight: Tensor
+    pose: Tensor  # (Q,): Row of :class:`Heads`
+    strength: Tensor  # (Q, E) float32: Gradients run to it, to the length and to the weight
+    length: Tensor  # (Q, E) float32, m: From the emitter to the ear
+    weight: Tensor  # (Q, E, N) float32: Factors at the nodes
 
 
 class Optics(nn.Module):

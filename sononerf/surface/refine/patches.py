@@ -39,19 +39,12 @@ FITS = 3
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Heights over planes, as polynomials of degree 2 or less.
+    """Heights over planes, as polynomials of degree 2 or less."""
 
-    Attributes:
-        centre ((N, 3), m): Origins of the planes.
-        axes (N, 3, 3): Two unit vectors along each plane, and its outward normal.
-        scale ((N, 2), m): Root mean squares of the parts along the first two.
-        numbers ((N, 6), m): Factors of the terms of :meth:`terms`.
-    """
-
-    centre: Floats
-    axes: Floats
-    scale: Floats
-    numbers: Floats
+    centre: Floats  # (N, 3), m: Origins of the planes
+    axes: Floats  # (N, 3, 3): Two unit vectors along each plane, and its outward normal
+    scale: Floats  # (N, 2), m: Root mean squares of the parts along the first two
+    numbers: Floats  # (N, 6), m: Factors of the terms of :meth:`terms`
 
     def terms(self, of: Ints, places: Floats) -> Floats:
         """Return 1, u, v, u^2 - 1, u v and v^2 - 1 of places (M, 3), m, on patches (M,), as (M, 6).

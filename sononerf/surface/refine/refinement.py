@@ -50,35 +50,27 @@ from sononerf.surface.start.read_out import LEVELS, StartMethod
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """A refined surface.
+    """A refined surface."""
 
-    Attributes:
-        mesh: m.
-        gain (E, F): Factor of rendered magnitudes, learned on training poses.
-        confidence (V,): Number of training poses that see each vertex near the direction of a
-            mirror; 0 where echoes do not bound its place.
-        error ((V,), m): See :mod:`sononerf.surface.refine.surface_error`.
-        start: Name of the start that was refined.
-        kept: True where the refined surface explains the validation poses about as well as the
-            start, or better.
-        error_db: Objective on validation poses, see
-            :class:`~sononerf.surface.refine.objective.Comparison`.
-        history: Per stage: its number, start, way, last mismatch, and objective after it.
-        candidates: Per start: its name, its objective, that of its best surface (None where it
-            did not get beyond the first stage), and whether it was chosen.
-        faults: Faults of the refinement, one line each: a surface that could not be traced and
-            counted as the worst, or a stage that went without the simulator's correction.
-    """
-
-    mesh: trimesh.Trimesh
-    gain: Floats
+    mesh: trimesh.Trimesh  # m
+    gain: Floats  # (E, F): Factor of rendered magnitudes, learned on training poses
+    # (V,): Number of training poses that see each vertex near the direction of a mirror; 0 where
+    # echoes do not bound its place
     confidence: Floats
-    error: Floats
-    start: StartMethod
+    error: Floats  # (V,), m: See :mod:`sononerf.surface.refine.surface_error`
+    start: StartMethod  # Name of the start that was refined
+    # True where the refined surface explains the validation poses about as well as the start, or
+    # better
     kept: bool
+    # Objective on validation poses, see :class:`~sononerf.surface.refine.objective.Comparison`
     error_db: float
+    # Per stage: its number, start, way, last mismatch, and objective after it
     history: list[dict[str, Any]]
+    # Faults of the refinement, one line each: a surface that could not be traced and counted as the
+    # worst, or a stage that went without the simulator's correction
     faults: list[str]
+    # Per start: its name, its objective, that of its best surface (None where it did not get beyond
+    # the first stage), and whether it was chosen
     candidates: list[dict[str, Any]]
 
 

@@ -130,31 +130,20 @@ _DB = 20.0 / math.log(10.0)
 
 @dataclass(eq=False)
 class Calibration:
-    """Errors of a recording; zero where nothing is wrong.
+    """Errors of a recording; zero where nothing is wrong."""
 
-    Attributes:
-        gain (E, F): Natural logarithm of how much too loud each receiver is.
-        range_offset (m): Excess of all measured ranges.
-        speed_of_sound: Natural logarithm of the true speed over the assumed one.
-    """
-
-    gain: Floats
-    range_offset: float = 0.0
-    speed_of_sound: float = 0.0
+    gain: Floats  # (E, F): Natural logarithm of how much too loud each receiver is
+    range_offset: float = 0.0  # m: Excess of all measured ranges
+    speed_of_sound: float = 0.0  # Natural logarithm of the true speed over the assumed one
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Estimated errors of a recording and their uncertainties.
+    """Estimated errors of a recording and their uncertainties."""
 
-    Attributes:
-        calibration: The errors.
-        deviation: One standard deviation of each kind, in its own unit.
-        error_db: Mean absolute difference over active cells before each step, and after the last.
-    """
-
-    calibration: Calibration
-    deviation: dict[str, float]
+    calibration: Calibration  # The errors
+    deviation: dict[str, float]  # One standard deviation of each kind, in its own unit
+    # Mean absolute difference over active cells before each step, and after the last
     error_db: list[float]
 
 

@@ -89,18 +89,13 @@ POSES = 8
 
 @dataclass(frozen=True, eq=False)
 class SurfaceError:
-    """Error of the vertices of a surface.
+    """Error of the vertices of a surface."""
 
-    Attributes:
-        error ((V,), m): The true surface is within this distance with a probability of 90 %, if
-            the vertex was heard.
-        heard (V,): True where echoes bound the place of the surface.
-        factors (V, 5): The factors of the error, without their exponents.
-    """
-
+    # (V,), m: The true surface is within this distance with a probability of 90 %, if the vertex
+    # was heard
     error: Floats
-    heard: Bools
-    factors: Floats
+    heard: Bools  # (V,): True where echoes bound the place of the surface
+    factors: Floats  # (V, 5): The factors of the error, without their exponents
 
 
 def surface_error(

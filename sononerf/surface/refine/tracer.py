@@ -37,17 +37,11 @@ FAINT = 3e-3
 
 @dataclass(frozen=True, eq=False)
 class Later:
-    """Echoes of one pose after the first bounce.
+    """Echoes of one pose after the first bounce."""
 
-    Attributes:
-        ear (N,): Index of the ear.
-        delay ((N,), s): Time since the emission.
-        weight ((N, F) float32): Strength at the nodes that the optics keep, with spread and
-            absorption.
-    """
-
-    ear: Ints
-    delay: Floats
+    ear: Ints  # (N,): Index of the ear
+    delay: Floats  # (N,), s: Time since the emission
+    # (N, F) float32: Strength at the nodes that the optics keep, with spread and absorption
     weight: Singles
 
 

@@ -37,20 +37,14 @@ _CUTOFF = 2.5  # standard deviations after which the Gaussian is cut off
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Points of a surface as poses hear them.
+    """Points of a surface as poses hear them."""
 
-    Attributes:
-        points ((G, 3), m): World frame.
-        normals (G, 3): Unit vectors towards the poses.
-        weight (G,): Compressed power of the echo without spreading, at most 1; the loudest point of
-            half of the poses reaches 1.
-        pose (G,): Index of the pose that hears it.
-    """
-
-    points: Floats
-    normals: Floats
+    points: Floats  # (G, 3), m: World frame
+    normals: Floats  # (G, 3): Unit vectors towards the poses
+    # (G,): Compressed power of the echo without spreading, at most 1; the loudest point of half of
+    # the poses reaches 1
     weight: Floats
-    pose: NDArray[np.intp]
+    pose: NDArray[np.intp]  # (G,): Index of the pose that hears it
 
     def where(self, kept: Bools | Ints) -> Evidence:
         """Return those for which (G,) is true, or those of some indices."""

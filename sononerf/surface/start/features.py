@@ -139,18 +139,14 @@ def pooled(
 
 @dataclass(frozen=True, eq=False)
 class PlaceFeatures:
-    """Features of places on a lattice of two voxels.
+    """Features of places on a lattice of two voxels."""
 
-    Attributes:
-        means (X, Y, Z, KINDS, HARMONICS), behind ((X, Y, Z, 4), voxels), direction (X, Y, Z, 3): As
-            of :func:`pooled`.
-        pairs: Number of pose-ear pairs.
-    """
-
+    # X, Y, Z, KINDS, HARMONICS), behind ((X, Y, Z, 4), voxels), direction (X, Y, Z, 3: As of
+    # :func:`pooled`
     means: Singles
     behind: Singles
     direction: Singles
-    pairs: int
+    pairs: int  # Number of pose-ear pairs
 
     def turned(self, order: tuple[int, ...], signs: tuple[int, ...]) -> tuple[Singles, Singles]:
         """Return the input of the network in a turned or mirrored frame.

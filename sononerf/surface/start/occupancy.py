@@ -171,29 +171,19 @@ _CONTRADICTED = 4.0  # range resolutions; if all places lie farther in front, on
 
 @dataclass(frozen=True, eq=False)
 class Gathered:
-    """All evidence, on one lattice; a surface of it is found by :func:`estimate_occupancy`.
+    """All evidence, on one lattice; a surface of it is found by :func:`estimate_occupancy`."""
 
-    Attributes:
-        evidence: The oriented points.
-        weight (G,): Weights of the points, from 0 to 1: their own weight times their reliability.
-        points ((G, 3), m): Places of the points on the lattice, moved outward where the body is
-            thin.
-        lattice: The voxels.
-        thin (X, Y, Z): Thinness of the body, from 0 to 1.
-        bound ((X, Y, Z), voxels): Signed distance of the boundary of free space; no body lies below
-            it.
-        hull: The free space.
-        resolution (m): Range resolution.
-    """
-
-    evidence: Evidence
+    evidence: Evidence  # The oriented points
+    # (G,): Weights of the points, from 0 to 1: their own weight times their reliability
     weight: Floats
+    # (G, 3), m: Places of the points on the lattice, moved outward where the body is thin
     points: Floats
-    lattice: Lattice
-    thin: Singles
+    lattice: Lattice  # The voxels
+    thin: Singles  # (X, Y, Z): Thinness of the body, from 0 to 1
+    # (X, Y, Z), voxels: Signed distance of the boundary of free space; no body lies below it
     bound: Singles
-    hull: EchoHull
-    resolution: float
+    hull: EchoHull  # The free space
+    resolution: float  # m: Range resolution
     _found: dict[str, Singles] = field(default_factory=dict, init=False, repr=False)
 
 

@@ -54,26 +54,17 @@ surface."""
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """All that start surfaces are made of.
+    """All that start surfaces are made of."""
 
-    Attributes:
-        hull: The onsets and the poses that they were heard from.
-        box ((2, 3), m): Lower and upper corner of the region.
-        resolution (m): Range resolution of the analysis.
-        levels: Levels of the echoes over range; None if only the free space is known.
-        volume: Energy of the field; None without a field, like the next one.
-        gathered: Evidence of field and onsets.
-        methods: Start surfaces that a refinement tries.
-        found: Start surfaces that were made of it, by method.
-    """
-
-    hull: EchoHull
-    box: Floats
-    resolution: float
+    hull: EchoHull  # The onsets and the poses that they were heard from
+    box: Floats  # (2, 3), m: Lower and upper corner of the region
+    resolution: float  # m: Range resolution of the analysis
+    # Levels of the echoes over range; None if only the free space is known
     levels: RangeLevels | None = None
-    volume: Volume | None = None
-    gathered: Gathered | None = None
-    methods: tuple[StartMethod, ...] = STARTS
+    volume: Volume | None = None  # Energy of the field; None without a field, like the next one
+    gathered: Gathered | None = None  # Evidence of field and onsets
+    methods: tuple[StartMethod, ...] = STARTS  # Start surfaces that a refinement tries
+    # Start surfaces that were made of it, by method
     found: dict[StartMethod, trimesh.Trimesh] = field(default_factory=dict, repr=False)
 
 

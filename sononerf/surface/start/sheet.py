@@ -52,23 +52,14 @@ _DENSITY = 3.0  # columns over which the density of points is measured
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """A grid in the plane of the sheet, and its height above that plane.
+    """A grid in the plane of the sheet, and its height above that plane."""
 
-    Attributes:
-        centre, axes ((3,), (3, 3)): Origin, m, and the directions along, across and above as
-            columns.
-        lower (2,): Lower corner of the grid, m.
-        step: m.
-        depth (U, V, Z): Greatest depth below the onsets, m, positive inside.
-        heights (Z,): m.
-    """
-
-    centre: Floats
+    centre: Floats  # (3,), (3, 3): Origin, m, and the directions along, across and above as columns
     axes: Floats
-    lower: Floats
-    step: float
-    depth: Floats
-    heights: Floats
+    lower: Floats  # (2,): Lower corner of the grid, m
+    step: float  # m
+    depth: Floats  # (U, V, Z): Greatest depth below the onsets, m, positive inside
+    heights: Floats  # (Z,): m
 
 
 def fit_sheet(known: Gathered) -> trimesh.Trimesh:
