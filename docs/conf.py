@@ -26,11 +26,7 @@ from sononerf.settings.section import Section
 project = "sononerf"
 author = "The sononerf developers"
 version = release = __version__
-extensions = [
-    "myst_parser",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.napoleon",
-]
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
 html_theme = "furo"
 html_title = f"sononerf {version}"
 html_copy_source = False

@@ -44,10 +44,7 @@ def _turned(strokes: tuple[Stroke, ...], width: float) -> tuple[Stroke, ...]:
 
 _STEM = _line((0.0, 0.0), (0.0, 1.0))
 _UPPER_BOWL: Stroke = ((0.0, 1.0), *_arc(0.3, 0.75, 0.25, 0.25, 90, -90), (0.0, 0.5))
-_SIX = (
-    _arc(0.3, 0.3, 0.3, 0.3, 0, 360),
-    _arc(0.55, 0.3, 0.55, 0.7, 100, 180),
-)
+_SIX = (_arc(0.3, 0.3, 0.3, 0.3, 0, 360), _arc(0.55, 0.3, 0.55, 0.7, 100, 180))
 
 # Strokes (y, z) in units of the letter's height, without corners; thickness is added all round.
 FONT: dict[str, tuple[Stroke, ...]] = {

@@ -49,9 +49,7 @@ def loft(path: ArrayLike, radius: ArrayLike) -> trimesh.Trimesh:
     return trimesh.Trimesh(np.concatenate([*rings, points[[0, -1]]]), faces, process=False)
 
 
-def _frames(
-    along: NDArray[np.float64],
-) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def _frames(along: NDArray[np.float64]) -> list[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Return two directions square to each of the line's, which do not spin about it."""
     aside = np.eye(3)[np.argmin(np.abs(along[0]))]
     frames = []

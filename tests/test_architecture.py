@@ -19,14 +19,7 @@ PACKAGE = ROOT / "sononerf"
 
 FLOORS = (
     ("errors", "numerics", "progress", "memory", "executor"),
-    (
-        "version",
-        "storage",
-        "matlab_files",
-        "display",
-        "settings",
-        "geometry",
-    ),
+    ("version", "storage", "matlab_files", "display", "settings", "geometry"),
     ("scene", "head"),
     ("echoes",),
     ("simulation", "recordings"),

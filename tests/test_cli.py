@@ -391,11 +391,7 @@ def test_a_plugins_scene_goes_the_whole_way(plugin, quick, tmp_path, monkeypatch
     monkeypatch.chdir(tmp_path)
     listed = {row["name"]: row for row in json.loads(done("scenes", "--json").out)["scenes"]}
     assert listed["fixture_bar"]["distribution"] == "sononerf-fixture"
-    overrides = [
-        "scene.name=fixture_bar",
-        "scene.options={length: 0.05}",
-        "preview.every_epochs=9",
-    ]
+    overrides = ["scene.name=fixture_bar", "scene.options={length: 0.05}", "preview.every_epochs=9"]
     done("fit", SMOKE, *overrides, "--accelerator", "cpu", "--output", "bar")
     metrics = json.loads((tmp_path / "bar" / "metrics.json").read_text())
     assert metrics["geometry"]["chamfer_m"] < 0.01

@@ -107,10 +107,7 @@ def test_the_papers_scenes_differ_in_scene_and_poses_alone():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "slices",
-    [16, 512],
-)
+@pytest.mark.parametrize("slices", [16, 512])
 def test_the_papers_training_takes_steps(tmp_path, monkeypatch, slices):
     settings = load_settings(
         PAPER,

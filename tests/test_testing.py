@@ -15,10 +15,7 @@ from sononerf.scene.scene import Scene
 
 @pytest.mark.parametrize(
     ("name", "options"),
-    [
-        ("grid", {"finest": 0.01, "levels": 2}),
-        ("fourier", {"width": 16, "octaves": 6}),
-    ],
+    [("grid", {"finest": 0.01, "levels": 2}), ("fourier", {"width": 16, "octaves": 6})],
 )
 def test_built_in_fields_hold(name, options):
     testing.check_field(name, **options)

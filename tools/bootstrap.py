@@ -84,10 +84,7 @@ def install(root: Path, environment: Path, what: str) -> None:
     pip = [str(interpreter(environment)), "-m", "pip", "install", "--disable-pip-version-check"]
     # Python compiles what it imports at the first import, a tenth of what is installed.
     pip.append("--no-compile")
-    for arguments in (
-        [*(["--index-url", index] if index else []), TORCH],
-        ["--editable", what],
-    ):
+    for arguments in ([*(["--index-url", index] if index else []), TORCH], ["--editable", what]):
         code = subprocess.call([*pip, "--quiet", *arguments], cwd=root)
         if code:
             say("installing failed; give the same command again to go on")

@@ -85,11 +85,7 @@ def simulate(
     # A folder that cannot be written is reported before minutes of simulation.
     with results_folder(preview) if preview is not None else nullcontext():
         store = run(
-            settings,
-            output=output,
-            workers=workers,
-            scheduler=scheduler,
-            progress=Progress(),
+            settings, output=output, workers=workers, scheduler=scheduler, progress=Progress()
         )
         say(f"wrote {store.path} ({len(store) - len(store.missing())} poses)")
         if preview is not None:
@@ -377,8 +373,7 @@ def report(
         typer.Option("--format", help="Also write figures of this kind, for a paper."),
     ] = None,
     output: Annotated[
-        Path | None,
-        typer.Option(help="The page; RUN/report.html by default."),
+        Path | None, typer.Option(help="The page; RUN/report.html by default.")
     ] = None,
 ) -> None:
     """Write one page of a run: numbers, pictures, settings."""
@@ -395,8 +390,7 @@ def report(
 def table(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Folders of runs.")],
     csv: Annotated[
-        Path | None,
-        typer.Option(help="Also write all numbers, in SI units, one line per run."),
+        Path | None, typer.Option(help="Also write all numbers, in SI units, one line per run.")
     ] = None,
 ) -> None:
     """Print the numbers of runs beside one another."""

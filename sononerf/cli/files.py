@@ -149,21 +149,11 @@ def import_(
         raise SettingsError("--output is missing; name the store, such as --output data/recorded")
     from sononerf.progress import Progress
     from sononerf.run.build import results_folder
-    from sononerf.run.import_recordings import (
-        check_before,
-        describe,
-        draw,
-        import_understood,
-    )
+    from sononerf.run.import_recordings import check_before, describe, draw, import_understood
     from sononerf.run.understand import understand
 
     known = understand(
-        form,
-        source,
-        output,
-        settings_file=settings,
-        overrides=overrides or (),
-        progress=Progress(),
+        form, source, output, settings_file=settings, overrides=overrides or (), progress=Progress()
     )
     for line in describe(known):
         say(line)

@@ -18,13 +18,7 @@ from sononerf import storage
 from sononerf.display import Picture, Shown, picture_of
 from sononerf.echoes.detection import Onsets, asked_poses, find_onsets, seal_recorded
 from sononerf.echoes.free_space import EchoHull, weighted
-from sononerf.echoes.memory_ensemble import (
-    Ensemble,
-    MemoryEnsemble,
-    repeats,
-    seal,
-    split_of,
-)
+from sononerf.echoes.memory_ensemble import Ensemble, MemoryEnsemble, repeats, seal, split_of
 from sononerf.echoes.range_levels import RangeLevels, evenly_chosen
 from sononerf.echoes.region import WITNESS_GAIN, EchoRegion
 from sononerf.echoes.store import EnsembleStore
@@ -68,11 +62,7 @@ class Echoes(Shown):
     """
 
     def __init__(
-        self,
-        store: Ensemble,
-        head: Head,
-        hull: EchoHull | None = None,
-        box: Floats | None = None,
+        self, store: Ensemble, head: Head, hull: EchoHull | None = None, box: Floats | None = None
     ) -> None:
         self.store, self.head, self.box = store, head, box
         self.positions, self.rotations = store.positions, store.rotations

@@ -168,12 +168,7 @@ def _is_beside(
 
 @compiled
 def _behind(
-    points: Floats,
-    emitters: Floats,
-    receivers: Floats,
-    first: Floats,
-    axes: Floats,
-    within: float,
+    points: Floats, emitters: Floats, receivers: Floats, first: Floats, axes: Floats, within: float
 ) -> Floats:
     """Return how far points (N, 3) lie behind first echoes (P, E): (N, P, E), m.
 
@@ -278,11 +273,7 @@ def weighted(hull: EchoHull, resolution: float, within: Floats | None = None) ->
 
 
 def _remove(
-    weight: Floats,
-    homeless: NDArray[np.intp],
-    against: Bools,
-    meets: Bools,
-    enough: float,
+    weight: Floats, homeless: NDArray[np.intp], against: Bools, meets: Bools, enough: float
 ) -> None:
     """Set the weight of outliers to zero; arrays as of ``_cells``."""
     count = against.sum(axis=1).astype(int)

@@ -252,11 +252,7 @@ class MemoryEnsemble(Ensemble):
 
 
 def seal(
-    ensemble: Ensemble,
-    again: dict[int, Singles],
-    *,
-    silent: str,
-    noise: Floats | None = None,
+    ensemble: Ensemble, again: dict[int, Singles], *, silent: str, noise: Floats | None = None
 ) -> None:
     """Fix the reported decibels and the noise floor of a complete ensemble, which seals it.
 

@@ -290,11 +290,7 @@ def _sorted(
 
 @compiled
 def _gather(
-    gained: Singles,
-    sensed: Singles,
-    index: NDArray[np.int32],
-    heard: Singles,
-    audible: Singles,
+    gained: Singles, sensed: Singles, index: NDArray[np.int32], heard: Singles, audible: Singles
 ) -> None:
     """Add the heard power and the audibility of its bin to each voxel (X, Y, Z), in place."""
     for i in range(index.shape[0]):

@@ -117,12 +117,7 @@ def _starts(points: Floats, target: Floats, scaled: bool) -> list[Floats]:
     return starts
 
 
-def _closest(
-    points: Floats,
-    target: Floats,
-    start: Floats,
-    scaled: bool,
-) -> tuple[float, Floats]:
+def _closest(points: Floats, target: Floats, start: Floats, scaled: bool) -> tuple[float, Floats]:
     """Iterate from a start; return the mean distance, m, and the motion."""
     tree, motion, before = cKDTree(target), start, np.inf
     for _ in range(STEPS):

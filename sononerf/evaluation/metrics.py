@@ -15,12 +15,7 @@ from sononerf.evaluation.solid import Nearest, Solid, sample_surface
 from sononerf.head.decibels import mae_db
 from sononerf.numerics import Floats
 
-__all__ = [
-    "geometry_metrics",
-    "mae_db",
-    "prediction_metrics",
-    "target_metrics",
-]
+__all__ = ["geometry_metrics", "mae_db", "prediction_metrics", "target_metrics"]
 
 
 def geometry_metrics(
@@ -117,10 +112,7 @@ def _volume_metrics(found: Solid, true: Solid) -> dict[str, float | None]:
 
 
 def _normal_consistency(
-    points: Floats,
-    normals: Floats,
-    true_points: Floats,
-    true_normals: Floats,
+    points: Floats, normals: Floats, true_points: Floats, true_normals: Floats
 ) -> float:
     there, back = _nearest_of(true_points, points), _nearest_of(points, true_points)
     forward = np.abs((normals * true_normals[there]).sum(axis=1)).mean()

@@ -12,13 +12,7 @@ from torch.utils.data import DataLoader, DistributedSampler
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import InputError
-from sononerf.field.range_slices import (
-    PoseReader,
-    RangeSlices,
-    SliceStream,
-    WholePoses,
-    one_by_one,
-)
+from sononerf.field.range_slices import PoseReader, RangeSlices, SliceStream, WholePoses, one_by_one
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.settings.loading import checked_section
 from sononerf.settings.schema import DataSettings, FitSettings

@@ -19,12 +19,7 @@ from torchmetrics import MeanMetric
 from sononerf.echoes.echoes import Echoes
 from sononerf.errors import IncompatibleError, NumericalError, SettingsError, expect
 from sononerf.field.checkpoint_io import DurableCheckpointIO
-from sononerf.field.factories import (
-    FieldFactory,
-    RendererFactory,
-    box_of,
-    make,
-)
+from sononerf.field.factories import FieldFactory, RendererFactory, box_of, make
 from sononerf.field.field import Field
 from sononerf.field.range_slices import RangeSlices, seed_of
 from sononerf.field.renderer import Possible, Renderer

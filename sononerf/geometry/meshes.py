@@ -66,9 +66,7 @@ def total_curvature(mesh: trimesh.Trimesh, normals: Floats) -> Floats:
     return np.sqrt(np.maximum(square, 0.0))
 
 
-def weight_gradients(
-    corners: Floats,
-) -> tuple[Floats, Floats]:
+def weight_gradients(corners: Floats) -> tuple[Floats, Floats]:
     """Gradients of the barycentric weights of a triangle's second and third corner.
 
     In: corners ((T, 3, 3), m). Out: second, third ((T, 3), 1/m).

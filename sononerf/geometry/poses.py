@@ -180,9 +180,7 @@ def rotation_from_euler(yaw: ArrayLike, pitch: ArrayLike, roll: ArrayLike) -> Fl
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def euler_from_rotation(
-    rotations: ArrayLike,
-) -> tuple[Floats, Floats, Floats]:
+def euler_from_rotation(rotations: ArrayLike) -> tuple[Floats, Floats, Floats]:
     """Yaw, pitch and roll of rotation matrices; looking straight up or down, yaw is 0.
 
     In: rotations (..., 3, 3). Out: yaw, pitch, roll ((...,), rad).
@@ -194,9 +192,7 @@ def euler_from_rotation(
     upright = level < 1e-9
     yaw = np.where(upright, 0.0, np.arctan2(r[..., 1, 0], r[..., 0, 0]))
     roll = np.where(
-        upright,
-        np.arctan2(-r[..., 1, 2], r[..., 1, 1]),
-        np.arctan2(r[..., 2, 1], r[..., 2, 2]),
+        upright, np.arctan2(-r[..., 1, 2], r[..., 1, 1]), np.arctan2(r[..., 2, 1], r[..., 2, 2])
     )
     return yaw, pitch, roll
 

@@ -258,13 +258,7 @@ class RayCaster:
         along = np.ascontiguousarray(directions)
         return Hits(*_hits_of(found, start, along, self._planes, self._gradients, self._corners))
 
-    def visible(
-        self,
-        points: Floats,
-        targets: Floats,
-        *,
-        normals: Floats | None = None,
-    ) -> Bools:
+    def visible(self, points: Floats, targets: Floats, *, normals: Floats | None = None) -> Bools:
         """True where nothing stands between points and targets.
 
         In: points ((N, 3), m), targets ((N, 3) or (3,), m), normals (N, 3). Out: visible (N,).

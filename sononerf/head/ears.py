@@ -286,10 +286,7 @@ def _analysed(
         return np.broadcast_to(stacked, (len(fine.positions), *stacked.shape[1:]))
 
     analysed = dataclasses.replace(
-        fine,
-        frequency=frequency_axis(analysis),
-        beam=beam.astype(np.float32),
-        ears=of_all(ears),
+        fine, frequency=frequency_axis(analysis), beam=beam.astype(np.float32), ears=of_all(ears)
     )
     return analysed, of_all(lags) if lags else None
 

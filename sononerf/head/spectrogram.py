@@ -122,10 +122,7 @@ def spectrogram(
 
 
 def _filtered(
-    signal: Floats,
-    settings: SpectrogramSettings,
-    starts: slice,
-    delay: Floats,
+    signal: Floats, settings: SpectrogramSettings, starts: slice, delay: Floats
 ) -> Floats:
     """Each frequency's row as a filter, an envelope on that frequency; a delay is then a phase."""
     filters = row_filters(settings)

@@ -41,11 +41,7 @@ class Calibration:
     range_offset: float  # m: To be added to every range
 
 
-def calibrate(
-    echo: Floats,
-    reference: ReferenceSettings,
-    head: Head,
-) -> Calibration:
+def calibrate(echo: Floats, reference: ReferenceSettings, head: Head) -> Calibration:
     r"""Compare the echo of a reference target with theory.
 
     A rigid sphere of radius a, large against the wavelength, sends back a/2 of the pressure that
@@ -149,11 +145,7 @@ def analysis_bytes(head: Head, pings: int) -> float:
 
 
 def found_ranges(
-    head: Head,
-    cutter: Cutter,
-    recording: Recording,
-    given: Collection[str],
-    progress: Progress,
+    head: Head, cutter: Cutter, recording: Recording, given: Collection[str], progress: Progress
 ) -> tuple[dict[str, float], Floats]:
     """Find range limits that are left out from the echoes.
 
@@ -222,10 +214,7 @@ def _widest(window: int, count: int, delay: float, metre: float) -> float:
 
 
 def calibrated(
-    recording: Recording,
-    wanted: ImportSettings,
-    head: Head,
-    folder: Path,
+    recording: Recording, wanted: ImportSettings, head: Head, folder: Path
 ) -> tuple[Cutter, dict[str, Any]]:
     """Return the cutter of pings, with all corrections, and the applied calibration."""
     speed, rate = head.speed_of_sound, recording.sampling_rate
@@ -251,11 +240,7 @@ def calibrated(
         if cutter.background is not None:
             size = min(echo.shape[1], cutter.background.shape[1])
             echo[:, :size] -= cutter.background[:, :size]
-        found = calibrate(
-            mix(echo, wanted.channels) * wanted.scale,
-            target,
-            head,
-        )
+        found = calibrate(mix(echo, wanted.channels) * wanted.scale, target, head)
         delay -= 2.0 * found.range_offset / speed
         cutter = replace(cutter, delay=delay, gain=wanted.scale * found.gain)
         if cutter.background is not None:

@@ -231,10 +231,7 @@ def _volume(source: Path, frame: Frame) -> Part:
         for name, axis in zip("xyz", volume.axes(), strict=True)
     }
     meaning = "reflectivity summed over directions and frequencies"
-    return {
-        "reflectivity": Named(volume.values, ("x", "y", "z"), "1", meaning),
-        **axes,
-    }, {}
+    return {"reflectivity": Named(volume.values, ("x", "y", "z"), "1", meaning), **axes}, {}
 
 
 def _reconstructed(source: Path, name: str) -> Path:

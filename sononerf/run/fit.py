@@ -42,12 +42,7 @@ from sononerf.run.fit_warnings import fit_warnings
 from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run import Run
-from sononerf.run.simulate import (
-    background_path,
-    open_ensemble,
-    open_or_simulate,
-    store_path,
-)
+from sononerf.run.simulate import background_path, open_ensemble, open_or_simulate, store_path
 from sononerf.settings.loading import faults_of
 from sononerf.settings.schema import Settings
 
@@ -268,11 +263,7 @@ def _prepared(
 
 
 def _fit(
-    settings: Settings,
-    run: Run,
-    work: _Work,
-    hardware: dict[str, Any],
-    progress: Progress,
+    settings: Settings, run: Run, work: _Work, hardware: dict[str, Any], progress: Progress
 ) -> None:
     echoes, module, data = work.echoes, work.module, work.data
     renderer = module.renderer

@@ -109,12 +109,7 @@ def read_recordings(
     chosen = assignments(options or {})
     progress = progress or Progress()
     known = understand(
-        form,
-        Path(source),
-        output,
-        settings_file=settings_file,
-        overrides=chosen,
-        progress=progress,
+        form, Path(source), output, settings_file=settings_file, overrides=chosen, progress=progress
     )
     store, found = import_understood(known, output, progress=progress)
     if found.message:

@@ -163,10 +163,7 @@ def simulate(
 
 
 def write_waveforms(
-    settings: Settings,
-    folder: Path,
-    *,
-    progress: Progress | None = None,
+    settings: Settings, folder: Path, *, progress: Progress | None = None
 ) -> list[Path]:
     """Simulate the sound at the receivers at every pose, and write WAV files with a table.
 

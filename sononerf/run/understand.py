@@ -191,11 +191,7 @@ def _settings_data(
 
 
 def _complete(
-    data: dict[str, Any],
-    recording: Recording,
-    wanted: ImportSettings,
-    output: Path,
-    where: str,
+    data: dict[str, Any], recording: Recording, wanted: ImportSettings, output: Path, where: str
 ) -> Settings:
     """Complete the settings from the recording, and check them like those of a fit."""
     for section, known in recording.settings.items():

@@ -50,12 +50,7 @@ CALL_PRESETS = {
         "harmonics. Hyperbolic, and the harmonics' amplitudes, are typical.",
     ),
     "rhinolophus_fm": CallPreset(
-        {
-            "kind": "linear",
-            "duration": 0.87e-3,
-            "frequency_start": 83e3,
-            "frequency_end": 63e3,
-        },
+        {"kind": "linear", "duration": 0.87e-3, "frequency_start": 83e3, "frequency_end": 63e3},
         "greater horseshoe bat, the sweep that ends the call; its constant tone tells no range",
         "M. M. Andrews et al., Acta Chiropterologica 8(1):197-212, 2006: 83 kHz. B. Vogler and "
         "G. Neuweiler, Journal of Comparative Physiology A 152:421-432, 1983: 12 to 20 kHz wide. "
@@ -75,12 +70,7 @@ CALL_PRESETS = {
         "W. Jansen and J. Steckel, SonoTraceLab, IEEE Access 12, 2024.",
     ),
     "airsas": CallPreset(
-        {
-            "kind": "linear",
-            "duration": 1e-3,
-            "frequency_start": 30e3,
-            "frequency_end": 10e3,
-        },
+        {"kind": "linear", "duration": 1e-3, "frequency_start": 30e3, "frequency_end": 10e3},
         "an in-air synthetic aperture sonar: a straight sweep from 30 to 10 kHz in a millisecond",
         "A. Reed et al., Neural Volumetric Reconstruction for Coherent Synthetic Aperture Sonar, "
         "ACM Transactions on Graphics 42(4), 2023; direction and duration as in the waveform that "

@@ -182,13 +182,7 @@ class Diffraction:
         self._end = np.cumsum(measure)
 
     def sound(
-        self,
-        hearing: Hearing,
-        position: Floats,
-        rotation: Floats,
-        *,
-        points: int,
-        offset: float,
+        self, hearing: Hearing, position: Floats, rotation: Floats, *, points: int, offset: float
     ) -> Sound:
         """Return the sound of edges and curved places at the ears of a pose.
 

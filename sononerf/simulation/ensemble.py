@@ -162,11 +162,7 @@ def _finished(path: Path, wanted: str) -> EnsembleStore | None:
 
 
 def echo_hash(
-    scene: Scene,
-    poses: Poses,
-    split: NDArray[np.int8],
-    head: Head,
-    options: SimulationSettings,
+    scene: Scene, poses: Poses, split: NDArray[np.int8], head: Head, options: SimulationSettings
 ) -> str:
     """Return a hash of all inputs of the echoes.
 
@@ -219,11 +215,7 @@ def _plain(head: Head, options: SimulationSettings) -> dict[str, Any]:
 
 
 def _attributes(
-    wanted: str,
-    scene: Scene,
-    head: Head,
-    options: SimulationSettings,
-    about: Mapping[str, Any],
+    wanted: str, scene: Scene, head: Head, options: SimulationSettings, about: Mapping[str, Any]
 ) -> dict[str, Any]:
     further = dict(about)
     if scene.to_original is not None:

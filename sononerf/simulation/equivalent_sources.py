@@ -90,11 +90,7 @@ class Equations:
 
 
 def _slopes(
-    points: Floats,
-    normals: Floats,
-    places: Floats,
-    wavenumber: complex,
-    axes: Floats | None = None,
+    points: Floats, normals: Floats, places: Floats, wavenumber: complex, axes: Floats | None = None
 ) -> NDArray[np.complex64]:
     r"""Return :math:`\partial_n` of pressure at points (N, 3) for sources (M, 3).
 
@@ -158,10 +154,7 @@ def _squares(points: Floats, places: Floats) -> Floats:
 
 
 def arriving(
-    points: Floats,
-    normals: Floats,
-    emitters: Floats,
-    wavenumber: complex,
+    points: Floats, normals: Floats, emitters: Floats, wavenumber: complex
 ) -> NDArray[np.complex64]:
     r"""Return :math:`\partial_n e^{-j k r} / r` at points (N, 3) for emitters (P, 3)."""
     return np.float32(4.0 * math.pi) * _slopes(points, normals, emitters, wavenumber)

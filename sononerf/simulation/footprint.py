@@ -188,11 +188,7 @@ def onto(rows: Singles, turned: Singles, further: Ints, distance: Floats) -> Sin
 
 @compiled
 def land(
-    bundles: Singles,
-    incoming: Floats,
-    normals: Floats,
-    flat: Floats,
-    gradients: Singles,
+    bundles: Singles, incoming: Floats, normals: Floats, flat: Floats, gradients: Singles
 ) -> tuple[Singles, Singles, Floats, Floats]:
     """Return footprints of bundles on the surface, and the mirrored bundles.
 

@@ -222,10 +222,7 @@ def air_loss(synthesis: Synthesis, decay: Floats) -> Floats:
 
 
 def synthesise(
-    synthesis: Synthesis,
-    bins: Bins,
-    air: NDArray[np.floating[Any]],
-    basis: Complexes,
+    synthesis: Synthesis, bins: Bins, air: NDArray[np.floating[Any]], basis: Complexes
 ) -> Floats:
     """Weaken each node's bins by the air, filter them with its part of the spectrum, add up.
 
@@ -255,12 +252,7 @@ def synthesise(
 
 @compiled
 def _filter(
-    spectrum: Complexes,
-    half: NDArray[Any],
-    basis: Complexes,
-    size: int,
-    part: int,
-    width: float,
+    spectrum: Complexes, half: NDArray[Any], basis: Complexes, size: int, part: int, width: float
 ) -> None:
     """Add one level of bins, filtered, to a spectrum (K / part,), in place.
 

@@ -373,12 +373,7 @@ def sources_worth(scene: Scene) -> int:
 
 
 def low_band(
-    scene: Scene,
-    hearing: Hearing,
-    arrival: Arrival,
-    *,
-    sources: int,
-    frequency_min: float,
+    scene: Scene, hearing: Hearing, arrival: Arrival, *, sources: int, frequency_min: float
 ) -> LowBand | str:
     """Return the low band of a scene, or the reason for its absence.
 

@@ -176,14 +176,7 @@ class Rays:
             echo += self.hearing.echo(edges, self._hats)
         return echo
 
-    def later(
-        self,
-        sound: Listener,
-        position: Floats,
-        rotation: Floats,
-        *,
-        seed: int,
-    ) -> None:
+    def later(self, sound: Listener, position: Floats, rotation: Floats, *, seed: int) -> None:
         """Pass the echoes of the first bounce to a listener; edges are left out."""
         first, second, _ = np.random.default_rng(seed).random(3)
         paths = self._paths(position, rotation, (first, second), self.bounces)
@@ -229,11 +222,7 @@ class Rays:
         return np.concatenate(points), np.concatenate(strength)
 
     def _paths(
-        self,
-        position: Floats,
-        rotation: Floats,
-        offset: tuple[float, float],
-        bounces: int,
+        self, position: Floats, rotation: Floats, offset: tuple[float, float], bounces: int
     ) -> Iterator[Bounce]:
         emitter, _ = self.hearing.places(position, rotation)
         axis, half_angle = aim(emitter, self._centre, self._radius)
@@ -262,11 +251,7 @@ class Rays:
         return cap.reaching(ways / np.maximum(distance, 1e-300)[:, None], half_angle)
 
     def _hidden(
-        self,
-        position: Floats,
-        rotation: Floats,
-        offset: tuple[float, float],
-        shadow: Shadow,
+        self, position: Floats, rotation: Floats, offset: tuple[float, float], shadow: Shadow
     ) -> Iterator[Bounce]:
         """Return the first hits behind obstacles, as if the obstacles were not there."""
         outlines = self._outlines
@@ -346,17 +331,8 @@ class Rays:
             )
 
     def _heard(
-        self,
-        bounce: Bounce,
-        ear: Floats,
-        lit: Shadow | None = None,
-        shadow: Shadow | None = None,
-    ) -> tuple[
-        Ints,
-        NDArray[np.floating[Any]],
-        Singles,
-        tuple[Ints, NDArray[np.complex64]] | None,
-    ]:
+        self, bounce: Bounce, ear: Floats, lit: Shadow | None = None, shadow: Shadow | None = None
+    ) -> tuple[Ints, NDArray[np.floating[Any]], Singles, tuple[Ints, NDArray[np.complex64]] | None]:
         """Return which hits an ear hears (N,), their gain (N, F), and their paths' spread (N,), m.
 
         The last two are the shaded hits (M,) and the transmitted fraction (M, F), or None.
@@ -380,12 +356,7 @@ class Rays:
         return near, gain, ways.spread.take(near), shaded
 
     def _shaded(
-        self,
-        bounce: Bounce,
-        near: Ints,
-        seen: Bools,
-        lit: Shadow | None,
-        shadow: Shadow | None,
+        self, bounce: Bounce, near: Ints, seen: Bools, lit: Shadow | None, shadow: Shadow | None
     ) -> tuple[Bools, tuple[Ints, NDArray[np.complex64]] | None]:
         """Return which hits pass obstacles, and the transmission of those near an outline."""
         points, triangle = bounce.points.take(near, axis=0), bounce.triangles[near, -1]

@@ -49,10 +49,7 @@ class Reflection:
         return share
 
     def heard(
-        self,
-        cosine: Floats,
-        detour: NDArray[np.floating[Any]],
-        curvature: Floats,
+        self, cosine: Floats, detour: NDArray[np.floating[Any]], curvature: Floats
     ) -> NDArray[np.floating[Any]]:
         r"""Lobe times strength.
 

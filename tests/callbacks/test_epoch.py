@@ -56,9 +56,7 @@ def test_after_every_epoch(training, tmp_path):
     steps = Steps()
     training(CheckpointCallback(tmp_path, 60.0), steps).train()
     assert steps.seen == [4, 8]
-    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == [
-        "last.ckpt",
-    ]
+    assert sorted(p.name for p in (tmp_path / "checkpoints").iterdir()) == ["last.ckpt"]
 
 
 def test_the_time_of_a_fit_begins_at_zero(tmp_path):

@@ -10,13 +10,7 @@ import trimesh
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensorboard.plugins.hparams import plugin_data_pb2
 
-from sononerf.callbacks import (
-    add_mesh,
-    event_folder,
-    log_results,
-    serve,
-    writing,
-)
+from sononerf.callbacks import add_mesh, event_folder, log_results, serve, writing
 from tests.browser import CHROMIUM, browser
 
 

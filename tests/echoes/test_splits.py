@@ -21,8 +21,7 @@ def split(poses, **given):
 
 
 @pytest.mark.parametrize(
-    ("count", "expected"),
-    [(2, [2, 0, 0]), (3, [1, 1, 1]), (40, [34, 2, 4]), (1000, [970, 10, 20])],
+    ("count", "expected"), [(2, [2, 0, 0]), (3, [1, 1, 1]), (40, [34, 2, 4]), (1000, [970, 10, 20])]
 )
 def test_sizes_follow_the_number_of_poses(count, expected):
     assert np.bincount(split(poses_of(count)), minlength=3).tolist() == expected

@@ -6,10 +6,7 @@ import pytest
 import trimesh
 
 from sononerf.errors import NumericalError
-from sononerf.evaluation.baseline import (
-    backprojection,
-    best_level_surface,
-)
+from sononerf.evaluation.baseline import backprojection, best_level_surface
 from sononerf.geometry.lattice import grid_over, volume_from_function
 from sononerf.geometry.poses import Poses
 
@@ -46,10 +43,7 @@ def listener(ranges=RANGES, ears=EARS):
     def places(positions, rotations):
         return positions + rotations @ EMITTER, positions[:, None] + ears @ rotations.swapaxes(1, 2)
 
-    return SimpleNamespace(
-        range=np.asarray(ranges),
-        places=places,
-    )
+    return SimpleNamespace(range=np.asarray(ranges), places=places)
 
 
 def run(spectrograms, positions, rotations, ranges=RANGES, ears=EARS):

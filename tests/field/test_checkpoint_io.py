@@ -10,11 +10,7 @@ import pytest
 import torch
 
 from sononerf.errors import InputError, StorageError
-from sononerf.field.checkpoint_io import (
-    DurableCheckpointIO,
-    load_weights,
-    save_weights,
-)
+from sononerf.field.checkpoint_io import DurableCheckpointIO, load_weights, save_weights
 
 
 @pytest.fixture

@@ -6,14 +6,7 @@ import torch
 
 from sononerf.field.field import Field, sphere_directions
 from sononerf.field.lobe import LOG_STRENGTH_FLOOR, RADIUS_UNIT
-from tests.field.lobes import (
-    FREQUENCY,
-    REGION,
-    fill,
-    grid,
-    places_in,
-    say,
-)
+from tests.field.lobes import FREQUENCY, REGION, fill, grid, places_in, say
 
 LOBE = torch.tensor([2.0, -4.0, 4.0], dtype=torch.float64)  # of length 6
 

@@ -462,12 +462,7 @@ def store(tmp_path_factory):
 def fit(store, renderer, path, steps):
     torch.manual_seed(0)
     field = GridField(REGION, FREQUENCY, spacing=0.01, levels=1)
-    found = module(
-        renderer,
-        field,
-        reference=store.attributes["reference"],
-        learning_rate=0.3,
-    )
+    found = module(renderer, field, reference=store.attributes["reference"], learning_rate=0.3)
     options = {"batch_poses": 4, "batch_slices": 200, "batch_frequencies": "all"}
     heard = SimpleNamespace(store=store, reference=store.attributes["reference"])
     data = EchoDataModule(heard, {**options, "steps_per_epoch": steps})

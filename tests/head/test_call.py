@@ -5,14 +5,7 @@ import numpy as np
 import pytest
 import scipy.signal
 
-from sononerf.head.call import (
-    call_waveform,
-    covered,
-    emit,
-    has_ghosts,
-    sweep_delay,
-    sweep_rate,
-)
+from sononerf.head.call import call_waveform, covered, emit, has_ghosts, sweep_delay, sweep_rate
 from sononerf.settings.schema import CallSettings
 
 SWEEPS = [

@@ -201,9 +201,7 @@ def test_any_number_of_receivers(count, directivity):
     np.testing.assert_allclose(ears.positions, line(count))
     assert ears.alike == (directivity != "ear" or count == 1)
     np.testing.assert_allclose(
-        ear_gain(ears, count - 1, direction(20, 10)),
-        ears.ears[-1, :, 50, 100][None],
-        rtol=1e-4,
+        ear_gain(ears, count - 1, direction(20, 10)), ears.ears[-1, :, 50, 100][None], rtol=1e-4
     )
 
 

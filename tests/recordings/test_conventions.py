@@ -116,10 +116,7 @@ def test_what_is_missing_or_double_is_told(given, settings, words):
 
 @pytest.mark.parametrize(
     ("rotation", "words"),
-    [
-        (np.diag([1.0, -1.0, 1.0]), "mirror image"),
-        (np.ones((3, 3)), "no rotation matrix"),
-    ],
+    [(np.diag([1.0, -1.0, 1.0]), "mirror image"), (np.ones((3, 3)), "no rotation matrix")],
 )
 def test_a_matrix_that_is_no_rotation_is_told(rotation, words):
     with pytest.raises(InputError, match=words):

@@ -97,9 +97,7 @@ class Still(Head):
 
 def calibration(call, echo):
     return calibrate(
-        echo,
-        TARGET,
-        Still(ears=EarSettings(notch_depth=0.0), call=call, analysis=ANALYSIS),
+        echo, TARGET, Still(ears=EarSettings(notch_depth=0.0), call=call, analysis=ANALYSIS)
     )
 
 

@@ -187,10 +187,7 @@ SHUFFLED = np.random.default_rng(3).permutation(PINGS).tolist()
 FAULTS = {
     # Files.
     "no table": (lambda f: (f / "poses.csv").unlink(), r"poses\.csv: no table of poses"),
-    "no ping": (
-        lambda f: ping(f).unlink(),
-        r"1 poses have no recording, .*ping_005\.wav",
-    ),
+    "no ping": (lambda f: ping(f).unlink(), r"1 poses have no recording, .*ping_005\.wav"),
     "a ping has no pose": (
         lambda f: shutil.copy(ping(f), ping(f, 999)),
         r"1 recordings have no pose, such as ping_999\.wav",
@@ -261,10 +258,7 @@ WARNED = {
     "north and east": (renamed(x_mm="y_mm", y_mm="x_mm"), r"another convention of poses"),
     "wrong frame": (settings(("frame: ned", "frame: enu")), r"left and right|another convention"),
     "millimetres for metres": (renamed(x_mm="x_m", y_mm="y_m", z_mm="z_m"), r"lengths in mm\?"),
-    "scalar last": (
-        renamed(qw="qz", qx="qw", qy="qx", qz="qy"),
-        r"scalar is its last number",
-    ),
+    "scalar last": (renamed(qw="qz", qx="qw", qy="qx", qz="qy"), r"scalar is its last number"),
     "swapped channels": (every(lambda s: s[:, [2, 1, 0, 3]]), r"channels 0 and 2 swapped"),
     "wrong rate": (every_file(500_000), r"sampling rate"),
     "late": (

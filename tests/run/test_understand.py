@@ -48,8 +48,7 @@ def test_the_rate_and_the_band_come_from_recording_and_call(recorded):
 
 
 @pytest.mark.parametrize(
-    ("rate", "low", "high", "window"),
-    [(450e3, 20e3, 80e3, 32), (100e3, 10e3, 30e3, 16)],
+    ("rate", "low", "high", "window"), [(450e3, 20e3, 80e3, 32), (100e3, 10e3, 30e3, 16)]
 )
 def test_another_band_runs_with_no_setting_but_the_band(recorded, rate, low, high, window):
     given = (f"spectrogram.frequency_min={low}", f"spectrogram.frequency_max={high}")

@@ -84,11 +84,7 @@ def nested(**part):
             "scene.options.parts.1.rotation: found a reflection",
         ),
         ({"scale": 0}, SettingsError, "scene.options.parts.1.scale: found 0"),
-        (
-            {"scal": 1},
-            SettingsError,
-            "scene.options.parts.1.scal: unknown key; did you mean scale",
-        ),
+        ({"scal": 1}, SettingsError, "scene.options.parts.1.scal: unknown key; did you mean scale"),
         ({"position": [0, 0]}, SettingsError, "scene.options.parts.1.position"),
         ({"material": "wood"}, SettingsError, "scene.options.parts.1.material: found 'wood'"),
         (

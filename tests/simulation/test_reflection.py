@@ -7,12 +7,7 @@ import pytest
 from scipy.integrate import quad
 
 from sononerf.scene.material import RIGID, SONOTRACELAB, Material
-from sononerf.simulation.reflection import (
-    leave,
-    lobe_exponent,
-    reflection,
-    unfaded,
-)
+from sononerf.simulation.reflection import leave, lobe_exponent, reflection, unfaded
 
 SPEED = 343.0
 

@@ -17,14 +17,7 @@ from sononerf.geometry.plane import Plane
 from sononerf.surface import surface
 from sononerf.surface.start import read_out
 from sononerf.surface.start.evidence import Evidence
-from sononerf.surface.surface import (
-    FACING,
-    THIN,
-    Openness,
-    known_part,
-    leaving_out,
-    without_unseen,
-)
+from sononerf.surface.surface import FACING, THIN, Openness, known_part, leaving_out, without_unseen
 
 RADIUS, DISTANCE, RESOLUTION = 0.02, 0.4, 0.006
 THINNEST = THIN * RESOLUTION

@@ -144,12 +144,7 @@ def _strokes(random: Random) -> manifold3d.CrossSection:
             along = wide * (end - start) / length
             side = np.array([-along[1], along[0]])
             found += _cross(
-                [
-                    start - along - side,
-                    end + along - side,
-                    end + along + side,
-                    start - along + side,
-                ]
+                [start - along - side, end + along - side, end + along + side, start - along + side]
             )
     return found
 

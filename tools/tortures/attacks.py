@@ -175,10 +175,7 @@ def _urls() -> Iterator[Attack]:
             ),
         )
         yield f"truth at {url}", lambda _, url=url: ("evaluate", "run", "--truth", url)
-        yield (
-            f"store at {url}",
-            lambda _, url=url: ("fit", f"data.store={url}", "--output", "x"),
-        )
+        yield (f"store at {url}", lambda _, url=url: ("fit", f"data.store={url}", "--output", "x"))
 
 
 def _names() -> Iterator[Attack]:

@@ -122,10 +122,7 @@ def _tables() -> dict[str, tuple[str, str]]:
             _table(np.tile(places[:1], (24, 1)), (yaw[:1].repeat(24), pitch[:1].repeat(24), roll)),
             "all 24 poses are at one place",
         ),
-        "NaN in a table": (
-            _table(places * [[np.nan, 1, 1]], (yaw, pitch, roll)),
-            "finite|NaN|nan",
-        ),
+        "NaN in a table": (_table(places * [[np.nan, 1, 1]], (yaw, pitch, roll)), "finite|NaN|nan"),
     }
 
 

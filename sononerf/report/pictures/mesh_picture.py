@@ -169,9 +169,7 @@ def sides_png(
     )
 
 
-def _laid_out(
-    rows: Sequence[Sequence[tuple[str, NDArray[np.uint8], ColourScale | None]]],
-) -> bytes:
+def _laid_out(rows: Sequence[Sequence[tuple[str, NDArray[np.uint8], ColourScale | None]]]) -> bytes:
     """Lay pictures (H, W, 3) of one size side by side, with their titles and legends."""
     height, width, _ = rows[0][0][1].shape
     down, across = 1.0 / len(rows), 1.0 / len(rows[0])

@@ -15,12 +15,7 @@ from sononerf.errors import NumericalError
 from sononerf.evaluation.numbers import Comparison
 from sononerf.geometry.lattice import Volume, require_finite
 from sononerf.numerics import Floats
-from sononerf.report.pictures.figure import (
-    PictureFormat,
-    figure,
-    picture_bytes,
-    pixels_from_figure,
-)
+from sononerf.report.pictures.figure import PictureFormat, figure, picture_bytes, pixels_from_figure
 from sononerf.report.pictures.mesh_picture import mesh_png, round_length
 from sononerf.report.pictures.shading import DEFAULT_VIEW
 

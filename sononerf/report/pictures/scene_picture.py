@@ -285,12 +285,7 @@ def _draw_waves(axes: Any, distance: Floats, waves: Floats, names: list[str]) ->
 
 
 def _draw_spectrograms(
-    part: Any,
-    axes: Any,
-    sounds: Floats,
-    ranges: Floats,
-    frequencies: Floats,
-    names: list[str],
+    part: Any, axes: Any, sounds: Floats, ranges: Floats, frequencies: Floats, names: list[str]
 ) -> None:
     top = max(5.0, float(np.ceil(sounds.max() / 5.0)) * 5.0)
     for panel, sound in zip(axes, sounds, strict=True):

@@ -45,11 +45,7 @@ class Camera:
 
 
 def camera_for(
-    points: ArrayLike,
-    *,
-    size: tuple[int, int],
-    view: ArrayLike = DEFAULT_VIEW,
-    fill: float = 0.78,
+    points: ArrayLike, *, size: tuple[int, int], view: ArrayLike = DEFAULT_VIEW, fill: float = 0.78
 ) -> Camera:
     """Place a camera so that points (N, 3) fill a share of a picture (width, height)."""
     cloud = np.asarray(points, dtype=np.float64).reshape(-1, 3)
@@ -87,12 +83,7 @@ def _lit(normals: Floats) -> Floats:
     return np.maximum(brightness, 0.05)
 
 
-def draw_mesh(
-    pixels: Floats,
-    mesh: trimesh.Trimesh,
-    camera: Camera,
-    colour: ArrayLike,
-) -> Floats:
+def draw_mesh(pixels: Floats, mesh: trimesh.Trimesh, camera: Camera, colour: ArrayLike) -> Floats:
     """Draw a mesh over pixels, in place.
 
     In: pixels (H, W, 3), colour ((3,) or (V, 3)). Out: nearness ((H, W), m), minus infinity where

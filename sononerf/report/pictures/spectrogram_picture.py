@@ -13,12 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from sononerf.geometry.poses import Poses
 from sononerf.head.decibels import ACTIVE_DB
 from sononerf.numerics import Floats, Ints
-from sononerf.report.pictures.figure import (
-    PictureFormat,
-    figure,
-    picture_bytes,
-    pixels_from_figure,
-)
+from sononerf.report.pictures.figure import PictureFormat, figure, picture_bytes, pixels_from_figure
 
 MARGIN = 0.02
 """Range that is shown before the first and after the last active cell, m."""
@@ -158,11 +153,7 @@ def axis_edges(axis: Floats) -> tuple[float, float]:
 
 
 def draw_cells(
-    panel: Any,
-    values: Floats,
-    ranges: Floats,
-    frequencies: Floats,
-    **options: Any,
+    panel: Any, values: Floats, ranges: Floats, frequencies: Floats, **options: Any
 ) -> Any:
     """Draw cells (R, F) over range (m) and frequency (Hz, drawn in kHz) and return the picture.
 

@@ -30,14 +30,7 @@ from sononerf.surface.refine.candidates import (
     planned,
     without_twin,
 )
-from sononerf.surface.refine.descent import (
-    POSES,
-    SHARP,
-    STAGES,
-    Descent,
-    Stage,
-    poses_that_hear,
-)
+from sononerf.surface.refine.descent import POSES, SHARP, STAGES, Descent, Stage, poses_that_hear
 from sononerf.surface.refine.objective import Comparison, Level, OnsetRanges
 from sononerf.surface.refine.optics import Optics
 from sononerf.surface.refine.plane_descent import POSES as PLANE_POSES

@@ -46,9 +46,7 @@ from torch import Tensor
 
 from sononerf.echoes.echoes import Echoes
 from sononerf.numerics import Bools, Floats, Ints
-from sononerf.surface.refine.mesh_operators import (
-    sparse_tensor,
-)
+from sononerf.surface.refine.mesh_operators import sparse_tensor
 from sononerf.surface.refine.objective import Level, differences, measured
 from sononerf.surface.refine.optics import Heard, Optics
 from sononerf.surface.refine.remesh import distance_from

@@ -68,11 +68,7 @@ def listen(
 
 
 def _candidates(
-    optics: Optics,
-    points: Tensor,
-    area: Tensor,
-    bending: Tensor,
-    heads: Heads,
+    optics: Optics, points: Tensor, area: Tensor, bending: Tensor, heads: Heads
 ) -> tuple[Tensor, Tensor]:
     """Return pairs of pose and vertex (Q,), (Q,) that could hear each other without obstacles."""
     emitters, middles = heads.emitters, heads.ears.mean(1)

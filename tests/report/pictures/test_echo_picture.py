@@ -134,9 +134,7 @@ def test_wrong_input_is_refused(ball):
 @pytest.mark.parametrize("receivers", [1, 3, 8])
 def test_any_number_of_receivers(ball, receivers):
     data = draw(
-        ball,
-        echo=np.stack([wave()] * receivers),
-        spectrogram_db=np.stack([sounds()] * receivers),
+        ball, echo=np.stack([wave()] * receivers), spectrogram_db=np.stack([sounds()] * receivers)
     )
     image = pixels(data)
     view = image[:, : int(0.45 * image.shape[1])]
