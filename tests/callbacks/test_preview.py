@@ -13,8 +13,8 @@ import trimesh
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sononerf import callbacks as preview_module
 from sononerf.callbacks import PreviewCallback
-from sononerf.callbacks import preview as preview_module
 from sononerf.errors import NumericalError
 
 

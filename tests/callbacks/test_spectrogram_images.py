@@ -10,9 +10,9 @@ import torch
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from sononerf import callbacks as images_module
+from sononerf import callbacks as tensorboard_module
 from sononerf.callbacks import SpectrogramImages
-from sononerf.callbacks import preview as images_module
-from sononerf.callbacks import tensorboard as tensorboard_module
 
 
 def callback(made, poses=None):

@@ -192,10 +192,10 @@ def test_one_call_loads_field_and_echoes_once(run, no_projections, monkeypatch):
     monkeypatch.setattr(geometry_module, "BASELINE_VOXELS", 16)
     monkeypatch.setattr(baseline, "LEVEL_SAMPLES", 300)
     loaded = []
-    for name in ("read_model", "find_ensemble"):
-        real = getattr(run_module, name)
+    for home, name in ((run_module.model_files, "read_model"), (run_module, "find_ensemble")):
+        real = getattr(home, name)
         monkeypatch.setattr(
-            run_module, name, lambda *given, real=real, n=name: loaded.append(n) or real(*given)
+            home, name, lambda *given, real=real, n=name: loaded.append(n) or real(*given)
         )
     monkeypatch.setattr(
         finish_module, "learn_traced", lambda f, e, m, s, **o: finish_module.Traced.none(m, f.head)

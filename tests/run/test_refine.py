@@ -21,8 +21,8 @@ from sononerf.run.reconstruct import STAGES, reconstruct, refine_surface
 from sononerf.run.run import Run
 from sononerf.storage import commit_json, read_json
 from sononerf.surface import reconstruction
-from sononerf.surface.refine import comparison as core
 from sononerf.surface.refine import descent as stages
+from sononerf.surface.refine import objective as core
 from sononerf.surface.refine.descent import Stage
 from sononerf.surface.refine.refinement import Refinement
 from sononerf.surface.surface import Surface

@@ -8,7 +8,7 @@ from PIL import Image
 
 from sononerf.errors import NumericalError
 from sononerf.geometry.poses import look_at
-from sononerf.report.pictures import echo_picture as echo
+from sononerf.report.pictures import scene_picture as echo
 from sononerf.report.pictures.scene_picture import EARS, echo_png, visible_hits
 from sononerf.report.pictures.shading import background, camera_for, draw_mesh
 

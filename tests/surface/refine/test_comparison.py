@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from sononerf.errors import SonoNerfError
-from sononerf.surface.refine import comparison as module
+from sononerf.surface.refine import objective as module
 from sononerf.surface.refine.objective import Comparison, Level, OnsetRanges
 from tests.memory import changed, deaf_hull
 from tests.surface.conftest import RADIUS

@@ -16,7 +16,7 @@ from sononerf.run.build import head_of
 from sononerf.scene.scene import Scene
 from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.simulation.simulator import Simulator
-from sononerf.surface.refine import objective
+from sononerf.surface.refine import objective as objectives_module
 from sononerf.surface.refine import refinement as module
 from sononerf.surface.refine.candidates import (
     Candidate,
@@ -76,7 +76,7 @@ def test_the_spectrum_of_a_recording_is_learned_from_the_first_stage_on(bumpy, e
 
 @pytest.fixture(autouse=True)
 def few_rays(monkeypatch):
-    monkeypatch.setattr(objective, "RAYS", 4000)
+    monkeypatch.setattr(objectives_module, "RAYS", 4000)
 
 
 @pytest.fixture(scope="module")
@@ -367,7 +367,7 @@ def test_levels_and_the_best_other_start_stay_until_they_lose(
         return last[order[0] if len(history) == 4 else order[1]]
 
     order = sorted(last, key=lambda name: min(v for k, v in first.items() if k[0] == name))
-    monkeypatch.setattr(objective.Comparison, "objective", objective)
+    monkeypatch.setattr(objectives_module.Comparison, "objective", objective)
     saved = {}
     for _ in range(2):  # the second time all stages are saved
         history.clear()
