@@ -37,5 +37,4 @@ def compiled(function: Callable[Given, Result]) -> Callable[Given, Result]:
         made = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder may be written: it is compiled in each process
         made = numba.njit(**options)(function)
-    result: Callable[Given, Result] = made
-    return result
+    return made

@@ -78,8 +78,7 @@ class EchoHull:
     @property
     def sources(self) -> Floats:
         """Half way between emitter and ears, (P, 3) m."""
-        middle: Floats = (self.emitters + self.receivers.mean(axis=1)) / 2
-        return middle
+        return (self.emitters + self.receivers.mean(axis=1)) / 2
 
     @property
     def width(self) -> float:

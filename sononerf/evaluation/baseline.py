@@ -241,17 +241,13 @@ def _kernel(values: Floats, window_step: float, step: float, depth: float) -> Fl
     slices = step * np.arange(-reach, reach + 1)
     shifts = depth * ((np.arange(DEPTH_STEPS) + 0.5) / DEPTH_STEPS - 0.5)
     place = (slices[:, None] + shifts) / window_step + half
-    kernel: Floats = np.interp(place, np.arange(len(values)), values, left=0.0, right=0.0).mean(
-        axis=1
-    )
-    return kernel
+    return np.interp(place, np.arange(len(values)), values, left=0.0, right=0.0).mean(axis=1)
 
 
 def _heard_back(profile: Floats, kernel: Floats, spread: Floats) -> Singles:
     """Carry a profile from the slices back to the bins of range: the adjoint of hearing."""
     back = np.convolve(profile, kernel[::-1], mode="full") * spread
-    result: Singles = back.astype(np.float32)
-    return result
+    return back.astype(np.float32)
 
 
 @compiled

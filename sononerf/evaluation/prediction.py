@@ -223,15 +223,13 @@ def ranked(measured_db: ArrayLike, predicted_db: ArrayLike) -> Ints:
     """
     measured, predicted = same_shape(measured_db, predicted_db)
     error_db = np.abs(predicted - measured).mean(axis=(1, 2, 3))
-    order: Ints = np.argsort(error_db, kind="stable")
-    return order
+    return np.argsort(error_db, kind="stable")
 
 
 def evenly(order: Ints, count: int) -> Ints:
     """Return ``count`` of an order (P,), evenly spaced from the first to the last."""
     places = np.linspace(0.0, len(order) - 1.0, count)
-    chosen: Ints = order[np.floor(places + 0.5).astype(np.int64)]
-    return chosen
+    return order[np.floor(places + 0.5).astype(np.int64)]
 
 
 def prediction_metrics(

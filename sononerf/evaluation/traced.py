@@ -74,14 +74,12 @@ def interval_db(predicted_db: ArrayLike, half_db: Floats) -> Floats:
     In: predicted_db ((..., F), dB), half_db ((CLASSES, F), dB).
     """
     level = level_class(predicted_db)
-    found: Floats = half_db[level, np.arange(level.shape[-1])]
-    return found
+    return half_db[level, np.arange(level.shape[-1])]
 
 
 def level_class(predicted_db: ArrayLike) -> Ints:
     """Return the class of predicted levels, 0 to ``CLASSES`` - 1."""
-    found: Ints = (np.asarray(predicted_db) / STEP_DB).astype(np.int64).clip(0, CLASSES - 1)
-    return found
+    return (np.asarray(predicted_db) / STEP_DB).astype(np.int64).clip(0, CLASSES - 1)
 
 
 def _quantile(errors: Floats) -> float:

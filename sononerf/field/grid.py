@@ -95,8 +95,7 @@ class _Reading:
             grid.reshape(grid.shape[1], -1).index_select(1, vertices)
             for grid, vertices in zip(grids, self._vertices, strict=True)
         ]
-        total: Tensor = _Product.apply(self._matrix, self._transpose, torch.cat(read, dim=1).T)
-        return total
+        return _Product.apply(self._matrix, self._transpose, torch.cat(read, dim=1).T)
 
     def holds(self, places: Tensor, grid: Tensor) -> bool:
         """Return whether this matrix belongs to these places and to grids like this."""

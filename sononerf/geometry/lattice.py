@@ -62,10 +62,9 @@ class Lattice:
 
     def read(self, grid: NDArray[np.floating], points: Floats) -> Floats:
         """Read a grid at points, linearly between voxels, (N,)."""
-        read: Floats = map_coordinates(
+        return map_coordinates(
             grid, self.coordinates(points).T, order=1, mode="nearest", output=np.float64
         )
-        return read
 
 
 def level_surface(

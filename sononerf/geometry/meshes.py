@@ -93,8 +93,7 @@ def _smooth_corners(mesh: trimesh.Trimesh, crease: float) -> NDArray[np.int32]:
     rows, columns = np.concatenate(first), np.concatenate(second)
     size = faces.size
     links = coo_array((np.ones(len(rows), dtype=bool), (rows, columns)), shape=(size, size))
-    labels: NDArray[np.int32] = connected_components(links, directed=False)[1]
-    return labels
+    return connected_components(links, directed=False)[1]
 
 
 def bodies(mesh: trimesh.Trimesh) -> Ints:
@@ -102,8 +101,7 @@ def bodies(mesh: trimesh.Trimesh) -> Ints:
     count = len(mesh.faces)
     pairs = np.asarray(mesh.face_adjacency, dtype=np.int64).reshape(-1, 2)
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
-    label: Ints = connected_components(graph, directed=False)[1].astype(np.int64)
-    return label
+    return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def enclosing_balls(corners: Floats, label: Ints, count: int) -> tuple[Floats, Floats]:

@@ -48,14 +48,12 @@ class Plane:
     def turn(self) -> Floats:
         """Matrix (3, 3) that mirrors vectors (..., 3) by multiplication from either side."""
         normal = np.asarray(self.normal)
-        turn: Floats = np.eye(3) - 2.0 * np.outer(normal, normal)
-        return turn
+        return np.eye(3) - 2.0 * np.outer(normal, normal)
 
     def mirrored(self, points: Floats) -> Floats:
         """Return the images (..., 3) of points (..., 3), m."""
         at = np.asarray(self.point)
-        image: Floats = (np.asarray(points) - at) @ self.turn + at
-        return image
+        return (np.asarray(points) - at) @ self.turn + at
 
     def with_image(self, mesh: trimesh.Trimesh) -> tuple[trimesh.Trimesh, Bools | None]:
         """Return the part of a mesh above the plane, and its image, as one mesh.

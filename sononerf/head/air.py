@@ -91,7 +91,6 @@ def air_absorption(
     classical = 1.84e-11 / p * np.sqrt(t)
     of_oxygen = 0.01275 * np.exp(-2239.1 / kelvin) / (oxygen + f**2 / oxygen)
     of_nitrogen = 0.1068 * np.exp(-3352.0 / kelvin) / (nitrogen + f**2 / nitrogen)
-    absorption: Floats = (
+    return (
         8.686 * f**2 * (classical + t**-2.5 * (of_oxygen + of_nitrogen))  # (5)
     )
-    return absorption

@@ -67,16 +67,14 @@ def _phase(settings: CallSettings, time: Floats) -> Floats:
     if settings.kind == "linear":
         return 2.0 * np.pi * (start + (end - start) / (2.0 * settings.duration) * time) * time
     k = (1.0 / end - 1.0 / start) / settings.duration
-    phase: Floats = 2.0 * np.pi / k * np.log1p(k * start * time)
-    return phase
+    return 2.0 * np.pi / k * np.log1p(k * start * time)
 
 
 def _envelope(settings: CallSettings, time: Floats) -> Floats:
     inside = np.minimum(time, settings.duration - time)  # s, from the nearer end
     flank = settings.taper * settings.duration / 2.0
     rise = np.clip(inside / flank, 0.0, 1.0) if flank > 0.0 else 1.0
-    envelope: Floats = np.where(inside < 0.0, 0.0, 0.5 - 0.5 * np.cos(np.pi * rise))
-    return envelope
+    return np.where(inside < 0.0, 0.0, 0.5 - 0.5 * np.cos(np.pi * rise))
 
 
 def covered(settings: CallSettings, frequency: ArrayLike) -> Bools:
@@ -135,8 +133,7 @@ def _time_of(settings: CallSettings, swept: Floats, harmonic: Floats) -> Floats:
         share = (swept / harmonic - start) / (end - start)
     else:
         share = (harmonic / swept - 1.0 / start) / (1.0 / end - 1.0 / start)
-    delay: Floats = settings.duration * np.clip(share, 0.0, 1.0)
-    return delay
+    return settings.duration * np.clip(share, 0.0, 1.0)
 
 
 def sweep_delay(settings: CallSettings, frequency: ArrayLike) -> Floats:
@@ -204,8 +201,7 @@ def emit(impulse_responses: ArrayLike, waveform: Floats) -> Floats:
         return responses * waveform[0]  # no rounding by transforms
     import scipy.signal  # takes half a second
 
-    echo: Floats = scipy.signal.fftconvolve(responses, waveform[None], axes=-1)
-    return echo
+    return scipy.signal.fftconvolve(responses, waveform[None], axes=-1)
 
 
 EPSILON = 0.01

@@ -31,10 +31,7 @@ def compress(magnitude: ArrayLike, reference: float) -> Floats:
     """
     if not reference > 0.0:
         raise ValueError(f"reference is {reference}, expected above 0")
-    level_db: Floats = (20.0 / math.log(10.0)) * np.log1p(
-        np.asarray(magnitude, dtype=np.float64) / reference
-    )
-    return level_db
+    return (20.0 / math.log(10.0)) * np.log1p(np.asarray(magnitude, dtype=np.float64) / reference)
 
 
 def active_level(noise: ArrayLike | None, reference: float) -> float | Floats:
@@ -50,8 +47,7 @@ def active_level(noise: ArrayLike | None, reference: float) -> float | Floats:
 
 def expand(level_db: ArrayLike, reference: float) -> Floats:
     """Return the linear magnitude of compressed levels: the inverse of :func:`compress`."""
-    magnitude: Floats = reference * (10.0 ** (np.asarray(level_db) / 20.0) - 1.0)
-    return magnitude
+    return reference * (10.0 ** (np.asarray(level_db) / 20.0) - 1.0)
 
 
 def same_shape(measured: ArrayLike, predicted: ArrayLike) -> tuple[Any, Any]:

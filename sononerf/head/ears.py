@@ -309,13 +309,12 @@ def ear_gain(ears: Ears, ear: int, directions_head: Floats) -> Singles:
 
 def _look_up(ears: Ears, table: int, directions: Floats) -> Singles:
     upward, across = ears.elevation, ears.azimuth
-    gain: Singles = _bilinear(
+    return _bilinear(
         np.ascontiguousarray(ears._by_direction[table]),
         np.ascontiguousarray(directions, dtype=np.float64),
         (float(upward[0]), (len(upward) - 1) / float(upward[-1] - upward[0]), len(upward)),
         (float(across[0]), (len(across) - 1) / float(across[-1] - across[0]), len(across)),
     )
-    return gain
 
 
 @compiled

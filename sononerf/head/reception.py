@@ -60,8 +60,7 @@ def loudest_power(echo: Floats, analysis: SpectrogramSettings, samples: int) -> 
     band = (frequency >= analysis.frequency_min) & (frequency <= analysis.frequency_max)
     heard = np.fft.irfft(np.fft.rfft(padded, length) * band, length)
     total = np.cumsum(heard**2, axis=-1)
-    power: Floats = (total[:, samples:] - total[:, :-samples]).max(axis=-1) / samples
-    return power
+    return (total[:, samples:] - total[:, :-samples]).max(axis=-1) / samples
 
 
 def noise_level(settings: NoiseSettings, power: Floats, analysis: SpectrogramSettings) -> Floats:
@@ -71,8 +70,7 @@ def noise_level(settings: NoiseSettings, power: Floats, analysis: SpectrogramSet
     """
     share = 2.0 * (analysis.frequency_max - analysis.frequency_min) / analysis.sampling_rate
     ratio = 10.0 ** (np.asarray(settings.snr_db, dtype=np.float64) / 10.0)
-    level: Floats = np.sqrt(power / (ratio * share))
-    return level
+    return np.sqrt(power / (ratio * share))
 
 
 def draw_noise(level: Floats, samples: int, *, seed: int) -> Floats:
@@ -107,8 +105,7 @@ def row_duration(call: CallSettings, analysis: SpectrogramSettings, frequency: A
     In: frequency ((F,), Hz). Out: duration ((F,), s).
     """
     lasts, wide = row_widths(analysis, frequency)
-    duration: Floats = np.hypot(lasts, wide / sweep_rate(call, frequency))
-    return duration
+    return np.hypot(lasts, wide / sweep_rate(call, frequency))
 
 
 def best_window(call: CallSettings, analysis: SpectrogramSettings) -> int:
@@ -159,8 +156,7 @@ def effective_window(call: CallSettings, analysis: SpectrogramSettings) -> Float
     row = _point_echo(call, analysis, extra + (length - 1) / 2.0)
     power = row**2 + row[:, ::-1] ** 2
     middle = power[:, (power.shape[1] - 1) // 2]
-    window: Floats = np.sqrt(power / middle[:, None])
-    return window
+    return np.sqrt(power / middle[:, None])
 
 
 def _point_echo(call: CallSettings, analysis: SpectrogramSettings, side: float) -> Floats:

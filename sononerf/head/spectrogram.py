@@ -117,8 +117,7 @@ def spectrogram(
     turn = turn * np.arange(low, high + 1)
     window = np.hamming(settings.window)[:, None]
     real, imaginary = (np.square(frames @ (window * part)) for part in (np.cos(turn), np.sin(turn)))
-    magnitude: Floats = np.sqrt(real + imaginary)
-    return magnitude
+    return np.sqrt(real + imaginary)
 
 
 def _filtered(

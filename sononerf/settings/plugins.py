@@ -169,5 +169,4 @@ def _options_model(factory: Callable[..., Any], where: str, given: int) -> type[
     config = ConfigDict(
         extra="forbid", arbitrary_types_allowed=True, allow_inf_nan=False, protected_namespaces=()
     )
-    model: type[BaseModel] = create_model("Options", __config__=config, **fields)
-    return model
+    return create_model("Options", __config__=config, **fields)

@@ -83,8 +83,7 @@ def _thin(corners: Floats) -> Bools:
     sides = np.roll(corners, -1, axis=1) - corners
     longest = np.square(sides).sum(axis=2).max(axis=1)
     twice_area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    thin: Bools = twice_area <= 1e-6 * longest
-    return thin
+    return twice_area <= 1e-6 * longest
 
 
 def wedge_directivity(

@@ -77,10 +77,9 @@ class Equations:
     def solve(self, incident: NDArray[np.complex64]) -> NDArray[np.complex64]:
         """Return the sources' strengths (M, P) for normal slopes of pressure (N, P)."""
         wanted = self._adjoint @ -incident[: self._asked]
-        strength: NDArray[np.complex64] = scipy.linalg.cho_solve(
+        return scipy.linalg.cho_solve(
             (self._factor, True), wanted, overwrite_b=True, check_finite=False
         )
-        return strength
 
     def error(self, incident: NDArray[np.complex64], strength: NDArray[np.complex64]) -> float:
         """Return what is left of the normal slope at the points that were left out, relative."""
@@ -149,8 +148,7 @@ def _squares(points: Floats, places: Floats) -> Floats:
     """Return squared distances (N, M), m²; products suffice, for coordinates are as small."""
     square = np.square(points).sum(axis=1)[:, None] + np.square(places).sum(axis=1)
     square -= 2.0 * points @ places.T
-    found: Floats = square
-    return found
+    return square
 
 
 def arriving(

@@ -301,5 +301,4 @@ def hearing_of(head: Head) -> Hearing:
 
 
 def _into_head(vectors: Floats, rotation: Floats) -> Floats:
-    turned: Floats = vectors @ rotation
-    return turned
+    return vectors @ rotation

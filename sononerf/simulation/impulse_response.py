@@ -217,8 +217,7 @@ def air_loss(synthesis: Synthesis, decay: Floats) -> Floats:
     """Return the attenuation by air in each bin (B, F), from its decay (F,) in 1/s."""
     rate = OVERSAMPLING * synthesis.sampling_rate
     times = [np.arange(size) * (2.0**level / rate) for level, size in enumerate(synthesis.sizes)]
-    loss: Floats = np.exp(-np.multiply.outer(np.concatenate(times), decay))
-    return loss
+    return np.exp(-np.multiply.outer(np.concatenate(times), decay))
 
 
 def synthesise(

@@ -214,8 +214,7 @@ class LowBand:
             power for power in itertools.product(range(ORDER + 1), repeat=3) if sum(power) <= ORDER
         ]
         terms = np.stack([np.prod(points**power, axis=1) for power in powers], axis=1)
-        blend: Floats = terms @ np.linalg.pinv(terms[:CONTROL], rcond=1e-6)
-        return blend
+        return terms @ np.linalg.pinv(terms[:CONTROL], rcond=1e-6)
 
     @property
     def thin(self) -> float:
@@ -243,8 +242,7 @@ class LowBand:
         """Return the taper of the response (K,) at frequencies (K,) in Hz."""
         band = self.frequency_max - self.frequency_full
         fall = np.clip((frequency - self.frequency_full) / band, 0.0, 1.0)
-        left: Floats = 0.5 * (1.0 + np.cos(np.pi * fall))
-        return left
+        return 0.5 * (1.0 + np.cos(np.pi * fall))
 
     def prepare(
         self, positions: Floats, rotations: Floats, done: Callable[[], None] | None = None

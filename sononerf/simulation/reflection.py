@@ -45,8 +45,7 @@ class Reflection:
         """Return how curved places are, 0 to 1, by their total curvature (N,) in 1/m."""
         steepness = 8.0 * self.material.transition_slope
         away = steepness * (curvature - self.material.transition_curvature)
-        share: Floats = 0.5 * (1.0 + np.tanh(0.5 * away))
-        return share
+        return 0.5 * (1.0 + np.tanh(0.5 * away))
 
     def heard(
         self, cosine: Floats, detour: NDArray[np.floating[Any]], curvature: Floats
@@ -134,8 +133,7 @@ def coarse_gain(bend: Singles) -> Singles:
     b = np.minimum(bend, np.float32(COARSEST))
     fade = np.square(np.float32(FADE) + b / np.float32(12.0)) + np.float32(1.0)
     fade /= np.float32(FADE**2 + 1.0)
-    gain: Singles = np.sqrt(fade) * np.exp(np.square(b) / np.float32(720.0))
-    return gain
+    return np.sqrt(fade) * np.exp(np.square(b) / np.float32(720.0))
 
 
 @compiled

@@ -163,8 +163,7 @@ class Shadow:
     def _key(self, points: Floats) -> Ints:
         at = ((points - self._low) * (1.0 / self._cell)).astype(np.int64)
         np.clip(at, 0, self._shape - 1, out=at)
-        key: Ints = (at[:, 0] * self._shape[1] + at[:, 1]) * self._shape[2] + at[:, 2]
-        return key
+        return (at[:, 0] * self._shape[1] + at[:, 1]) * self._shape[2] + at[:, 2]
 
     def passed(
         self, points: Floats, triangle: Ints
@@ -198,8 +197,7 @@ class Shadow:
         """Return the largest transmission (N,) over frequency to points in the shadow."""
         row, table = self.passed(points, triangle)
         most = np.append(np.abs(table).max(axis=1, initial=0.0), 0.0)
-        level: Floats = most[row]
-        return level
+        return most[row]
 
     def _solve(self, points: Floats, body: Ints) -> NDArray[np.int32]:
         pieces = self._pieces
@@ -375,8 +373,7 @@ def passing(
 
 def _product(real: Floats, factor: Complexes) -> Complexes:
     """Multiply a real matrix by a complex one, without making the real one complex."""
-    product: Complexes = (real @ factor.view(np.float64)).view(np.complex128)
-    return product
+    return (real @ factor.view(np.float64)).view(np.complex128)
 
 
 def behind(

@@ -123,14 +123,10 @@ def confidence_colours(poses: ArrayLike) -> Floats:
         ],
         axis=-1,
     ).clip(0, 1)
-    colours: Floats = np.where(
-        linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055
-    )
-    return colours
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
 
 
 def linear_light(colours: ArrayLike) -> Floats:
     """Turn sRGB colours (..., 3), 0 to 1, into linear light, as glTF has them."""
     given = np.asarray(colours, dtype=np.float64)
-    light: Floats = np.where(given <= 0.04045, given / 12.92, ((given + 0.055) / 1.055) ** 2.4)
-    return light
+    return np.where(given <= 0.04045, given / 12.92, ((given + 0.055) / 1.055) ** 2.4)

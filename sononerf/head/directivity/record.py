@@ -207,8 +207,7 @@ class Directivity:
             return np.repeat(values, len(frequency), axis=-1)
         left = right - 1
         part = ((frequency - known[left]) / (known[right] - known[left])).clip(0.0, 1.0)
-        found: Floats = values[..., left] * (1.0 - part) + values[..., right] * part
-        return found
+        return values[..., left] * (1.0 - part) + values[..., right] * part
 
 
 def unit_vectors(azimuth: Floats, elevation: Floats) -> Floats:

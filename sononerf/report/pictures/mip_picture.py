@@ -38,8 +38,7 @@ def _scaled(projection: ArrayLike, scale: Scale) -> Floats:
     top = float(values.max())
     if not top > 0:
         return np.full(values.shape, -RANGE_DB)
-    decibels: Floats = 10 * np.log10(np.maximum(values / top, 10 ** (-RANGE_DB / 10)))
-    return decibels
+    return 10 * np.log10(np.maximum(values / top, 10 ** (-RANGE_DB / 10)))
 
 
 def _limits(values: Floats, scale: Scale) -> tuple[float, float]:

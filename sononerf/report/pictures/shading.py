@@ -135,13 +135,11 @@ def _crevices(nearness: Floats) -> Floats:
         blurred, np.meshgrid(rows, columns, indexing="ij"), order=1, mode="nearest"
     )
     rise = (around - filled) / max(high - low, 1e-9)
-    light: Floats = 1 - np.clip(1.6 * rise, -0.06, 0.30)
-    return light
+    return 1 - np.clip(1.6 * rise, -0.06, 0.30)
 
 
 def averaged(pixels: Floats, factor: int = OVERSAMPLING) -> NDArray[np.uint8]:
     """Average blocks of pixels (H, W, 3) in 0 to 1 into bytes."""
     height, width = pixels.shape[0] // factor, pixels.shape[1] // factor
     blocks = pixels[: height * factor, : width * factor].reshape(height, factor, width, factor, 3)
-    result: NDArray[np.uint8] = np.round(255 * blocks.mean(axis=(1, 3))).astype(np.uint8)
-    return result
+    return np.round(255 * blocks.mean(axis=(1, 3))).astype(np.uint8)

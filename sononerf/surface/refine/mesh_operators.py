@@ -64,8 +64,7 @@ class MeshOperators:
     def neighbours(self, values: Tensor) -> Tensor:
         """Sum over the neighbours of each vertex (V, K) of values (V, K)."""
         single = values.dtype == torch.float32
-        found: Tensor = (self._single if single else self._adjacency) @ values
-        return found
+        return (self._single if single else self._adjacency) @ values
 
     def averaged(self, values: Tensor) -> Tensor:
         """Mean (V, K) over each vertex and its neighbours of values (V, K)."""

@@ -226,10 +226,7 @@ class Optics(nn.Module):
         corners = torch.stack([corner, corner + 1, corner + columns, corner + columns + 1], dim=1)
         weights = torch.stack([(1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t], dim=1)
         flat = self.get_buffer("tables").flatten(0, 1)
-        found: Tensor = nn.functional.embedding_bag(
-            corners, flat, per_sample_weights=weights, mode="sum"
-        )
-        return found
+        return nn.functional.embedding_bag(corners, flat, per_sample_weights=weights, mode="sum")
 
     def pieces(
         self,

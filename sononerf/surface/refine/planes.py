@@ -104,8 +104,7 @@ def _given_to_the_best(mesh: trimesh.Trimesh, part: Ints, tolerance: float) -> I
 
 def _counted(part: Ints) -> Ints:
     """Return the parts with numbers from 0 on."""
-    found: Ints = np.unique(part, return_inverse=True)[1].reshape(-1)
-    return found
+    return np.unique(part, return_inverse=True)[1].reshape(-1)
 
 
 def summed(of: Ints, values: Floats, count: int) -> Floats:

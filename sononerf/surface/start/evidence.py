@@ -275,8 +275,7 @@ def _agreement(evidence: Evidence, resolution: float) -> Floats:
     usual = float(np.average(support, weights=power))
     if not usual > 0:
         return np.zeros(count)
-    found: Floats = support / around * support / (support + FEW * usual)
-    return found
+    return support / around * support / (support + FEW * usual)
 
 
 _ALIKE = 0.5  # cosine of the greatest angle between the normals of a vertex and of a point

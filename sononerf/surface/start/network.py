@@ -203,8 +203,7 @@ def _in_frame(places: PlaceFeatures, order: tuple[int, ...], signs: tuple[int, .
     with torch.no_grad():
         made = _network()(torch.from_numpy(seen)[None], torch.from_numpy(bound)[None])
     back = tuple(axis for axis, sign in enumerate(signs) if sign < 0)
-    found: Singles = np.flip(made[0].numpy(), back).transpose(np.argsort(order))
-    return found
+    return np.flip(made[0].numpy(), back).transpose(np.argsort(order))
 
 
 def levels_surfaces(
