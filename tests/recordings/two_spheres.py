@@ -189,6 +189,7 @@ SETTINGS = f"""\
 air: {{speed_of_sound: {SPEED}}}
 ears:
   receivers: [[0, -0.02, 0], [0, 0.02, 0], [0, 0, -0.02], [0, 0, 0.02]]
+  emitter: [0, 0, 0]
   directivity: omnidirectional
   beam_radius: 0
 call: {{kind: file, file: call.wav}}
