@@ -36,8 +36,6 @@ from sononerf.run import fit as fit_module
 from sononerf.settings.loading import read_yaml
 from tests.small_views import draw_small
 
-pytestmark = pytest.mark.thorough
-
 CONFIGS = Path(__file__).resolve().parent.parent / "configs"
 SMOKE = str(CONFIGS / "smoke.yaml")
 COMMANDS = (

@@ -58,7 +58,6 @@ def test_it_says_only_what_differs_from_the_defaults(path):
     assert [key for key, value in leaves(settings) if key in same and same[key] == value] == []
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("path", FILES, ids=named)
 def test_its_scene_field_and_renderer_build(path):
     settings = load_settings(path)

@@ -68,7 +68,6 @@ def echoes():
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 @pytest.mark.parametrize(("kind", "left"), [("siren", 0.95), ("hash", 0.97), ("splats", 0.9)])
 def test_they_learn(kind, left, echoes, splats, tmp_path):
     quiet_lightning()

@@ -127,7 +127,6 @@ def test_a_notebook_runs(notebook, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_a_users_script_is_typed():
     done = subprocess.run(
         [sys.executable, "-m", "mypy", "--strict", "tests/typed_script.py"],

@@ -6,31 +6,25 @@
     python tools/benchmark.py surfaces [--only NAME ...] [--seeds 0 1 2] [--exact STORE]
     python tools/benchmark.py surfaces --foreign FOLDER [--calls 400 100 25]
     python tools/benchmark.py step [--accelerator cpu] [--compare OLD.json]
-    python tools/benchmark.py fit [--scene three_spheres] [--error 0.45] [--compare OLD.json]
-    python tools/benchmark.py reconstruct RUN [RUN ...] [--spacings 0.002 0.001]
     python tools/benchmark.py errors RUN [RUN ...] [--calibrate]
-    python tools/benchmark.py next_poses [--only NAME ...] [--seeds 0 1 2]
 
 ``exact``: the simulator against frozen solutions of the wave equation, by band, and what it puts
 before the first echo.
 
 ``step``: what a step of a fit costs for each field through each renderer, medians of at least
 five, beside equation 17 of the paper written down as it stands (which takes 9 GB of memory), the
-machine's matrix product and its copying. ``fit``: how long the default takes to a held-out error.
-``reconstruct``: how long fitted runs take to be read out. The files of these three are named by
-version, machine and device, and ``--compare`` prints what has changed.
+machine's matrix product and its copying. Its file is named by version, machine and device, and
+``--compare`` prints what has changed.
 
 ``errors``: the fractions of vertices and of held-out cells that the errors of finished runs hold,
 and the area under the sparsification error, beside that of the numbers of poses and, where runs of
-seeds 1 to 4 lie beside that of seed 0, of how far their surfaces lie apart. ``next_poses``: the
-calls that proposed poses need for an F-score, beside farthest and random ones.
+seeds 1 to 4 lie beside that of seed 0, of how far their surfaces lie apart.
 
-``surfaces``: how good the surfaces of all kinds of scenes are, some under
-changed conditions; one line of JSON for each run. What is ``scaled`` is measured in the unscaled
-world's metres. With ``--foreign`` all bodies of a folder are reconstructed instead, and each start
-surface and each candidate of the refinement is compared with the truth too. ``fit`` and
-``surfaces`` leave runs, a table as JSON and logs in a folder (``--output``), share ensembles
-(``--data``), go on where they were interrupted, and lay KEY=VALUE over the settings (``--set``).
+``surfaces``: how good the surfaces of all kinds of scenes are, some under changed conditions; one
+line of JSON for each run. With ``--foreign`` all bodies of a folder are reconstructed instead, and
+each start surface and each candidate of the refinement is compared with the truth too. It leaves
+runs, a table and logs in a folder (``--output``), shares ensembles (``--data``), goes on where it
+was interrupted, and lays KEY=VALUE over the settings (``--set``).
 """
 
 from __future__ import annotations
@@ -47,20 +41,14 @@ sys.path.insert(0, str(ROOT))  # the parts of this command, and the tests' exact
 
 from tools.benchmarks.errors import errors  # noqa: E402
 from tools.benchmarks.exact import exact  # noqa: E402
-from tools.benchmarks.fit import fit  # noqa: E402
-from tools.benchmarks.next_poses import WAYS, next_poses  # noqa: E402
-from tools.benchmarks.reconstruct import reconstruct  # noqa: E402
 from tools.benchmarks.step import step  # noqa: E402
 from tools.benchmarks.surfaces import CASES, surfaces  # noqa: E402
 
 BODIES = ["three_spheres", "balls", "leaf", "beaker"]
-LISTENED = ["three_spheres", "rings", "procedural-108", "procedural-113"]
-ERROR_HELP = "over all cells of held-out poses, dB (0.45)"
 ONLY_HELP = "rows of the table; all, but exact only with --exact"
 SEEDS_HELP = "of the fits of three_spheres, ua and leaf; of all others the first alone (0 1 2)"
 EXACT_HELP = "ensemble of exact echoes of three_spheres, 100 calls, analysed up to 80 kHz"
 FOREIGN_HELP = "closed meshes in metres, in place of the rows of the table"
-SPACINGS_HELP = "voxel sizes in metres; by default the run's own"
 SET_HELP = "laid over the settings of every run"
 
 
@@ -81,40 +69,22 @@ def main() -> None:
     command = added(errors)
     command.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="finished runs")
     command.add_argument("--calibrate", action="store_true", help="print exponents and scale")
-    command = added(next_poses)
-    command.add_argument("--only", nargs="+", metavar="NAME", default=LISTENED, help="scenes")
+    command = added(step)
+    command.add_argument("--accelerator", choices=("auto", "cpu", "gpu"), default="auto")
+    command.add_argument("--compare", type=Path, metavar="OLD.json", help="print ratios")
+    command.add_argument("--scene", default="three_spheres")
+    names = [case.name for case in CASES]
+    command = added(surfaces)
+    command.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=ONLY_HELP)
+    command.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help=SEEDS_HELP)
+    command.add_argument("--exact", type=Path, metavar="STORE", help=EXACT_HELP)
+    command.add_argument("--foreign", type=Path, metavar="FOLDER", help=FOREIGN_HELP)
     command.add_argument(
-        "--seeds", type=int, nargs="+", default=[0, 1, 2], help="of poses and fits"
+        "--calls", type=int, nargs="+", default=[400, 100, 25], help="of --foreign"
     )
-    command.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS, help="all")
-    command.add_argument("--score", type=float, default=0.9, help="F-score at 2 mm (0.9)")
-    command.add_argument("--most", type=int, default=100, help="calls (100)")
-    command.add_argument("--output", type=Path, default=Path("runs") / "next_poses")
-    for series in (surfaces, step, fit, reconstruct):
-        command = added(series)
-        if series is surfaces:
-            names = [case.name for case in CASES]
-            command.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=ONLY_HELP)
-            command.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help=SEEDS_HELP)
-            command.add_argument("--exact", type=Path, metavar="STORE", help=EXACT_HELP)
-            command.add_argument("--foreign", type=Path, metavar="FOLDER", help=FOREIGN_HELP)
-            command.add_argument(
-                "--calls", type=int, nargs="+", default=[400, 100, 25], help="of --foreign"
-            )
-        if series is step:
-            command.add_argument("--accelerator", choices=("auto", "cpu", "gpu"), default="auto")
-        if series in (step, fit, reconstruct):
-            command.add_argument("--compare", type=Path, metavar="OLD.json", help="print ratios")
-        if series is fit:
-            command.add_argument("--error", type=float, default=0.45, help=ERROR_HELP)
-        if series is reconstruct:
-            command.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="fitted runs")
-            command.add_argument("--spacings", type=float, nargs="+", help=SPACINGS_HELP)
-        if series in (step, fit):
-            command.add_argument("--scene", default="three_spheres")
+    for name in ("step", "surfaces"):
+        command = commands.choices[name]
         command.add_argument("--output", type=Path, help="folder of runs and table")
-        if series is reconstruct:
-            continue
         command.add_argument("--data", type=Path, help="folder of the ensembles; DIR/data")
         command.add_argument("--set", nargs="+", default=[], metavar="KEY=VALUE", help=SET_HELP)
     arguments = parser.parse_args()

@@ -118,7 +118,6 @@ def test_noise_has_as_many_independent_values_as_its_spread_tells():
     assert ECHO.looks == pytest.approx(power.mean() ** 2 / power.var(), rel=0.05)
 
 
-@pytest.mark.thorough
 def test_noise_is_detected_about_as_rarely_as_is_stated(monkeypatch):
     """At one in a thousand, for it can be counted; the mean is not quite gamma-distributed."""
     monkeypatch.setattr(detection, "FALSE_ALARMS", 1e-3)

@@ -75,7 +75,6 @@ def test_the_box_holds_the_places_and_hardly_more(count):
     assert spare.max() < (0.040 if count == 12 else 0.030)
 
 
-@pytest.mark.thorough
 def test_a_world_three_times_as_large_is_found_three_times_as_large():
     """The same arrays on longer axes."""
     positions, rotations = around(40)
@@ -157,7 +156,6 @@ def test_echoes_of_one_pose_alone_are_one_clear_line():
         region_of(positions, rotations, heard).box()
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("looks", ["at", "along"])
 def test_poses_on_a_line(looks):
     place = np.array([[0.3, 0.1, 0.02]])
@@ -167,7 +165,6 @@ def test_poses_on_a_line(looks):
     assert holds(box, place)
 
 
-@pytest.mark.thorough
 def test_poses_on_one_side():
     positions, rotations = around(100)
     ahead = positions[:, 0] > 0.2

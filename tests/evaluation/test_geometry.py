@@ -28,7 +28,6 @@ def moved(mesh, scale, seed):
     return other
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("seed", [0, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2, 3))])
 @pytest.mark.parametrize(("kind", "scale"), [("rigid", 1.0), ("similarity", 2.5)])
 def test_a_moved_body_comes_back(body, kind, scale, seed):
@@ -45,7 +44,6 @@ def test_no_registration_moves_nothing_and_a_rigid_one_keeps_the_size(body):
     assert register(moved(body, 2.0, 0), body, "rigid").scale == pytest.approx(1.0)
 
 
-@pytest.mark.thorough
 def test_a_mirror_image_stays_one(body):
     mirrored = body.copy()
     mirrored.apply_transform(np.diag([-1.0, 1.0, 1.0, 1.0]))

@@ -56,7 +56,6 @@ def assert_same(one, two):
 
 
 # The stream is endless; a worker that is left in the middle of it sometimes aborts as it exits.
-@pytest.mark.thorough
 @pytest.mark.filterwarnings(
     "ignore:.*_MultiProcessingDataLoaderIter.__del__:pytest.PytestUnraisableExceptionWarning"
 )

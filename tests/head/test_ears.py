@@ -157,7 +157,6 @@ def test_analysed_ears_are_what_the_window_makes_of_an_echo():
     assert heard.beam.max() == pytest.approx(1.0, abs=1e-5)
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("kind", ["linear", "hyperbolic"])
 def test_analysed_ears_are_what_a_sweeps_rows_hear(kind):
     """A sweep, filtered by an ear, through the dechirped spectrogram: each row's power and time."""

@@ -303,7 +303,6 @@ def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
         assert np.abs(late).max() < error
 
 
-@pytest.mark.thorough
 def test_of_many_poses_hull_and_region_ask_the_same_ones(tiny, echoes, monkeypatch):
     store = EnsembleStore.open(echoes)
     whole = region_of(tiny(), Echoes(store, head_of(tiny())))[0]
@@ -444,7 +443,6 @@ def test_what_contradicts_the_store_is_refused_and_what_agrees_is_not(alone):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_a_fit_of_a_store_needs_no_scene(alone, tmp_path):
     run = tmp_path / "run"
     fit(alone(), run, accelerator="cpu")

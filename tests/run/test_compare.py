@@ -48,7 +48,6 @@ def numbers(folder):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_a_run_does_not_differ_from_its_copy(run):
     one = run("one")
     # What is true of their scenes makes no difference to what is heard.
@@ -62,7 +61,6 @@ def test_a_run_does_not_differ_from_its_copy(run):
     assert found["poses"] == 8  # that both were trained on, once
 
 
-@pytest.mark.thorough
 def test_what_only_the_first_hears_is_found(run, tmp_path):
     one = run("one")
     silent = run("silent", gain=1e-6, scene={"options": {"radius": 0.01}})
@@ -81,7 +79,6 @@ def test_what_only_the_first_hears_is_found(run, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_runs_that_look_turned_round_are_said_to_be(run, tmp_path, caplog):
     one, silent = run("one"), run("silent", gain=1e-6)
     for first, second in ((one, silent), (silent, one)):
@@ -99,7 +96,6 @@ def test_runs_that_look_turned_round_are_said_to_be(run, tmp_path, caplog):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_poses_of_both_runs_are_listened_from(run):
     other = run("other", poses={"seed": 5})
     found = numbers(compare_runs(run("one"), other, accelerator="cpu"))

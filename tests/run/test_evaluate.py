@@ -56,7 +56,6 @@ def test_what_is_evaluated(run, few_samples):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_another_mesh_takes_the_numbers_of_the_last_one_away(
     run, tmp_path, few_samples, no_projections
 ):
@@ -75,7 +74,6 @@ def test_another_mesh_takes_the_numbers_of_the_last_one_away(
         assert again["geometry"]["chamfer_m"] != first["geometry"]["chamfer_m"]
 
 
-@pytest.mark.thorough
 def test_a_scene_that_is_not_installed_has_no_truth(run, few_samples):
     description = json.loads((run / "model.json").read_text())
     description["settings"]["scene"] = {"name": "theirs", "options": {}}
@@ -87,7 +85,6 @@ def test_a_scene_that_is_not_installed_has_no_truth(run, few_samples):
         assert min(image.size) > 50
 
 
-@pytest.mark.thorough
 def test_what_needs_a_closed_surface_is_null_for_an_open_one(
     run, few_samples, no_projections, monkeypatch
 ):
@@ -101,7 +98,6 @@ def test_what_needs_a_closed_surface_is_null_for_an_open_one(
     assert geometry["chamfer_m"] > 0
 
 
-@pytest.mark.thorough
 def test_amid_surroundings_the_target_is_judged_alone_too(
     run, few_samples, no_projections, monkeypatch
 ):
@@ -118,7 +114,6 @@ def test_amid_surroundings_the_target_is_judged_alone_too(
     assert geometry["target"]["chamfer_m"] < geometry["chamfer_m"]
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("content", [b"", b"ply\nnonsense", b"\x00" * 100])
 def test_a_damaged_mesh_is_told(run, content):
     (run / "reconstruction").mkdir()
@@ -128,7 +123,6 @@ def test_a_damaged_mesh_is_told(run, content):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_a_true_surface_from_a_file_replaces_the_scene(run, few_samples, no_projections, tmp_path):
     sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.03)
     sphere.export(tmp_path / "true.stl")
@@ -138,7 +132,6 @@ def test_a_true_surface_from_a_file_replaces_the_scene(run, few_samples, no_proj
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_a_registered_surface_is_judged_in_the_frame_of_the_truth(
     run, few_samples, no_projections, tmp_path
 ):

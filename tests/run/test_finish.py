@@ -185,7 +185,6 @@ def test_too_little_memory_to_trace_is_told_and_tried_again(run, steps, monkeypa
     assert Run(run).is_finished
 
 
-@pytest.mark.thorough
 def test_one_call_loads_field_and_echoes_once(run, no_projections, monkeypatch):
     metrics = functools.partial(geometry_module.geometry_metrics, samples=2000)
     monkeypatch.setattr(geometry_module, "geometry_metrics", metrics)

@@ -224,7 +224,6 @@ def test_canary_what_resuming_rests_on_is_missed(tiny, tmp_path, interrupt, monk
     assert any(name.startswith("field.") for name in changed)
 
 
-@pytest.mark.thorough
 def test_without_validation_poses_epochs_are_still_ours(tiny, tmp_path, interrupt):
     settings = tiny(poses={"validation": 0, "heldout": 0}, data={"store": str(tmp_path / "store")})
     run(settings, tmp_path / "through")
@@ -289,7 +288,6 @@ def test_other_settings_are_refused_by_name(tiny, finished):
     assert files(finished) == before
 
 
-@pytest.mark.thorough
 def test_overwrite_moves_aside_and_loses_nothing(tiny, tmp_path):
     path = tmp_path / "run"
     run(tiny(), path)
@@ -345,7 +343,6 @@ def test_a_gradient_that_is_no_number_leaves_a_sound_checkpoint(tiny, tmp_path, 
     assert not (tmp_path / "run" / "model.json").exists()
 
 
-@pytest.mark.thorough
 def test_what_a_fit_cost_is_counted_over_its_parts(tiny, tmp_path, interrupt, monkeypatch):
     path = tmp_path / "run"
 
@@ -450,7 +447,6 @@ def test_a_gpu_that_is_not_there_or_apples(tiny, tmp_path, monkeypatch):
     assert usable_accelerator("auto") == "cpu"
 
 
-@pytest.mark.thorough
 def test_a_process_does_not_wait_for_a_first_one_that_does_not_run(tiny, tmp_path, monkeypatch):
     monkeypatch.setattr(rank_zero_only, "rank", 1)
     monkeypatch.setattr(fit_module, "PATIENCE_SECONDS", 1.0)
@@ -475,7 +471,6 @@ def line(count):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("count", "directivity"), [(1, "omnidirectional"), (8, "omnidirectional"), (3, "file")]
 )

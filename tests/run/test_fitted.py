@@ -203,7 +203,6 @@ def test_a_gpu_that_is_not_there_or_apples(run, monkeypatch):
         render_poses(fitted.model, poses, accelerator="gpu", progress=QUIET)
 
 
-@pytest.mark.thorough
 def test_what_was_fitted_without_its_background_is_measured_without_it(run, tiny, echoes, tmp_path):
     """The surroundings are the tiny echoes themselves, at half their magnitude."""
     heard = EnsembleStore.open(echoes)

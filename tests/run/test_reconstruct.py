@@ -54,7 +54,6 @@ def test_every_file_is_there_and_readable(run):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
     coarse = reconstruct(run, spacing=0.012, output=tmp_path / "coarse")
     assert read_out(coarse)["method"] in ("open", "filled", "hull")
@@ -73,7 +72,6 @@ def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
     assert not (run / "metrics.json").exists()
 
 
-@pytest.mark.thorough
 def test_a_method_is_refined_where_that_is_asked_for(run, tmp_path, no_projections, monkeypatch):
     monkeypatch.setattr(reconstruction, "RAYS", 500)
     for where in (refinement, descent):
@@ -88,7 +86,6 @@ def test_a_method_is_refined_where_that_is_asked_for(run, tmp_path, no_projectio
         reconstruct(run, method="isosurface", refine=True, output=tmp_path / "level")
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("openness", "name", "said"),
     [
@@ -122,7 +119,6 @@ def test_what_kind_of_surface_it_is_is_written_and_of_open_ones_it_is_said(
     assert heard == said
 
 
-@pytest.mark.thorough
 def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, monkeypatch):
     asked = []
     plain = surface_module.judge_openness
@@ -143,7 +139,6 @@ def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, mo
     assert trimesh.load_mesh(folder / "mesh.ply").is_watertight == (kind != "one-sided")
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("settings", "given", "expected"),
     [
@@ -196,7 +191,6 @@ def test_a_level_above_everything_has_no_surface(run):
         reconstruct(run, level=1e9)
 
 
-@pytest.mark.thorough
 def test_the_hull_of_first_echoes_is_the_surface_where_the_field_has_none(
     run, no_projections, monkeypatch
 ):

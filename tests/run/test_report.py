@@ -299,7 +299,6 @@ def test_without_held_out_poses_nothing_is_asked_for(run):
     assert "sononerf predict" not in text
 
 
-@pytest.mark.thorough
 def test_the_papers_figures_have_their_counterparts(finished, monkeypatch):
     other = finished / "compare-empty"
     other.mkdir()

@@ -132,7 +132,6 @@ def size_of(path):
         return image.size
 
 
-@pytest.mark.thorough
 def test_scenes_are_drawn_but_those_that_cannot_be(broken, few, tmp_path):
     written, skipped = draw_scenes(tmp_path / "pictures")
     assert [path.name for path in written] == ["loud.png", "sphere.png"]

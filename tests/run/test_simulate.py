@@ -228,7 +228,6 @@ def test_the_same_command_mends_a_damaged_pose(tiny, echoes, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_a_killed_worker_costs_nothing(tiny, tmp_path, monkeypatch):
     settings = tiny(poses={"count": 20}, simulation={"rays": 4000})
     alone = simulate(settings, output=tmp_path / "alone", workers=1)
@@ -286,7 +285,6 @@ def before_a_wall(settings):
     return Scene(both, (RIGID, LEAF), marked.astype(int), background=marked)
 
 
-@pytest.mark.thorough
 def test_the_scenes_own_background_is_simulated_alone_and_taken_off(tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     settings = tiny(data={"store": None, "background": "scene"})

@@ -276,7 +276,6 @@ class Counted(Progress):
         return sum(task.done for task in self.tasks if task.what == "solving")
 
 
-@pytest.mark.thorough
 def test_the_low_band_is_solved_once_for_learning_and_predicting(run):
     description = json.loads((run / "model.json").read_text())
     description["settings"]["simulation"]["sources"] = 300

@@ -25,8 +25,6 @@ from sononerf.run.view import View
 from sononerf.surface.mesh_files import mesh_bytes
 from tests.browser import CHROMIUM, browser
 
-pytestmark = pytest.mark.thorough
-
 
 def given_a_surface(run):
     mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.021)

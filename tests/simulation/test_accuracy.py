@@ -14,8 +14,6 @@ from sononerf.simulation import accuracy, workers
 from sononerf.simulation.accuracy import settle_rays
 from sononerf.simulation.simulator import ensemble_poses
 
-pytestmark = pytest.mark.thorough
-
 QUIET = Progress(quiet=True)
 NOISE = {"snr_db": 10}
 

@@ -165,7 +165,6 @@ def test_poses_out_of_reach_are_told_of(caplog):
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_poses_are_checked_fast_in_a_million_triangles():
     scene = Scene(trimesh.creation.icosphere(subdivisions=8, radius=1.0))
     assert len(scene.mesh.faces) > 1_300_000
@@ -257,7 +256,6 @@ class Deadly:
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 @pytest.mark.parametrize("times", [3, 99])
 def test_a_pose_is_not_blamed_for_its_workers(tmp_path, caplog, times):
     found, poses = {}, poses_at([1.0, 0.0, 0.0], [-2.0, 0.0, 0.0], [3.0, 0.0, 0.0])
@@ -282,7 +280,6 @@ class Slow:
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_a_fault_of_the_writer_ends_the_workers_at_once():
     def full(index, spectrogram):
         raise OSError("disk full")
@@ -329,7 +326,6 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_ctrl_c_is_for_us_and_not_for_our_workers():
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=120, check=False

@@ -183,7 +183,6 @@ def test_level_does_not_depend_on_the_number_of_rays_nor_on_the_seed():
             assert difference(few, many) < error
 
 
-@pytest.mark.thorough
 def test_more_bounces_only_add():
     position = np.array([0.3, 0.0, 0.0])
     rotation = look_at(position, np.zeros(3))
@@ -201,7 +200,6 @@ def test_more_bounces_only_add():
     assert difference(three, one) > 0.02
 
 
-@pytest.mark.thorough
 def test_turning_scene_and_head_together_changes_nothing():
     mesh = load_scene("three_spheres").mesh
     position = np.array([0.3, 0.2, 0.1])
@@ -217,7 +215,6 @@ def test_turning_scene_and_head_together_changes_nothing():
     assert difference(one[0], one[1]) > 0.1
 
 
-@pytest.mark.thorough
 def test_the_mirrored_scene_exchanges_the_ears():
     mesh = load_scene("three_spheres").mesh
     mirrored = trimesh.Trimesh(mesh.vertices * [1, -1, 1], mesh.faces[:, ::-1])
@@ -229,7 +226,6 @@ def test_the_mirrored_scene_exchanges_the_ears():
     assert difference(one[0], two[0]) > 0.1
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("body", ["three_spheres", "box"])
 def test_exchanging_emitter_and_ear_changes_nothing(body):
     """Reciprocity (Lord Rayleigh, Theory of Sound, section 294), up to the rays' noise."""
@@ -382,7 +378,6 @@ def test_silence_behind_the_head_and_beyond_the_last_frame():
     assert np.abs(late).max() == 0.0
 
 
-@pytest.mark.thorough
 def test_a_seed_says_the_same_each_time_and_pickled():
     engine = rays(load_scene("three_spheres"), None, bat(), rays=5000)
     position = np.array([0.0, 0.4, 0.0])

@@ -10,8 +10,6 @@ from sononerf.settings.loading import validate_settings
 from tests.simulation.judges import Case
 from tests.simulation.listening import ball, echoes, hearing, level_db, rays, spectrum, wall
 
-pytestmark = pytest.mark.thorough
-
 BAND = np.linspace(40e3, 80e3, 41)
 
 

@@ -120,7 +120,6 @@ def test_level_does_not_depend_on_the_number_of_rays():
     assert active_error(few, many) < 0.4  # what 30,000 rays scatter by, not 20 log10(3) = 9.5
 
 
-@pytest.mark.thorough
 def test_turning_scene_and_head_together_changes_nothing():
     mesh = load_scene("three_spheres").mesh
     position = np.array([0.3, 0.2, 0.1])

@@ -54,7 +54,6 @@ def test_many_poses_are_simulated_in_other_processes(monkeypatch, poses, process
 
 
 @pytest.mark.slow
-@pytest.mark.thorough
 def test_workers_that_are_stopped_while_they_answer_keep_nobody_waiting():
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT], capture_output=True, text=True, timeout=120, check=False

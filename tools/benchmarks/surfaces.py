@@ -6,38 +6,26 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import trimesh
-
 from sononerf import storage
-from sononerf.evaluation.metrics import geometry_metrics
-from sononerf.evaluation.solid import Solid
-from sononerf.scene.scene import load_scene
-from sononerf.settings.loading import load_settings
 from tools.benchmarks.experiment import (
     CONFIG,
-    STOPPED,
     Column,
     Row,
     aligned,
     append_line,
     ending,
-    ensemble_name,
     origin,
     run_experiment,
     shown,
 )
 from tools.benchmarks.foreign import foreign
-from tools.benchmarks.scaled import UNSCALED, scaled_settings, scaled_store
 
-FACTOR = 3.0
-"""Scale of the world in the case ``scaled``."""
 SPHERES = "scene.name=three_spheres"
 PROCEDURAL = range(100, 120)
 """Seeds of shapes on which nothing was settled."""
@@ -77,8 +65,6 @@ CASES = (
     ),
     Case("25-calls", (SPHERES, "poses.count=25")),
     Case("three-times-as-large", (SPHERES, "scene.options.radius=0.045")),
-    Case("unscaled", (SPHERES, *UNSCALED)),
-    Case("scaled", (SPHERES, *UNSCALED)),
     Case("noisy-rays", (SPHERES, "simulation.engine=rays", "noise.snr_db=20")),
     Case("exact", (SPHERES, "poses.count=100", "spectrogram.frequency_max=80e3")),
     *(Case(name, (f"scene.name={name}",)) for name in NEW),
@@ -155,14 +141,11 @@ class _Experiment:
     """One case with one seed."""
 
     def __init__(self, case: Case, seed: int, output: Path, arguments: argparse.Namespace) -> None:
-        self.case, self.exact = case, arguments.exact
+        self.case = case
+        self.store = Path(arguments.exact) if case.name == "exact" else None
         self.data = arguments.data or output / "data"
         self.folder = output / f"{case.name}-{seed}"
-        plain = [*case.settings, *arguments.set]
-        self.unscaled = plain
-        if case.name == "scaled":
-            plain = [*plain, *scaled_settings(load_settings(CONFIG, plain), FACTOR)]
-        self.settings = [*plain, f"fit.seed={seed}"]
+        self.settings = [*case.settings, *arguments.set, f"fit.seed={seed}"]
         self.head: Row = {"name": case.name, "seed": seed, "settings": self.settings}
 
     def row(self) -> Row:
@@ -174,49 +157,12 @@ class _Experiment:
                 self.settings,
                 config=CONFIG.with_name(f"{self.case.config}.yaml"),
                 enough="prediction",
-                store=self._store(),
+                store=self.store,
             )
         except RuntimeError as error:
             return {**self.head, **origin(), "failed": str(error)}
         row = {**self.head, **origin(), **measured(metrics)}
-        if not metrics.get("geometry"):
-            return {**row, "failed": "no surface"}
-        return {**row, **self._unscaled_geometry()} if self.case.name == "scaled" else row
-
-    def _store(self) -> Path | None:
-        if self.case.name == "exact":
-            return Path(self.exact)
-        if self.case.name != "scaled":
-            return None
-        settings = load_settings(CONFIG, self.settings)
-        source = self.data / ensemble_name(load_settings(CONFIG, self.unscaled))
-        target = self.data / ensemble_name(settings)
-        _simulate(source, self.unscaled)
-        scaled_store(source, target, settings, FACTOR)
-        return target
-
-    def _unscaled_geometry(self) -> Row:
-        """Compare what was found with the truth, both made as small as the unscaled world."""
-        settings = load_settings(CONFIG, self.settings)
-        true = load_scene(settings.scene.name, settings.scene.options).mesh.copy()
-        found = trimesh.load_mesh(self.folder / "reconstruction" / "mesh.ply")
-        for mesh in (true, found):
-            mesh.apply_scale(1.0 / FACTOR)
-        geometry = geometry_metrics(found, Solid(true))
-        row = measured({"geometry": geometry})
-        return {key: value for key, value in row.items() if value is not None}
-
-
-def _simulate(store: Path, settings: Sequence[str]) -> None:
-    """Have an ensemble simulated, unless it is there."""
-    command = [sys.executable, "-m", "sononerf.cli", "simulate", str(CONFIG), *settings]
-    code = subprocess.run(
-        [*command, "--output", str(store)], stdout=sys.stderr, check=False
-    ).returncode
-    if code in STOPPED:
-        raise KeyboardInterrupt
-    if code:
-        raise RuntimeError(f"exit code {code}: the unscaled world was not simulated")
+        return row if metrics.get("geometry") else {**row, "failed": "no surface"}
 
 
 def measured(metrics: Mapping[str, Any]) -> Row:

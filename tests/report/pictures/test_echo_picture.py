@@ -57,7 +57,6 @@ def like(image, colour, tolerance=12):
     return (np.abs(image.astype(int) - colour) <= tolerance).all(axis=-1)
 
 
-@pytest.mark.thorough
 def test_a_picture_is_a_png_and_always_the_same(ball):
     data = draw(ball)
     assert data == draw(ball)

@@ -207,7 +207,6 @@ def test_a_start_that_cannot_be_traced_is_told_and_counts_as_the_worst(
     assert fault in caplog.text
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize("corrected", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_saved_stages_are_not_repeated_and_the_end_is_the_same(
     bumpy, echoes, optics, simulated_stage, corrected
@@ -337,7 +336,6 @@ def test_what_is_too_thin_for_the_first_blur_is_never_blurred(echoes, optics):
 PLANS = [(start, way) for start in ("levels", "body") for way in ("blurred", "sharp")]
 
 
-@pytest.mark.thorough
 @pytest.mark.parametrize(
     ("objectives", "last", "chosen", "stages"),
     [
@@ -491,7 +489,6 @@ def box_echoes(box, settings, poses, simulated):
     return echoes_of(head, *at, lambda i: found[i], hull=deaf_hull())
 
 
-@pytest.mark.thorough
 def test_flat_parts_move_as_planes_and_go_on_alone_where_they_are_right(box, box_echoes, optics):
     fine = box.subdivide_to_size(0.6 * optics.wavelength)
     worn = trimesh.smoothing.filter_laplacian(fine.copy().apply_scale(1.02), iterations=3)
@@ -511,7 +508,6 @@ def test_flat_parts_move_as_planes_and_go_on_alone_where_they_are_right(box, box
     assert np.degrees(angles[-20:]).min() > 80.0
 
 
-@pytest.mark.thorough
 def test_planes_that_begin_from_the_fuller_surface_compete_with_levels(box, box_echoes, optics):
     fine = box.subdivide_to_size(0.6 * optics.wavelength)
     fuller = trimesh.smoothing.filter_laplacian(fine.copy(), iterations=2)
@@ -598,7 +594,6 @@ def slab(height):
     return plate.subdivide().subdivide().subdivide().subdivide()
 
 
-@pytest.mark.thorough
 def test_a_sheet_keeps_its_triangles_and_wins_where_it_is_about_as_good(
     bumpy, echoes, optics, monkeypatch
 ):
