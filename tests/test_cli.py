@@ -4,12 +4,10 @@
 from __future__ import annotations
 
 import contextlib
-import errno
 import functools
 import io
 import json
 import os
-import re
 import shutil
 import signal
 import subprocess
@@ -326,14 +324,6 @@ def test_the_options_of_one_scene_are_told():
     assert "leave NAME out" in refused(2, "scenes", "leaf", "--preview", "there")
 
 
-def test_a_comparison_is_told_in_millimetres(tmp_path, monkeypatch):
-    found = {"strongest_m": [0.0071, 0.013, -0.06], "score": 0.52, "distance_m": 0.00484}
-    (tmp_path / "comparison.json").write_text(json.dumps(found))
-    monkeypatch.setattr("sononerf.run.compare.compare_runs", lambda *a, **k: tmp_path)
-    said = done("compare", "runs/a", "runs/b").err
-    assert "at (7.1, 13.0, -60.0) mm, 0.52 of the maximum; 4.8 mm from the middle of what" in said
-
-
 @pytest.mark.slow
 def test_two_runs_are_compared(at_home, tmp_path):
     state, description = load_weights(at_home.run)
@@ -372,16 +362,6 @@ def test_overwrite_moves_the_old_run_aside(fit_alone, clean):
     assert "moved the old run to" in result.err
     assert (clean / "run.old-1" / "model.safetensors").read_bytes() == first
     assert (clean / "run" / "model.safetensors").read_bytes() != first
-
-
-@pytest.mark.slow
-def test_what_follows_the_fit_is_made_up_for(fit_alone, clean):
-    command = ("fit", SMOKE, *SHORT, "--accelerator", "cpu", "--output", "run")
-    done(*command)
-    model = (clean / "run" / "model.json").stat()
-    done(*command)  # as after a stop between the fit and its end
-    assert [run.path for run in fit_alone] == [Path("run")] * 2
-    assert (clean / "run" / "model.json").stat() == model
 
 
 @pytest.mark.slow
@@ -514,24 +494,6 @@ def test_several_faults_are_told_at_once(clean):
 
 
 STL = trimesh.creation.box((0.05, 0.05, 0.05)).export(file_type="stl")
-BROKEN_MESHES = {
-    "missing": None,
-    "empty": b"",
-    "truncated": STL[:-7],
-    "NaN": STL[:96] + np.float32(np.nan).tobytes() + STL[100:],
-    "no mesh": b"<html>not found</html>",
-}
-
-
-@pytest.mark.parametrize("name", BROKEN_MESHES)
-@pytest.mark.parametrize("command", ["fit", "simulate"])
-def test_mesh_files_that_are_none(clean, command, name):
-    if BROKEN_MESHES[name] is not None:
-        Path("mine.stl").write_bytes(BROKEN_MESHES[name])
-    before = tree(clean)
-    scene = ["scene.name=mesh", "scene.options={path: mine.stl, unit: m}"]
-    assert "mine.stl" in refused(3, command, SMOKE, *scene, "--output", "out")
-    assert tree(clean) == before
 
 
 def test_a_mesh_needs_its_unit(clean):
@@ -762,26 +724,6 @@ def test_a_fault_of_ours_is_one_line_and_a_file_with_its_traceback(monkeypatch, 
     assert refused(1, "scenes").endswith("or of a plugin")
 
 
-@pytest.mark.parametrize(
-    ("raised", "hint"),
-    [
-        (OSError(errno.ENOSPC, "No space left on device", "/disk/events"), "/disk/events: .*full"),
-        (OSError(errno.EIO, "Input/output error"), "input/output error"),
-    ],
-)
-def test_a_disk_that_fails_a_library_is_a_storage_fault(monkeypatch, raised, hint):
-    from sononerf.run import scenes
-
-    def library():
-        try:
-            raise raised
-        except OSError as error:
-            raise ValueError("the library's own words") from error
-
-    monkeypatch.setattr(scenes, "describe_scenes", library)
-    assert re.search(hint, refused(4, "scenes"))
-
-
 # Help.
 
 
@@ -815,54 +757,6 @@ def test_quiet_leaves_results_and_errors(clean):
 
 
 # Signals.
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signals_outside_the_fit_unwind_and_say_so(monkeypatch, number):
-    from sononerf.run import scenes
-
-    closed = []
-
-    def work():
-        try:
-            os.kill(os.getpid(), number)
-            time.sleep(5)
-        finally:
-            closed.append(True)
-
-    before = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
-    monkeypatch.setattr(scenes, "describe_scenes", work)
-    assert refused(128 + number, "scenes") == "stopped; the same command begins anew"
-    assert closed == [True]
-    after = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)]
-    assert after == before
-
-
-def test_a_disk_fault_that_was_handled_is_not_the_cause_of_another_fault(monkeypatch):
-    from sononerf.run import scenes
-
-    def broken():
-        try:
-            raise PermissionError(errno.EACCES, "Permission denied")
-        except OSError:
-            raise ZeroDivisionError("ours") from None
-
-    monkeypatch.setattr(scenes, "describe_scenes", broken)
-    assert "unforeseen: ZeroDivisionError" in refused(1, "scenes")
-
-
-def test_a_signal_during_an_import_is_told_whatever_the_import_makes_of_it(monkeypatch):
-    from sononerf.run import scenes
-
-    def compiled():
-        try:
-            os.kill(os.getpid(), signal.SIGTERM)
-            time.sleep(5)
-        except BaseException as error:
-            raise ImportError("multiarray failed to import") from error
-
-    monkeypatch.setattr(scenes, "describe_scenes", compiled)
-    assert refused(143, "scenes").startswith("stopped; ")
 
 
 @pytest.mark.parametrize("place", ["typer", "sononerf.cli.files"])

@@ -3,8 +3,6 @@
 
 import importlib
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -35,23 +33,3 @@ def test_a_compiled_function_calls_compiled_ones_of_its_own_file_alone(name):
         for called in function.py_func.__code__.co_names:
             value = own.get(called)
             assert value is None or value.py_func.__module__ == name, called
-
-
-def test_where_no_folder_may_be_written_functions_are_compiled_in_each_process(tmp_path):
-    source = tmp_path / "doubling.py"
-    source.write_text(
-        "from sononerf.numerics import compiled\n\n\n@compiled\ndef double(x):\n    return 2 * x\n"
-    )
-    nowhere = tmp_path / "file"
-    nowhere.touch()
-    environment = {**os.environ, "HOME": str(nowhere), "XDG_CACHE_HOME": str(nowhere)}
-    code = (
-        "import numba.core.caching as c\n"
-        "c.CacheImpl._locator_classes = []\n"
-        "from doubling import double; print(double(21))"
-    )
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", code],
-        cwd=tmp_path, env=environment, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert (done.stdout, done.stderr) == ("42\n", "")

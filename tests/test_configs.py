@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 import re
 import shlex
 from pathlib import Path
@@ -11,9 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from sononerf.field.module import EchoModule
 from sononerf.run.build import head_of, module_for
-from sononerf.run.fit import fit
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import dump_yaml, load_settings, read_yaml, validate_settings
 
@@ -103,35 +100,3 @@ def test_the_papers_scenes_differ_in_scene_and_poses_alone():
         "leaf_dragonfly": ({"name": "leaf_dragonfly"}, {}),
     }
     assert all(data == settings["three_spheres"] for data in settings.values())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("slices", [16, 512])
-def test_the_papers_training_takes_steps(tmp_path, monkeypatch, slices):
-    settings = load_settings(
-        PAPER,
-        [
-            "poses.count=4",
-            "poses.validation=0",
-            "poses.heldout=0",
-            "simulation.rays=1000",
-            "fit.max_steps=3",
-            f"fit.batch_slices={slices}",
-            f"data.store={tmp_path / 'store'}",
-        ],
-    )
-    losses = []
-    real = EchoModule._loss
-
-    def loss(self, predicted, measured):
-        found = real(self, predicted, measured)
-        losses.append(float(found.detach()))
-        return found
-
-    monkeypatch.setattr(EchoModule, "_loss", loss)
-    fit(settings, tmp_path / "run", accelerator="cpu", workers=1)
-    assert len(losses) == 3
-    assert all(math.isfinite(loss) for loss in losses)
-    # The second step overshoots, as Adam does at this rate; the third has made up for it.
-    assert slices < 512 or losses[-1] <= losses[0]
-    assert (tmp_path / "run" / "model.safetensors").is_file()

@@ -1,15 +1,11 @@
 # SPDX-License-Identifier: MIT
-import shutil
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import pytest
 
 from sononerf.errors import ResourceError
 from sononerf.memory import available_memory, require_disk, require_memory
-from sononerf.run.simulate import simulate
-from sononerf.settings.loading import validate_settings
 
 
 def test_available_memory_is_plausible():
@@ -38,15 +34,3 @@ def test_files_that_the_disk_does_not_hold_are_refused(tmp_path):
     ):
         require_disk(1e18, tmp_path / "new" / "store", "echoes", "lower it")
     assert not (tmp_path / "new").exists()
-
-
-@pytest.mark.parametrize(
-    ("count", "words"),
-    [(10**9, "drawing 1,000,015 poses|drawing 1,000,000,0"), (3 * 10**5, "disk")],
-)
-def test_too_many_poses_are_refused_at_once(count, words, tmp_path, monkeypatch):
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=10**9))
-    settings = validate_settings({"scene": {"name": "sphere"}, "poses": {"count": count}}, "test")
-    with pytest.raises(ResourceError, match=words):
-        simulate(settings, output=tmp_path / "store")
-    assert not (tmp_path / "store").exists()

@@ -80,32 +80,6 @@ def test_echoes_alone_give_a_surface(made):
         sn.reconstruct(model)
 
 
-def test_a_start_that_was_asked_for_is_the_only_one_that_is_refined(made, monkeypatch):
-    _, echoes, model, best = made
-    monkeypatch.setattr(reconstruction, "RAYS", 500)
-    for where in (refinement, stages):
-        monkeypatch.setattr(where, "STAGES", SHORT)
-    start = sn.reconstruct(model, echoes, options={"method": "filled"}, progress=QUIET)
-    surface = sn.refine(start, echoes, progress=QUIET)
-    assert [one["start"] for one in surface.candidates] == ["filled"]
-    assert {"open", "filled", "levels"} <= {one["start"] for one in best.candidates}
-    assert [one["start"] for one in best.candidates if one["chosen"]] == [best.method]
-
-
-def test_a_prediction_traces_echoes_off_the_surface_it_is_given(made, monkeypatch):
-    scene, echoes, model, _ = made
-    surface = sn.Surface(scene.mesh, echoes=echoes)
-    from sononerf.evaluation import traced
-
-    monkeypatch.setattr(traced, "RAYS", 500)
-    heard = sn.predict(model, surface, echoes.poses("test"), progress=QUIET)
-    assert heard.traced_weight > 0
-    monkeypatch.setattr(traced, "regress_weight", None)  # it is not learned again
-    again = sn.predict(model, surface, echoes.poses("test"), progress=QUIET)
-    np.testing.assert_array_equal(again.magnitude, heard.magnitude)
-    assert sn.compare(heard, echoes)["mae_db"] < sn.compare(heard, echoes)["rendered_mae_db"]
-
-
 def test_a_mesh_of_ones_own_is_a_surface(made):
     scene, echoes, model, _ = made
     mine = sn.Surface(scene.mesh)
@@ -171,15 +145,3 @@ def test_objects_show_themselves_in_a_notebook(made):
     alone, both = echoes.plot(number), echoes.plot(number, heard)
     assert alone._repr_png_()[:4] == b"\x89PNG"
     assert len(both.data) > len(alone.data)
-
-
-def test_the_picture_of_echoes_is_of_what_was_measured(made, monkeypatch):
-    from sononerf.report import notebook
-
-    _, echoes, _, _ = made
-    drawn = []
-    monkeypatch.setattr(notebook, "spectrogram_picture", lambda *given: drawn.append(given) or b"")
-    echoes.plot(2)
-    ((measured, predicted, *_),) = drawn
-    assert measured.shape == echoes.spectrogram(2).shape
-    assert predicted is None

@@ -215,21 +215,6 @@ def test_probe_that_fails_leaves_nothing_behind(tmp_path, monkeypatch, number):
     assert names(tmp_path) == []
 
 
-def test_a_probe_that_cannot_be_removed_at_once_is_removed_later(tmp_path, monkeypatch):
-    unlink, refused = os.unlink, []
-
-    def refuse_once(path, **options):
-        if not refused:
-            refused.append(path)
-            raise OSError(errno.EIO, os.strerror(errno.EIO))
-        unlink(path, **options)
-
-    monkeypatch.setattr(os, "unlink", refuse_once)
-    with pytest.raises(StorageError, match="input/output error"):
-        storage.probe_writable(tmp_path / "a")
-    assert names(tmp_path) == []
-
-
 def test_probe_below_a_file_is_a_storage_error(tmp_path):
     (tmp_path / "file").write_bytes(b"")
     for folder in (tmp_path / "file" / "folder", tmp_path / "file"):
@@ -247,19 +232,6 @@ def test_messages_say_what_to_do(tmp_path):
         assert hint in str(error)
     assert "odd" in str(storage.storage_error("cannot be written", tmp_path, OSError("odd")))
     assert json.loads(storage.to_json({"b": 1, "a": 2}, sort_keys=True)) == {"a": 2, "b": 1}
-
-
-def test_all_of_a_file_is_there_when_it_is_synced(tmp_path, monkeypatch):
-    sizes, real = [], os.fsync
-
-    def fsync(descriptor):
-        found = os.fstat(descriptor)
-        sizes.append("folder" if stat.S_ISDIR(found.st_mode) else found.st_size)
-        real(descriptor)
-
-    monkeypatch.setattr(os, "fsync", fsync)
-    storage.commit_bytes(tmp_path / "file", b"content")
-    assert sizes == [7, "folder"]
 
 
 def test_a_file_in_place_of_a_folder_is_refused(tmp_path):

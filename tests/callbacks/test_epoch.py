@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
 
 import lightning
 import pytest
@@ -77,58 +76,3 @@ def test_a_signal_stops_after_the_step(training, tmp_path, number):
         made.train()
     assert caught.value.exit_code == 128 + number
     assert saved(tmp_path) == 2
-
-
-def test_a_signal_during_validation_stops_after_it(training, tmp_path):
-    keeper = CheckpointCallback(tmp_path, 60.0)
-    made = training(Kill(4, signal.SIGTERM, validating=True), keeper)
-    with keeper.watching(), pytest.raises(StoppedError, match="step 4 of 8"):
-        made.train()
-    assert saved(tmp_path) == 4
-
-
-def test_a_second_signal_does_what_it_did_without_us(training, tmp_path, monkeypatch):
-    class AtOnceError(BaseException):
-        pass
-
-    def unwind(number, frame):
-        raise AtOnceError
-
-    before = signal.signal(signal.SIGTERM, unwind)
-    try:
-        keeper = CheckpointCallback(tmp_path, 60.0)
-        made = training(Kill(2, signal.SIGTERM, signal.SIGTERM), keeper)
-        with keeper.watching(), pytest.raises(AtOnceError):
-            made.train()
-        assert signal.getsignal(signal.SIGTERM) is unwind
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def test_what_was_ignored_stays_ignored(training, tmp_path):
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        keeper = CheckpointCallback(tmp_path, 60.0)
-        made = training(Kill(2, signal.SIGHUP), keeper)
-        with keeper.watching():
-            made.train()
-        assert made.trainer.global_step == 8
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
-
-
-def test_outside_the_main_thread_signals_are_left_alone(tmp_path):
-    failed = []
-
-    def watch():
-        try:
-            with CheckpointCallback(tmp_path, 60.0).watching():
-                pass
-        except ValueError as error:
-            failed.append(error)
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    thread.join()
-    assert failed == []

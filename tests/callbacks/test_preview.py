@@ -7,15 +7,12 @@ import io
 import json
 
 import lightning
-import pytest
 import torch
 import trimesh
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sononerf import callbacks as preview_module
 from sononerf.callbacks import PreviewCallback
-from sononerf.errors import NumericalError
 
 
 def previews(folder, **changes):
@@ -88,34 +85,6 @@ def test_training_mode_is_put_back(training, tmp_path):
 def test_every_so_many_epochs(training, tmp_path):
     training(previews(tmp_path, every_epochs=2)).train()
     assert [p.name for p in (tmp_path / "epochs").iterdir()] == ["0002"]
-
-
-def test_a_field_without_a_surface_is_news_and_no_fault(training, tmp_path, monkeypatch):
-    def none(*given, **options):
-        raise NumericalError("no surface: the field is silent")
-
-    monkeypatch.setattr(preview_module, "energy_volume", none)
-    modes = Modes()
-    made = training(previews(tmp_path), modes)
-    made.train()
-    assert made.trainer.global_step == 8
-    assert modes.seen == [True] * 8
-    for number in ("0001", "0002"):
-        folder = tmp_path / "epochs" / number
-        assert [p.name for p in folder.iterdir()] == ["metrics.json"]
-        assert json.loads((folder / "metrics.json").read_text())["no_surface"] == (
-            "no surface: the field is silent"
-        )
-
-
-def test_other_faults_are_not_hidden(training, tmp_path, monkeypatch):
-    def broken(*given, **options):
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(preview_module, "energy_volume", broken)
-    made = training(previews(tmp_path))
-    with pytest.raises(ZeroDivisionError):
-        made.train()
 
 
 def test_only_one_of_many_devices_writes(training, tmp_path):

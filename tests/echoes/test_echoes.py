@@ -4,7 +4,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sononerf.echoes import echoes as module
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import InputError
@@ -78,18 +77,3 @@ def test_onsets_before_a_box_are_clutter_and_the_box_is_the_region(tmp_path):
     assert echoes.box is None
     with pytest.raises(InputError, match=r"box: found .* expected a lower and an upper corner"):
         echoes.within(box[::-1])
-
-
-def test_memory_is_bounded(monkeypatch):
-    reads = []
-
-    def read(number):
-        reads.append(number)
-        return np.zeros((2, 5, 3), np.float32)
-
-    echoes = echoes_of(None, np.zeros((3, 3)), np.zeros((3, 3, 3)), read)
-    monkeypatch.setattr(module, "KEPT_BYTES", 2 * 2 * 5 * 3 * 4)
-    for _ in range(2):
-        for number in range(3):
-            echoes.magnitude(number)
-    assert reads == [0, 1, 2, 2]

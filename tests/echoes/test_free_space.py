@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from sononerf.echoes import free_space as hull_module
 from sononerf.echoes.free_space import EchoHull, weighted
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.plane import Plane
@@ -179,33 +178,6 @@ def test_a_convex_body_heard_from_all_around_is_left_as_it_is():
     assert (hull.clearance(inside)[0] > 0.0005).all()
 
 
-def test_parts_of_the_points_make_no_difference(monkeypatch):
-    hull = by_chance(within=0.9)
-    points = points_around(100, 0.5)
-    whole = hull.clearance(points)
-    monkeypatch.setattr(hull_module, "AT_ONCE", 7 * 12 * 2)
-    assert hull.chunk == 7
-    for one, two in zip(hull.clearance(points), whole, strict=True):
-        np.testing.assert_allclose(one, two, rtol=0, atol=1e-13)
-    monkeypatch.setattr(hull_module, "AT_ONCE", 3)
-    assert hull.chunk == 1
-    clearance, pose = hull.clearance(np.zeros((0, 3)))
-    assert clearance.shape == pose.shape == (0,)
-    assert pose.dtype == np.intp
-
-
-def test_moving_everything_changes_nothing():
-    """Also 100 m away: squares of 1e4 m² leave 1e-12 m² of their differences, over 2 x 1 m."""
-    hull, shift = by_chance(within=0.9), np.array([100.0, -50.0, 20.0])
-    points = points_around(50)
-    moved = hull_of(
-        hull.emitters + shift, hull.receivers + shift, hull.first, hull.axes, within=0.9
-    )
-    found, expected = moved.clearance(points + shift)[0], hull.clearance(points)[0]
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(moved.sources, hull.sources + shift, rtol=0, atol=1e-12)
-
-
 def test_a_pose_hears_from_half_way_between_emitter_and_ears():
     hull = hull_of(
         [[0.004, 0.0, -0.01], [1.0, 2.0, 3.0]],
@@ -230,29 +202,6 @@ def test_an_outlier_tells_nothing():
     )
     np.testing.assert_allclose(found, alone.clearance(points)[0])
     assert (hull.clearance(points)[1] == 3).any()
-
-
-def test_where_many_are_outliers_some_of_the_others_may_be():
-    """One in twenty of those that are found: the place counts that the second pose leaves least."""
-    hull = by_chance(60)
-    weight = np.ones_like(hull.first)
-    weight[:25] = 0.0
-    points = points_around(50)
-    robust = dataclasses.replace(hull, weight=weight)
-    assert (hull.undetected, robust.undetected) == (0, 1)
-    left = np.sort(robust.behind(points).min(axis=2), axis=1)
-    np.testing.assert_allclose(robust.clearance(points)[0], left[:, 1])
-
-
-def test_how_far_poses_lie_from_a_line():
-    along = np.linspace(-1, 1, 9)[:, None] * [0.3, 0.1, -0.2] + [0.0, 0.5, 0.1]
-    straight = EchoHull(along, along[:, None], np.ones((9, 1)), along)
-    assert straight.width < 1e-12
-    bent = along.copy()
-    bent[4] += [0.1, -0.1, 0.1]  # across the line
-    hull = EchoHull(bent, bent[:, None], np.ones((9, 1)), bent)
-    assert hull.width == pytest.approx(np.sqrt(0.03) * 8 / 9, rel=0.02)
-    assert EchoHull(along[:1], along[:1, None], np.ones((1, 1)), along[:1]).width == 0.0
 
 
 AWAY = 0.4

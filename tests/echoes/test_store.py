@@ -3,14 +3,9 @@
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import json
-import os
 import pickle
-import random
-import signal
-import time
 
 import numpy as np
 import pytest
@@ -19,7 +14,7 @@ import zarr
 from sononerf import storage
 from sononerf.echoes.memory_ensemble import seal
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import IncompatibleError, InputError, NumericalError, StorageError
+from sononerf.errors import IncompatibleError, InputError, NumericalError
 from sononerf.head.decibels import compress
 
 POSES, RANGES, FREQUENCIES = 9, 7, 5
@@ -96,14 +91,6 @@ def test_bytes_know_no_order_of_writing(tmp_path):
     other.update_attributes(noise_floor=0.5)
     other.update_attributes(reference=np.float64(1e-3))
     assert tree(tmp_path / "a") == tree(tmp_path / "b")
-
-
-def test_every_write_is_committed(tmp_path, monkeypatch):
-    committed = []
-    real = os.replace
-    monkeypatch.setattr(os, "replace", lambda a, b: (committed.append(str(b)), real(a, b)))
-    filled(tmp_path / "s")
-    assert {str(tmp_path / "s" / name) for name in tree(tmp_path / "s")} == set(committed)
 
 
 @pytest.mark.parametrize("poison", [np.nan, np.inf, 1e30, -1.0])
@@ -218,21 +205,6 @@ def test_create_refuses_a_folder_of_something_else(tmp_path):
         EnsembleStore.create(tmp_path / "s" / "thesis.tex", **axes())
 
 
-def test_a_half_made_store_is_none_and_is_made_again(tmp_path, monkeypatch):
-    def fail(*_):
-        raise StorageError("the disk is full")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("sononerf.echoes.store.write_group", fail)
-        with pytest.raises(StorageError):
-            EnsembleStore.create(tmp_path / "a", **axes(range=np.arange(1.0, 4.0)))
-    with pytest.raises(InputError, match="no ensemble store"):
-        EnsembleStore.open(tmp_path / "a")
-    filled(tmp_path / "a")
-    filled(tmp_path / "b")
-    assert tree(tmp_path / "a") == tree(tmp_path / "b")
-
-
 def edited(path, change):
     data = json.loads(path.read_text())
     change(data)
@@ -281,65 +253,7 @@ def test_a_store_travels_to_another_process(tmp_path):
 KILL_POSES, KILL_SHAPE = 30, (2, 40, 16)
 
 
-def simulate(path, told=lambda: None):
-    """What a worker does: open, add what is missing, seal."""
-    with storage.lock(path):
-        store = EnsembleStore.create(
-            path,
-            poses_positions=np.zeros((KILL_POSES, 3)),
-            poses_rotations=np.tile(np.eye(3), (KILL_POSES, 1, 1)),
-            split=np.zeros(KILL_POSES),
-            range=np.arange(1.0, 1.0 + KILL_SHAPE[1]),
-            frequency=np.arange(1.0, 1.0 + KILL_SHAPE[2]),
-            attributes={"echo_hash": "k"},
-        )
-        for index in store.missing():
-            store.write_pose(index, spectrogram(index, KILL_SHAPE))
-            told()
-
-
 # The child uses nothing that a thread of its parent may hold.
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork.*:DeprecationWarning")
-def test_kills_at_random_moments_lose_nothing_and_change_nothing(tmp_path):
-    simulate(tmp_path / "whole")
-    generator = random.Random(0)
-    kills = killed_midway = 0
-    path = tmp_path / "killed-0"
-    while kills < 30:
-        heard, tells = os.pipe()
-        pid = os.fork()
-        if pid == 0:
-            try:
-                simulate(path, told=functools.partial(os.write, tells, b"."))
-            finally:
-                os._exit(0)
-        os.close(tells)
-        # Counted in poses, and a little more: it comes midway however busy the machine is.
-        for _ in range(generator.randrange(KILL_POSES)):
-            os.read(heard, 1)
-        time.sleep(generator.uniform(0, 0.003))
-        os.kill(pid, signal.SIGKILL)
-        os.waitpid(pid, 0)
-        os.close(heard)
-        kills += 1
-        if not (path / "zarr.json").exists():
-            continue
-        store = EnsembleStore.open(path)
-        missing = store.missing()
-        killed_midway += 0 < len(missing) < KILL_POSES
-        for index in set(range(KILL_POSES)) - set(missing):
-            np.testing.assert_array_equal(
-                store.read_pose(index), spectrogram(index, KILL_SHAPE), strict=True
-            )
-        if not missing:
-            simulate(path)
-            assert tree(path) == tree(tmp_path / "whole")
-            path = tmp_path / f"killed-{kills}"
-    simulate(path)
-    assert tree(path) == tree(tmp_path / "whole")
-    assert killed_midway >= 15  # else the kills came where nothing was to be lost
-
-
 def store_of(path, levels):
     store = EnsembleStore.create(
         path,
@@ -375,13 +289,3 @@ def test_without_repeats_there_is_no_noise_floor(tmp_path):
 def test_silence_is_told(tmp_path):
     with pytest.raises(NumericalError, match="nothing was heard"):
         seal(store_of(tmp_path / "s", [0.0, 0.0, 3.0]), {}, silent="nothing was heard")
-
-
-@pytest.mark.parametrize("axis", ["position", "rotation", "split", "range", "frequency"])
-@pytest.mark.parametrize("change", [lambda data: data[:-9] + b"x" + data[-8:], lambda data: b""])
-def test_a_damaged_axis_names_its_way_out(tmp_path, axis, change):
-    simulate(tmp_path)
-    (chunk,) = (file for file in (tmp_path / axis).rglob("c*") if file.is_file())
-    chunk.write_bytes(change(chunk.read_bytes()))
-    with pytest.raises(InputError, match=f"{axis}.*; fetch the store again, or move its folder"):
-        EnsembleStore.open(tmp_path)

@@ -4,7 +4,6 @@ import pytest
 
 from sononerf.errors import NumericalError
 from sononerf.evaluation.metrics import mae_db, prediction_metrics
-from sononerf.head import decibels
 
 
 @pytest.fixture(scope="module")
@@ -60,14 +59,6 @@ def test_what_does_not_exist_is_none(measured):
     found = prediction_metrics(silent, silent, mean_db=silent[0])
     assert found["pearson"] is found["ssim"] is found["mae_db_active"] is None
     assert found["mae_db"] == 0
-
-
-def test_chunks_change_nothing(measured, monkeypatch):
-    predicted = measured + np.random.default_rng(1).normal(size=measured.shape)
-    whole = prediction_metrics(measured, predicted, mean_db=measured.mean(axis=0))
-    monkeypatch.setattr(decibels, "CHUNK_POSES", 2)
-    pieces = prediction_metrics(measured, predicted, mean_db=measured.mean(axis=0))
-    assert pieces == pytest.approx(whole, rel=1e-5)
 
 
 def test_wrong_input_is_refused(measured):

@@ -93,26 +93,6 @@ def test_what_is_not_kept_is_silent(field, device):
             assert field.inside(probe).tolist() == [True, True, False]
 
 
-def test_what_lies_outside_is_kept_for_a_lattice_until_either_changes(field, monkeypatch):
-    asked, inside = [], field.inside
-    monkeypatch.setattr(field, "inside", lambda p: asked.append(1) or inside(p))
-    lattice = REGION.mean(0) + torch.tensor([[0.0, 0.0, 0.0], [0.04, 0.0, 0.0]]).double()
-    with torch.inference_mode():
-        assert field.outside(lattice) is None
-    assert field.outside(lattice) is None
-    assert len(asked) == 1
-    far = lattice + 1.0
-    with torch.inference_mode():
-        assert field.outside(far).tolist() == [True, True]
-    assert not field.outside(far).is_inference()  # a fit's gradient may need it
-    field.resolution = 0.02
-    field.keep(lattice[:1], 0.02)
-    assert field.outside(lattice).tolist() == [False, True]
-    field.keep(lattice, 0.02)
-    assert field.outside(lattice) is None
-    assert len(asked) == 4
-
-
 @pytest.mark.parametrize("times", [2, 4])
 def test_a_coarse_lattice_keeps_as_far_as_it_reaches(field, times):
     field.resolution = 0.05 / times

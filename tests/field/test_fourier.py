@@ -7,7 +7,6 @@ import torch
 from sononerf.errors import SettingsError
 from sononerf.field.field import sphere_directions
 from sononerf.field.fourier import FourierField
-from sononerf.field.grid import GridField
 from sononerf.geometry.poses import rotation_from_euler
 
 REGION = torch.tensor([[-0.1] * 3, [0.1] * 3], dtype=torch.float64)
@@ -45,34 +44,6 @@ def test_the_paper_has_about_half_a_million():
     assert 480_000 < sum(p.numel() for p in field.parameters()) < 600_000
 
 
-@BOTH
-def test_shape_and_type(inputs, device):
-    field = fourier(inputs, octaves=3, width=8).to(device)
-    places = places_in(6).reshape(2, 3, 3).to(device)
-    directions = sphere_directions(6, places).reshape(2, 3, 3)
-    response = field(places, directions)
-    assert response.shape == (2, 3, 3)
-    assert (response.device, response.dtype) == (places.device, torch.complex128)
-    assert field(places, directions[0, 0]).shape == (2, 3, 3)
-    assert field.select(places[0], directions, torch.tensor([1], device=device)).shape == (2, 3, 1)
-    single = field.float()(places.float(), directions.float())
-    assert single.dtype == torch.complex64
-
-
-@BOTH
-def test_gradients(inputs):
-    field = fourier(inputs, 2, octaves=2, width=8)
-    places = torch.cat((places_in(3), places_in(1) + 1))
-    directions = sphere_directions(4, REGION)
-    names = [name for name, _ in field.named_parameters()]
-
-    def response(*values):
-        state = dict(zip(names, values, strict=True))
-        return torch.func.functional_call(field, state, (places, directions))
-
-    assert torch.autograd.gradcheck(response, tuple(field.parameters()), fast_mode=True)
-
-
 def assert_sines(found, numbers, base, count):
     """Compare with sin(base^k pi x); the frequencies are kept in single precision."""
     for row, x in zip(found.reshape(len(numbers), count).tolist(), numbers, strict=True):
@@ -105,59 +76,12 @@ def test_the_layers_see_the_stated_sines(inputs):
     assert torch.equal(seen["skip"][0, 8:], first)
 
 
-@BOTH
-def test_zero_outside_the_region_and_where_not_kept(inputs):
-    field = fourier(inputs, octaves=3, width=8)
-    places, directions = places_in(50), sphere_directions(50, REGION)
-    inside = field(places, directions)
-    assert (inside.abs() > 0).all()
-    mixed = torch.cat((places + 0.3, places))
-    response = field(mixed, directions.repeat(2, 1))
-    assert response[:50].abs().max() == 0
-    torch.testing.assert_close(response[50:], inside)
-    assert field(places + 0.3, directions).abs().max() == 0
-    field.keep(places[:1], field.resolution)
-    assert (field(places, directions).abs().amax(-1) > 0).tolist()[:1] == [True]
-    assert int((field(places, directions).abs().amax(-1) > 0).sum()) < 5
-
-
 def test_the_scale_multiplies_positions_alone():
     field = fourier(octaves=3, width=8, scale=2.0)
     plain = fourier(octaves=3, width=8)
     plain.load_state_dict(field.state_dict())
     places, directions = places_in(5) / 2, sphere_directions(5, REGION)
     torch.testing.assert_close(field(places, directions), plain(2 * places, directions))
-
-
-def test_order_changes_nothing_and_resolution_is_a_hundredth():
-    field = fourier(octaves=3, width=8)
-    places, directions = places_in(20), sphere_directions(20, REGION)
-    whole = field(places, directions)
-    torch.testing.assert_close(field(places.flip(0), directions.flip(0)), whole.flip(0))
-    assert field.resolution == pytest.approx(0.002)
-
-
-def test_weights_are_read_back():
-    field = fourier(octaves=3, width=8)
-    field.keep(places_in(3), field.resolution)
-    torch.manual_seed(1)
-    other = FourierField(REGION, FREQUENCY[:3], octaves=3, width=8).double()
-    other.load_state_dict(field.state_dict())
-    places, directions = places_in(20), sphere_directions(20, REGION)
-    assert torch.equal(other(places, directions), field(places, directions))
-
-
-def test_direction_octaves_are_those_of_the_direction_alone():
-    field = fourier(octaves=5, direction_octaves=2, width=8)
-    assert field.trunk[0].in_features == 3 * 5 + 3 * 2
-    assert fourier(octaves=5, width=8).trunk[0].in_features == 6 * 5
-    middle, along_x = torch.zeros(1, 3).double(), torch.tensor([[0.1, 0.0, 0.0]]).double()
-    told = field._embedded(middle, along_x)[0][0]
-    place, turns = told[:15], told[15:]
-    assert (place == 0).all()
-    expected = torch.sin(math.pi * 0.1 * torch.tensor([1.0, math.sqrt(2.0)], dtype=torch.float64))
-    torch.testing.assert_close(turns[:2], expected, rtol=1e-6, atol=0)
-    assert (turns[2:] == 0).all()
 
 
 def test_the_codes_network_has_no_direction_to_embed():
@@ -181,12 +105,3 @@ def test_products_in_half_precision_answer_alike_and_learn(inputs):
     for (name, ours), theirs in zip(field.named_parameters(), exact.parameters(), strict=True):
         assert ours.grad.dtype == torch.float32, name
         assert float((ours.grad - theirs.grad).norm() / theirs.grad.norm()) < 0.1, name
-
-
-def test_the_spacing_that_resolves_it_may_be_given():
-    assert fourier(octaves=3, width=8, spacing=0.004).resolution == 0.004
-
-
-def test_a_network_is_worth_threads_where_lobes_are_not():
-    assert FourierField.costly
-    assert not GridField.costly

@@ -3,36 +3,8 @@ import pytest
 import torch
 
 from sononerf.errors import SettingsError
-from sononerf.field.field import lattice_over, sphere_directions
+from sononerf.field.field import lattice_over
 from tests.field.lobes import REGION, fill, grid, places_in
-
-WITH_OPTIONS = pytest.mark.parametrize("options", [{}, {"rank": 2}])
-
-
-@WITH_OPTIONS
-def test_gradients(options):
-    field = fill(grid(spacing=0.025, **options), size=0.5)
-    places, directions = places_in(4), sphere_directions(4, REGION)
-    names = [name for name, _ in field.named_parameters()]
-
-    def response(*values):
-        state = dict(zip(names, values, strict=True))
-        return torch.func.functional_call(field, state, (places, directions))
-
-    assert torch.autograd.gradcheck(response, tuple(field.parameters()))
-
-
-@WITH_OPTIONS
-def test_a_new_field_is_one_everywhere_and_has_finite_gradients(options):
-    field = grid(**options)
-    response = field(places_in(5), sphere_directions(5, REGION))
-    # The lobe's length is 1e-3 at least.
-    torch.testing.assert_close(response, torch.ones_like(response), rtol=0, atol=1.1e-3)
-    response[:, :2].sum().backward()
-    assert all(p.grad.isfinite().all() for p in field.parameters())
-    for values in field.grids:
-        moved = values.grad.abs().amax(dim=(0, 2, 3, 4)) > 0
-        assert moved.tolist() == [i != 4 for i in range(len(moved))]
 
 
 def test_there_are_lobes_and_one_spectrum_unless_more_is_asked_for():
@@ -94,29 +66,6 @@ def test_a_lattice_is_read_as_any_places_are(options, which):
             strict=True,
         ):
             torch.testing.assert_close(one, two, rtol=0, atol=1e-4)
-
-
-def test_how_a_lattice_is_read_is_found_once():
-    field = fill(grid())
-    places, others = lattice_in(field), places_in(5)
-    with torch.inference_mode():  # validation may come first
-        field.code_of_lattice(places, None)
-    known = field._reading
-    field.code_of_lattice(places, torch.tensor([1])).sum().backward()
-    assert field._reading is known
-    assert len(field.code_of_lattice(others, None)) == 5
-    assert field._reading is not known
-    field.float()
-    assert field.code_of_lattice(others, None).dtype == torch.float32
-
-
-def test_the_grids_cover_the_region():
-    sizes = [tuple(values.shape[4:1:-1]) for values in grid(levels=3).grids]
-    # 51, 40 and 27 mm in steps of 10, 20, 40 mm: intervals rounded up, one vertex more.
-    assert sizes == [(7, 5, 4), (4, 3, 3), (3, 2, 2)]
-    # A side that divides gets no vertex too many from rounding.
-    whole = torch.tensor([[-0.1] * 3, [0.2] * 3], dtype=torch.float64)
-    assert tuple(grid(whole, spacing=0.1, levels=1).grids[0].shape) == (1, 5, 4, 4, 4)
 
 
 def test_the_spacing_is_found_from_the_number_of_vertices():

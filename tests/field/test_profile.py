@@ -7,7 +7,6 @@ import pytest
 import torch
 import trimesh
 
-from sononerf.field.field import lattice_over
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.field.profile import ProfileRenderer
@@ -180,17 +179,6 @@ def test_each_frequency_has_a_window_of_its_own(listener, one_place):
     assert (made.log_kernel[:, 50:] == -9.0).all()
 
 
-def test_a_row_that_is_not_swept_has_a_window_all_the_same(listener, one_place):
-    """What is not called has no middle to measure by: leakage may be louder off it, or nothing."""
-    window = torch.ones(3, 101, dtype=torch.float64)
-    window[1, :40] = window[1, 61:] = 5.0
-    window[2, :40] = window[2, 61:] = 0.0
-    _, renderer = one_place(np.zeros(3))
-    made = ProfileRenderer(renderer.region, dataclasses.replace(listener, window=window))
-    assert (made.log_kernel[1, :25] == 0.0).all()
-    assert (made.log_kernel[2, 6:] == -9.0).all()
-
-
 def test_a_sweeps_rows_hear_a_place_by_their_lag_farther_off(head, listener, one_place):
     def lag(azimuth, elevation):
         return np.array([-0.002, 0.0, 0.005]) * (1 + azimuth) * (1 - elevation)
@@ -214,62 +202,6 @@ def test_a_sweeps_rows_hear_a_place_by_their_lag_farther_off(head, listener, one
         np.testing.assert_allclose(found, sign * lag(azimuth, elevation), atol=3e-5)
 
 
-def bins_of(renderer):
-    """Number of fine bins that any slice sees."""
-    return (len(renderer.range) - 1) * renderer.oversampling + 2 * renderer.log_kernel.shape[1] + 1
-
-
-def heard_from_bins(renderer, monkeypatch):
-    """Power in each slice from one unit of power in each fine bin, (K, R, F)."""
-    count = bins_of(renderer)
-    unit = torch.eye(count, dtype=torch.float64).expand(1, 1, 3, -1, -1)
-    with monkeypatch.context() as patch:
-        patch.setattr(renderer, "_profile", lambda *_: (unit, range(len(renderer.range))))
-        some = torch.zeros(count, 3, dtype=torch.float64)
-        heard = renderer(None, some, some, rows(poses=count))
-    return (heard[:, 0].square()).detach().numpy()
-
-
-def slow(head, renderer, reflectivity, position, rotation):
-    """Power laid into fine bins, place by place, (E, K, F)."""
-    laid = np.zeros((2, bins_of(renderer), 3))
-    for place in renderer.lattice.numpy():
-        paths = place - position - (rotation @ np.vstack((head.emitter, head.ears)).T).T
-        d = np.linalg.norm(paths, axis=1)
-        value = reflectivity(torch.from_numpy(place), torch.from_numpy(-paths[0] / d[0])).numpy()
-        beam, _ = head.towards(rotation.T @ paths[0])
-        for ear in (0, 1):
-            air = np.exp(-head.alpha * (d[0] + d[1 + ear]))
-            gain = head.towards(rotation.T @ paths[1 + ear])[1][ear]
-            power = (np.abs(value) * beam * gain * air / (d[0] * d[1 + ear])) ** 2
-            index, part = divmod(((d[0] + d[1 + ear]) / 2 - renderer.first) / renderer.bin, 1)
-            laid[ear, int(index)] += (1 - part) * power
-            laid[ear, int(index) + 1] += part * power
-    return laid
-
-
-@pytest.mark.parametrize("kind", ["real", "complex"])
-def test_many_places_against_a_slow_loop(head, listener, formula, kind, monkeypatch):
-    def turning(places, directions):
-        return smooth(places, directions) * torch.exp(1j * 50 * places[..., :1])
-
-    function = smooth if kind == "real" else turning
-    field = formula(REGION, listener.frequency, function, spacing=0.01)
-    renderer = quiet(ProfileRenderer(REGION, listener))
-    renderer.prepare(field, None, 0)
-    window = heard_from_bins(renderer, monkeypatch)
-    with torch.no_grad():
-        renderer.log_noise.copy_(torch.tensor([-1.0, 0.0, 0.5]))
-    found = renderer(field, *tensors(POSITION, ROTATION), rows(poses=2)).detach().numpy()
-    assert not np.iscomplexobj(found)
-    for pose in (0, 1):
-        laid = slow(head, renderer, function, POSITION[pose], ROTATION[pose])
-        power = np.einsum("ekf,krf->erf", laid, window)
-        expected = np.sqrt(power + np.exp([-2.0, 0.0, 1.0]))
-        np.testing.assert_allclose(found[pose], expected, rtol=1e-6)
-        assert expected.max() > 5 * expected.min()
-
-
 LOBES = pytest.mark.parametrize("make", [grid])
 
 
@@ -282,33 +214,6 @@ def heard_by_lobes(make, listener, **options):
 
 
 # Ranges run from 0.25 to 0.33 m: in their midst, across either end, and beyond them.
-@pytest.mark.parametrize("far", [0.29, 0.25, 0.34, 0.2, 0.4])
-def test_only_slices_that_may_sound_are_looked_at_and_nothing_is_lost(
-    listener, formula, far, monkeypatch
-):
-    region = REGION + torch.tensor([0.30 - far, 0.0, 0.0])
-    field = formula(region, listener.frequency, smooth, spacing=0.005)
-    renderer = quiet(ProfileRenderer(region, listener, oversampling=3))
-    renderer.prepare(field, None, 0)
-    given = (*tensors(POSITION[0], ROTATION[0]), rows())
-    sounding = renderer._sounding
-    looked = []
-    monkeypatch.setattr(renderer, "_sounding", lambda at: looked.append(sounding(at)) or looked[0])
-    some = renderer(field, *given)
-    monkeypatch.setattr(renderer, "_sounding", lambda _: range(120))
-    whole = renderer(field, *given)
-    torch.testing.assert_close(some, whole, rtol=1e-12, atol=1e-15)
-    parameters = [renderer.log_kernel, renderer.log_gain, renderer.log_noise]
-    for mine, theirs in zip(
-        torch.autograd.grad(some.sum(), parameters),
-        torch.autograd.grad(whole.sum(), parameters),
-        strict=True,
-    ):
-        torch.testing.assert_close(mine, theirs)
-    assert len(looked[0]) < 110
-    assert (float(whole.detach().max()) < 1e-9) == (far in (0.2, 0.4))
-
-
 @LOBES
 def test_what_is_heard_follows_the_places_that_are_alive(make, listener):
     _, renderer, hear = heard_by_lobes(make, listener)
@@ -326,28 +231,6 @@ def test_what_is_heard_follows_the_places_that_are_alive(make, listener):
     assert hear().max() < 1e-10
 
 
-class Direct(GridField):
-    """Multiplies the places themselves with what is learned, so that its gradient needs them."""
-
-    def code(self, positions):
-        return torch.cat((positions * self.spectrum, positions[:, :2]), dim=1)
-
-
-def direct(region, frequency):
-    return Direct(region, frequency, spacing=0.01, levels=2).double()
-
-
-@pytest.mark.parametrize("make", [grid, direct])
-def test_a_fit_may_begin_with_a_validation(make, listener):
-    field, _, hear = heard_by_lobes(make, listener)
-    with torch.inference_mode():
-        first = hear()
-    again = hear()
-    again.sum().backward()
-    assert torch.equal(first, again)
-    assert field.spectrum.grad.abs().min() > 0
-
-
 @LOBES
 def test_a_sample_has_the_right_power_on_average(make, listener):
     """Some of the places that are loudest in the books being dead."""
@@ -363,17 +246,6 @@ def test_a_sample_has_the_right_power_on_average(make, listener):
     deviation = draws.std(0) / math.sqrt(len(draws))
     assert ((draws.mean(0) - whole).abs() <= 5 * deviation)[loud].all()
     assert (deviation / whole)[loud].median() < 0.05  # so that the test can tell
-
-
-def test_loud_places_are_drawn_more_often(listener):
-    _, renderer, _ = heard_by_lobes(grid, listener, points=70, uniform=0.4)
-    renderer.alive[:50] = False
-    renderer.energy = (torch.arange(125) >= 115).double()
-    torch.manual_seed(0)
-    drawn, _ = renderer.train()._draw()
-    assert drawn.max() < 75
-    # 6 in 10 by their energy, and 2 in 15 of the others: 65 %, by chance 6 % more or less.
-    assert (drawn >= 65).double().mean() == pytest.approx(0.65, abs=0.18)
 
 
 def test_doubling_the_range_divides_by_four(listener, one_place):
@@ -438,15 +310,6 @@ def test_turning_scene_and_head_together_changes_nothing(listener, formula):
     torch.testing.assert_close(*heard, rtol=1e-9, atol=1e-9)
 
 
-def test_the_order_of_the_places_changes_nothing(cloud):
-    field, renderer = cloud
-    one = renderer(field, *tensors(POSITION, ROTATION), rows(poses=2))
-    order = torch.randperm(125, generator=torch.Generator().manual_seed(0))
-    renderer.lattice = renderer.lattice[order]
-    two = renderer(field, *tensors(POSITION, ROTATION), rows(poses=2))
-    torch.testing.assert_close(one, two, rtol=1e-12, atol=1e-12)
-
-
 def test_silence_in_only_noise_out(listener, formula):
     field = formula(REGION, listener.frequency, lambda x, u: 0 * smooth(x, u), spacing=0.01)
     renderer = ProfileRenderer(REGION, listener).double()
@@ -498,16 +361,6 @@ def test_a_sample_of_the_places_is_right_on_average(cloud):
     assert int(renderer.points_evaluated) == 600 * 30  # in training alone
 
 
-def test_the_first_lattice_is_as_fine_as_its_bound_allows(listener, formula):
-    field = formula(REGION, listener.frequency, smooth, spacing=0.005)
-    # 9 x 9 x 9 = 729 vertices at 5 mm, 125 at 10 mm, 27 at 20 mm.
-    for start, count, spacing in ((729, 729, 0.005), (728, 125, 0.01), (124, 27, 0.02)):
-        renderer = ProfileRenderer(REGION, listener, start=start).double()
-        assert renderer.prepare(field, None, 0)
-        assert (len(renderer.lattice), float(renderer.spacing)) == (count, pytest.approx(spacing))
-        assert not renderer.prepare(field, None, 1)
-
-
 def test_only_possible_places_are_laid(listener, formula):
     field = formula(REGION, listener.frequency, smooth, spacing=0.01)
     asked = []
@@ -529,87 +382,6 @@ def ball(places, directions):
     return torch.where(inside, 1.0, 1e-6)[..., None].expand(*directions.shape[:-1], 3)
 
 
-def test_the_lattice_is_refined_where_there_is_energy(listener, formula):
-    region = torch.tensor([[-0.024] * 3, [0.024] * 3], dtype=torch.float64)
-    field = formula(region, listener.frequency, ball, spacing=0.002)
-    renderer = quiet(ProfileRenderer(region, listener, start=400, prune_every=10))
-    assert renderer.prepare(field, None, 0)
-    assert float(renderer.spacing) == pytest.approx(0.008)  # 343 vertices
-    assert [renderer.prepare(field, None, step) for step in (1, 9)] == [False, False]
-    assert len(renderer.lattice) == 343
-    spacings = []
-    for step in (10, 20, 30):
-        changed = renderer.prepare(field, None, step)
-        spacings.append((changed, round(float(renderer.spacing), 4)))
-        # The field sounds as far as the new lattice speaks for, half a spacing around it.
-        edge = renderer.lattice[renderer.alive][:, 0].max() + 0.45 * float(renderer.spacing)
-        assert field.inside(torch.stack((edge, 0 * edge, 0 * edge)))
-    assert spacings == [(True, 0.004), (True, 0.002), (False, 0.002)]
-    # Every vertex of the fine lattice that is loud is there and alive, and no other.
-    found = renderer.lattice[renderer.alive]
-    fine = lattice_over(region, 0.002)
-    expected = fine[fine.norm(dim=1) < 0.0062]
-    assert len(found) == len(expected)
-    assert torch.cdist(found, expected).amin(1).max() < 1e-6
-    # The field is silent from now on where nothing is left.
-    assert field.inside(expected).all()
-    assert not field.inside(expected + 0.013).any()
-    heard = renderer(field, *tensors(POSITION[0], ROTATION[0]), rows())
-    assert heard.max() > 1
-
-
-def test_a_box_of_unequal_sides_is_refined_where_there_is_energy_too(listener, formula):
-    corners = [[-0.008, -0.016, -0.024], [0.04, 0.024, 0.016]]
-    region = torch.tensor(corners, dtype=torch.float64)
-    field = formula(region, listener.frequency, ball, spacing=0.002)
-    renderer = quiet(ProfileRenderer(region, listener, start=400, prune_every=10))
-    for step in (0, 10, 20, 30):
-        renderer.prepare(field, None, step)
-    found, fine = renderer.lattice[renderer.alive], lattice_over(region, 0.002)
-    expected = fine[fine.norm(dim=1) < 0.0062]
-    assert len(found) == len(expected) > 50
-    assert torch.cdist(found, expected).amin(1).max() < 1e-6
-
-
-def test_a_refined_lattice_reaches_the_far_corner_of_its_region(listener, formula):
-    # In floating point 0.3 / 0.1 lies just below three.
-    region = torch.tensor([[0.0] * 3, [0.3] * 3], dtype=torch.float64)
-    field = formula(region, listener.frequency, smooth, spacing=0.1)
-    renderer = quiet(ProfileRenderer(region, listener, start=30, prune_every=10))
-    for step, spacing, farthest in ((0, 0.2, 0.2), (10, 0.1, 0.3)):
-        assert renderer.prepare(field, None, step)
-        assert float(renderer.spacing) == pytest.approx(spacing)
-        assert float(renderer.lattice.max()) == pytest.approx(farthest)
-    assert len(renderer.lattice) == 64
-
-
-def test_a_lattice_that_is_refined_stays_within_what_is_possible(listener, formula):
-    """The neighbours of what is alive are asked about, each as finely as it is laid."""
-    region = torch.tensor([[-0.024] * 3, [0.024] * 3], dtype=torch.float64)
-    field = formula(region, listener.frequency, ball, spacing=0.002)
-    asked = []
-
-    def left(places, tolerance):
-        asked.append(tolerance)
-        return places[:, 0] <= 0.25 * tolerance
-
-    renderer = quiet(ProfileRenderer(region, listener, start=400, prune_every=10))
-    for step, spacing in ((0, 0.008), (10, 0.004), (20, 0.002), (30, 0.002)):
-        renderer.prepare(field, left, step)
-        assert float(renderer.spacing) == pytest.approx(spacing)
-        half = spacing * math.sqrt(3) / 2  # of a cell's diagonal
-        assert asked[-1] == pytest.approx(half)
-        assert renderer.lattice[:, 0].max() <= 0.25 * half
-    assert len(asked) == 3
-    assert field.inside(torch.tensor([[-0.004, 0.0, 0.0]], dtype=torch.float64)).all()
-    # All that is loud and possible is there.
-    fine = lattice_over(region, 0.002)
-    expected = fine[(fine.norm(dim=1) < 0.0062) & (fine[:, 0] <= 0.25 * half)]
-    found = renderer.lattice[renderer.alive]
-    assert len(found) == len(expected)
-    assert torch.cdist(found, expected).amin(1).max() < 1e-6
-
-
 def test_a_place_60_db_below_its_surroundings_is_dropped(listener, formula):
     """And one 50 dB below them is not: such is the edge of a face beside its flash."""
     region = torch.tensor([[0.0] * 3, [0.02, 0.0, 0.0]], dtype=torch.float64)
@@ -624,35 +396,6 @@ def test_a_place_60_db_below_its_surroundings_is_dropped(listener, formula):
     renderer.prepare(field, None, 0)
     renderer.prepare(field, None, 1)
     assert renderer.alive.tolist() == [True, True, False]
-
-
-def test_what_is_weak_but_alone_is_kept(listener, formula):
-    """Judged by its surroundings of 30 mm: a faint place far from a loud one stays."""
-    region = torch.tensor([[-0.1, 0.0, 0.0], [0.1, 0.01, 0.01]], dtype=torch.float64)
-
-    def two(places, directions):
-        value = torch.full_like(places[..., 0], 1e-6)
-        value = torch.where(places[..., 0] < -0.095, 1.0, value)
-        value = torch.where(places[..., 0] > 0.095, 1e-3, value)
-        return value[..., None].expand(*directions.shape[:-1], 3)
-
-    field = formula(region, listener.frequency, two, spacing=0.01)
-    renderer = ProfileRenderer(region, listener, prune_every=1, prune_below=1e-4).double()
-    renderer.prepare(field, None, 0)
-    renderer.prepare(field, None, 1)
-    x = renderer.lattice[renderer.alive][:, 0]
-    assert (x < -0.095).sum() == 4
-    assert (x > 0.095).sum() == 4
-    near_loud = (x > -0.095) & (x < -0.045)
-    assert not near_loud.any()
-
-
-def test_never_pruned_where_the_settings_say_so(listener, formula):
-    field = formula(REGION, listener.frequency, ball, spacing=0.005)
-    renderer = ProfileRenderer(REGION, listener, start=200, prune_every=0).double()
-    renderer.prepare(field, None, 0)
-    assert not any(renderer.prepare(field, None, step) for step in range(1, 300))
-    assert len(renderer.lattice) == 125
 
 
 def test_the_lattice_goes_with_the_weights(listener, formula, cloud):
@@ -682,68 +425,6 @@ def test_gradients(listener, gradients_are_right, kind):
     poses = tensors(POSITION, ROTATION)
     wanted = torch.tensor([[30, 45], [20, 60]])
     assert gradients_are_right(field, renderer, *poses, wanted, torch.tensor([0, 2]))
-
-
-class Everywhere(GridField):
-    """All places are rendered for all poses."""
-
-    def audible(self, positions, sources, code=None):
-        return torch.ones(len(sources), len(positions), dtype=torch.bool)
-
-
-def test_leaving_out_who_does_not_answer_changes_nothing_to_be_heard(listener):
-    """Each lobe is left out 43 dB below its own peak, which is 1 / 20 000 of its power."""
-    heard, evaluated = [], []
-    for kind in (GridField, Everywhere):
-        field = kind(REGION, listener.frequency, spacing=0.005, levels=1).double()
-        generator = torch.Generator().manual_seed(0)
-        with torch.no_grad():
-            shape = field.grids[0].shape
-            field.grids[0].copy_(torch.randn(shape, dtype=torch.float64, generator=generator))
-            field.grids[0][:, 0] = 0.0
-            field.grids[0][:, 1:4] *= 12.0
-        renderer = quiet(ProfileRenderer(REGION, listener))
-        renderer.prepare(field, None, 0)
-        heard.append(renderer(field, *tensors(POSITION, ROTATION), rows(poses=2)).detach())
-        evaluated.append(int(renderer.points_evaluated))
-    assert evaluated[1] == 2 * 729
-    assert evaluated[0] < 0.7 * evaluated[1]
-    torch.testing.assert_close(heard[0], heard[1], rtol=0, atol=1e-4 * float(heard[1].max()))
-    assert not torch.equal(*heard)
-
-
-def test_where_no_one_answers_there_is_noise(listener):
-    class Deaf(GridField):
-        def audible(self, positions, sources, code=None):
-            return torch.zeros(len(sources), len(positions), dtype=torch.bool)
-
-    field = Deaf(REGION, listener.frequency, spacing=0.01, levels=1).double()
-    renderer = ProfileRenderer(REGION, listener).double()
-    renderer.prepare(field, None, 0)
-    heard = renderer(field, *tensors(POSITION, ROTATION), rows(poses=2))
-    torch.testing.assert_close(heard, torch.full_like(heard, math.exp(-16)), rtol=1e-6, atol=0)
-    heard.sum().backward()
-    assert all(p.grad.isfinite().all() for p in renderer.parameters() if p.grad is not None)
-    assert int(renderer.points_evaluated) == 0
-
-
-def test_a_lead_brings_the_echo_nearer_by_as_much(head, listener, one_place, monkeypatch):
-    """Towards one of two poses, by whole slices: what is heard is the same, and nothing else is."""
-    field, renderer = one_place([0.004, 0.013, -0.006])
-    poses = tensors(POSITION, ROTATION)
-    before = renderer(field, *poses, rows(poses=2)).detach()
-    plain = field.echo
-
-    def echo(positions, directions, bins, place, code):
-        response, lead = plain(positions, directions, bins, place, code)
-        return response, lead + 5 * head.step * (directions[:, 0] > 0.5)
-
-    monkeypatch.setattr(field, "echo", echo)
-    after = renderer(field, *poses, rows(poses=2)).detach()
-    assert before[0].max() > 1
-    torch.testing.assert_close(after[0, :, :-5], before[0, :, 5:], rtol=0, atol=1e-6)
-    torch.testing.assert_close(after[1], before[1])
-    assert (after[0] - before[0]).abs().max() > 0.1 * before[0].max()
 
 
 def test_gradients_of_a_lead(listener, formula, gradients_are_right):
@@ -836,14 +517,3 @@ def test_a_tiny_sphere_sounds_where_and_as_long_as_the_simulator_hears_it(kind, 
         if even:
             assert np.abs(late[0] - late[1]).mean() < 0.0006
         assert least < (long[0] / long[1]).min() < (long[0] / long[1]).max() < most
-
-
-def test_weights_of_before_are_read_without_the_buffers_of_modes_that_are_gone(listener, formula):
-    field = formula(REGION, listener.frequency, smooth, spacing=0.005)
-    old, new = (ProfileRenderer(REGION, listener) for _ in range(2))
-    old.prepare(field, None, 0)
-    state = old.state_dict()
-    gone = {"phased": torch.zeros(()), "wave": torch.ones(3), "opaque": torch.zeros(7).bool()}
-    new.load_state_dict({**state, **gone})
-    assert new.state_dict().keys() == state.keys()
-    torch.testing.assert_close(new.lattice, old.lattice.float())

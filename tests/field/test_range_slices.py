@@ -99,15 +99,6 @@ def test_a_pass_meets_everything_once(store, whole):
         assert sorted(met) == [(pose, row) for pose in TRAIN for row in range(RANGES)]
 
 
-def test_the_last_batch_of_a_pass_is_filled_up(store):
-    found = stream(store, batch=3)
-    assert found.batches_per_pass == 3
-    poses = torch.cat([found[step].pose for step in range(3)]).tolist()
-    assert len(poses) == 9
-    assert sorted(poses[:7]) == TRAIN
-    assert poses[7:] == poses[:2]
-
-
 def test_of_silent_slices_a_share_is_met_and_of_the_others_all(store):
     # In pose p, row r the loudest cell is 1000 p + 100 + 10 r + 4: with 3134 as the bound the rows
     # 0 to 2 of pose 3 are silent, and all of poses 0 and 2.
@@ -125,18 +116,6 @@ def test_of_silent_slices_a_share_is_met_and_of_the_others_all(store):
     assert sounding < set(some)
     assert met(silent_share=0.4, seed=5) != some
     assert len(met(silent_share=1.0)) == RANGES * len(TRAIN)
-
-
-def test_whole_poses_are_met_with_their_silence(store):
-    with pytest.raises(ValueError, match="silence"):
-        stream(store, silent_share=0.5)
-
-
-def test_a_batch_is_no_larger_than_what_there_is(store):
-    found = stream(store, batch=100, batch_frequencies=100)
-    assert sorted(found[0].pose.tolist()) == TRAIN
-    assert found[0].bins.tolist() == list(range(FREQUENCIES))
-    assert found.batches_per_pass == 1
 
 
 def test_frequencies_are_drawn_evenly_and_in_order(store):
@@ -166,48 +145,6 @@ def test_a_batch_that_leaves_a_device_without_work_is_refused(store):
     assert len(stream(store, batch=2, share=(1, 2))[0].pose) == 1
     with pytest.raises(SettingsError, match="batch of 1 cannot be shared by 2 devices"):
         stream(store, batch=1, share=(1, 2))
-
-
-def test_memory_is_bounded_and_the_longest_unused_goes_first(store, monkeypatch):
-    read = []
-    plain = EnsembleStore.read_pose
-
-    def counted(self, index):
-        read.append(index)
-        return plain(self, index)
-
-    monkeypatch.setattr(EnsembleStore, "read_pose", counted)
-    size = 2 * RANGES * FREQUENCIES * 4
-    reader = PoseReader(store, 2 * size + size // 2)
-    for index in (0, 1, 0, 2, 0, 1):
-        assert reader[index][1, 2, 3] == value(index, 1, 2, 3)
-        kept = sum(values.nbytes for values in reader._kept.values())
-        assert kept <= 2 * size
-    assert read == [0, 1, 2, 1]
-    # One is always kept: the rest of a batch may be of the same pose.
-    small = PoseReader(store, 1)
-    assert small[4] is small[4]
-
-
-def test_memory_is_bounded_for_any_number_of_receivers(tmp_path):
-    ears = 16
-    store = EnsembleStore.create(
-        tmp_path / "store",
-        poses_positions=np.zeros((4, 3)),
-        poses_rotations=np.zeros((4, 3, 3)),
-        split=np.zeros(4, int),
-        range=0.2 + 0.01 * np.arange(RANGES),
-        frequency=1e4 * (1 + np.arange(FREQUENCIES)),
-        attributes={"echo_hash": "a"},
-        receivers=ears,
-    )
-    for pose in range(4):
-        store.write_pose(pose, np.ones((ears, RANGES, FREQUENCIES)))
-    reader = PoseReader(store, 2 * ears * RANGES * FREQUENCIES * 4)
-    first = reader[0]
-    assert reader[0] is first
-    assert [reader[pose] for pose in (1, 2)]
-    assert reader[0] is not first
 
 
 def test_whole_poses_with_and_without_measurements(store):

@@ -3,7 +3,6 @@ import numpy as np
 import pytest
 import torch
 
-from sononerf.field.fourier import FourierField
 from sononerf.field.renderer import ShellRenderer
 from sononerf.geometry.poses import rotation_from_euler
 
@@ -69,14 +68,6 @@ def test_equation_17_against_a_slow_loop(head, listener, field, told):
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=2e-10)
 
 
-@pytest.mark.parametrize(("call_spectrum", "learned"), [("flat", False), ("learned", True)])
-def test_a_call_spectrum_is_learned_where_it_is_asked_for(listener, field, call_spectrum, learned):
-    renderer = ShellRenderer(REGION, listener, call_spectrum=call_spectrum).double()
-    renderer(field, *poses(), ROWS).sum().backward()
-    assert renderer.log_gain.grad is not None
-    assert (renderer.log_spectrum.grad is not None) == learned
-
-
 def test_six_hundred_even_directions_over_the_forward_hemisphere(renderer):
     directions = renderer.directions
     assert directions.shape == (600, 3)
@@ -110,24 +101,6 @@ def test_what_lies_outside_costs_nothing(formula, listener, renderer):
     assert int(renderer.points_evaluated) == len(places)
 
 
-def test_a_slice_that_misses_the_region_is_silent(formula, listener, field):
-    renderer = ShellRenderer(REGION, listener).double()
-    far = torch.from_numpy(POSITION) + 5
-    heard = renderer(field, far, torch.from_numpy(ROTATION), ROWS)
-    assert heard.abs().max() == 0
-    heard.sum().backward()
-    assert renderer.log_gain.grad == 0
-
-
-def test_frequencies_and_slices_are_those_asked_for(field, renderer):
-    whole = renderer(field, *poses(), torch.arange(120).expand(2, -1))
-    bins = torch.tensor([2, 0])
-    some = renderer(field, *poses(), ROWS, bins)
-    assert some.shape == (2, 2, 3, 2)
-    for pose in (0, 1):
-        torch.testing.assert_close(some[pose], whole[pose][:, ROWS[pose]][..., bins])
-
-
 def test_the_mirrored_field_exchanges_the_ears(formula, listener):
     mirror = torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64)
     region = torch.tensor([[-0.2] * 3, [0.2] * 3], dtype=torch.float64)
@@ -147,11 +120,3 @@ def test_the_mirrored_field_exchanges_the_ears(formula, listener):
     )
     torch.testing.assert_close(one, two.flip(1), rtol=0.005, atol=0)
     assert (one - two).abs().max() > 0.05 * one.max()
-
-
-@pytest.mark.parametrize("bins", [None, torch.tensor([0])])
-def test_gradients(listener, gradients_are_right, bins):
-    torch.manual_seed(0)
-    field = FourierField(REGION, listener.frequency, octaves=2, width=8)
-    renderer = ShellRenderer(REGION, listener, directions=60)
-    assert gradients_are_right(field, renderer, *poses(), ROWS[:, :2], bins)

@@ -169,27 +169,6 @@ def test_curvature_is_that_of_the_surface():
     )
 
 
-def test_without_embree_the_answers_are_the_same(monkeypatch):
-    mesh = trimesh.creation.icosphere(subdivisions=2)
-    other = mesh.copy()
-    other.apply_translation([0.0, 1.5, 0.0])
-    mesh = trimesh.util.concatenate([mesh, other])
-    directions = fibonacci_cap(300, axis=(-1, 0, 0), half_angle=0.6, offset=(0.5, 0.0))
-    origin = np.array([3.0, 0.1, 0.2])
-    fast = RayCaster(mesh)
-    monkeypatch.setattr(raycast, "EmbreeScene", None)
-    slow = RayCaster(mesh)
-    assert type(slow._engine) is not type(fast._engine)
-    a, b = shoot(fast, origin, directions), shoot(slow, origin, directions)
-    np.testing.assert_array_equal(a.triangle, b.triangle)
-    np.testing.assert_allclose(a.points, b.points, atol=1e-12)
-    target = np.array([2.0, 1.5, 0.0])
-    flat = fast.face_normals[a.triangle]
-    seen = slow.visible(a.points, target, normals=flat)
-    np.testing.assert_array_equal(seen, fast.visible(a.points, target, normals=flat))
-    assert 0 < seen.sum() < len(seen)
-
-
 def test_occlusion_agrees_with_the_ray_caster():
     ball = trimesh.creation.icosphere(subdivisions=2, radius=0.02)
     points = np.random.default_rng(0).uniform(-0.06, 0.06, (500, 3))

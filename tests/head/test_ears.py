@@ -11,10 +11,8 @@ from sononerf.head.call import call_waveform, sweep_delay
 from sononerf.head.directivity.directivity_files import write_sofa
 from sononerf.head.ears import (
     SPEED,
-    Ears,
     analysed_ears,
     beam_gain,
-    directivity_content,
     ear,
     ear_gain,
     ear_tables,
@@ -98,11 +96,6 @@ def test_beam_has_the_pistons_null_where_the_book_says():
     np.testing.assert_allclose(gain[1:, 0], 0.0, atol=1e-4)
 
 
-def test_no_radius_emits_alike_in_all_directions():
-    ears = ear_tables(EarSettings(beam_radius=0.0), FREQUENCY)
-    np.testing.assert_array_equal(ears.beam, 1.0)
-
-
 def test_look_up_equals_scipys_interpolator(ears):
     directions = np.concatenate([fibonacci_sphere(500), -np.eye(3), np.eye(3)])
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
@@ -115,19 +108,6 @@ def test_look_up_equals_scipys_interpolator(ears):
     ):
         oracle = RegularGridInterpolator((ears.elevation, ears.azimuth), np.moveaxis(table, 0, -1))
         np.testing.assert_allclose(found, oracle(places), atol=1e-6)
-
-
-def test_shapes_are_checked(ears):
-    with pytest.raises(ValueError, match="do not fit the grid"):
-        Ears(
-            ears.azimuth,
-            ears.elevation,
-            ears.frequency[:2],
-            ears.beam,
-            ears.ears,
-            ears.emitter,
-            ears.positions,
-        )
 
 
 def test_analysed_ears_are_what_the_window_makes_of_an_echo():
@@ -204,40 +184,12 @@ def test_any_number_of_receivers(count, directivity):
     )
 
 
-def test_a_synthetic_ear_looks_to_its_own_side():
-    ears = ear_tables(EarSettings(receivers=[(0, -0.01, 0), (0, 0, 0), (0, 0.02, 0)]), [10e3])
-    looks = [np.degrees(ears.azimuth[table[0].max(axis=0).argmax()]) for table in ears.ears]
-    np.testing.assert_allclose(looks, [-25, 0, 25], atol=1.01)
-    two = ear_tables(EarSettings(), [10e3])
-    np.testing.assert_array_equal(ears.ears[2], two.ears[0])
-    np.testing.assert_array_equal(ears.ears[0], two.ears[1])
-
-
-def test_an_omnidirectional_receiver_hears_alike_everywhere():
-    ears = ear_tables(EarSettings(directivity="omnidirectional"), FREQUENCY)
-    assert (ears.ears == 1.0).all()
-    assert (ears.beam < 1.0).any()  # the emitter is another matter
-
-
 def test_a_piston_receiver_is_a_piston_of_its_radius():
     head = EarSettings(directivity="piston", piston_radius=0.004, beam_radius=0.004)
     ears = ear_tables(head, FREQUENCY)
     np.testing.assert_array_equal(ears.ears[0], ears.beam)
     wider = ear_tables(head.model_copy(update={"piston_radius": 0.002}), FREQUENCY)
     assert (wider.ears >= ears.ears - 1e-6).mean() > 0.99
-
-
-def test_analysed_ears_of_receivers_that_are_alike_are_those_of_one():
-    analysis = SpectrogramSettings(frequency_min=50e3, frequency_max=52e3)
-    for call in (CallSettings(), CallSettings(kind="linear")):
-        one, alone = (
-            analysed_ears(EarSettings(directivity="piston", receivers=line(n)), call, analysis)
-            for n in (1, 8)
-        )
-        assert alone[0].ears.shape[0] == 8
-        np.testing.assert_array_equal(alone[0].ears[5], one[0].ears[0])
-        if one[1] is not None:
-            np.testing.assert_array_equal(alone[1][5], one[1][0])
 
 
 @pytest.fixture
@@ -300,34 +252,11 @@ def test_places_of_settings_count_before_those_of_the_file(file, tmp_path):
     )
 
 
-def test_one_measured_receiver_serves_all_places(tmp_path):
-    table = tmp_path / "a.csv"
-    table.write_text("azimuth_deg,elevation_deg,frequency_hz,gain\n0,0,5e4,1\n9,9,5e4,0.5\n")
-    ears = ear_tables(measured(table, receivers=line(8)), [50e3])
-    assert ears.ears.shape[0] == 8
-    assert ears.alike
-    with pytest.raises(SettingsError, match="does not state the places of its 1 receiver"):
-        ear_tables(measured(table), [50e3])
-
-
 def test_numbers_of_receivers_must_fit(file):
     with pytest.raises(SettingsError, match=r"gives 3 places, but .*a\.sofa holds 2 receivers"):
         ear_tables(measured(file, receivers=line(3)), [50e3])
     with pytest.raises(InputError, match="no such file"):
         ear_tables(measured(file.with_name("b.sofa")), [50e3])
-
-
-def test_a_changed_file_is_heard(file):
-    analysis = SpectrogramSettings(frequency_min=40e3, frequency_max=50e3)
-    before = analysed_ears(measured(file), CallSettings(), analysis)[0]
-    content = directivity_content(measured(file))
-    known = pair()
-    object.__setattr__(known, "gains", known.gains / 2)
-    write_sofa(file, known)
-    after = analysed_ears(measured(file), CallSettings(), analysis)[0]
-    np.testing.assert_allclose(after.ears, before.ears / 2, rtol=1e-5)
-    assert directivity_content(measured(file)) != content
-    assert directivity_content(EarSettings()) is None
 
 
 def ring(*angles_deg):

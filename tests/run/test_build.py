@@ -3,37 +3,28 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 import trimesh
 
-from sononerf.echoes import detection as onsets
-from sononerf.echoes import echoes as echoes_module
-from sononerf.echoes.detection import Onsets, asked_poses
 from sononerf.echoes.echoes import Echoes
 from sononerf.echoes.free_space import EchoHull
-from sononerf.echoes.region import WITNESS_GAIN
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError, SettingsError
-from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.fourier import FourierField
 from sononerf.field.grid import GridField
 from sononerf.field.module import EchoModule
 from sononerf.field.profile import ProfileRenderer
 from sononerf.field.renderer import ShellRenderer
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.head.reception import effective_window
 from sononerf.run.build import head_of, module_for, read_truth, true_mesh, with_store
 from sononerf.run.fit import finish, fit
 from sononerf.run.simulate import simulate
-from sononerf.settings import plugins
 from sononerf.settings.loading import load_settings, validate_settings
 from sononerf.settings.schema import HEAD_SECTIONS
 from sononerf.surface.refine.objective import SCALE
@@ -54,33 +45,6 @@ def region_of(settings, echoes):
     return module.field.region, module.possible
 
 
-def test_the_head_has_the_axes_of_the_store(tiny, echoes):
-    store, head = EnsembleStore.open(echoes), head_of(tiny())
-    np.testing.assert_array_equal(head.range, store.range)
-    np.testing.assert_array_equal(head.frequency, store.frequency)
-    assert head.speed_of_sound == store.attributes["speed_of_sound"] == 343.0
-    assert head_of(tiny(air={"temperature_c": 0.0})).speed_of_sound == pytest.approx(331.3, abs=0.5)
-    # dB per metre become nepers: 20 log10(e) dB are one.
-    assert float(head.row_absorption[-1]) == pytest.approx(3.3 / 8.686, rel=0.3)  # at 100 kHz
-
-
-def test_a_sweep_is_heard_longer_and_later_in_each_row(tiny):
-    impulse = head_of(tiny())
-    assert impulse.lag is None
-    np.testing.assert_array_equal(impulse.window, np.tile(np.hamming(64), (47, 1)))
-    settings = tiny(call={"kind": "hyperbolic"}, spectrogram={"window": 120, "frequency_min": 45e3})
-    head = head_of(settings)
-    np.testing.assert_array_equal(
-        head.window, effective_window(settings.call, settings.spectrogram)
-    )
-    assert head.window.shape[1] > 200
-    assert head.lag.shape == head.row_gains.ears.shape
-    # 0.4 ms for 110 kHz are 0.6 mm per kHz: a few kHz off the middle of a row that a notch cuts.
-    assert 0.5e-3 < np.abs(head.lag).max() < 30e-3
-    other = head_of(tiny(spectrogram={"window": 120}))
-    assert not np.array_equal(head.row_gains.ears, other.row_gains.ears[:, 18:])
-
-
 @pytest.mark.parametrize(
     ("field", "renderer", "kinds"),
     [
@@ -97,91 +61,6 @@ def test_any_field_with_any_renderer(tiny, field, renderer, kinds):
     assert module.learning_rate == module.field.learning_rate
 
 
-def test_the_module_is_told_what_is_heard_at_first(tiny):
-    settings = tiny(fit={"early_range_db": 25.0, "early_share": 0.5})
-    module = module_for(settings, head_of(settings), BOX, 1.0)
-    module.total_steps = 8
-    whole = settings.spectrogram.dynamic_range_db
-    assert [module.range_db(step) for step in (0, 3, 4)] == [25.0, 25.0, whole]
-
-
-def test_slices_without_an_active_cell_are_silent(tiny):
-    settings = tiny(
-        renderer={"kind": "shell", "options": {}}, fit={"silent_share": 0.0, "batch_slices": 1}
-    )
-    known = head_of(settings)
-    spectrograms = torch.zeros(2, len(known.range), len(known.frequency))
-    spectrograms[1, 3, 2] = 0.41  # 2.98 dB where the reference is 1
-    spectrograms[0, 5, 1] = 0.42  # 3.05 dB
-    store = SimpleNamespace(
-        indices=lambda split: np.array([0]),
-        positions=np.zeros((1, 3)),
-        rotations=np.eye(3)[None],
-        range=known.range,
-        frequency=known.frequency,
-        receivers=2,
-        attributes={"reference": 1.0},
-        read_pose=lambda number: spectrograms.numpy(),
-    )
-    heard = SimpleNamespace(store=store, reference=1.0)
-    stream = EchoDataModule(heard, settings.fit, whole_poses=False).stream()
-    assert stream.items == 1
-    assert int(stream[0].rows) == 5
-
-
-def test_the_hull_knows_where_training_poses_called_and_heard_from(tiny, monkeypatch):
-    receivers = ((-0.010, 0.010, 0.005), (-0.010, -0.004, 0.005))
-    head = head_of(tiny(ears={"emitter": (0.002, 0.0, -0.010), "receivers": receivers}))
-    left = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]  # looks along y
-    store = SimpleNamespace(
-        positions=np.array([[9.0, 9.0, 9.0], [1.0, 2.0, 3.0], [0.0, 0.0, 0.0]]),
-        rotations=np.array([np.eye(3), left, np.eye(3)]),
-        indices=lambda split: {"train": np.array([1, 2]), "val": np.array([0])}[split],
-    )
-    heard = np.array([[0.4, 0.41], [-np.inf, 0.39]])
-    found = Onsets(np.array([1, 2]), np.ones(3), np.ones((2, 2, 3)), np.ones((2, 2, 3)), heard)
-    asked = []
-    monkeypatch.setattr(
-        echoes_module, "find_onsets", lambda *given, **_: asked.append(given) or found
-    )
-    monkeypatch.setattr(echoes_module, "weighted", lambda hull, *_: hull)
-    hull = Echoes(store, head).hull
-    expected = [[1.0, 2.002, 2.99], [0.002, 0.0, -0.01]]
-    np.testing.assert_allclose(hull.emitters, expected, rtol=0, atol=1e-7)
-    expected = [[0.99, 1.99, 3.005], [1.004, 1.99, 3.005]]
-    np.testing.assert_allclose(hull.receivers[0], expected, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(hull.receivers[1], receivers, rtol=0, atol=1e-7)
-    # Half way: the ears' middle is (-10, 3, 5) mm, that to it from the emitter (-4, 1.5, -2.5) mm.
-    expected = [[1 - 0.0015, 2 - 0.004, 3 - 0.0025], [-0.004, 0.0015, -0.0025]]
-    np.testing.assert_allclose(hull.sources, expected, rtol=0, atol=1e-7)
-    np.testing.assert_array_equal(hull.first, heard)
-    np.testing.assert_array_equal(hull.axes, [[0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
-    (given,) = asked
-    assert given[0] is store
-    np.testing.assert_allclose(given[1].window, np.hamming(64) ** 2, rtol=1e-12)
-    assert given[1].spacing == pytest.approx(343.0 / 2 / 1e6)
-    for values in (hull.emitters, hull.receivers, hull.first, hull.axes):
-        assert values.dtype == np.float64
-    # A sweep is heard too far off by its mean lag; what is silent has no part in it.
-    gain = head.row_gains.ears * head.row_gains.beam
-    silent = gain < 1e-3 * gain.max()
-    assert silent.any()
-    head.__dict__["_smeared"] = (head.row_gains, np.where(silent, 0.05, 0.001) * 2.0 / 343.0)
-    head.__dict__.pop("mean_lag")
-    np.testing.assert_allclose(Echoes(store, head).hull.first, heard - 0.001, rtol=0, atol=2e-6)
-
-
-def test_the_hull_is_weighted_by_the_range_resolution(tiny, echoes, monkeypatch):
-    asked = []
-    monkeypatch.setattr(
-        echoes_module, "weighted", lambda *given: asked.append(given) or "the others"
-    )
-    assert Echoes(EnsembleStore.open(echoes), head_of(tiny())).hull == "the others"
-    ((hull, resolution, _),) = asked
-    assert hull.first.shape == (8, 2)
-    assert resolution == head_of(tiny()).resolution == pytest.approx(0.0058, abs=1e-4)
-
-
 def test_the_hull_of_a_sphere_holds_it_and_little_more(tiny, echoes):
     """The front of a sphere is its nearest point."""
     hull = Echoes(EnsembleStore.open(echoes), head_of(tiny())).hull
@@ -192,42 +71,6 @@ def test_the_hull_of_a_sphere_holds_it_and_little_more(tiny, echoes):
     assert (front < 0.1 * head_of(tiny()).resolution).all()
     assert (hull.clearance(0.0199 * fibonacci_sphere(200))[0] > 0).all()
     assert (hull.clearance(0.021 * hull.sources / 0.4)[0] < 0).all()
-
-
-def test_a_pose_speaks_for_where_it_hears_in_every_direction(tiny):
-    """A gain of a tenth of the best ends a cone of 60 degrees; to the left it reaches farther."""
-    known = head_of(tiny()).row_gains
-    ahead = known.directions[..., 0]
-    beam = np.where(ahead > 0.5, 2.0, 0.1)
-    beam[:, (known.azimuth > 0.6) & (known.azimuth < 1.8)] = 1.0
-    flat = dataclasses.replace(
-        known,
-        beam=np.broadcast_to(beam, known.beam.shape).astype(np.float32),
-        ears=np.ones_like(known.ears),
-    )
-    # The tables have a direction every few degrees.
-    assert flat.cone(WITNESS_GAIN) == pytest.approx(0.5, abs=0.04)
-    assert flat.cone(WITNESS_GAIN) <= 0.5
-    everywhere = dataclasses.replace(flat, beam=np.full_like(known.beam, 3.0))
-    assert everywhere.cone(WITNESS_GAIN) == -1.0
-    # What one ear or one frequency hears is heard.
-    ears = np.zeros_like(known.ears)
-    ears[1, 5] = 1.0
-    assert dataclasses.replace(everywhere, ears=ears).cone(WITNESS_GAIN) == -1.0
-    real = known.cone(WITNESS_GAIN)
-    assert -1.0 < real < 1.0
-    gain = (known.beam * known.ears.max(axis=0)).max(axis=0)
-    assert gain[ahead > real].min() >= 0.1 * gain.max()
-
-
-def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):
-    def weights(seed):
-        settings = tiny(field={"kind": "fourier", "options": {}}, fit={"seed": seed})
-        torch.rand(3)  # whatever went before
-        return next(module_for(settings, head_of(settings), BOX, 1.0).field.parameters())
-
-    assert torch.equal(weights(1), weights(1))
-    assert not torch.equal(weights(1), weights(2))
 
 
 @pytest.mark.parametrize(
@@ -252,19 +95,6 @@ def test_the_seed_of_the_fit_is_that_of_the_first_weights(tiny):
 def test_wrong_kinds_and_options_are_refused(tiny, changes, message):
     with pytest.raises(SettingsError, match=f"^tiny: {message}"):
         module_for(tiny(**changes), head_of(tiny(**changes)), None, 1.0)
-
-
-def test_a_plugin_that_makes_something_else(tiny, monkeypatch):
-    real = plugins.load
-
-    def load(group, name):
-        return (
-            (lambda region, frequency: "no field") if group == plugins.FIELDS else real(group, name)
-        )
-
-    monkeypatch.setattr(plugins, "load", load)
-    with pytest.raises(InputError, match="'grid' makes a str, expected a sononerf Field"):
-        module_for(tiny(field={"options": {}}), head_of(tiny()), None, 1.0)
 
 
 def test_the_region_comes_from_the_echoes_or_from_the_settings(tiny, echoes):
@@ -301,44 +131,6 @@ def test_the_region_and_the_hull_are_found_in_noise(tiny, tmp_path):
         late = both - (np.linalg.norm(hull.sources, axis=1) - 0.02)[(hull.weight > 0).all(axis=1)]
         assert len(late) > 20
         assert np.abs(late).max() < error
-
-
-def test_of_many_poses_hull_and_region_ask_the_same_ones(tiny, echoes, monkeypatch):
-    store = EnsembleStore.open(echoes)
-    whole = region_of(tiny(), Echoes(store, head_of(tiny())))[0]
-    monkeypatch.setattr(onsets, "MOST_POSES", 6)
-    asked = asked_poses(store)
-    heard = Echoes(store, head_of(tiny()))
-    hull = heard.hull
-    assert hull.first.shape == (6, 2)
-    assert len(asked) < len(store.indices("train"))
-    np.testing.assert_array_equal(heard.onsets.poses, asked)
-    np.testing.assert_allclose(hull.axes, store.rotations[asked][:, :, 0])
-    few = region_of(tiny(), heard)[0]
-    assert (few[0] <= whole[0] + 0.002).all()
-    assert (few[1] >= whole[1] - 0.002).all()
-
-
-def test_what_is_possible_is_what_the_hull_leaves(tiny, echoes):
-    store = EnsembleStore.open(echoes)
-    hull = Echoes(store, head_of(tiny())).hull
-    own, given = (region_of(tiny(), Echoes(store, head_of(tiny()), each)) for each in (None, hull))
-    torch.testing.assert_close(own[0], given[0])
-    places = own[0][0] + torch.rand(2000, 3) * (own[0][1] - own[0][0])
-    found = given[1](places, 0.002)
-    assert torch.equal(own[1](places, 0.002), found)
-    clearance = hull.clearance(places.double().numpy())[0]
-    # A quarter of how far a place speaks for its surroundings, and an onset's error.
-    assert clearance[found.numpy()].min() >= -0.0011
-    assert (clearance < -0.0011).any()
-    # The middle of the sphere is where nobody hears anything come from, and the front is.
-    front = 0.02 * hull.sources / np.linalg.norm(hull.sources, axis=1)[:, None]
-    assert given[1](torch.as_tensor(front).float(), 0.002).all()
-    # A hull that leaves nothing is not believed over the settings' own box.
-    box = {"lower": (-0.1,) * 3, "upper": (0.1,) * 3}
-    empty = EchoHull(hull.emitters, hull.receivers, hull.first + 1.0, hull.axes)
-    _, possible = region_of(tiny(region=box), Echoes(store, head_of(tiny()), empty))
-    assert possible(places, 0.002).all()
 
 
 @pytest.mark.parametrize("config", ["sweep", "recorded", "three_spheres"])

@@ -6,7 +6,6 @@ from __future__ import annotations
 import functools
 import json
 
-import numpy as np
 import pytest
 import trimesh
 from PIL import Image
@@ -14,10 +13,8 @@ from PIL import Image
 from sononerf.errors import InputError, NumericalError
 from sononerf.evaluation import baseline
 from sononerf.evaluation import geometry as geometry_module
-from sononerf.run import build
 from sononerf.run.evaluate import evaluate
 from sononerf.run.reconstruct import reconstruct
-from sononerf.scene.scene import Scene
 
 GEOMETRY = {
     "chamfer_m",
@@ -83,35 +80,6 @@ def test_a_scene_that_is_not_installed_has_no_truth(run, few_samples):
     assert metrics["baseline"] == {"backprojection": None, "voxels": None}
     with Image.open(run / "reconstruction" / "view.png") as image:
         assert min(image.size) > 50
-
-
-def test_what_needs_a_closed_surface_is_null_for_an_open_one(
-    run, few_samples, no_projections, monkeypatch
-):
-    open_mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
-    open_mesh.update_faces(np.arange(len(open_mesh.faces)) > 40)
-    open_scene = Scene(open_mesh)
-    monkeypatch.setattr(build, "load_scene", lambda *given: open_scene)
-    geometry = evaluate(run)["geometry"]
-    for key in ("volume_ratio", "iou", "thickness_bias_m"):
-        assert geometry[key] is None, key
-    assert geometry["chamfer_m"] > 0
-
-
-def test_amid_surroundings_the_target_is_judged_alone_too(
-    run, few_samples, no_projections, monkeypatch
-):
-    sphere = trimesh.creation.icosphere(subdivisions=3, radius=0.02)
-    slab = trimesh.creation.box((0.1, 0.1, 0.01))
-    slab.apply_translation((0, 0, -0.09))
-    both = trimesh.util.concatenate([slab, sphere])
-    scene = Scene(both, background=np.arange(len(both.faces)) < len(slab.faces))
-    monkeypatch.setattr(build, "load_scene", lambda *given: scene)
-    geometry = evaluate(run)["geometry"]
-    assert geometry.keys() == GEOMETRY | {"target"}
-    assert geometry["target"]["share"] == 1.0  # nothing was reconstructed near the slab
-    assert geometry["target"]["fscore"]["0.005"] > geometry["fscore"]["0.005"]
-    assert geometry["target"]["chamfer_m"] < geometry["chamfer_m"]
 
 
 @pytest.mark.parametrize("content", [b"", b"ply\nnonsense", b"\x00" * 100])

@@ -8,9 +8,6 @@ import importlib.metadata
 import json
 import os
 import signal
-import time
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +18,8 @@ import trimesh
 from lightning.fabric.utilities.rank_zero import rank_zero_only
 
 from sononerf import memory, storage
-from sononerf.callbacks import SIGNALS, CheckpointCallback, PreviewCallback, ProgressCallback
+from sononerf.callbacks import SIGNALS, ProgressCallback
 from sononerf.echoes.echoes import Echoes
-from sononerf.echoes.free_space import EchoHull
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import (
     IncompatibleError,
@@ -33,11 +29,7 @@ from sononerf.errors import (
     ResourceError,
     StoppedError,
 )
-from sononerf.field import datamodule
-from sononerf.field.checkpoint_io import DurableCheckpointIO
-from sononerf.field.datamodule import EpochSampler
 from sononerf.field.fitting import usable_accelerator
-from sononerf.field.module import EchoModule
 from sononerf.head.directivity.directivity_files import write_sofa
 from sononerf.run import fit as fit_module
 from sononerf.run.build import head_of
@@ -147,81 +139,7 @@ def test_a_signal_at_the_last_step_stops_what_would_follow_the_fit(
     assert differences(what_a_run_holds(tmp_path / "run"), uninterrupted) == []
 
 
-class PowerCutError(BaseException):
-    """The process is gone."""
-
-
-@pytest.mark.parametrize(
-    ("owner", "hook", "step"),
-    [
-        (PreviewCallback, "on_train_epoch_end", PER_EPOCH),  # validated, not yet saved
-        (CheckpointCallback, "on_train_epoch_end", PER_EPOCH),  # previewed, not yet saved
-        (CheckpointCallback, "on_train_epoch_end", 2 * PER_EPOCH),
-        (CheckpointCallback, "on_train_batch_end", PER_EPOCH),  # not yet validated
-        (CheckpointCallback, "on_train_batch_end", 6),
-        (ProgressCallback, "on_train_batch_end", 1),
-        (CheckpointCallback, "on_train_epoch_end", STEPS),
-    ],
-)
-def test_a_fit_that_was_cut_off_ends_bit_for_bit_alike(
-    tiny, tmp_path, monkeypatch, uninterrupted, owner, hook, step
-):
-    real = getattr(owner, hook)
-
-    def cut(self, trainer, pl_module, *rest):
-        if pl_module.global_step == step:
-            raise PowerCutError
-        return real(self, trainer, pl_module, *rest)
-
-    settings = tiny(fit={"checkpoint_seconds": 1e-9})  # a checkpoint at every step
-    with monkeypatch.context() as patch:
-        patch.setattr(owner, hook, cut)
-        with pytest.raises(PowerCutError):
-            run(settings, tmp_path / "run")
-    run(settings, tmp_path / "run")
-    assert differences(what_a_run_holds(tmp_path / "run"), uninterrupted) == []
-
-
 # Canaries: where something that resuming rests on is taken away, the tests above must see it.
-
-
-def forget_the_seed_of_a_step(monkeypatch):
-    monkeypatch.setattr(EchoModule, "_own_random_numbers", lambda self, step: nullcontext())
-
-
-def lose(key):
-    def change(monkeypatch):
-        real = DurableCheckpointIO.load_checkpoint
-
-        def load_checkpoint(self, *arguments, **options):
-            content = real(self, *arguments, **options)
-            if key == "moments":
-                content["optimizer_states"][0]["state"] = {}
-            elif key == "schedule":
-                content["lr_schedulers"][0]["last_epoch"] = 0
-                content["lr_schedulers"][0]["_step_count"] = 1
-            return content
-
-        monkeypatch.setattr(DurableCheckpointIO, "load_checkpoint", load_checkpoint)
-
-    return change
-
-
-def begin_the_data_anew(monkeypatch):
-    monkeypatch.setattr(EpochSampler, "__iter__", lambda self: iter(range(self.steps)))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [forget_the_seed_of_a_step, lose("moments"), lose("schedule"), begin_the_data_anew],
-    ids=["seeds", "moments", "schedule", "data"],
-)
-def test_canary_what_resuming_rests_on_is_missed(tiny, tmp_path, interrupt, monkeypatch, change):
-    change(monkeypatch)
-    run(tiny(), tmp_path / "through")
-    held = run_with_stops(tiny(), tmp_path / "stopped", interrupt, [6])
-    changed = differences(held, what_a_run_holds(tmp_path / "through"))
-    assert any(name.startswith("field.") for name in changed)
 
 
 def test_without_validation_poses_epochs_are_still_ours(tiny, tmp_path, interrupt):
@@ -288,17 +206,6 @@ def test_other_settings_are_refused_by_name(tiny, finished):
     assert files(finished) == before
 
 
-def test_overwrite_moves_aside_and_loses_nothing(tiny, tmp_path):
-    path = tmp_path / "run"
-    run(tiny(), path)
-    first = files(path)
-    for number, seed in ((1, 1), (2, 2)):
-        run(tiny(fit={"seed": seed, "max_steps": 2}), path, overwrite=True)
-        assert (tmp_path / f"run.old-{number}" / "model.json").is_file()
-    moved = files(tmp_path / "run.old-1")
-    assert {name: moved[name] for name in first} == first
-
-
 def test_overwrite_leaves_a_run_at_work_and_other_peoples_folders_alone(tiny, tmp_path):
     path = tmp_path / "run"
     run(tiny(fit={"max_steps": 1}), path)
@@ -325,96 +232,6 @@ def test_what_fails_before_the_fit_leaves_no_run(tiny, tmp_path):
         run(deaf, tmp_path / "kept" / "runs" / "run")
     assert (tmp_path / "kept").exists()
     assert not (tmp_path / "kept" / "runs").exists()
-
-
-def test_a_gradient_that_is_no_number_leaves_a_sound_checkpoint(tiny, tmp_path, monkeypatch):
-    real = EchoModule._loss
-
-    def loss(self, predicted, measured):
-        found = real(self, predicted, measured)
-        return found * float("nan") if self.global_step == 6 else found
-
-    monkeypatch.setattr(EchoModule, "_loss", loss)
-    with pytest.raises(NumericalError, match=r"is not finite at step 6; .* anew with --overwrite$"):
-        run(tiny(fit={"checkpoint_seconds": 1e-9}), tmp_path / "run")
-    content = DurableCheckpointIO().load_checkpoint(tmp_path / "run" / "checkpoints" / "last.ckpt")
-    assert content["global_step"] == 6
-    assert all(bool(value.isfinite().all()) for value in content["state_dict"].values())
-    assert not (tmp_path / "run" / "model.json").exists()
-
-
-def test_what_a_fit_cost_is_counted_over_its_parts(tiny, tmp_path, interrupt, monkeypatch):
-    path = tmp_path / "run"
-
-    def cost():
-        return json.loads((path / "metrics.json").read_text())["cost"]
-
-    interrupt(5, signal.SIGTERM)
-    with pytest.raises(StoppedError):
-        run(tiny(), path)
-    first = cost()["simulate_s"]
-    ensemble, load = fit_module.open_or_simulate, DurableCheckpointIO.load_checkpoint
-
-    def slow(*arguments, **options):
-        time.sleep(first + 0.1)
-        return ensemble(*arguments, **options)
-
-    def long_ago(self, *arguments, **options):
-        content = load(self, *arguments, **options)
-        content["callbacks"]["CheckpointCallback"]["elapsed"] += 1000.0
-        return content
-
-    monkeypatch.setattr(fit_module, "open_or_simulate", slow)
-    monkeypatch.setattr(DurableCheckpointIO, "load_checkpoint", long_ago)
-    run(tiny(), path)
-    assert 1000.0 < cost()["fit_s"] < 1100.0
-    assert cost()["simulate_s"] == first
-    assert cost()["steps"] == STEPS
-    assert cost()["points_evaluated"] > 0
-    assert cost()["device"] == "cpu"
-    assert cost()["peak_memory_bytes"] > 50_000_000
-
-
-@pytest.mark.parametrize(
-    ("changes", "least", "steps", "epochs"),
-    [
-        ({"steps_per_epoch": "auto"}, 1, 12, 3),  # 8 poses, 2 at a time
-        ({"steps_per_epoch": "auto", "batch_poses": 3}, 1, 9, 3),
-        ({"steps_per_epoch": "auto"}, 5, 15, 3),  # a pass is shorter than an epoch may be
-        ({"max_steps": 6}, 60, 6, 2),
-        ({"max_steps": 2}, 60, 2, 1),  # shorter than an epoch: it is the epoch then
-    ],
-)
-def test_the_smaller_bound_ends_the_fit(tiny, tmp_path, monkeypatch, changes, least, steps, epochs):
-    monkeypatch.setattr(datamodule, "LEAST_STEPS", least)
-    run(tiny(fit=changes), tmp_path / "run")
-    held = what_a_run_holds(tmp_path / "run")
-    assert (held["steps"], len(held["epochs"])) == (steps, epochs)
-
-
-def test_a_run_holds_where_its_training_poses_listened(finished, echoes, tiny):
-    store = EnsembleStore.open(echoes)
-    held = safetensors.torch.load_file(finished / "model.safetensors")
-    known = head_of(tiny())
-    train = store.indices("train")
-    assert held["hull.emitters"].shape == held["hull.axes"].shape == (8, 3)
-    assert held["hull.receivers"].shape == (8, 2, 3)
-    for row, index in enumerate(train):
-        turn = store.rotations[index]
-        emitter = store.positions[index] + turn @ known.emitter
-        ears = store.positions[index] + known.receivers @ turn.T
-        np.testing.assert_allclose(held["hull.emitters"][row], emitter, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(held["hull.receivers"][row], ears, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(held["hull.axes"][row], turn[:, 0], rtol=0, atol=1e-12)
-
-
-@pytest.mark.parametrize("width", [0.0, 0.02])
-def test_of_poses_on_a_line_it_is_said_what_they_do_not_tell(
-    tmp_path, tiny, monkeypatch, caplog, width
-):
-    monkeypatch.setattr(EchoHull, "width", width)
-    run(tiny(fit={"epochs": 1, "steps_per_epoch": 1}), tmp_path / "run")
-    assert ("straight line" in caplog.text) == (width == 0.0)
 
 
 def test_a_run_holds_what_its_training_poses_heard_first(finished, echoes, tiny):
@@ -445,21 +262,6 @@ def test_a_gpu_that_is_not_there_or_apples(tiny, tmp_path, monkeypatch):
         fit(tiny(), tmp_path / "run", accelerator="gpu")
     assert not (tmp_path / "run").exists()
     assert usable_accelerator("auto") == "cpu"
-
-
-def test_a_process_does_not_wait_for_a_first_one_that_does_not_run(tiny, tmp_path, monkeypatch):
-    monkeypatch.setattr(rank_zero_only, "rank", 1)
-    monkeypatch.setattr(fit_module, "PATIENCE_SECONDS", 1.0)
-    settings = tiny(data={"store": str(tmp_path / "never")})
-    began = time.monotonic()
-    with storage.lock(tmp_path / "run"), ThreadPoolExecutor() as pool:
-        waiting = pool.submit(fit, settings, tmp_path / "run", accelerator="cpu")
-        time.sleep(2.0)
-        assert not waiting.done()
-        (tmp_path / "run" / ".lock").unlink()
-        with pytest.raises(ResourceError, match="first process of this fit does not run"):
-            waiting.result(timeout=30.0)
-    assert time.monotonic() - began > 2.5
 
 
 def test_memory_is_counted_in_bytes():

@@ -9,14 +9,12 @@ import shutil
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import IncompatibleError, InputError, ResourceError
+from sononerf.errors import IncompatibleError, InputError
 from sononerf.head.decibels import compress
 from sononerf.run import predict as predict_module
-from sononerf.run import run as run_module
 from sononerf.run.fit import fit
 from sononerf.run.predict import predict
 from sononerf.run.run import Run
@@ -105,23 +103,6 @@ def test_other_splits_have_their_own_folder_and_no_numbers(run, split, count, no
     assert not (run / "metrics.json").exists()
 
 
-def test_poses_of_ones_own_need_neither_store_nor_scene(run, tmp_path, monkeypatch):
-    def gone(*given):
-        raise AssertionError("asked for the ensemble")
-
-    monkeypatch.setattr(run_module, "find_ensemble", gone)
-    (tmp_path / "poses.csv").write_text(CSV)
-    folder = predict(run, poses_csv=tmp_path / "poses.csv", accelerator="cpu")
-    assert folder == run / "prediction-poses"
-    arrays = arrays_of(folder)
-    assert arrays.keys() == {"predicted"} | AXES
-    assert len(arrays["predicted"]) == 2
-    np.testing.assert_allclose(arrays["position"][0], [-0.4, 0, 0], rtol=1e-6)
-    np.testing.assert_allclose(arrays["rotation"][1][:, 0], [0, 0, -1], atol=1e-6)  # looks down
-    assert len(list(folder.glob("pose_*.png"))) == 2
-    assert not (run / "metrics.json").exists()
-
-
 @pytest.mark.parametrize(
     ("pictures", "drawn"),
     [("all", 8), (0, 0), (3, 3), pytest.param(100, 8, marks=pytest.mark.slow)],
@@ -142,16 +123,6 @@ def test_best_median_and_worst_are_drawn(run):
     assert {path.name for path in folder.glob("pose_*.png")} == expected
 
 
-def test_what_was_not_measured_is_not_drawn(run, tmp_path, monkeypatch):
-    drawn = []
-    monkeypatch.setattr(
-        predict_module, "spectrogram_picture", lambda measured, *_: drawn.append(measured) or b""
-    )
-    (tmp_path / "poses.csv").write_text(CSV)
-    predict(run, poses_csv=tmp_path / "poses.csv", accelerator="cpu")
-    assert drawn == [None, None]
-
-
 @pytest.mark.parametrize("pose", ["9,0,0,180,0,0", "0.4,0,-300,0,0,0", "1e200,0,0,180,0,0"])
 def test_poses_that_can_hear_nothing_of_the_region_are_refused(run, tmp_path, pose):
     csv = tmp_path / "poses.csv"
@@ -159,15 +130,6 @@ def test_poses_that_can_hear_nothing_of_the_region_are_refused(run, tmp_path, po
     with pytest.raises(InputError, match=r"poses\.csv: from pose 2 .* positions are in metres"):
         predict(run, poses_csv=csv, output=tmp_path / "out", accelerator="cpu")
     assert not (tmp_path / "out").exists()
-
-
-def test_nor_are_those_that_are_too_near_to_hear_any(run, tmp_path):
-    csv = tmp_path / "poses.csv"
-    csv.write_text(f"{CSV}0,0,0,0,0,0\n")
-    module = Run(run).model
-    assert module.field.region.norm(dim=1).max() < module.renderer.range[0]
-    with pytest.raises(InputError, match="from pose 2"):
-        predict(run, poses_csv=csv, accelerator="cpu")
 
 
 def test_poses_within_the_region_are_told(run, tmp_path, no_pictures, caplog):
@@ -180,14 +142,6 @@ def test_poses_within_the_region_are_told(run, tmp_path, no_pictures, caplog):
     predict(within, poses_csv=csv, accelerator="cpu")
     (told,) = caplog.messages
     assert told == "poses 2 lie within the fitted region, where none was trained"
-
-
-def test_a_pose_that_hears_the_regions_far_side_alone_will_do(run, tmp_path, no_pictures):
-    csv, module = tmp_path / "poses.csv", Run(run).model
-    lower, upper = module.field.region.double().numpy()
-    first = float(module.renderer.range[0])
-    csv.write_text(f"{CSV}{upper[0] + first - (upper[0] - lower[0]) / 2},0,0,180,0,0\n")
-    assert len(arrays_of(predict(run, poses_csv=csv, accelerator="cpu"))["pose"]) == 3
 
 
 def test_that_tracing_is_missing_is_told(run, no_pictures, caplog):
@@ -203,17 +157,6 @@ def test_that_tracing_is_missing_is_told(run, no_pictures, caplog):
     assert "0.30" in told
 
 
-def test_the_same_field_predicts_the_same_bits_wherever_it_lies(run, fitted, tmp_path, no_pictures):
-    (tmp_path / "poses.csv").write_text(CSV)
-    first, second = (
-        arrays_of(
-            predict(p, poses_csv=tmp_path / "poses.csv", output=tmp_path / o, accelerator="cpu")
-        )
-        for p, o in ((run, "a"), (fitted, "b"))
-    )
-    np.testing.assert_array_equal(first["predicted"], second["predicted"])
-
-
 @pytest.mark.parametrize(
     ("change", "error", "message"),
     [
@@ -227,10 +170,3 @@ def test_what_cannot_be_predicted_leaves_no_folder(run, change, error, message):
     with pytest.raises(error, match=message):
         predict(run, accelerator="cpu")
     assert not (run / "prediction").exists()
-
-
-def test_a_gpu_that_is_not_there_or_apples(run, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
-    with pytest.raises(ResourceError):
-        predict(run, accelerator="gpu")

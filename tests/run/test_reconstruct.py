@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import io
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,15 +12,7 @@ import trimesh
 from PIL import Image
 
 from sononerf.errors import NumericalError, SettingsError
-from sononerf.progress import Progress
 from sononerf.run.reconstruct import reconstruct
-from sononerf.run.run import Run
-from sononerf.surface import reconstruction
-from sononerf.surface import surface as surface_module
-from sononerf.surface.refine import descent, refinement
-from sononerf.surface.start import read_out as read_out_module
-from sononerf.surface.surface import Openness
-from tests.run.test_refine import SHORT
 
 
 def read_out(folder):
@@ -70,73 +61,6 @@ def test_spacing_and_level_are_obeyed(run, tmp_path, no_projections):
     same = reconstruct(run, spacing=0.007, level=level, output=tmp_path / "same")
     assert (fine / "mesh.ply").read_bytes() == (same / "mesh.ply").read_bytes()
     assert not (run / "metrics.json").exists()
-
-
-def test_a_method_is_refined_where_that_is_asked_for(run, tmp_path, no_projections, monkeypatch):
-    monkeypatch.setattr(reconstruction, "RAYS", 500)
-    for where in (refinement, descent):
-        monkeypatch.setattr(where, "STAGES", SHORT)
-    plain = reconstruct(run, method="filled", output=tmp_path / "plain")
-    assert read_out(plain)["candidates"] == []
-    folder = reconstruct(run, method="filled", refine=True, output=tmp_path / "refined")
-    (found,) = read_out(folder)["candidates"]
-    assert (found["start"], found["chosen"]) == ("filled", True)
-    assert found["error_db"] == pytest.approx(read_out(folder)["validation_error_db"])
-    with pytest.raises(SettingsError, match="an iso-surface is not refined"):
-        reconstruct(run, method="isosurface", refine=True, output=tmp_path / "level")
-
-
-@pytest.mark.parametrize(
-    ("openness", "name", "said"),
-    [
-        (
-            {"unseen_share": 0.384, "thin_share": 0.01},
-            "one-sided",
-            ["the surface is open: 38% of it, which no pose heard, is left out"],
-        ),
-        (
-            {"unseen_share": 0.02, "thin_share": 0.926},
-            "sheet",
-            ["the surface is a sheet: 93% of it has its other side right behind it"],
-        ),
-        ({"unseen_share": 0.02, "thin_share": 0.01}, "closed", []),
-    ],
-)
-def test_what_kind_of_surface_it_is_is_written_and_of_open_ones_it_is_said(
-    run, tmp_path, no_projections, monkeypatch, openness, name, said
-):
-    kind = Openness(np.zeros(0, dtype=bool), **openness)
-    real = reconstruction.finished_surface
-    monkeypatch.setattr(
-        reconstruction,
-        "finished_surface",
-        lambda *given, **more: replace(real(*given, **more), openness=kind),
-    )
-    heard, progress = [], Progress(quiet=True)
-    monkeypatch.setattr(progress, "say", heard.append)
-    folder = reconstruct(run, spacing=0.012, output=tmp_path / "out", progress=progress)
-    assert read_out(folder)["surface"] == name
-    assert heard == said
-
-
-def test_the_surface_of_a_run_is_judged_by_its_own_poses(run, no_projections, monkeypatch):
-    asked = []
-    plain = surface_module.judge_openness
-
-    def judge(mesh, sources, *, resolution, plane):
-        asked.append(sources)
-        assert resolution == Run(run).head.resolution
-        assert plane is None
-        return plain(mesh, sources, resolution=resolution)
-
-    monkeypatch.setattr(surface_module, "judge_openness", judge)
-    folder = reconstruct(run, spacing=0.012)
-    np.testing.assert_allclose(asked[0], Run(run).hull.sources)
-    assert len(asked) == 1
-    kind = read_out(folder)["surface"]
-    assert kind in ("closed", "sheet", "one-sided")
-    # Only what was heard from one side is cut open.
-    assert trimesh.load_mesh(folder / "mesh.ply").is_watertight == (kind != "one-sided")
 
 
 @pytest.mark.parametrize(
@@ -189,22 +113,3 @@ def test_only_an_isosurface_has_a_level(run):
 def test_a_level_above_everything_has_no_surface(run):
     with pytest.raises(NumericalError):
         reconstruct(run, level=1e9)
-
-
-def test_the_hull_of_first_echoes_is_the_surface_where_the_field_has_none(
-    run, no_projections, monkeypatch
-):
-    real, asked = read_out_module.estimate_occupancy, []
-
-    def only_the_hull(known, belief):
-        asked.append(belief)
-        if belief != "hull":
-            raise NumericalError("no surface: the lattice is empty")
-        return real(known, belief)
-
-    monkeypatch.setattr(read_out_module, "estimate_occupancy", only_the_hull)
-    folder = reconstruct(run)
-    assert asked == ["filled", "hull"]
-    assert read_out(folder)["method"] == "hull"
-    with pytest.raises(NumericalError, match="the lattice is empty"):
-        reconstruct(run, method="open")

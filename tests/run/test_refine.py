@@ -7,17 +7,13 @@ import json
 import shutil
 from functools import partial
 
-import numpy as np
 import pytest
-import torch
 import trimesh
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from sononerf import storage
-from sononerf.errors import ResourceError
 from sononerf.progress import Progress
 from sononerf.run import reconstruct as reconstruct_module
-from sononerf.run.reconstruct import STAGES, reconstruct, refine_surface
+from sononerf.run.reconstruct import reconstruct, refine_surface
 from sononerf.run.run import Run
 from sononerf.storage import commit_json, read_json
 from sononerf.surface import reconstruction
@@ -98,42 +94,3 @@ def test_without_its_echoes_a_surface_is_not_refined(run, no_projections):
     assert heard.said[0].startswith("the surface is not refined: ")
     assert "is not there" in heard.said[0]
     assert read_json(folder / "read_out.json")["method"] == "filled"
-
-
-@pytest.mark.parametrize("what", ["killed", "another start", "damaged"])
-def test_stages_that_are_saved_are_taken_where_they_belong_to_the_same_refinement(run, what):
-    before = refined(run)
-    calls, real = [], storage.commit_bytes
-
-    def stops(file, data):
-        real(file, data)
-        if file.parent == run / STAGES:
-            calls.append(file)
-            raise KeyboardInterrupt
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(storage, "commit_bytes", stops)
-        with pytest.raises(KeyboardInterrupt):
-            refined(run)
-    (file,) = (run / STAGES).iterdir()
-    start = BUMPY
-    if what == "damaged":
-        file.write_bytes(b"nonsense")
-    if what == "another start":
-        start = BUMPY.copy().apply_scale(1.1)
-        before = refined(shutil.copytree(run, run.parent / "other"), start)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            storage, "commit_bytes", lambda file, data: (calls.append(file), real(file, data))
-        )
-        again = refined(run, start)
-    stages_done = [call for call in calls[1:] if call.parent == run / STAGES]
-    assert len(stages_done) == (2 if what == "killed" else 3)
-    assert not list((run / STAGES).iterdir())
-    np.testing.assert_array_equal(again.mesh.vertices, before.mesh.vertices)
-
-
-def test_a_gpu_that_is_not_there_is_refused(run, monkeypatch):
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    with pytest.raises(ResourceError, match="no GPU"):
-        refine_surface(Run(run), Surface(BUMPY), accelerator="gpu", progress=QUIET)

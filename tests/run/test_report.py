@@ -10,14 +10,13 @@ import json
 import re
 import shutil
 import time
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import trimesh
 from PIL import Image
 
-from sononerf.errors import InputError, NumericalError
+from sononerf.errors import InputError
 from sononerf.report.surface_views import SurfaceViews
 from sononerf.run import report as report_module
 from sononerf.run.compare import table
@@ -283,13 +282,6 @@ def test_what_is_not_there_yet_is_named_with_its_command(run):
     assert not pictures_of(run / "report.html")
 
 
-def test_a_missing_picture_is_named(finished):
-    (finished / "reconstruction" / "mip_y.png").unlink()
-    page = report(finished)
-    assert f"mip_y.png is missing; sononerf reconstruct {finished} makes it" in plain(page)
-    assert "Reflectivity, the largest along y." not in pictures_of(page)
-
-
 def test_without_held_out_poses_nothing_is_asked_for(run):
     description = json.loads((run / "model.json").read_text())
     description["settings"]["poses"]["heldout"] = 0
@@ -297,49 +289,6 @@ def test_without_held_out_poses_nothing_is_asked_for(run):
     text = plain(report(run))
     assert "No pose was held out" in text
     assert "sononerf predict" not in text
-
-
-def test_the_papers_figures_have_their_counterparts(finished, monkeypatch):
-    other = finished / "compare-empty"
-    other.mkdir()
-    told = {"second": "empty", "score": 0.553, "distance_m": 0.0063}
-    (other / "comparison.json").write_text(json.dumps(told))
-    (other / "mip_x.png").write_bytes(b"difference")
-    drawn = []
-    real = report_module.scene_png
-
-    def scene_png(mesh, positions, forward, *, split):
-        drawn.append((len(positions), np.bincount(split).tolist()))
-        return real(mesh, positions, forward, split=split)
-
-    monkeypatch.setattr(report_module, "scene_png", scene_png)
-    page = report(finished, paper=True)
-    assert drawn == [(12, [8, 2, 2])]
-    *_, scene, isosurface, difference = pictures_of(page).items()
-    assert (scene[0], isosurface[0][:19]) == ("The scene.", "Sum over 100 direct")
-    for _, picture in (scene, isosurface):
-        assert picture.startswith(b"\x89PNG")
-    assert difference == ("mip_x", b"difference")
-    text = plain(page)
-    assert "Beside empty the strongest difference is 0.55 of the common maximum, 6.3 mm" in text
-    assert "Sum over 100 directions" in text
-
-
-def test_without_a_surface_the_page_says_so(finished, monkeypatch):
-    def nothing(*given, **options):
-        raise NumericalError("no surface: the field is silent everywhere")
-
-    monkeypatch.setattr(report_module, "read_isosurface", nothing)
-    text = plain(report(finished, paper=True))
-    assert "None: no surface: the field is silent everywhere." in text
-    assert f"sononerf compare {finished} OTHER" in text
-
-
-def test_a_damaged_prediction_is_named(finished):
-    (finished / "prediction" / "spectrograms.npz").write_bytes(b"PK\x03\x04 cut off")
-    with pytest.raises(InputError, match=r"spectrograms\.npz: damaged .*sononerf predict"):
-        report(finished)
-    assert not (finished / "report.html").exists()
 
 
 @pytest.mark.parametrize(
@@ -357,47 +306,6 @@ def test_numbers_that_are_none_are_named(finished, section, holds):
     (finished / "metrics.json").write_text(json.dumps({**METRICS, section: holds}))
     with pytest.raises(InputError, match=r"metrics\.json: damaged .*; remove it and repeat"):
         report(finished)
-
-
-@pytest.mark.parametrize("text", ["[]", '{"score": "x"}', '{"score": 0.'])
-def test_a_damaged_comparison_is_told_before_the_long_work(finished, monkeypatch, text):
-    (finished / "compare-a").mkdir()
-    (finished / "compare-a" / "comparison.json").write_text(text)
-    monkeypatch.setattr(
-        report_module, "read_isosurface", lambda *given, **more: pytest.fail("read out")
-    )
-    with pytest.raises(InputError, match=r"comparison\.json"):
-        report(finished, paper=True)
-    assert not (finished / "report.html").exists()  # nor pictures without a page
-
-
-@pytest.mark.parametrize(
-    ("method", "level", "said"),
-    [
-        ("isosurface", 2.5, "level as set: 2.5"),
-        ("auto", 2.5, "level as set: 2.5"),
-        ("filled", "auto", "level by Otsu's rule"),
-    ],
-)
-def test_the_isosurface_is_drawn_as_the_settings_say(finished, monkeypatch, method, level, said):
-    description = json.loads((finished / "model.json").read_text())
-    own = {"method": method, "level": level, "spacing": 0.005, "directions": 12}
-    own |= {"smoothing": 0.045} if method == "isosurface" else {}
-    description["settings"]["reconstruction"] = own
-    (finished / "model.json").write_text(json.dumps(description))
-    asked = {}
-
-    def read_out(field, **options):
-        asked.update(options)
-        mesh = trimesh.creation.icosphere()
-        volume = SimpleNamespace(spacing=options["spacing"])
-        return mesh, volume, 2.5
-
-    monkeypatch.setattr(report_module, "read_isosurface", read_out)
-    assert said in plain(report(finished, paper=True))
-    assert asked["level"] == level
-    assert (asked["spacing"], asked["directions"]) == (0.005, 12)
-    assert asked["smoothing"] == own.get("smoothing", 0.0)
 
 
 def test_commands_can_be_copied_whatever_the_run_is_called(run):

@@ -90,16 +90,6 @@ def test_sections_of_the_metrics_do_not_touch_each_other(run):
     }
 
 
-def test_a_section_that_is_dropped_takes_no_other_with_it(run):
-    run.drop_metrics("geometry")
-    assert not run.metrics_file.exists()
-    run.write_metrics("geometry", None)
-    run.write_metrics("cost", {"steps": 1})
-    run.drop_metrics("geometry")
-    run.drop_metrics("geometry")
-    assert json.loads(run.metrics_file.read_text()) == {"schema": 1, "cost": {"steps": 1}}
-
-
 def test_metrics_that_are_none(run):
     run.metrics_file.write_text("[1]")
     with pytest.raises(InputError, match="holds no metrics"):

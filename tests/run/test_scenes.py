@@ -4,20 +4,15 @@
 from __future__ import annotations
 
 import io
-import logging
 import sys
 
-import numpy as np
 import pytest
 from PIL import Image
 
-from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import StorageError
 from sononerf.run import scenes as scenes_module
 from sononerf.run.scenes import (
     describe_scene,
     describe_scenes,
-    draw_ensemble,
     draw_scenes,
     option_table,
     scene_table,
@@ -141,41 +136,3 @@ def test_scenes_are_drawn_but_those_that_cannot_be(broken, few, tmp_path):
     assert reasons["choosy"] == "needs scene.options.size"
     assert "no_such_module" in reasons["broken"]
     assert reasons["failing"].endswith("no luck")
-
-
-def test_a_folder_that_is_a_file_is_refused_before_the_work(tmp_path, monkeypatch):
-    monkeypatch.setattr(scenes_module, "load_scene", lambda *_: pytest.fail("was built"))
-    (tmp_path / "file").write_text("x")
-    with pytest.raises(StorageError, match="file"):
-        draw_scenes(tmp_path / "file")
-
-
-def test_an_ensemble_is_drawn_with_the_echo_of_its_first_test_pose(
-    tiny, echoes, tmp_path, monkeypatch, caplog
-):
-    drawn = {}
-    real = scenes_module.echo_png
-
-    def keep(*given, **named):
-        drawn.update(points=given[1], level=given[2], position=given[3], named=named)
-        return real(*given, **named)
-
-    monkeypatch.setattr(scenes_module, "echo_png", keep)
-    store = EnsembleStore.open(echoes)
-    load = scenes_module.load_scene
-
-    def warn(*given, **named):
-        logging.getLogger("sononerf").warning("parts intersect")
-        return load(*given, **named)
-
-    monkeypatch.setattr(scenes_module, "load_scene", warn)
-    written = draw_ensemble(tiny(), store, tmp_path)
-    assert caplog.text == ""  # it was said before the simulation
-    assert [path.name for path in written] == ["scene.png", "pose_0010.png"]
-    assert all(min(size_of(path)) > 100 for path in written)
-    assert store.split[10] == 2
-    assert drawn["named"]["title"] == "sphere, pose 10"
-    # The loudest hit of a sphere is where its surface faces the head.
-    loudest = drawn["points"][np.argmax(drawn["level"])]
-    towards = drawn["position"] / np.linalg.norm(drawn["position"])
-    assert np.degrees(np.arccos(loudest @ towards / 0.02)) < 15

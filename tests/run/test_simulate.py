@@ -3,16 +3,11 @@
 
 from __future__ import annotations
 
-import logging
-import os
 import shutil
-import signal
 from dataclasses import replace
 
-import distributed
 import numpy as np
 import pytest
-import trimesh
 
 from sononerf.echoes.store import EnsembleStore, SubtractedStore
 from sononerf.errors import (
@@ -24,7 +19,6 @@ from sononerf.errors import (
 )
 from sononerf.head.decibels import compress
 from sononerf.head.directivity.directivity_files import write_sofa
-from sononerf.run import simulate as run_module
 from sononerf.run.import_recordings import read_recordings
 from sononerf.run.simulate import (
     background_path,
@@ -34,9 +28,7 @@ from sononerf.run.simulate import (
     store_path,
     write_waveforms,
 )
-from sononerf.scene.material import LEAF, RIGID
-from sononerf.scene.scene import Scene, load_scene
-from sononerf.simulation import ensemble as simulate_module
+from sononerf.scene.scene import load_scene
 from sononerf.storage import lock
 from tests.head.directivity.patterns import pair
 
@@ -90,14 +82,6 @@ def test_what_is_background_sounds_as_it_would_otherwise(tiny):
     assert echo_hash(settings, replace(scene, background=background)) == hashed(settings)
 
 
-def test_another_simulator_makes_another_ensemble(tiny, monkeypatch):
-    settings = tiny()
-    scene = load_scene(settings.scene.name, settings.scene.options)
-    before = echo_hash(settings, scene)
-    monkeypatch.setattr(simulate_module, "VERSION", simulate_module.VERSION + 1)
-    assert echo_hash(settings, scene) != before
-
-
 HEADER = "x,y,z,yaw,pitch,roll\n"
 ROWS = [f"0.4,{0.01 * row},0.0,180,{row},0\n" for row in range(8)]
 
@@ -136,84 +120,14 @@ def test_where_the_store_lies(tiny, tmp_path, monkeypatch):
     assert store_path(tiny(data={"store": "there"}), scene, tmp_path / "here").name == "here"
 
 
-def test_a_whole_store_is_opened_and_nothing_is_simulated(tiny, echoes, monkeypatch):
-    monkeypatch.setattr(simulate_module, "Simulator", None)
-    store = simulate(tiny())
-    assert store.path == echoes
-    assert store.mode == "r"
-
-
 def test_a_store_of_other_settings_is_refused(tiny, echoes):
     with pytest.raises(IncompatibleError, match="holds echoes of other settings"):
         simulate(tiny(simulation={"rays": 501}), output=echoes)
 
 
-def test_an_interrupted_simulation_goes_on(tiny, echoes, tmp_path, monkeypatch):
-    real = EnsembleStore.write_pose
-    written = []
-
-    def cut(self, index, spectrogram):
-        if len(written) == 5:
-            raise KeyboardInterrupt
-        written.append(index)
-        real(self, index, spectrogram)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(EnsembleStore, "write_pose", cut)
-        with pytest.raises(KeyboardInterrupt):
-            simulate(tiny(), output=tmp_path / "store", workers=1)
-
-    def count(self, index, spectrogram):
-        assert index not in written
-        real(self, index, spectrogram)
-
-    monkeypatch.setattr(EnsembleStore, "write_pose", count)
-    store = simulate(tiny(), output=tmp_path / "store", workers=1)
-    whole = EnsembleStore.open(echoes)
-    assert store.missing() == []
-    for index in range(len(whole)):
-        np.testing.assert_array_equal(store.read_pose(index), whole.read_pose(index))
-    for name in ("reference", "noise_floor_mae_db", "echo_hash"):
-        assert store.attributes[name] == whole.attributes[name]
-
-
 def content(store):
     files = sorted(path for path in store.path.rglob("*") if path.is_file())
     return {str(path.relative_to(store.path)): path.read_bytes() for path in files}
-
-
-class Stopper:
-    """Calls something after so many poses were written."""
-
-    def __init__(self, monkeypatch):
-        self.real, self.after, self.action, self.written = EnsembleStore.write_pose, -1, None, 0
-        monkeypatch.setattr(EnsembleStore, "write_pose", lambda *given: self.write(*given))
-
-    def arm(self, after, action):
-        self.after, self.action, self.written = after, action, 0
-
-    def write(self, store, index, spectrogram):
-        self.real(store, index, spectrogram)
-        self.written += 1
-        if self.written == self.after:
-            self.action()
-
-
-def test_stops_and_other_numbers_of_workers_change_no_byte(tiny, echoes, tmp_path, monkeypatch):
-    stopper = Stopper(monkeypatch)
-
-    def stop():
-        raise KeyboardInterrupt
-
-    for after, workers in ((3, 1), (4, 2)):
-        stopper.arm(after, stop)
-        with pytest.raises(KeyboardInterrupt):
-            simulate(tiny(), output=tmp_path / "store", workers=workers)
-    stopper.arm(-1, stop)
-    store = simulate(tiny(), output=tmp_path / "store", workers=3)
-    alone = EnsembleStore.open(echoes)
-    assert stopper.written == len(alone) - 3 - 4
-    assert content(store) == content(alone)
 
 
 def test_the_same_command_mends_a_damaged_pose(tiny, echoes, tmp_path):
@@ -225,26 +139,6 @@ def test_the_same_command_mends_a_damaged_pose(tiny, echoes, tmp_path):
     made = simulate(tiny(), output=tmp_path / "store", workers=1)
     assert made.damaged() == []
     assert content(made) == content(EnsembleStore.open(echoes))
-
-
-@pytest.mark.slow
-def test_a_killed_worker_costs_nothing(tiny, tmp_path, monkeypatch):
-    settings = tiny(poses={"count": 20}, simulation={"rays": 4000})
-    alone = simulate(settings, output=tmp_path / "alone", workers=1)
-    stopper = Stopper(monkeypatch)
-    cluster = distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=True,
-        dashboard_address="127.0.0.1:0",
-        silence_logs=logging.CRITICAL,
-    )
-    with cluster:
-        before = [worker.pid for worker in cluster.workers.values()]
-        stopper.arm(5, lambda: os.kill(before[0], signal.SIGKILL))
-        store = simulate(settings, output=tmp_path / "shared", scheduler=cluster.scheduler_address)
-    assert stopper.written == len(alone) == 24
-    assert content(store) == content(alone)
 
 
 def test_the_noise_floor_is_that_of_other_rays(echoes, tiny, tmp_path):
@@ -275,60 +169,12 @@ def test_a_store_in_use_is_left_alone(tiny, tmp_path):
         simulate(tiny(), output=tmp_path / "store")
 
 
-def before_a_wall(settings):
-    """The tiny sphere, and a plate behind it that is background."""
-    sphere = load_scene("sphere", settings.scene.options).mesh
-    plate = trimesh.creation.box((0.002, 0.1, 0.1))
-    plate.apply_translation((-0.03, 0, 0))
-    both = trimesh.util.concatenate([sphere, plate])
-    marked = np.arange(len(both.faces)) >= len(sphere.faces)
-    return Scene(both, (RIGID, LEAF), marked.astype(int), background=marked)
-
-
-def test_the_scenes_own_background_is_simulated_alone_and_taken_off(tiny, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    settings = tiny(data={"store": None, "background": "scene"})
-    scene = before_a_wall(settings)
-    monkeypatch.setattr(run_module, "load_scene", lambda *given, **named: scene)
-    left = open_or_simulate(settings, workers=1).store
-    whole = simulate(tiny(data={"store": None}), workers=1)
-    alone = EnsembleStore.open(background_path(settings))
-    assert left.path == whole.path
-    assert alone.path.name.endswith("-background")
-    for index in range(len(whole)):
-        power = whole.read_pose(index) ** 2 - alone.read_pose(index) ** 2
-        np.testing.assert_allclose(left.read_pose(index) ** 2, power.clip(min=0), atol=1e-6)
-    assert max(alone.read_pose(index).max() for index in range(len(alone))) > 0
-    assert max(left.read_pose(index).max() for index in range(len(left))) > 0
-    # The plate alone is heard as it is, and as what it is made of.
-    plate = scene.surroundings()
-    assert len(plate.mesh.faces) == 12
-    assert (plate.part == 1).all()
-    assert plate.materials == (RIGID, LEAF)
-    # What is there is not simulated again.
-    monkeypatch.setattr(simulate_module, "Simulator", None)
-    np.testing.assert_array_equal(open_or_simulate(settings).store.read_pose(0), left.read_pose(0))
-
-
 def test_a_background_of_ones_own_is_taken_off(tiny, echoes, tmp_path):
     settings = tiny(data={"background": str(echoes)})
     assert background_path(settings) == echoes
     assert isinstance(open_or_simulate(settings).store, SubtractedStore)
     assert background_path(tiny()) is None
     assert not isinstance(open_or_simulate(tiny()).store, SubtractedStore)
-
-
-def test_a_background_that_is_not_there_is_told_before_anything_is_simulated(tiny, monkeypatch):
-    monkeypatch.setattr(simulate_module, "simulate", None)
-    with pytest.raises(InputError, match="nowhere: no ensemble store"):
-        open_or_simulate(tiny(data={"background": "nowhere"}))
-
-
-def test_a_scene_without_background_has_none_to_take_off(tiny, monkeypatch):
-    monkeypatch.setattr(simulate_module, "simulate", None)
-    with pytest.raises(SettingsError, match="the scene 'sphere' marks no background") as error:
-        open_or_simulate(tiny(data={"background": "scene"}))
-    assert "\n" not in str(error.value)
 
 
 SWEEP = {"kind": "linear", "duration": 3e-4, "frequency_start": 100e3, "frequency_end": 20e3}

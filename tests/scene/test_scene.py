@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: MIT
 import logging
 import sys
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -196,36 +195,6 @@ def test_faults_of_options_name_the_file_that_sets_them():
         with pytest.raises(SettingsError) as caught:
             load_scene(name, options, source="mine.yaml")
         assert all(line.startswith("mine.yaml: ") for line in str(caught.value).splitlines())
-
-
-def test_a_size_is_blamed_on_options_where_there_are_some(monkeypatch):
-    with pytest.raises(SettingsError, match=r"^scene\.options: the mesh is 200 m large, expected"):
-        load_scene("sphere", {"radius": 100})
-    ball = {"scene": "sphere", "options": {"radius": 100}}
-    nested = r"^mine: scene\.options\.parts\.0\.options: the mesh is 200 m large"
-    with pytest.raises(SettingsError, match=nested):
-        load_scene("composed", {"parts": [ball]}, source="mine")
-    apart = [{"scene": "sphere", "position": [place, 0, 0]} for place in (-90, 90)]
-    with pytest.raises(SettingsError, match=r"^mine: scene\.options: the mesh is 180 m large"):
-        load_scene("composed", {"parts": apart}, source="mine")
-    monkeypatch.setattr(plugins, "load", lambda group, name: lambda: Scene(box(200)))
-    with pytest.raises(InputError, match=r"^scene 'sphere' of sononerf \S+: the mesh is 200 m"):
-        load_scene("sphere")
-
-
-def test_faults_of_anothers_mesh_name_who_made_it(monkeypatch):
-    monkeypatch.setattr(plugins, "load", lambda group, name: lambda: Scene(trimesh.Trimesh()))
-    with pytest.raises(InputError, match=r"^the mesh has no triangles"):
-        load_scene("sphere")  # ours say themselves what they read
-    other = [replace(plugin, distribution="bats") for plugin in list_scenes()]
-    monkeypatch.setattr("sononerf.scene.scene.list_scenes", lambda: other)
-    with pytest.raises(
-        InputError, match=r"^scene 'sphere' of bats 0\S+: the mesh has no triangles"
-    ):
-        load_scene("sphere")
-    monkeypatch.setattr(plugins, "load", lambda group, name: lambda: 5)
-    with pytest.raises(InputError, match=r"^scene 'sphere' of bats 0\S+ returned int"):
-        load_scene("sphere")
 
 
 def test_a_mesh_without_any_area_is_refused():

@@ -10,7 +10,7 @@ from sononerf.run.build import simulator_of
 from sononerf.run.simulate import simulate
 from sononerf.scene.scene import load_scene
 from sononerf.settings.loading import validate_settings
-from sononerf.simulation import accuracy, workers
+from sononerf.simulation import accuracy
 from sononerf.simulation.accuracy import settle_rays
 from sononerf.simulation.simulator import ensemble_poses
 
@@ -52,13 +52,6 @@ def test_the_accuracy_is_reached_and_costs_rays(few, tmp_path):
     assert 500 <= rays[0] < rays[1] < accuracy.MOST
 
 
-def test_one_worker_is_this_process_in_trials_too(few, tmp_path, monkeypatch):
-    monkeypatch.setattr(workers, "WORTH_RAYS", 0)
-    monkeypatch.setattr(workers, "computed", None)
-    store = simulate(settings(accuracy_db=2.0), output=tmp_path / "store", workers=1)
-    assert store.missing() == []
-
-
 @pytest.mark.slow
 def test_noise_of_the_ears_asks_for_no_more_rays(few):
     quiet, noisy = (settled(settings(noise, accuracy_db=2.0))[0] for noise in (None, NOISE))
@@ -68,26 +61,6 @@ def test_noise_of_the_ears_asks_for_no_more_rays(few):
 def test_a_number_of_rays_is_taken_as_it_is():
     rays, simulator = settled(settings(rays=777))
     assert rays == simulator.rays.rays == 777
-
-
-def test_no_more_rays_are_taken_than_the_most(few, monkeypatch, capsys):
-    monkeypatch.setattr(accuracy, "MOST", 900)
-    assert settled(settings(accuracy_db=0.01), Progress())[0] == 900
-    assert "fewer were less accurate than" in capsys.readouterr().err
-
-
-def test_a_store_records_the_number_and_goes_on_with_it(few, tmp_path, monkeypatch):
-    wanted = settings(accuracy_db=3.0)
-    store = simulate(wanted, output=tmp_path / "store", workers=1)
-    rays = store.attributes["rays"]
-    assert rays >= 500
-    whole = [store.read_pose(index).tobytes() for index in range(len(store))]
-    chunk_path(store.path, "spectrogram", (3, 0, 0, 0)).unlink()
-    assert EnsembleStore.open(store.path).missing() == [3]
-    monkeypatch.setattr(accuracy, "FIRST", 10 * rays)
-    again = simulate(wanted, output=tmp_path / "store", workers=1)
-    assert again.attributes["rays"] == rays
-    assert [again.read_pose(index).tobytes() for index in range(len(again))] == whole
 
 
 @pytest.mark.slow

@@ -11,13 +11,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf import executor
 from sononerf.errors import InputError, NumericalError, ResourceError, SonoNerfError
 from sononerf.geometry.poses import Poses, look_at
 from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
-from sononerf.simulation.ensemble import simulate, simulate_ensemble
+from sononerf.simulation.ensemble import simulate_ensemble
 from sononerf.simulation.pose_faults import check_aim, check_poses, check_reach
 from sononerf.simulation.simulator import ensemble_poses, pose_seed
 
@@ -36,13 +35,6 @@ def small():
     return simulator_of(load_scene("sphere"), found), ensemble_poses(found.poses)[0]
 
 
-def test_sets_follow_each_other_at_their_radius():
-    poses, split = ensemble_poses(settings(poses={"count": 7, "validation": 2, "heldout": 3}).poses)
-    assert split.tolist() == [0] * 7 + [1] * 2 + [2] * 3
-    assert split.dtype == np.int8
-    np.testing.assert_allclose(np.linalg.norm(poses.positions, axis=1), 0.4)
-
-
 def test_poses_of_a_cylinder_look_level_at_its_axis():
     wanted = {"arrangement": "cylinder", "radius": 0.8, "heights": [0.1, 0.5], "count": 40}
     poses, split = ensemble_poses(settings(poses={**wanted, "aim_jitter_deg": 0.0}).poses)
@@ -53,20 +45,6 @@ def test_poses_of_a_cylinder_look_level_at_its_axis():
     inward = -poses.positions[:, :2] / 0.8
     np.testing.assert_allclose(poses.rotations[:, :2, 0], inward, atol=1e-12)
     np.testing.assert_allclose(poses.rotations[:, 2, 2], 1.0)
-
-
-def test_no_set_moves_another_and_the_seed_moves_all():
-    def sets(**changes):
-        wanted = {"count": 7, "validation": 2, "heldout": 3, **changes}
-        return ensemble_poses(settings(poses=wanted).poses)[0]
-
-    base = sets()
-    np.testing.assert_array_equal(base[-3:].rotations, sets(count=20)[-3:].rotations)
-    np.testing.assert_array_equal(base[-3:].positions, sets(validation=9)[-3:].positions)
-    np.testing.assert_array_equal(base[:7].rotations, sets(heldout=0)[:7].rotations)
-    other = sets(seed=1)
-    assert (base.rotations != other.rotations).any(axis=(1, 2)).all()
-    assert (base.positions[7:9] != base.positions[9:11]).any()
 
 
 def test_poses_on_the_sphere_are_those_of_the_first_release():
@@ -221,24 +199,6 @@ def test_a_failing_pose_is_named(small):
         poses.positions[3] = 0.4
 
 
-def test_faults_of_the_writer_are_not_blamed_on_a_pose(small):
-    def full(index, spectrogram):
-        raise OSError("disk full")
-
-    with pytest.raises(OSError, match="disk full"):
-        simulate_ensemble(*small, [0], full, seed_of=SEED_OF)
-
-
-def test_a_scheduler_that_is_not_there_is_named_first(small, monkeypatch, tmp_path):
-    monkeypatch.setattr(executor, "CONNECT_SECONDS", 1)
-    _, poses = small
-    with pytest.raises(ResourceError, match=r"tcp://127\.0\.0\.1:9 cannot be reached"):
-        simulate(
-            load_scene("sphere", {}), poses, output=tmp_path / "a", scheduler="tcp://127.0.0.1:9"
-        )
-    assert not (tmp_path / "a").exists()
-
-
 class Deadly:
     """A simulator that kills the process it runs in, so many times."""
 
@@ -349,15 +309,6 @@ def test_poses_inside_are_refused_even_where_bodies_overlap():
     inverted = Scene(trimesh.Trimesh(one.vertices, one.faces[:, ::-1]))
     with pytest.raises(InputError, match="inside"):
         check_poses(inverted, poses_at([0.0, 0.0, 0.05]))
-
-
-def test_only_the_first_ten_are_listed():
-    scene = load_scene("sphere", {"radius": 1.0})
-    inside = poses_at(*np.linspace(-0.1, 0.1, 12)[:, None] * [1.0, 0.0, 0.0])
-    with pytest.raises(
-        InputError, match=r"12 of 12 poses \(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, \.\.\.\) are"
-    ):
-        check_poses(scene, inside)
 
 
 def test_ears_inside_are_refused():

@@ -84,13 +84,6 @@ def test_a_point_adds_what_is_promised(ear):
     assert not echo[1 - ear].any()
 
 
-def test_edges_lack_the_factor_jf():
-    frequency = NODES[[2, 5, 8]]
-    ways = [echo_of(hearing(), 0, basis=basis)[0] for basis in (None, SYNTHESIS.hats)]
-    surface, edge = (spectrum(echo, frequency) for echo in ways)
-    np.testing.assert_allclose(surface, 1j * frequency * edge, rtol=1e-3)
-
-
 def test_air_takes_its_decibels_over_the_whole_path():
     frequency = NODES[[2, 5, 8]]
     with_air, without = (
@@ -98,11 +91,6 @@ def test_air_takes_its_decibels_over_the_whole_path():
     )
     path = 0.25 + np.linalg.norm(POINT - hearing().places(POSITION, ROTATION)[1][0])
     np.testing.assert_allclose(-20 * np.log10(with_air / without), 20.0 * path, rtol=0.003)
-
-
-def test_silence_is_silent():
-    assert hearing().echo(hearing().silence()).shape == (2, SYNTHESIS.samples)
-    assert not hearing().echo(hearing().silence()).any()
 
 
 def test_what_is_partly_hidden_is_split_into_two_sounds():

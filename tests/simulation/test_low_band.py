@@ -3,13 +3,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from sononerf.errors import ResourceError
 from sononerf.geometry.poses import look_at
 from sononerf.head.ears import Ears
 from sononerf.run.build import simulator_of
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.loading import validate_settings
-from sononerf.simulation import low_band as module
 from sononerf.simulation.hearing import Arrival
 from sononerf.simulation.low_band import (
     HeadPoses,
@@ -18,7 +16,6 @@ from sononerf.simulation.low_band import (
     resolved_frequency,
     sources_worth,
 )
-from sononerf.simulation.rays import Rays
 from tests.simulation.exact import SPEED, rigid_sphere
 from tests.simulation.judges import Case
 from tests.simulation.listening import ball, hearing, spectrum
@@ -94,12 +91,6 @@ def test_poses_are_solved_once_and_kept():
     np.testing.assert_array_equal(one, band_of(ball(0.015), most=100).echo(PLACE, np.eye(3)))
     band.prepare(PLACE[None], turns[:1], lambda: solved.append(1))
     assert len(solved) == len(band.frequency)
-
-
-def test_what_takes_too_much_memory_is_refused_before_it_starts(monkeypatch):
-    monkeypatch.setattr(module, "available_memory", lambda: 1000)
-    with pytest.raises(ResourceError, match=r"1 poses need about .* GB of memory at low"):
-        band_of(ball(0.015), most=100).echo(PLACE, np.eye(3))
 
 
 def test_the_inside_of_the_sources_does_not_resonate():
@@ -187,15 +178,6 @@ def test_high_frequencies_are_those_of_the_rays():
     loud = (alone > alone.max() - 20) & high
     assert loud.any()
     np.testing.assert_allclose(both[loud], alone[loud], atol=0.3)
-
-
-def test_both_bands_add_up_to_the_whole():
-    default = simulator(Scene(ball(0.015)))
-    frequency = default.hearing.synthesis.frequency
-    whole = Rays(default.scene, default.hearing, rays=1000, bounces=1, diffraction_points=100)
-    above = default.rays._hats / np.where(whole._hats == 0.0, 1.0, whole._hats)
-    some = np.abs(whole._hats[:, 3]) > 1e-3
-    np.testing.assert_allclose(above[some, 3] + default.low.taper(frequency)[some], 1.0, atol=1e-9)
 
 
 def half_open():

@@ -7,7 +7,7 @@ import trimesh
 
 from sononerf.geometry.directions import CapSpiral, fibonacci_cap
 from sononerf.geometry.raycast import RayCaster
-from sononerf.simulation.paths import SPLIT, aim, echo_paths, gathered, trace
+from sononerf.simulation.paths import SPLIT, aim, echo_paths, trace
 from tests.simulation.listening import ball, box, wall
 
 PARTS = SPLIT**2
@@ -200,36 +200,6 @@ def test_the_detour_is_how_much_longer_the_path_is_than_the_mirrors():
         assert found[np.flatnonzero(near == best)[0]] < 0.001 * exact.max()
 
 
-def test_the_detour_after_a_bounce_is_that_of_the_unfolded_path():
-    """Emitter, plate, ball, ear: the plate only moves the emitter to its image."""
-    plate, target = wall(-0.2, (-1, -1), (1, 1)), ball(0.05, (0.3, 0, 0), 6)
-    caster = RayCaster(trimesh.util.concatenate([plate, target]))
-    emitter, image = np.array([0.1, 0.02, 0.0]), np.array([-0.5, 0.02, 0.0])
-    directions = about_x(20_000, 0.1) * [-1, 1, 1]
-    found = bounces(caster, directions, 2, emitter=emitter)[1]
-    listener = np.array([0.1, -0.02, 0.03])
-    straight = found.points - image
-    straight /= np.linalg.norm(straight, axis=1, keepdims=True)
-    (same,) = bounces(RayCaster(target), straight, 1, emitter=image)
-    np.testing.assert_allclose(same.points, found.points, atol=1e-6)
-    first, unfolded = detour(found, listener), detour(same, listener)
-    near = unfolded[0] < 0.1  # not along the ball's rim
-    assert near.sum() > 1000
-    # The ray starts some micrometres above the plate.
-    for one, two in zip(first, unfolded, strict=True):
-        np.testing.assert_allclose(one[near], two[near], rtol=1e-3, atol=1e-7)
-
-
-@pytest.mark.parametrize(("radius", "expected"), [(None, 0.6), (0.05, 2 * 0.25 * 0.3 / 0.05)])
-def test_how_a_path_bends_at_the_glint(radius, expected):
-    """There and back over the angle: 2 h from a plate, 2 h (1 + h / a) from a ball."""
-    mesh = wall(0.3, (-1, -1), (1, 1)) if radius is None else ball(radius, (0.3, 0, 0), 6)
-    (bounce,) = bounces(RayCaster(mesh), [[1.0, 1e-5, 2e-5] / np.sqrt(1 + 5e-10)], 1)
-    assert detour(bounce, ORIGIN)[2][0] == pytest.approx(
-        expected, rel=0.01
-    )  # of a facet of 1 degree
-
-
 @pytest.mark.parametrize("angle", [0.0, 0.01, 0.1])
 @pytest.mark.parametrize("radius", [None, 0.1])
 def test_the_spread_is_that_of_the_path_over_a_square_cell(radius, angle):
@@ -304,131 +274,3 @@ def test_later_hits_come_from_divided_rays_and_lose_no_solid_angle():
     np.testing.assert_allclose(covered[1:], expected, rtol=0.01)
     # Whoever hits twice is divided, with his neighbours, though nothing is in doubt.
     assert count[2] >= 4 * len(plain[1].ray)
-
-
-@pytest.mark.parametrize("extra", [0, PARTS - 1, PARTS, 1000, 1003])
-def test_no_more_rays_are_shot_than_allowed(extra):
-    shot = []
-
-    class Counting(RayCaster):
-        def first_hit(self, origins, directions):
-            shot.append(len(directions))
-            return super().first_hit(origins, directions)
-
-    caster = Counting(wall(0.3, (-2, -2), (2, 2)))
-    cap = CapSpiral(600, (1.0, 0.0, 0.0), 0.5, (0.5, 0.5))
-    list(echo_paths(caster, ORIGIN, cap, bounces=1, extra=extra, judge=doubtful(-1.0)))
-    assert sum(shot) == 600 + PARTS * (extra // PARTS)
-
-
-def test_the_most_doubtful_cells_are_divided_first():
-    cap = CapSpiral(600, (1.0, 0.0, 0.0), 0.5, (0.5, 0.5))
-    caster = RayCaster(wall(0.3, (-2, -2), (2, 2)))
-    doubts = []
-
-    def judge(bounce):
-        heard, _ = all_alike(bounce)
-        doubt = np.where(bounce.solid_angle < cap.solid_angle, 0.0, 1.0 + bounce.emitted[:, 1])
-        doubts.append(doubt)
-        return heard, doubt
-
-    whole, parts = echo_paths(caster, ORIGIN, cap, bounces=1, extra=400, judge=judge)
-    assert (len(whole.ray), len(parts.ray)) == (600 - 400 // PARTS, 400)
-    assert (1.0 + whole.emitted[:, 1]).max() < np.sort(doubts[0])[600 - 400 // PARTS]
-
-
-def test_what_is_not_heard_is_left_out_but_may_be_divided():
-    cap = CapSpiral(600, (1.0, 0.0, 0.0), 0.5, (0.5, 0.5))
-    caster = RayCaster(wall(0.3, (-2, -2), (2, 2)))
-
-    def judge(bounce):
-        first = bounce.solid_angle == cap.solid_angle
-        return bounce.emitted[:, 2] > 0.0, np.full(len(bounce.ray), 1.0 if first else 0.0)
-
-    found = list(echo_paths(caster, ORIGIN, cap, bounces=1, extra=10_000, judge=judge))
-    assert all((bounce.emitted[:, 2] > 0.0).all() for bounce in found)
-    assert [len(bounce.ray) for bounce in found] == [0, pytest.approx(300 * PARTS, rel=0.03)]
-
-
-def test_paths_are_the_same_each_time():
-    cap = CapSpiral(1000, (1.0, 1.0, 0.0), 0.5, (0.5, 0.0))
-    one, two = (
-        list(echo_paths(corner(), ORIGIN, cap, bounces=3, extra=4000, judge=doubtful(0.7)))
-        for _ in range(2)
-    )
-    assert len(one) == len(two) > 3
-    for a, b in zip(one, two, strict=True):
-        np.testing.assert_array_equal(a.points, b.points)
-        np.testing.assert_array_equal(a.footprint.shift, b.footprint.shift)
-
-
-def test_many_rays_at_once_are_as_good_as_few():
-    """Rays are followed some thousands at a time; each keeps its number."""
-    cap = CapSpiral(40_000, (1.0, 0.0, 0.0), 0.5, (0.5, 0.5))
-    caster = RayCaster(wall(0.3, (-2, -2), (2, 2)))
-    found = list(echo_paths(caster, ORIGIN, cap, bounces=1, extra=0, judge=all_alike))
-    ray, emitted, length = (
-        np.concatenate([getattr(bounce, name) for bounce in found])
-        for name in ("ray", "emitted", "length")
-    )
-    np.testing.assert_array_equal(ray, np.arange(40_000))
-    np.testing.assert_allclose(emitted, cap.directions(), atol=1e-12)
-    np.testing.assert_allclose(length, 0.3 / emitted[:, 0], rtol=1e-9)
-
-
-def test_one_bounce_is_one_bounce():
-    cap = CapSpiral(400, (1.0, 1.0, 0.0), 0.5, (0.5, 0.0))
-    paths = list(echo_paths(corner(), ORIGIN, cap, bounces=1, extra=0, judge=all_alike))
-    assert [path.number for path in paths] == [1]
-    away = CapSpiral(400, (-1.0, -1.0, 0.0), 0.1, (0.5, 0.0))
-    assert not list(echo_paths(corner(), ORIGIN, away, bounces=3, extra=100, judge=all_alike))
-
-
-def test_the_chosen_hits_are_the_chosen_hits():
-    (bounce, _) = bounces(corner(), CapSpiral(50, (1.0, 1.0, 0.0), 0.5, (0.5, 0.0)).directions(), 2)
-    chosen = np.array([7, 3, 40])
-    few = bounce[chosen]
-    for name in ("ray", "emitted", "points", "flat", "mirrored", "length", "triangles"):
-        np.testing.assert_array_equal(getattr(few, name), getattr(bounce, name)[chosen])
-    for name in ("shift", "square", "bend", "curving", "onward", "sink", "tube"):
-        whole = getattr(bounce.footprint, name)
-        np.testing.assert_array_equal(getattr(few.footprint, name), whole[..., chosen])
-
-
-def test_hits_that_are_gathered_are_the_same_hits():
-    caster, cap = corner(), CapSpiral(4000, (1.0, 1.0, 0.0), 0.5, (0.5, 0.0))
-
-    def paths():
-        return echo_paths(caster, ORIGIN, cap, bounces=3, extra=4000, judge=doubtful(0.7))
-
-    apart, together = list(paths()), list(gathered(paths()))
-    assert len(together) < len(apart)
-    assert all(len(bounce.ray) for bounce in together)
-    assert {bounce.number for bounce in together} == {1, 2}
-    for number in (1, 2):
-        totals = []
-        for bounces in (apart, together):
-            rows = []
-            for bounce in bounces:
-                if bounce.number == number and len(bounce.ray):
-                    angle = np.broadcast_to(bounce.solid_angle, len(bounce.ray))
-                    felt = detour(bounce, np.array([0.1, 0.2, 0.3]))
-                    rows.append(np.column_stack([bounce.points, bounce.length, angle, *felt]))
-            found = np.concatenate(rows)
-            totals.append(found[np.lexsort(found.T)])
-        np.testing.assert_array_equal(*totals)
-
-
-def test_rays_that_are_left_out_change_nothing_where_they_miss():
-    caster, cap = corner(), CapSpiral(4000, (1.0, 0.0, 0.0), 2.5, (0.5, 0.0))
-    hits = caster.first_hit(np.zeros((4000, 3)) + ORIGIN, cap.directions()).ray
-    assert len(hits) < 3900
-    whole, some = (
-        list(
-            echo_paths(caster, ORIGIN, cap, bounces=3, extra=4000, judge=doubtful(0.7), index=index)
-        )
-        for index in (None, hits)
-    )
-    for one, other in zip(whole, some, strict=True):
-        np.testing.assert_array_equal(one.ray, other.ray)
-        np.testing.assert_array_equal(one.points, other.points)

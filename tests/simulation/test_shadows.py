@@ -84,14 +84,3 @@ def test_emitter_and_ear_exchanged_hear_the_same_past_an_obstacle():
         for a, b, s in ((one, two, 1), (two, one, 2))
     )
     assert np.abs(there - back).max() < 0.06 * np.abs(there).max()
-
-
-def test_bodies_that_hide_nothing_are_as_they_are(monkeypatch):
-    mesh = trimesh.util.concatenate([ball(0.015, (0.4, 0.2, 0.0)), ball(0.015, (0.45, -0.2, 0.0))])
-    found = echoes(rays(mesh, RIGID, bounces=1))
-    monkeypatch.setattr("sononerf.simulation.rays.Shadow.none", True)
-    monkeypatch.setattr(
-        "sononerf.simulation.rays.Shadow.passed",
-        lambda self, points, triangle, solve=True: (np.full(len(points), -1), np.ones((1, 1))),
-    )
-    np.testing.assert_array_equal(echoes(rays(mesh, RIGID, bounces=1)), found)

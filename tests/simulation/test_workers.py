@@ -8,10 +8,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sononerf.geometry.poses import Poses
-from sononerf.simulation import workers
-from sononerf.simulation.workers import simulated
-
 SCRIPT = """
 import numpy as np
 from contextlib import closing
@@ -40,17 +36,6 @@ class Plain:
     """A simulator of 4,000 rays."""
 
     low, rays = None, SimpleNamespace(rays=4000)
-
-
-@pytest.mark.parametrize(("poses", "processes"), [(62, 1), (63, 3)])
-def test_many_poses_are_simulated_in_other_processes(monkeypatch, poses, processes):
-    monkeypatch.setattr(workers, "available_cores", lambda: 3)
-    used = []
-    monkeypatch.setattr(workers, "computed", lambda *given, **more: used.append(given[-1]) or [])
-    monkeypatch.setattr(workers, "_one", lambda *given: used.append(1))
-    places = Poses(np.zeros((poses, 3)), np.tile(np.eye(3), (poses, 1, 1)))
-    list(simulated(Plain(), places, list(range(poses)), lambda index: index))
-    assert set(used) == {processes}
 
 
 @pytest.mark.slow

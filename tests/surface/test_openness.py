@@ -1,28 +1,20 @@
 # SPDX-License-Identifier: MIT
 """Closed surfaces, sheets, and what was heard from one side alone."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-import torch
 import trimesh
 from skimage.measure import marching_cubes
 
 from sononerf.echoes.free_space import EchoHull
-from sononerf.field.fourier import FourierField
 from sononerf.geometry.directions import fibonacci_sphere
-from sononerf.geometry.lattice import Lattice
 from sononerf.geometry.plane import Plane
 from sononerf.surface import surface
-from sononerf.surface.start import read_out
-from sononerf.surface.start.evidence import Evidence
 from sononerf.surface.surface import FACING, THIN, Openness, known_part, leaving_out, without_unseen
 
 RADIUS, DISTANCE, RESOLUTION = 0.02, 0.4, 0.006
 THINNEST = THIN * RESOLUTION
 CAP = np.radians(30)
-WALL = 0.05
 
 
 def judge_openness(mesh, sources, resolution=RESOLUTION, plane=None):
@@ -227,13 +219,6 @@ def test_a_pit_that_no_pose_looks_into_was_not():
     assert not found.unseen[~inside & (depth > 0.002)].any()
 
 
-def test_pieces_of_the_work_change_nothing(monkeypatch):
-    whole = judge_openness(sphere(), cap())
-    monkeypatch.setattr(surface, "_CHUNK", 777)
-    pieces = judge_openness(sphere(), cap())
-    np.testing.assert_array_equal(pieces.unseen, whole.unseen)
-
-
 @pytest.mark.parametrize(
     ("unseen", "thin", "kind"),
     [
@@ -313,99 +298,3 @@ def test_between_what_was_heard_the_onsets_close_an_open_surface():
     # A ball bulges out of the convex hull of its places by less than the resolution.
     assert known[between].all()
     assert not known[off > 0.02].any()
-
-
-def test_one_pose_alone_does_not_tell_where_a_surface_ends():
-    mesh, hull, _ = room_behind()
-    heard = heard_where(mesh, lambda p: np.linalg.norm(p, axis=1) < RADIUS + 0.001)
-    stray = heard_where(mesh, lambda p: p[:, 1] > 0.05, 1)
-    assert stray.any()
-    one = known_part(mesh, heard, hull, resolution=RESOLUTION)
-    both = known_part(mesh, np.maximum(heard, stray), hull, resolution=RESOLUTION)
-    np.testing.assert_array_equal(one, both)
-
-
-def test_where_nothing_was_heard_of_a_surface_the_onsets_bound_it_and_walls_do_not():
-    mesh, hull, half = room_behind()
-    none = np.zeros(len(mesh.vertices), np.int32)
-    known = known_part(mesh, none, hull, resolution=RESOLUTION)
-    depth = hull.clearance(mesh.triangles_center)[0]
-    assert known.any()
-    assert depth[known].max() < RESOLUTION
-    assert not known[mesh.triangles_center[:, 0] < -0.9 * half].any()
-    flat = heard_where(mesh, lambda p: np.arange(len(p)) < 2)
-    assert 0 < known_part(mesh, flat, hull, resolution=RESOLUTION).sum() < 30
-
-
-@pytest.fixture
-def read(monkeypatch):
-    """Read out a field whose occupancy is the sphere, whatever was heard."""
-
-    def body(gathered, belief):
-        return sphere()
-
-    def gathered(*given):
-        nothing = np.zeros((0, 3))
-        evidence = Evidence(nothing, nothing, np.zeros(0), np.zeros(0, np.intp))
-        return SimpleNamespace(
-            hull=given[2],
-            resolution=given[6],
-            evidence=evidence,
-            weight=np.zeros(0),
-            lattice=Lattice.over(np.full(3, -WALL), np.full(3, WALL), 0.002),
-        )
-
-    monkeypatch.setattr(read_out, "gather_evidence", gathered)
-    monkeypatch.setattr(
-        surface, "poses_that_heard", lambda mesh, *given: np.arange(len(mesh.vertices))
-    )
-    monkeypatch.setattr(read_out, "estimate_occupancy", body)
-
-    def make(hull):
-        torch.manual_seed(0)
-        region = torch.tensor([[-WALL] * 3, [WALL] * 3])
-        field = FourierField(region, torch.tensor([40e3, 60e3]), octaves=2, width=8)
-        reading = read_out.read_field(
-            field, hull, spacing=0.02, directions=2, resolution=RESOLUTION
-        )
-        ((method, mesh),) = read_out.start_surfaces(reading, ["filled"])
-        return surface.finished_surface(mesh, method, reading)
-
-    return make
-
-
-def test_a_closed_surface_is_read_out_whole(read):
-    found = read(hull_over(all_around()))
-    assert found.openness.kind == "closed"
-    assert found.mesh.is_watertight
-    assert len(found.mesh.faces) == 5120
-
-
-def test_a_read_out_loses_what_no_pose_can_have_heard(read):
-    found = read(hull_over(cap()))
-    assert found.openness.kind == "one-sided"
-    assert len(found.openness.unseen) == 5120
-    assert len(found.mesh.faces) == (~found.openness.unseen).sum() < 5120
-    assert found.mesh.vertices[:, 0].min() > -0.6 * RADIUS
-    # Each vertex keeps its own number of poses.
-    np.testing.assert_array_equal(sphere().vertices[found.confidence], found.mesh.vertices)
-
-
-def test_a_wall_of_the_region_is_no_part_of_a_read_out(read, monkeypatch):
-    monkeypatch.setitem(globals(), "WALL", 0.015)
-    found = read(hull_over(cap()))
-    assert np.abs(found.mesh.triangles_center).max() < 0.013
-    assert found.openness.unseen.sum() == 5120 - len(found.mesh.faces)
-
-
-def test_a_hole_of_a_closed_surface_stays_closed(read):
-    found = read(hull_over(cap(np.radians(60))))
-    assert found.openness.unseen.any()
-    assert found.openness.kind == "closed"
-    assert found.mesh.is_watertight
-
-
-def test_what_lies_within_a_voxel_of_the_region_is_at_its_wall():
-    box = np.array([[-0.1, -0.1, -0.1], [0.1, 0.1, 0.1]])
-    places = np.array([[0, 0, 0], [0.0979, 0, 0], [0, -0.0981, 0], [0, 0, 0.2]])
-    assert surface.at_wall(places, box, 0.002).tolist() == [False, False, True, True]

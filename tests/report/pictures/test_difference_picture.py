@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: MIT
-import dataclasses
 import io
 
 import numpy as np
 import pytest
-import trimesh
 from PIL import Image
 
 from sononerf.evaluation.numbers import compare
 from sononerf.geometry.lattice import grid_over
-from sononerf.report.pictures import mip_picture as difference_module
-from sononerf.report.pictures.mip_picture import SILENT, difference_pngs, overlay_png
+from sononerf.report.pictures.mip_picture import difference_pngs
 
 GRID = grid_over([-0.03, -0.02, -0.05], [0.03, 0.02, 0.05], 0.005)
 MORE, LESS = np.array([0.02, -0.01, 0.03]), np.array([-0.02, 0.01, -0.03])
@@ -56,32 +53,3 @@ def test_where_something_was_truly_added_is_marked(comparison):
     without = difference_pngs(comparison, ("with", "without"))
     marked = difference_pngs(comparison, ("with", "without"), truth=LESS)
     assert all(marked[name] != without[name] for name in "xyz")
-
-
-@pytest.mark.slow
-def test_where_nothing_is_stronger_there_is_no_ring(comparison, recwarn):
-    none = dataclasses.replace(comparison, strongest=None)
-    ringed = difference_pngs(comparison, ("with", "without"))
-    plain = difference_pngs(none, ("with", "without"))
-    assert all(plain[name] != ringed[name] for name in "xyz")
-    marked = difference_pngs(none, ("with", "without"), truth=LESS)
-    assert all(marked[name] != plain[name] for name in "xyz")
-    assert not recwarn  # of a legend of nothing
-
-
-def test_a_surface_is_red_where_the_first_has_more_and_grey_where_neither(comparison, monkeypatch):
-    given = {}
-
-    def draw(mesh, *, view, colours):
-        given.update(view=view, colours=colours)
-        return b"png"
-
-    monkeypatch.setattr(difference_module, "mesh_png", draw)
-    places = np.array([MORE, LESS, [0.0, 0.0, 0.0], [0.2, 0.0, 0.0]])
-    mesh = trimesh.Trimesh(places, [[0, 1, 2], [1, 2, 3]], process=False)
-    assert overlay_png(mesh, comparison, view=(1.0, 0.0, 0.0)) == b"png"
-    more, less, neither, outside = given["colours"]
-    assert more[0] > more[2] + 0.2
-    assert less[2] > less[0] + 0.2
-    np.testing.assert_allclose([neither, outside], [SILENT, SILENT], atol=0.05)
-    assert given["view"] == (1.0, 0.0, 0.0)

@@ -8,7 +8,6 @@ from PIL import Image
 
 from sononerf.errors import NumericalError
 from sononerf.geometry.poses import look_at
-from sononerf.report.pictures import scene_picture as echo
 from sononerf.report.pictures.scene_picture import EARS, echo_png, visible_hits
 from sononerf.report.pictures.shading import background, camera_for, draw_mesh
 
@@ -114,15 +113,6 @@ def test_silence_without_hits(ball):
     drawn = pixels(draw(ball, points=np.zeros((0, 3)), level_db=[], **silent))
     assert (drawn[400:800, 1000:1500].sum(axis=-1) < 250).mean() > 0.8  # dark
     assert (drawn[100:300, 1000:1500].sum(axis=-1) > 700).mean() > 0.8  # two flat lines on white
-
-
-def test_an_echo_without_a_hit_is_that_of_edges(ball, monkeypatch):
-    said = []
-    monkeypatch.setattr(echo, "_draw_view", lambda *given: said.append(given[-1]))
-    silent = {"echo": np.zeros((2, 100)), "spectrogram_db": np.zeros((2, 121, 47))}
-    for heard in ({}, silent):
-        draw(ball, points=np.zeros((0, 3)), level_db=[], **heard)
-    assert said == ["no hit: edges alone are heard", "no hit is heard"]
 
 
 def test_wrong_input_is_refused(ball):

@@ -18,13 +18,7 @@ from sononerf.simulation.hearing import Hearing, hearing_of
 from sononerf.simulation.simulator import Simulator
 from sononerf.surface.refine import objective as objectives_module
 from sononerf.surface.refine import refinement as module
-from sononerf.surface.refine.candidates import (
-    Candidate,
-    after_first_stage,
-    best_of,
-    number_of_steps,
-    planned,
-)
+from sononerf.surface.refine.candidates import Candidate, best_of, planned
 from sononerf.surface.refine.descent import Descent, Stage
 from sononerf.surface.refine.objective import Level
 from sononerf.surface.refine.optics import Optics
@@ -102,46 +96,6 @@ def test_a_bumpy_sphere_becomes_round(bumpy, echoes, optics):
         return np.abs(np.linalg.norm(mesh.vertices, axis=1) - RADIUS).mean()
 
     assert off(found.mesh) < 0.5 * off(bumpy)
-
-
-def test_later_bounces_come_off_the_surface_before_the_stage_that_traces(
-    bumpy, echoes, optics, monkeypatch
-):
-    sources, real = [], module.LaterBounces
-
-    def noted(optics, mesh, *given, **named):
-        sources.append(mesh)
-        return real(optics, mesh, *given, **named)
-
-    monkeypatch.setattr(module, "LaterBounces", noted)
-    stages = (
-        dataclasses.replace(SHORT[0], beyond="none"),
-        dataclasses.replace(SHORT[0], beyond="trace"),
-        SHORT[1],
-    )
-    saved = {}
-    for _ in range(2):  # the second time it goes on after the stage that traces
-        work = begun({"body": bumpy}, echoes, optics, stages=stages, saved=saved)
-        work.first_stage()
-        (candidate,) = work.candidates
-        for number in (1, 2):
-            work.stage(candidate, number)
-        assert sources == [candidate.meshes[1]]
-        sources.clear()
-        saved.popitem()
-
-
-def test_a_surface_that_gets_worse_is_not_kept(echoes, optics, monkeypatch):
-    true = trimesh.creation.icosphere(subdivisions=5, radius=RADIUS)
-
-    def spoil(self, number, part):
-        self.vertices = self.vertices * 1.01
-        return 1.0
-
-    monkeypatch.setattr(Descent, "step", spoil)
-    found = refined(true, echoes, optics)
-    assert not found.kept
-    assert np.array_equal(found.mesh.vertices, true.vertices)
 
 
 def test_of_two_starts_the_one_that_explains_more_is_refined(bumpy, echoes, optics):
@@ -303,90 +257,6 @@ def preset(work, objective):
     return work
 
 
-def test_the_better_of_the_blurred_and_the_sharp_surface_goes_on(bumpy, echoes, optics):
-    # Of two that explain about as much the blurred one goes on.
-    for worse, better, value in (
-        ("blurred", "sharp", 9.0),
-        ("sharp", "blurred", 9.0),
-        ("blurred", "blurred", 1.1),
-    ):
-        ends = []
-        work = preset(
-            begun({"body": bumpy}, echoes, optics, after_stage=lambda m, _, e=ends: e.append(m)),
-            lambda mesh, one, number, w=worse, v=value: v if one and one.way == w else 1.0,
-        )
-        work.first_stage()
-        (candidate,) = work.candidates
-        assert candidate.way == better
-        assert candidate.meshes[1:] == [ends[0] if better == "blurred" else ends[1]]
-
-
-def test_what_is_too_thin_for_the_first_blur_is_never_blurred(echoes, optics):
-    thick = 0.5 * optics.wavelength
-    disc = trimesh.creation.cylinder(RADIUS, thick, sections=96).subdivide_to_size(thick / 2)
-    stages = (dataclasses.replace(SHORT[0], blur=1.2, steps=2), SHORT[1])
-    saved = {}
-    for _ in range(2):  # the second time the stage is saved
-        work = begun({"body": disc}, echoes, optics, stages=stages, saved=saved)
-        work.first_stage()
-        assert [(each["stage"], each["way"]) for each in work.history] == [(0, "sharp")]
-        assert [each.way for each in work.candidates] == ["sharp"]
-
-
-PLANS = [(start, way) for start in ("levels", "body") for way in ("blurred", "sharp")]
-
-
-@pytest.mark.parametrize(
-    ("objectives", "last", "chosen", "stages"),
-    [
-        # Both go through all stages; the better one is chosen.
-        ((2.0, 1.0, 1.1, 1.1), {"levels": 1.0, "body": 0.9}, ("body", "blurred"), 6),
-        ((1.1, 1.0, 1.4, 1.1), {"levels": 0.8, "body": 0.9}, ("levels", "sharp"), 6),
-        ((9.0, 5.0, 5.4, 5.0), {"levels": 5.0, "body": 2.9}, ("body", "blurred"), 6),
-        # One that is clearly worse after the first stage is left behind.
-        ((2.0, 1.0, 1.3, 1.2), {"levels": 1.0}, ("levels", "sharp"), 5),
-        ((8.0, 6.5, 5.4, 5.0), {"body": 2.9}, ("body", "blurred"), 5),
-    ],
-)
-def test_levels_and_the_best_other_start_stay_until_they_lose(
-    bumpy, echoes, optics, monkeypatch, objectives, last, chosen, stages
-):
-    small, large = (bumpy.copy().apply_scale(factor) for factor in (0.8, 1.1))
-    starts = {"small": small, "body": bumpy, "levels": large}
-    first = dict(zip(PLANS, objectives, strict=True))
-    history = []
-
-    def objective(objective, mesh, *given, **named):
-        factor = np.ptp(mesh.vertices[:, 0]) / np.ptp(bumpy.vertices[:, 0])
-        if any(len(mesh.vertices) == len(one.vertices) for one in starts.values()):
-            return 9.0 + abs(factor - 1.0)
-        if len(history) < 4:
-            return first[PLANS[len(history)]]
-        return last[order[0] if len(history) == 4 else order[1]]
-
-    order = sorted(last, key=lambda name: min(v for k, v in first.items() if k[0] == name))
-    monkeypatch.setattr(objectives_module.Comparison, "objective", objective)
-    saved = {}
-    for _ in range(2):  # the second time all stages are saved
-        history.clear()
-        found = refined(
-            starts, echoes, optics, saved=saved, after_stage=lambda *given: history.append(given)
-        )
-        assert [(one["start"], one["way"]) for one in found.history[:4]] == PLANS
-        assert len(found.history) == len(history) == stages
-        assert 8 * stages <= number_of_steps(starts, SHORT)
-        assert (found.start, found.kept) == (chosen[0], True)
-        assert (
-            found.history[-1 if found.history[-1]["start"] == chosen[0] else -2]["way"] == chosen[1]
-        )
-        listed = {each["start"]: each for each in found.candidates}
-        assert [name for name, each in listed.items() if each["chosen"]] == [chosen[0]]
-        assert listed["small"]["error_db"] is None
-        compared = [each["start_error_db"] for name, each in listed.items() if name in last]
-        assert all(each >= 9 for each in compared)
-        assert {name: listed[name]["error_db"] for name in last} == pytest.approx(last)
-
-
 @pytest.mark.parametrize(
     ("error", "closed", "chosen"),
     [
@@ -409,61 +279,6 @@ def test_in_doubt_a_closed_candidate_is_chosen_and_levels_before_others(
     inside = [meshes[name] for name in closed]
     found = best_of(candidates, lambda mesh: any(mesh is one for one in inside))
     assert found.start == chosen
-
-
-@pytest.mark.parametrize(
-    ("errors", "way", "kept"),
-    [
-        ({"levels sharp": 3.0, "fuller sharp": 5.0, "fuller blurred": 5.0}, "sharp", "levels"),
-        ({"levels sharp": 5.0, "fuller sharp": 3.0, "fuller blurred": 5.0}, "sharp", "fuller"),
-        ({"levels sharp": 3.2, "fuller sharp": 3.0, "fuller blurred": 2.3}, "blurred", "fuller"),
-        ({"levels sharp": 3.5, "fuller sharp": 3.4, "fuller blurred": 3.3}, "sharp", "fuller"),
-        ({"levels sharp": 3.4, "fuller sharp": 3.5, "fuller blurred": 5.0}, "sharp", "fuller"),
-    ],
-)
-def test_the_better_surface_of_the_network_goes_on_as_levels(bumpy, errors, way, kept):
-    starts = {name: bumpy.copy() for name in ("levels", "fuller")}
-    candidates = []
-    for name, error in errors.items():
-        start, way_of = name.split()
-        after = bumpy.copy()
-        after.metadata["of"] = start
-        candidates.append(Candidate(way_of, start, None, [starts[start], after], [9.0, error]))
-    (found,) = after_first_stage(candidates, lambda mesh: 0.0)
-    assert (found.start, found.way) == ("levels", way)
-    assert found.meshes[1].metadata["of"] == kept
-    assert found.meshes[0] is starts["levels"]  # what is kept where no refined one is better
-
-
-@pytest.mark.parametrize(
-    ("planes", "other", "sheet", "ways"),
-    [
-        (5.0, 4.0, 9.0, ["planes"]),
-        (5.8, 4.0, 9.0, ["planes", "sharp"]),
-        (6.0, 3.8, 9.0, ["sharp", "planes"]),
-        (6.0, 3.0, 9.0, ["sharp"]),
-        (5.0, 4.0, 4.5, ["sheet"]),
-        (5.0, 4.0, 4.7, ["planes"]),
-    ],
-)
-def test_planes_are_compared_by_echoes_alone_and_in_doubt_both_go_on(
-    bumpy, planes, other, sheet, ways
-):
-    def candidate(way, start, objective):
-        after = bumpy.copy()
-        after.metadata["way"] = way
-        return Candidate(way, start, None, [bumpy, after], [9.0, objective])
-
-    found = after_first_stage(
-        [
-            candidate("planes", "levels", planes),
-            candidate("sharp", "levels", other),
-            candidate("blurred", "open", 5.5),
-            candidate("sheet", "sheet", sheet),
-        ],
-        lambda mesh: 2.0 if mesh.metadata["way"] == "planes" else 0.0,
-    )
-    assert [one.way for one in found] == ways
 
 
 def test_levels_is_refined_from_the_fuller_surface_too():

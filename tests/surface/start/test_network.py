@@ -28,7 +28,6 @@ from sononerf.surface.start.features import (
     pooled,
 )
 from sononerf.surface.start.network import (
-    BLOCK,
     FRAMES,
     FULLER,
     LOGIT,
@@ -267,15 +266,6 @@ def test_the_lattice_has_a_bound_however_large_the_region_is():
     _, hull = heard(around(20))
     lattice = lattice_of(hull, 500 * BOX, RESOLUTION)
     assert np.prod(lattice.shape) < 2 * network.LARGEST
-
-
-def test_a_large_body_gets_a_coarser_lattice(monkeypatch):
-    monkeypatch.setattr(network, "LARGEST", 40_000)
-    levels, hull = heard(around(60))
-    lattice = lattice_of(hull, BOX, RESOLUTION)
-    assert np.prod(lattice.shape) < 100_000
-    assert all(size % BLOCK == 0 for size in lattice.shape)
-    assert levels_surfaces(levels, hull, BOX, RESOLUTION)[0].is_watertight
 
 
 def test_each_channel_is_a_voxel_of_its_place():

@@ -7,7 +7,6 @@ from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError, SettingsError
 from sononerf.field.field import Field, sphere_directions
 from sononerf.field.grid import GridField
-from sononerf.surface.start import read_out
 from sononerf.surface.start.read_out import (
     energy_volume,
     read_field,
@@ -84,12 +83,6 @@ def hull_of_the_sphere(count=300, radius=RADIUS):
     return EchoHull(sources, sources[:, None], away - radius, -ways / away)
 
 
-def deaf(sources):
-    """Known places of poses that heard no first echo."""
-    count = len(sources)
-    return EchoHull(sources, sources[:, None], np.full((count, 1), -np.inf), 0 * sources)
-
-
 def read(field, hull=None, method="filled", **options):
     """Read out at once, with the range resolution that fits the blur of the field."""
     hull = hull_of_the_sphere() if hull is None else hull
@@ -115,25 +108,6 @@ def test_the_surface_of_the_occupancy_is_the_sphere_and_says_who_heard_it(method
     assert found.openness.kind == "closed"
     assert found.confidence.shape == (len(found.mesh.vertices),)
     assert found.confidence.max() > 10
-
-
-@pytest.fixture(scope="module")
-def whole():
-    return read(sounding(RADIUS))
-
-
-def test_one_reading_serves_all_methods(whole):
-    reading = read_field(sounding(RADIUS), hull_of_the_sphere(), resolution=0.005)
-    found = dict(start_surfaces(reading, ["hull", "filled"]))
-    assert list(found) == ["hull", "filled"]
-    np.testing.assert_array_equal(whole.mesh.vertices, found["filled"].vertices)
-
-
-def test_a_method_without_a_surface_is_left_out_where_another_one_has_one():
-    reading = read_field(sounding(RADIUS), hull_of_the_sphere(), resolution=0.005)
-    assert [name for name, _ in start_surfaces(reading, ["sheet", "filled"])] == ["filled"]
-    with pytest.raises(NumericalError, match="one sheet"):
-        list(start_surfaces(reading, ["sheet"]))
 
 
 def test_where_the_field_is_silent_the_surface_lies_along_the_onsets():
@@ -166,33 +140,6 @@ def test_the_hull_is_what_first_echoes_leave_whatever_the_field_says():
     assert not silent.confidence.any()
 
 
-@pytest.mark.parametrize("method", ["open", "filled", "hull"])
-def test_where_nothing_was_heard_there_is_no_surface(method):
-    mute = sounding(RADIUS)
-    mute.occupancy.zero_()
-    hull = deaf(sources_around().double().numpy())
-    with pytest.raises(NumericalError, match="no pose heard an echo"):
-        read(mute, hull, method=method)
-
-
-def test_without_first_echoes_there_is_no_hull():
-    hull = deaf(sources_around().double().numpy())
-    with pytest.raises(NumericalError, match="no pose has a first echo"):
-        read(sounding(RADIUS), hull, method="hull")
-
-
-def test_a_volume_too_coarse_to_meet_the_field_does_not_matter_to_the_occupancy(monkeypatch):
-    plain = read_out.volume_from_function
-
-    def missed(function, *given, **options):
-        return plain(lambda points: 0 * points[:, 0], *given, **options)
-
-    monkeypatch.setattr(read_out, "volume_from_function", missed)
-    assert read(sounding(RADIUS)).mesh.is_watertight
-    with pytest.raises(NumericalError, match="no surface: the field is silent everywhere"):
-        cut(sounding(RADIUS))
-
-
 def test_few_poses_leave_a_body_that_holds_the_true_one():
     found = read(sounding(RADIUS), hull_of_the_sphere(20))
     assert found.mesh.is_watertight
@@ -217,17 +164,6 @@ def test_the_volume_holds_the_energy_where_it_is():
     alone = energy_volume(field, SPACING / 2, 100)
     np.testing.assert_array_equal(alone.values, volume.values)
     np.testing.assert_array_equal(alone.origin, volume.origin)
-
-
-def test_the_size_of_the_region_does_not_matter(whole):
-    wider = torch.stack((REGION[0] - 0.009, REGION[1] + 0.009))
-    one = whole.mesh
-    moved = Sounding(wider, FREQUENCY, spacing=SPACING, levels=1)
-    moved.load_state_dict(lobes_on_a_sphere(region=wider).state_dict())
-    two = read(moved).mesh
-    assert two.volume == pytest.approx(one.volume, rel=0.01)
-    np.testing.assert_allclose(two.centroid, one.centroid, atol=1e-4)
-    np.testing.assert_allclose(one.centroid, MIDDLE, atol=2e-4)
 
 
 def test_a_field_without_lobes_is_read_at_a_level():
@@ -273,17 +209,6 @@ def test_an_isosurface_of_lobes_is_a_shell():
     found = cut(lobes_on_a_sphere(), directions=30)
     # A shell: its outer side lies outside of the sphere, its inner side is a cavity.
     assert radii(found.mesh).min() < RADIUS - 0.0005 < RADIUS + 0.0005 < radii(found.mesh).max()
-
-
-def test_chunks_have_no_seams(monkeypatch, whole):
-    done = []
-    monkeypatch.setattr(read_out, "_CHUNK", 777)
-    pieces = read(sounding(RADIUS), progress=lambda *counts: done.append(counts))
-    np.testing.assert_allclose(pieces.volume.values, whole.volume.values, rtol=1e-5, atol=1e-9)
-    np.testing.assert_allclose(pieces.mesh.vertices, whole.mesh.vertices, atol=1e-5)
-    total = whole.volume.values.size
-    assert done[-1] == (total, total)
-    assert len(done) >= total // 777
 
 
 def test_what_is_not_kept_has_no_surface():

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: MIT
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import trimesh
-from scipy.spatial import cKDTree
 
 from sononerf.echoes.free_space import EchoHull
 from sononerf.errors import NumericalError
@@ -94,12 +91,6 @@ def test_a_sheet_is_found_however_it_is_turned(bent):
     assert np.quantile(off(sheet), 0.95) < 0.25 * RESOLUTION
 
 
-def test_a_sheet_scales_with_the_world(bent):
-    one, three = fit_sheet(gathered(*bent)), fit_sheet(gathered(*bent, scale=3.0))
-    away, _ = cKDTree(one.vertices).query(np.asarray(three.vertices) / 3.0)
-    assert np.quantile(away, 0.9) < 0.02 * RESOLUTION
-
-
 def test_a_thick_body_is_no_sheet():
     rng = np.random.default_rng(1)
     normals = rng.standard_normal((400, 3))
@@ -123,15 +114,3 @@ def test_a_sheet_of_which_only_the_rim_was_heard_is_refused(bent):
     sideways[:, 0] = 1.0
     with pytest.raises(NumericalError, match="sides of a sheet"):
         fit_sheet(gathered(points, sideways))
-
-
-def test_onsets_that_leave_no_room_are_refused(bent):
-    known = gathered(*bent)
-    outside = np.abs(known.bound) + np.float32(1.0)
-    with pytest.raises(NumericalError, match="no room"):
-        fit_sheet(dataclasses.replace(known, bound=outside))
-    # A few single voxels are less than the smoothing of the outline leaves.
-    few = outside + 3
-    few[8:40:8, 15, 6] = -0.01
-    with pytest.raises(NumericalError, match="no surface"):
-        fit_sheet(dataclasses.replace(known, bound=few))
