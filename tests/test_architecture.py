@@ -11,8 +11,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from packaging.requirements import Requirement
-from packaging.version import Version
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "sononerf"
@@ -69,8 +67,6 @@ def imports(tree):
             for alias in node.names:
                 yield alias.name, node.lineno
         elif isinstance(node, ast.ImportFrom):
-            if node.level:  # a rule of its own, `relative_imports`
-                continue
             if node.module == "sononerf":
                 for alias in node.names:
                     yield f"sononerf.{alias.name}", node.lineno
@@ -121,12 +117,6 @@ def strings_up(tree, room):
             yield node.lineno
 
 
-def relative_imports(tree):
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            yield node.lineno
-
-
 def impure_imports(tree, module):
     if module not in PURE:
         return
@@ -154,27 +144,6 @@ def device_choices(tree, room):
         ]
         if chosen or method == "cuda" or name == "torch.device":
             yield node.lineno
-
-
-def code_loading(tree, file):
-    forbidden = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "shelve", "marshal"}
-    if file == "executor.py":  # it pickles for its own worker processes, and reads no file
-        forbidden.remove("pickle")
-    for module, line in imports(tree):
-        if module.partition(".")[0] in forbidden:
-            yield line
-    for node, name, method in calls(tree):
-        if name in ("yaml.load", "yaml.unsafe_load", "yaml.full_load") and file != "loading.py":
-            yield node.lineno
-        if name == "torch.load" and file != "checkpoint_io.py":
-            yield node.lineno
-        if method == "load_from_checkpoint" or name in ("eval", "exec"):
-            yield node.lineno
-        for keyword in node.keywords:
-            if keyword.arg in ("allow_pickle", "weights_only"):
-                safe = keyword.arg == "weights_only"
-                if not (isinstance(keyword.value, ast.Constant) and keyword.value.value is safe):
-                    yield node.lineno
 
 
 SINKS = {
@@ -211,39 +180,6 @@ def writing(tree, file):
                 yield node.lineno
 
 
-def drawing(tree, room):
-    if room == "report":
-        return
-    for module, line in imports(tree):
-        if module.partition(".")[0] == "matplotlib":
-            yield line
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Attribute) and node.attr == "Plotter":
-            yield node.lineno
-
-
-def global_randomness(tree):
-    explicit = {"default_rng", "SeedSequence", "Generator", "PCG64", "Philox", "BitGenerator"}
-    for module, line in imports(tree):
-        if module == "random":
-            yield line
-    for node in ast.walk(tree):
-        name = dotted(node) if isinstance(node, ast.Attribute) else ""
-        found = re.fullmatch(r"(?:np|numpy)\.random\.(\w+)", name)
-        if found and found[1] not in explicit:
-            yield node.lineno
-
-
-def unnamed_entries(tree):
-    """Find docstrings that describe an entry of a list by a question, or by "Of ..."."""
-    question = r"What|Where|Which|Who|When|How|By how|So many|As many|Of|That|None of"
-    for node in ast.walk(tree):
-        if isinstance(node, ast.FunctionDef | ast.ClassDef):
-            text = ast.get_docstring(node) or ""
-            if re.search(rf"^    [\w, ]+( \(.*\))?: ({question})\b", text, re.MULTILINE):
-                yield node.lineno
-
-
 def faults(path):
     """Return every broken rule of one source file as `file:line: rule`."""
     tree = parse(path)
@@ -255,14 +191,9 @@ def faults(path):
     found = {
         "an arrow that points up": arrows_up(tree, room),
         "an arrow up by a string": strings_up(tree, room),
-        "a relative import": relative_imports(tree),
         "not pure": impure_imports(tree, module),
         "chooses a device": device_choices(tree, room),
-        "may run code from a file": code_loading(tree, file),
         "writes past storage": writing(tree, file),
-        "draws outside report": drawing(tree, room),
-        "global random numbers": global_randomness(tree),
-        "an entry without a noun": unnamed_entries(tree),
     }
     return [f"{name_of(path)}:{line}: {rule}" for rule, lines in found.items() for line in lines]
 
@@ -280,7 +211,6 @@ def test_every_source_keeps_the_rules():
         (arrows_up, ("scene",), "import sononerf_scenes.sphere", "import trimesh"),
         (arrows_up, ("scene",), "import sononerf.head.ears", "import sononerf.settings.plugins"),
         (arrows_up, ("echoes",), "def f():\n import sononerf.run.fit", "import sononerf.echoes.x"),
-        (relative_imports, (), "from .store import x", "from sononerf.echoes.store import x"),
         (impure_imports, ("sononerf.field.grid",), "import numpy", "import math, torch.nn"),
         (
             impure_imports,
@@ -293,16 +223,6 @@ def test_every_source_keeps_the_rules():
         (device_choices, ("echoes",), "torch.ones(1, device='cpu')", "f(device=x.device)"),
         (device_choices, ("field",), "x.cuda()", "x.cpu()"),
         (device_choices, ("field",), "torch.device(0)", "x.device"),
-        (code_loading, ("data.py",), "import pickle", "import json"),
-        (code_loading, ("scene.py",), "yaml.load(x)", "yaml.safe_load(x)"),
-        (code_loading, ("scene.py",), "torch.load(x)", "np.load(x)"),
-        (code_loading, ("checkpoint_io.py",), "torch.load(x, weights_only=False)", "torch.load(x)"),
-        (
-            code_loading,
-            ("a.py",),
-            "np.load(x, allow_pickle=True)",
-            "np.load(x, allow_pickle=False)",
-        ),
         (writing, ("a.py",), "open(p, 'w')", "open(p)"),
         (writing, ("a.py",), "p.open('wb')", "p.open('rb')"),
         (writing, ("a.py",), "open(p, mode='a')", "open('w.txt')"),
@@ -310,16 +230,6 @@ def test_every_source_keeps_the_rules():
         (writing, ("a.py",), "mesh.export(p)", "mesh.export(file_type='ply')"),
         (writing, ("a.py",), "np.save('a.npy', x)", "np.save(file, x)"),
         (writing, ("a.py",), "image.save(path)", "image.save(buffer, format='PNG')"),
-        (drawing, ("echoes",), "import matplotlib.pyplot", "import numpy"),
-        (drawing, ("geometry",), "pv.Plotter()", "pv.PolyData()"),
-        (global_randomness, (), "np.random.rand(3)", "np.random.default_rng(0)"),
-        (global_randomness, (), "import random", "import math"),
-        (
-            unnamed_entries,
-            (),
-            'def f(a):\n    """F.\n\n    Args:\n        a ((3,), m): Where it is.\n    """',
-            'def f(a):\n    """F.\n\n    Args:\n        a ((3,), m): Its place.\n    """',
-        ),
     ],
 )
 def test_each_rule_sees_a_source_that_breaks_it(rule, arguments, bad, good):
@@ -378,23 +288,6 @@ def test_importing_stays_light(module, heavy):
 @pytest.fixture(scope="module")
 def project():
     return tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-
-
-@pytest.mark.parametrize(
-    ("name", "refused", "allowed"),
-    [
-        ("lightning", ["2.6.2", "2.6.3", "2.6.5", "2.7.0"], "2.6.6"),
-        ("torch", ["2.9.1"], "2.10.0"),
-        ("trimesh", ["5.1.0"], "5.2.0"),
-        ("zarr", ["3.1.5"], "3.1.6"),
-    ],
-)
-def test_floors_hold(project, name, refused, allowed):
-    requirements = [Requirement(text) for text in project["project"]["dependencies"]]
-    (found,) = [requirement for requirement in requirements if requirement.name == name]
-    assert Version(allowed) in found.specifier
-    for version in refused:
-        assert Version(version) not in found.specifier
 
 
 def test_every_folder_is_packaged(project):

@@ -1,15 +1,23 @@
 # SPDX-License-Identifier: MIT
 """Processes that die, that cannot make what they are sent, and that a script starts."""
 
+import importlib
 import os
+import re
 import signal
 import subprocess
 import sys
+from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+import sononerf
+from sononerf import progress
 from sononerf.errors import NumericalError, ResourceError
 from sononerf.executor import TaskError, computed
+from sononerf.memory import available_memory, require_disk, require_memory
+from sononerf.progress import Progress
 
 TASKS = {number: (number,) for number in range(6)}
 
@@ -90,3 +98,142 @@ def test_a_script_without_a_guard_starts_workers(tmp_path):
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False)
     assert (done.stdout, done.returncode) == ("begun\n[(2, 3), (3, 4)]\n", 0), done.stderr
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that is set by hand."""
+    clock = SimpleNamespace(now=100.0)
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    return clock
+
+
+def test_plain_lines_come_now_and_then(clock, capsys):
+    with Progress().task("fitting", 50) as task:
+        for step in range(50):
+            clock.now += 1.0
+            task.advance(note=f"loss {step}")
+    out, err = capsys.readouterr()
+    assert out == ""
+    lines = err.splitlines()
+    assert lines[0] == "fitting: 10 of 50, 10 s, 1/s, 40 s left loss 9"
+    assert lines[-1] == "fitting: 50 of 50, 50 s loss 49"
+    # One per ten seconds, and one at the end: once, where both fall together.
+    assert [line.split(",")[0] for line in lines] == [
+        f"fitting: {n} of 50" for n in (10, 20, 30, 40, 50)
+    ]
+    assert "\x1b" not in err
+
+
+def test_short_work_says_nothing(clock, capsys):
+    with Progress().task("looking", 3) as task:
+        clock.now += 1.0
+        task.advance(3)
+    assert task.done == 3
+    assert capsys.readouterr() == ("", "")
+
+
+def test_quiet_says_nothing(clock, capsys):
+    shown = Progress(quiet=True)
+    shown.say("hello")
+    with shown.task("fitting", 2) as task:
+        clock.now += 60.0
+        task.advance(note="x")
+        task.advance()
+    assert (task.done, task.note) == (2, "x")
+    assert capsys.readouterr() == ("", "")
+
+
+def test_silenced_makes_each_new_one_quiet(clock, monkeypatch, capsys):
+    monkeypatch.setattr(Progress, "silenced", True)
+    shown = Progress()
+    shown.say("hello")
+    with shown.task("fitting", 2) as task:
+        clock.now += 60.0
+        task.advance()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_a_saying_is_one_line_as_it_is(capsys):
+    text = "region [-1, 2] mm " + "long " * 60 + "[red]end[/red]"
+    Progress().say(text)
+    assert capsys.readouterr() == ("", text + "\n")
+
+
+def test_a_narrow_terminal_gets_the_count_alone(monkeypatch, capsys):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", "40")
+    with Progress().task("fitting", 4) as task:
+        task.advance(3, note="a note that is longer than the line")
+    err = re.sub("\x1b[^a-zA-Z]*[a-zA-Z]", "", capsys.readouterr().err)
+    assert "3/4" in err
+    assert max(len(line.rstrip()) for line in re.split("[\r\n]", err)) <= 40
+
+
+def test_a_terminal_gets_a_bar(monkeypatch, capsys):
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "120")
+    monkeypatch.setenv("FORCE_COLOR", "1")  # what makes rich take any stream for a terminal
+    shown = Progress()
+    with shown.task("fitting", 4) as task:
+        task.advance(3, note="loss 7")
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert "fitting" in err
+    assert "3/4" in err
+    assert "loss 7" in err
+
+
+def test_available_memory_is_plausible():
+    free = available_memory()
+    assert free is None or 10_000_000 < free < 10**15
+
+
+def run(code):
+    """Run Python in a process of its own and return what it says."""
+    found = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False
+    )
+    return found.stdout + found.stderr
+
+
+def test_work_that_needs_too_much_is_refused_with_the_figure():
+    require_memory(1e6, "a small thing", "nothing")
+    with pytest.raises(ResourceError, match=r"a fit needs about 1,000,000 GB of memory, and .* GB"):
+        require_memory(1e15, "a fit", "make it smaller")
+
+
+def test_files_that_the_disk_does_not_hold_are_refused(tmp_path):
+    require_disk(1e3, tmp_path / "new" / "store", "echoes", "lower it")
+    with pytest.raises(
+        ResourceError, match=r"^echoes needs about [\d,]+ GB of disk, and .*; lower"
+    ):
+        require_disk(1e18, tmp_path / "new" / "store", "echoes", "lower it")
+    assert not (tmp_path / "new").exists()
+
+
+PACKAGE = Path(sononerf.__file__).parent
+HOLDERS = sorted(
+    str(path.relative_to(PACKAGE.parent).with_suffix("")).replace(os.sep, ".")
+    for path in PACKAGE.rglob("*.py")
+    if "\n@compiled\n" in path.read_text(encoding="utf-8")
+)
+
+
+def is_compiled(value):
+    return hasattr(value, "py_func")
+
+
+@pytest.mark.parametrize("name", HOLDERS)
+def test_a_compiled_function_calls_compiled_ones_of_its_own_file_alone(name):
+    """Numba looks at the time of that file, and of no other."""
+    module = importlib.import_module(name)
+    own = {key: value for key, value in vars(module).items() if is_compiled(value)}
+    assert own
+    for function in own.values():
+        if function.py_func.__module__ != name:
+            continue
+        for called in function.py_func.__code__.co_names:
+            value = own.get(called)
+            assert value is None or value.py_func.__module__ == name, called

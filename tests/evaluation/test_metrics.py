@@ -5,6 +5,10 @@ import trimesh
 
 from sononerf.errors import NumericalError
 from sononerf.evaluation.metrics import geometry_metrics, target_metrics
+from sononerf.evaluation.numbers import added_part, compare
+from sononerf.evaluation.traced import covered, interval_db, learn_interval
+from sononerf.geometry.lattice import Volume, grid_over
+from sononerf.head.decibels import RANGE_DB
 
 RADIUS = 0.015
 
@@ -176,3 +180,109 @@ def test_ground_that_lies_near_does_not_stand_in_for_what_is_missing():
     assert above["chamfer_m"] == pytest.approx(alone["chamfer_m"], rel=0.05)
     # Of the lower half all but a ring of 5 mm (a third of the half) is farther than 5 mm.
     assert alone["fscore"]["0.005"] == pytest.approx(2 / (1 + 1 / 0.67), abs=0.05)
+
+
+def drawn(seed, poses=12):
+    """Levels, and predictions whose error grows with the level and with the frequency."""
+    rng = np.random.default_rng(seed)
+    predicted = rng.uniform(0.0, 50.0, (poses, 2, 40, 24))
+    spread = (0.5 + predicted / 10.0) * np.linspace(0.5, 2.0, 24)
+    return predicted + spread * rng.standard_normal(predicted.shape), predicted
+
+
+def test_nine_tenths_of_new_cells_lie_within_the_interval_at_each_level_and_frequency():
+    half = learn_interval(*drawn(0), 3.0)
+    measured, predicted = drawn(1)
+    found = interval_db(predicted, half)
+    assert covered(measured, predicted, found, 3.0) == pytest.approx(0.9, abs=0.02)
+    loud = predicted > 30.0
+    within = np.abs(measured - predicted) <= found
+    for part in (loud[..., :8], loud[..., 16:]):
+        cells = within[..., :8] if part is loud[..., :8] else within[..., 16:]
+        assert cells[part].mean() == pytest.approx(0.9, abs=0.06)
+    assert found[..., -1][loud[..., -1]].mean() > 2.0 * found[..., 0][loud[..., 0]].mean()
+
+
+def test_levels_that_were_never_predicted_are_as_uncertain_as_lower_ones():
+    measured, predicted = drawn(0)
+    low = np.minimum(predicted, 20.0)
+    half = learn_interval(np.minimum(measured, 20.0), low, 3.0)
+    assert (interval_db(np.full((1, 24), 55.0), half) == half[3]).all()
+
+
+def test_lower_levels_that_were_never_predicted_are_as_uncertain_as_higher_ones():
+    measured, predicted = drawn(0)
+    half = learn_interval(measured + 24.0, predicted + 24.0, 3.0)
+    assert (interval_db(np.full((1, 24), 4.0), half) == half[4]).all()
+    assert (half[4] > 0.0).all()
+
+
+def test_where_nothing_was_heard_a_level_is_not_known():
+    silent = np.zeros((2, 1, 5, 3))
+    assert (learn_interval(silent, silent, 3.0) == RANGE_DB).all()
+    assert covered(silent, silent, silent, 3.0) is None
+
+
+GRID = grid_over([-0.03] * 3, [0.03] * 3, 0.005)
+
+
+def bump(place, height=1.0, width=0.006):
+    """A Gaussian about a place, m."""
+    distance = np.linalg.norm(GRID.points() - place, axis=1)
+    values = height * np.exp(-0.5 * (distance / width) ** 2)
+    return values.reshape(GRID.shape)
+
+
+def test_what_only_the_first_has_is_found_where_it_is():
+    both, more = bump([0.0, 0.0, -0.015]), bump([0.0, 0.01, 0.015], 0.5)
+    found = compare(GRID.with_values(both + more), GRID.with_values(both))
+    np.testing.assert_allclose(found.strongest, [0.0, 0.01, 0.015], atol=1e-9)
+    np.testing.assert_allclose(found.difference.values, found.first.values - found.second.values)
+    assert found.score == pytest.approx(0.5, rel=0.01)
+    # What is missing from the first is no place of its own.
+    turned = compare(GRID.with_values(both), GRID.with_values(both + more))
+    assert turned.score < 0.01
+    np.testing.assert_allclose(turned.difference.values, -found.difference.values)
+
+
+def test_the_common_maximum_is_one():
+    faint, loud = GRID.with_values(bump([0, 0, 0], 1e-9)), GRID.with_values(bump([0, 0, 0], 4e-9))
+    for pair in ((faint, loud), (loud, faint)):
+        found = compare(*pair)
+        assert max(found.first.values.max(), found.second.values.max()) == pytest.approx(1.0)
+        assert min(found.first.values.max(), found.second.values.max()) == pytest.approx(0.25)
+
+
+def test_equal_fields_do_not_differ():
+    one = GRID.with_values(bump([0, 0, 0]))
+    found = compare(one, one)
+    assert found.score == 0
+    assert found.strongest is None
+    assert (found.difference.values == 0).all()
+
+
+def test_what_is_weaker_everywhere_is_strongest_nowhere():
+    found = compare(GRID.with_values(bump([0, 0, 0])), GRID.with_values(bump([0, 0, 0]) + 1.0))
+    assert found.score < 0
+    assert found.strongest is None
+
+
+def test_what_cannot_be_compared():
+    one = GRID.with_values(bump([0, 0, 0]))
+    with pytest.raises(ValueError, match="different grids"):
+        compare(one, Volume(one.values, one.origin + 0.001, one.spacing))
+    with pytest.raises(ValueError, match="different grids"):
+        compare(one, Volume(one.values, one.origin, 0.004))
+    with pytest.raises(NumericalError, match="both are silent"):
+        compare(GRID, GRID)
+
+
+def test_what_was_added_is_told_from_what_was_there():
+    body = trimesh.creation.box((0.1, 0.02, 0.1))
+    more = trimesh.creation.icosphere(radius=0.01).apply_translation([0.0, 0.02, 0.03])
+    both = trimesh.util.concatenate([body, more])
+    found = added_part(both, body)
+    assert len(found.faces) == len(more.faces)
+    np.testing.assert_allclose(found.bounds, more.bounds)
+    assert added_part(body, both) is None
+    assert added_part(body, body) is None

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: MIT
+import hashlib
+import json
 import math
+import resource
 from types import SimpleNamespace
 
 import lightning
@@ -8,7 +11,15 @@ import pytest
 import torch
 
 from sononerf.echoes.store import EnsembleStore
-from sononerf.errors import NumericalError
+from sononerf.errors import IncompatibleError, InputError, NumericalError, StorageError
+from sononerf.field.checkpoint_io import (
+    DESCRIPTION_NAME,
+    WEIGHTS_NAME,
+    DurableCheckpointIO,
+    load_weights,
+    model_checksum,
+    save_weights,
+)
 from sononerf.field.datamodule import EchoDataModule
 from sononerf.field.grid import GridField
 from sononerf.field.module import EchoModule, decibels
@@ -252,3 +263,102 @@ def test_training_on_single_slices_lowers_the_loss(store, tmp_path):
     losses, _, found = fit(store, ShellRenderer(REGION, LISTENER, directions=200), tmp_path, 30)
     assert np.mean(losses[-3:]) < 0.8 * losses[0]
     assert all(p.isfinite().all() for p in found.parameters())
+
+
+STATE = {"grid": torch.arange(6.0).reshape(2, 3).T, "bias": torch.ones(2, dtype=torch.complex64)}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    save_weights(tmp_path, STATE, {"field": {"kind": "grid"}})
+    return tmp_path
+
+
+def test_round_trip(folder):
+    assert (
+        model_checksum(folder) == hashlib.sha256((folder / WEIGHTS_NAME).read_bytes()).hexdigest()
+    )
+    state, description = load_weights(folder)
+    assert state.keys() == STATE.keys()
+    for name, tensor in STATE.items():
+        assert torch.equal(state[name], tensor)
+    assert description["field"] == {"kind": "grid"}
+    assert description["schema_version"] == 1
+
+
+def test_same_weights_same_bytes(folder, tmp_path_factory):
+    other = tmp_path_factory.mktemp("other")
+    save_weights(other, STATE, {"field": {"kind": "grid"}})
+    for name in (WEIGHTS_NAME, DESCRIPTION_NAME):
+        assert (folder / name).read_bytes() == (other / name).read_bytes()
+
+
+def test_every_flipped_byte_is_refused(folder):
+    path = folder / WEIGHTS_NAME
+    whole = path.read_bytes()
+    for offset in range(0, len(whole), 7):
+        path.write_bytes(whole[:offset] + bytes([whole[offset] ^ 1]) + whole[offset + 1 :])
+        with pytest.raises(InputError, match="damaged"):
+            load_weights(folder)
+
+
+def test_missing_files_are_named(folder):
+    (folder / WEIGHTS_NAME).unlink()
+    with pytest.raises(InputError, match=WEIGHTS_NAME):
+        load_weights(folder)
+    (folder / DESCRIPTION_NAME).unlink()
+    with pytest.raises(InputError, match=DESCRIPTION_NAME):
+        load_weights(folder)
+
+
+@pytest.mark.parametrize(
+    ("version", "error"), [(2, IncompatibleError), (0, InputError), ("1", InputError)]
+)
+def test_other_schema_versions_are_refused(folder, version, error):
+    path = folder / DESCRIPTION_NAME
+    path.write_text(json.dumps({**json.loads(path.read_text()), "schema_version": version}))
+    with pytest.raises(error, match="schema_version"):
+        load_weights(folder)
+
+
+@pytest.fixture
+def path(tmp_path):
+    io = DurableCheckpointIO()
+    for step in range(3):
+        io.save_checkpoint({"step": step, "w": torch.full((100,), float(step))}, tmp_path / "c")
+    return tmp_path / "c"
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"no archive"])
+def test_a_damaged_one_is_one_clear_line(path, content):
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="start the fit again with --overwrite") as caught:
+        DurableCheckpointIO().load_checkpoint(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_full_disk_is_a_storage_error_and_keeps_the_old_one(path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+    try:
+        with pytest.raises(StorageError, match="size limit"):
+            DurableCheckpointIO().save_checkpoint({"w": torch.ones(100_000)}, path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert DurableCheckpointIO().load_checkpoint(path)["step"] == 2
+    assert [p.name for p in path.parent.iterdir()] == ["c"]
+
+
+def test_remove_leaves_nothing(path):
+    DurableCheckpointIO().remove_checkpoint(path)
+    assert list(path.parent.iterdir()) == []
+
+
+def test_nan_in_weights_is_refused_with_their_name(path):
+    state = {"field.table": torch.tensor([1.0, math.nan]), "hull.first": torch.tensor([-math.inf])}
+    DurableCheckpointIO().save_checkpoint({"state_dict": state}, path)
+    with pytest.raises(InputError, match=r"field\.table holds NaN; repeat the fit"):
+        DurableCheckpointIO().load_checkpoint(path)
+    save_weights(path.parent, state, {"echo_hash": "x"})
+    with pytest.raises(InputError, match=r"model\.safetensors: field\.table holds NaN"):
+        load_weights(path.parent)

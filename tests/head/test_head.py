@@ -5,6 +5,15 @@ import numpy as np
 import pytest
 
 from sononerf.geometry.poses import rotation_from_euler
+from sononerf.head.air import air_absorption, speed_of_sound
+from sononerf.head.decibels import (
+    ACTIVE_DB,
+    EXCEEDED,
+    active_level,
+    compress,
+    expand,
+    mae_all_and_active,
+)
 from sononerf.head.head import Head, PointEcho, own_top
 from sononerf.settings.schema import CallSettings, EarSettings, SpectrogramSettings
 
@@ -57,3 +66,88 @@ def test_a_head_has_a_plane_where_things_stand_on_a_support():
     plane = Head(support={"point": [0.0, 0.0, -0.1]}).plane
     assert plane is not None
     assert plane.height(np.array([[0.0, 0.0, 0.3]])) == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize(
+    ("temperature_c", "relative_humidity", "band", "per_kilometre"),
+    [
+        # ISO 9613-1:1993, table 1, dB/km, at exact mid-band frequencies 1000 * 10**(band / 10).
+        (10.0, 0.70, 0, 3.66e0),
+        (20.0, 0.70, 0, 4.98e0),
+        (20.0, 0.10, 7, 1.33e2),
+        (15.0, 0.20, 3, 2.82e1),  # also ISO 9613-2:1996, table 2
+        (10.0, 0.70, 9, 1.17e2),
+    ],
+)
+def test_rows_of_the_standard(temperature_c, relative_humidity, band, per_kilometre):
+    found = air_absorption(
+        1000.0 * 10.0 ** (band / 10.0),
+        temperature_c=temperature_c,
+        relative_humidity=relative_humidity,
+    )
+    assert 1000.0 * found == pytest.approx(per_kilometre, rel=5e-3)
+
+
+def test_ultrasound_as_computed_by_pyfar():
+    found = air_absorption([20e3, 50e3, 100e3], temperature_c=20.0, relative_humidity=0.5)
+    np.testing.assert_allclose(found, [0.524, 1.661, 3.280], atol=6e-4)
+
+
+def test_pressure_divides_the_relaxation_frequencies():
+    # Everything in the standard depends on f / p and on the molar share of water.
+    low = air_absorption(20e3, temperature_c=20.0, relative_humidity=0.25, pressure=101_325.0 / 2)
+    high = air_absorption(40e3, temperature_c=20.0, relative_humidity=0.5)
+    assert low == pytest.approx(high / 2, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"temperature_c": 50.1}, "temperature_c"),
+        ({"temperature_c": -20.1}, "temperature_c"),
+        ({"relative_humidity": 1.01}, "relative_humidity"),
+        ({"relative_humidity": -0.01}, "relative_humidity"),
+        ({"frequency": 1.1e6}, "frequency / pressure"),
+        ({"frequency": 10.0}, "frequency / pressure"),
+        ({"frequency": float("nan")}, "frequency / pressure"),
+    ],
+)
+def test_outside_the_standard_is_refused(arguments, match):
+    good = {"frequency": 50e3, "temperature_c": 20.0, "relative_humidity": 0.5}
+    with pytest.raises(ValueError, match=match):
+        air_absorption(**{**good, **arguments})
+
+
+@pytest.mark.parametrize(
+    ("temperature_c", "expected"), [(0.0, 331.3), (20.0, 343.2), (35.0, 351.9)]
+)
+def test_speed_of_sound(temperature_c, expected):
+    assert speed_of_sound(temperature_c) == pytest.approx(expected, abs=0.06)
+
+
+def test_noise_makes_one_cell_in_a_thousand_active():
+    rng = np.random.default_rng(0)
+    rms = np.array([[30.0], [50.0]])  # far above the reference, two ears, one frequency
+    parts = rng.standard_normal((2, 2, 400_000)) * np.sqrt(0.5)
+    magnitude = rms * np.hypot(*parts)  # Rayleigh's distribution
+    active = compress(magnitude, 1.0) >= active_level(rms, 1.0)[:, 0]
+    assert 0.8 * EXCEEDED < active.mean() < 1.2 * EXCEEDED
+
+
+def test_without_noise_or_with_little_of_it_three_decibels_are_active():
+    assert active_level(None, 1.0) == ACTIVE_DB
+    assert (active_level(np.full((2, 3), 1e-6), 1.0) == ACTIVE_DB).all()
+
+
+def test_levels_are_expanded_to_what_was_compressed():
+    magnitude = np.array([[0.0, 1e-3], [0.5, 40.0]])
+    np.testing.assert_allclose(expand(compress(magnitude, 0.2), 0.2), magnitude, rtol=1e-9)
+    assert compress(9 * 0.2, 0.2) == 20.0
+    with pytest.raises(ValueError, match="reference is 0, expected above 0"):
+        compress(magnitude, 0)
+
+
+def test_a_cell_at_the_active_level_is_active():
+    heard, predicted = np.zeros((1, 1, 1, 2)), np.array([[[[ACTIVE_DB, 1.0]]]])
+    for pair in ((heard, predicted), (predicted, heard)):
+        assert mae_all_and_active(*pair, ACTIVE_DB) == ((ACTIVE_DB + 1.0) / 2, ACTIVE_DB)

@@ -4,11 +4,16 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from sononerf.errors import InputError
 from sononerf.geometry.poses import Poses
+from sononerf.recordings.audio import Recording
+from sononerf.recordings.distance_model import predict
+from sononerf.recordings.pings import channels_of, check_channels, faults_of_channels
 from sononerf.recordings.pose_check import alternatives, check_poses, mirrored, shifted
 from sononerf.recordings.pose_tables import Columns, to_poses
 from sononerf.settings.import_schema import ImportSettings
@@ -191,3 +196,102 @@ def test_conventions_that_change_nothing_are_left_out():
     level = poses_of(rng, "table")
     flat = Poses(level.positions * [1, 1, 0], level.rotations)
     assert not {"sign of z", "sign of pitch"} & set(alternatives(table(flat), PLAIN))
+
+
+def predicted(poses, first):
+    out = poses.positions + poses.rotations @ EMITTER
+    back = poses.positions[:, None] + np.einsum("pij,ej->pei", poses.rotations, EARS)
+    first = np.where(np.isfinite(first), first, np.nan)
+    return predict((out[:, None] + back) / 2, back - out[:, None], first)
+
+
+def test_a_sphere_is_found_with_centre_and_size():
+    rng = np.random.default_rng(0)
+    unit = rng.normal(size=(20_000, 3))
+    ball = [0.02, -0.01, 0.03] + 0.04 * unit / np.linalg.norm(unit, axis=1, keepdims=True)
+    poses = poses_of(rng, "volume")
+    found = predicted(poses, first_echoes(rng, poses, ball))
+    np.testing.assert_allclose(found.centre, [0.02, -0.01, 0.03], atol=1e-3)
+    assert abs(found.size - 0.04) < 1e-3
+    assert np.nanmedian(np.abs(found.residual)) < 1e-3
+
+
+def test_bodies_of_parts_are_predicted_to_millimetres():
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        poses = poses_of(rng, ("sphere", "table")[seed % 2])
+        first = first_echoes(rng, poses, body(rng))
+        found = predicted(poses, first)
+        assert np.nanmedian(np.abs(found.residual)) < 4e-3
+        assert np.isnan(found.residual[~np.isfinite(first)]).all()
+        assert np.isfinite(found.residual[np.isfinite(first)]).all()
+
+
+def test_late_echoes_leave_no_body():
+    rng = np.random.default_rng(1)
+    poses = poses_of(rng, "sphere")
+    found = predicted(poses, first_echoes(rng, poses, body(rng)) + 0.15)
+    assert found.size < -0.05
+
+
+def test_few_pings_leave_a_sphere():
+    rng = np.random.default_rng(2)
+    poses = poses_of(rng, "sphere")[np.arange(0, 90, 6)]
+    found = predicted(poses, first_echoes(rng, poses, body(rng)))
+    assert np.nanmedian(np.abs(found.residual)) < 0.02
+
+
+LOOKS = 6.0
+
+
+def recording(*channels):
+    """One second of pings whose channels have so much amplitude."""
+    waves = np.random.default_rng(0).normal(size=(20, len(channels), 50))
+    waves *= np.reshape(channels, (-1, 1))
+    return Recording(
+        Path("pings"),
+        100.0,
+        tuple(map(str, range(20))),
+        np.zeros(20),
+        lambda ping: waves[ping],
+        Columns("t", {}, {}, None, {}),
+    )
+
+
+def test_a_silent_channel_is_refused():
+    check_channels(recording(1.0, 1e-6), None)
+    with pytest.raises(InputError, match=r"channel 1 is silent in all pings"):
+        check_channels(recording(1.0, 0.0), None)
+    check_channels(recording(1.0, 0.0), (0,))
+    check_channels(recording(0.0, 0.0), None)  # silence of all is told elsewhere
+
+
+def test_a_doubled_channel_is_refused():
+    with pytest.raises(InputError, match=r"channels 0 and 2 hold the same samples"):
+        check_channels(recording(1.0, 1.0, 1.0), (0, 1, 0))
+
+
+def power(*levels, noise=1e-4):
+    """Noise, and one echo of some power per channel."""
+    rng = np.random.default_rng(1)
+    found = noise * rng.gamma(LOOKS, 1.0 / LOOKS, size=(30, len(levels), 300))
+    found[:, :, 100] += levels
+    return found
+
+
+def test_levels_noise_and_echoes_are_counted():
+    loud, faint = channels_of(power(1.0, 0.1), LOOKS)
+    assert loud.level_db == pytest.approx(0.0, abs=0.01)
+    assert faint.level_db == pytest.approx(-10.0, abs=0.05)
+    assert loud.noise_db == pytest.approx(-42.0, abs=1.5)
+    assert (loud.heard, faint.heard, loud.asked) == (30, 30, 30)
+    assert faults_of_channels([loud, faint]) == []
+
+
+def test_channels_that_the_others_contradict_are_named():
+    deaf = faults_of_channels(channels_of(power(1.0, 0.0), LOOKS))
+    assert len(deaf) == 1
+    assert "channel 1 heard echoes in 0 of 30 pings, and another one in 30" in deaf[0]
+    faint = faults_of_channels(channels_of(power(1.0, 1e-5, noise=1e-9), LOOKS))
+    assert len(faint) == 1
+    assert "channel 1 is 50 dB fainter" in faint[0]

@@ -10,12 +10,14 @@ import os
 import signal
 from pathlib import Path
 
+import lightning
 import numpy as np
 import pytest
 import safetensors.torch
 import torch
 import trimesh
 from lightning.fabric.utilities.rank_zero import rank_zero_only
+from lightning.pytorch.callbacks import ModelCheckpoint
 
 from sononerf import memory, storage
 from sononerf.callbacks import SIGNALS, ProgressCallback
@@ -29,11 +31,18 @@ from sononerf.errors import (
     ResourceError,
     StoppedError,
 )
-from sononerf.field.fitting import usable_accelerator
+from sononerf.field.datamodule import EchoDataModule
+from sononerf.field.fitting import quiet_lightning, usable_accelerator
+from sononerf.field.module import EchoModule
+from sononerf.geometry.poses import Poses
 from sononerf.head.directivity.directivity_files import write_sofa
+from sononerf.head.head import Head
+from sononerf.progress import Progress
 from sononerf.run import fit as fit_module
 from sononerf.run.build import head_of
 from sononerf.run.fit import fit, peak_memory_bytes
+from sononerf.run.fit_warnings import LINE, fit_warnings
+from sononerf.run.predict import predict
 from sononerf.run.reconstruct import reconstruct
 from sononerf.run.run import STAGES, Run
 from tests.head.directivity.patterns import pair
@@ -317,3 +326,143 @@ def test_a_process_that_follows_does_not_wait_for_one_that_was_killed(tiny, tmp_
     settings = tiny(data={"store": str(tmp_path / "none")})
     with pytest.raises(ResourceError, match="the first process of this fit does not run"):
         fit(settings, path, accelerator="cpu")
+
+
+BODY = np.array([[-0.035] * 3, [0.035] * 3])
+"""Around the tiny experiment's sphere, m."""
+
+
+@pytest.fixture(scope="module")
+def heard(echoes):
+    return Echoes.open(echoes)
+
+
+def copied(heard, poses, rows):
+    """Return echoes of some poses of an ensemble, said to be heard at other poses."""
+    arrays = np.stack([heard.spectrogram(int(row)) for row in rows])
+    return Echoes.from_arrays(arrays, poses, heard.head, split=["train"] * len(rows))
+
+
+@pytest.mark.parametrize("is_set", [False, True])
+def test_a_sound_fit_gets_no_warning(heard, is_set):
+    assert fit_warnings(heard.within(BODY) if is_set else heard, BODY, is_set=is_set) == []
+
+
+@pytest.mark.parametrize(
+    ("region", "message"),
+    [
+        (BODY + np.array([0.0, 0.0, 0.07]), "training poses hear echoes, and none from the region"),
+        (BODY * 14.0, "poses lie inside the region"),
+        (BODY * 4.0, "places of training poses are few for a region of 280 mm"),
+        (BODY * 3.0 + np.array([0.0, 0.0, 1.5]), "no training pose hears 100 % of the region"),
+    ],
+)
+def test_a_region_that_does_not_suit_the_echoes_is_told(heard, region, message):
+    told = fit_warnings(heard.within(region), region, is_set=True)
+    assert any(message in line for line in told), told
+
+
+def test_repeated_poses_on_a_line_are_told(heard):
+    rows = [0, 0, 0, 0, 1]
+    told = fit_warnings(copied(heard, heard.poses()[rows], rows), BODY, is_set=False)
+    assert told[0].startswith("only 2 of 5 training poses differ")
+    assert LINE in told
+
+
+def test_poses_that_look_away_are_told(heard):
+    rows = np.arange(8)
+    turned = heard.rotations[rows] @ np.diag([-1.0, -1.0, 1.0])
+    poses = Poses(heard.positions[rows], turned)
+    (told,) = fit_warnings(copied(heard, poses, rows), BODY, is_set=False)
+    assert told.startswith("training poses look away from the body")
+    assert "the poses look the other way" in told
+
+
+def test_where_heads_look_makes_no_difference_to_omnidirectional_ones(heard):
+    ears = {"directivity": "omnidirectional", "beam_radius": 0.0}
+    head = Head.from_plain({**heard.head.plain(), "ears": ears})
+    turned = heard.rotations @ np.diag([-1.0, -1.0, 1.0])
+    arrays = np.stack([heard.spectrogram(row) for row in range(len(heard))])
+    echoes = Echoes.from_arrays(arrays, Poses(heard.positions, turned), head)
+    assert fit_warnings(echoes, BODY, is_set=False) == []
+
+
+def test_a_body_below_its_support_is_told(heard):
+    head = Head.from_plain({**heard.head.plain(), "support": {"point": [0.0, 0.0, 0.07]}})
+    told = fit_warnings(Echoes(heard.store, head), BODY, is_set=False)
+    assert any("from below the support" in line for line in told)
+
+
+class KilledError(Exception):
+    """The process is gone."""
+
+
+class Killed(lightning.Callback):
+    """Raises within the third epoch."""
+
+    def on_train_batch_end(self, trainer, pl_module, *rest):
+        if trainer.global_step == 10:
+            raise KilledError
+
+
+@pytest.fixture
+def made(tiny, echoes):
+    """Module and data of the tiny experiment; four steps are an epoch."""
+
+    def make():
+        settings = tiny()
+        heard = Echoes(EnsembleStore.open(echoes), head_of(settings))
+        module = EchoModule.for_echoes(
+            heard,
+            field_options=settings.field.options,
+            renderer_options=settings.renderer.options,
+            options=settings.fit,
+        )
+        return module, EchoDataModule(heard)
+
+    return make
+
+
+def trainer(folder, *callbacks, **options):
+    quiet_lightning()
+    return lightning.Trainer(
+        accelerator="cpu",
+        max_epochs=5,
+        callbacks=list(callbacks),
+        default_root_dir=folder,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        logger=False,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("every", [{"every_n_epochs": 1}, {"every_n_train_steps": 3}])
+def test_a_killed_fit_ends_with_the_weights_of_one_that_was_not(made, tmp_path, every):
+    through, data = made()
+    whole = trainer(tmp_path, enable_checkpointing=False)
+    whole.fit(through, data)
+    assert (whole.current_epoch, whole.global_step) == (5, 20)
+
+    def keeper():
+        return ModelCheckpoint(tmp_path, filename="kept", save_last=True, **every)
+
+    killed = trainer(tmp_path, keeper(), Killed())
+    with pytest.raises(KilledError):
+        killed.fit(*made())
+    resumed, data = made()
+    rest = trainer(tmp_path, keeper())
+    rest.fit(resumed, data, ckpt_path=tmp_path / "last.ckpt")
+    assert (rest.current_epoch, rest.global_step) == (5, 20)
+    for name, wanted in through.state_dict().items():
+        assert torch.equal(resumed.state_dict()[name], wanted), name
+
+
+def test_a_trainers_test_gives_the_numbers_of_a_prediction(run, tmp_path):
+    opened = Run(run)
+    predict(opened, accelerator="cpu", progress=Progress(quiet=True))
+    numbers = opened.read_metrics()["prediction"]
+    data = EchoDataModule(opened.echoes)
+    (found,) = trainer(tmp_path, enable_checkpointing=False).test(opened.model, data, verbose=False)
+    assert found["test/mae_db"] == pytest.approx(numbers["rendered_mae_db"], rel=1e-5)
+    assert found["test/mae_db_active"] == pytest.approx(numbers["rendered_mae_db_active"], rel=1e-5)

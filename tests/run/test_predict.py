@@ -6,6 +6,9 @@ from __future__ import annotations
 import io
 import json
 import shutil
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,11 +16,17 @@ from PIL import Image
 
 from sononerf.echoes.store import EnsembleStore
 from sononerf.errors import IncompatibleError, InputError
+from sononerf.head.call_file import attach
 from sononerf.head.decibels import compress
+from sononerf.head.directivity.directivity_files import write_sofa
 from sononerf.run import predict as predict_module
+from sononerf.run.build import with_attached
 from sononerf.run.fit import fit
 from sononerf.run.predict import predict
 from sononerf.run.run import Run
+from sononerf.settings.loading import validate_settings
+from tests.command import succeed
+from tests.head.directivity.patterns import FREQUENCY, pair, sononerf_fields, write_v5
 
 CSV = "x,y,z,yaw,pitch,roll\n-0.4,0,0,0,0,0\n0,0,0.4,0,90,0\n"
 AXES = {"range_m", "frequency_hz", "reference", "pose", "position", "rotation"}
@@ -170,3 +179,101 @@ def test_what_cannot_be_predicted_leaves_no_folder(run, change, error, message):
     with pytest.raises(error, match=message):
         predict(run, accelerator="cpu")
     assert not (run / "prediction").exists()
+
+
+@pytest.fixture
+def settings(tmp_path):
+    ears, call = tmp_path / "bat.sofa", tmp_path / "call.wav"
+    ears.write_bytes(b"an ear")
+    call.write_bytes(b"a call")
+    sections = {
+        "scene": {"name": "three_spheres"},
+        "ears": {"directivity": "file", "file": str(ears)},
+        "call": {"kind": "file", "file": str(call)},
+    }
+    return validate_settings(sections, "test")
+
+
+def test_copies_are_used_when_the_files_are_gone(settings, tmp_path):
+    attach(settings, tmp_path / "run")
+    settings.ears.file.unlink()
+    settings.call.file.unlink()
+    found = with_attached(settings, tmp_path / "run")
+    assert found.ears.file.read_bytes() == b"an ear"
+    assert found.call.file.read_bytes() == b"a call"
+    assert found.ears.file.suffix == ".sofa"
+    assert found.spectrogram == settings.spectrogram
+
+
+def test_a_copy_is_not_replaced(settings, tmp_path):
+    attach(settings, tmp_path / "run")
+    settings.call.file.write_bytes(b"another")
+    attach(settings, tmp_path / "run")
+    assert with_attached(settings, tmp_path / "run").call.file.read_bytes() == b"a call"
+
+
+def test_without_copies_the_settings_stay(settings, tmp_path):
+    assert with_attached(settings, tmp_path / "elsewhere") is settings
+    plain = validate_settings({"scene": {"name": "ua"}}, "test")
+    attach(plain, tmp_path / "plain")
+    assert not (tmp_path / "plain").exists()
+
+
+def test_a_missing_file_is_named_and_nothing_is_written(settings, tmp_path):
+    settings.ears.file.unlink()
+    with pytest.raises(InputError, match=r"bat\.sofa: cannot be read \(No such file"):
+        attach(settings, tmp_path / "run")
+    assert not Path(tmp_path / "run").exists()
+
+
+SHARPER = 4
+
+
+def write_csv(path, ears, order=(0, 1)):
+    """Write a table of gains; an order of (1, 0) gives each ear the other one's."""
+    x, y, z = ears.directions.T
+    azimuth = np.degrees(np.arctan2(y, x)).round(6)
+    elevation = np.degrees(np.arcsin(z)).round(6)
+    lines = ["receiver,azimuth_deg,elevation_deg,frequency_hz,gain"]
+    for number, ear in enumerate(order):
+        for m in range(len(x)):
+            lines += [
+                f"{number},{azimuth[m]},{elevation[m]},{frequency},{ears.gains[ear, m, f]:.9f}"
+                for f, frequency in enumerate(FREQUENCY)
+            ]
+    path.write_text("\n".join(lines) + "\n")
+
+
+@pytest.mark.slow
+def test_the_right_ear_fits_better(tmp_path):
+    ears = pair(beam=False)
+    # Narrow lobes, so that much depends on them.
+    ears = replace(ears, gains=ears.gains**SHARPER)
+    sides = sononerf_fields()["array_struct"]
+    for side in ("left_struct", "right_struct"):
+        table = sides[side]["hrtf_gridded_array"]
+        sides[side] = {**sides[side], "hrtf_gridded_array": table**SHARPER}
+    write_sofa(tmp_path / "right.sofa", ears)
+    write_v5(tmp_path / "right.mat", {"array_struct": sides})
+    write_csv(tmp_path / "right.csv", ears)
+    write_csv(tmp_path / "wrong.csv", ears, (1, 0))
+
+    run = partial(succeed, tmp_path)
+    places = "ears.receivers=[[0, 0.01, 0.002], [0, -0.01, 0.002]]"
+    run(
+        *("simulate", "scene.name=three_spheres", "poses.count=40", "simulation.rays=5000"),
+        *("simulation.noise_floor_poses=0", "ears.directivity=file", "ears.file=right.sofa"),
+        *(places, "--output", "direct", "--waveforms", "recordings"),
+    )
+    error = {}
+    for name in ("right.sofa", "right.mat", "right.csv", "wrong.csv"):
+        run("import", "recordings", "recordings", f"ears.file={name}", "--output", f"s-{name}")
+        run(
+            *("fit", f"data.store=s-{name}", "fit.epochs=3", "prediction.traced=off"),
+            *("reconstruction.refine=false", "--output", f"r-{name}"),
+        )
+        metrics = json.loads((tmp_path / f"r-{name}/metrics.json").read_text())
+        error[name] = metrics["prediction"]["mae_db_active"]
+    right = max(error[name] for name in error if name.startswith("right"))
+    assert right < 0.9 * error["wrong.csv"]
+    assert right < 1.1 * error["right.sofa"]

@@ -9,8 +9,16 @@ import pytest
 
 from sononerf.errors import SettingsError
 from sononerf.settings import loading
-from sononerf.settings.loading import apply_override, load_settings, read_yaml, validate_settings
-from sononerf.settings.schema import Settings
+from sononerf.settings.call_presets import CALL_PRESETS
+from sononerf.settings.import_schema import read_import_settings
+from sononerf.settings.loading import (
+    apply_override,
+    dump_yaml,
+    load_settings,
+    read_yaml,
+    validate_settings,
+)
+from sononerf.settings.schema import CallSettings, Settings
 
 SCENE = "scene: {name: sphere}\n"
 
@@ -349,3 +357,82 @@ def test_only_an_isosurface_is_smoothed(write):
         write(SCENE + "reconstruction: {smoothing: 0.045, method: isosurface}\n")
     )
     assert settings.reconstruction.smoothing == 0.045
+
+
+def settings(**call):
+    return validate_settings({"scene": {"name": "sphere"}, "call": call}, "test")
+
+
+@pytest.mark.parametrize("name", CALL_PRESETS)
+def test_a_preset_fills_the_section_with_what_its_source_says(name):
+    preset = CALL_PRESETS[name]
+    call = settings(preset=name).call
+    for key, value in preset.keys.items():
+        assert getattr(call, key) == value
+    assert set(preset.keys) <= set(CallSettings.model_fields) - {"preset"}
+    assert preset.keys["kind"] in ("linear", "hyperbolic")
+    assert any(year in preset.source for year in map(str, range(1960, 2027)))
+
+
+def test_what_is_set_beside_a_preset_wins():
+    call = settings(preset="eptesicus_fuscus", duration=1e-3, harmonics=[1.0]).call
+    assert (call.duration, call.harmonics) == (1e-3, (1.0,))
+    assert (call.frequency_start, call.frequency_end) == (75e3, 33e3)
+
+
+def test_resolved_settings_are_read_back_as_they_are(tmp_path):
+    first = settings(preset="airsas", taper=0.3)
+    (tmp_path / "a.yaml").write_text(dump_yaml(first))
+    assert load_settings(tmp_path / "a.yaml") == first
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("eptesicus", "did you mean eptesicus_fuscus?"),
+        ("zzz", "known here: eptesicus_fuscus, phyllops"),
+        (3, "preset: found 3"),
+        (["airsas"], "preset: found"),
+    ],
+)
+def test_an_unknown_preset_is_refused(name, words):
+    with pytest.raises(SettingsError) as caught:
+        settings(preset=name)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+MIRROR = [[1, 0, 0], [0, -1, 0], [0, 0, 1]]
+
+
+def test_units_have_no_default():
+    settings = read_import_settings({}, "a.yaml")
+    assert (settings.length, settings.angle, settings.quaternion) == (None, None, None)
+
+
+def test_what_belongs_together_is_taken():
+    settings = read_import_settings(
+        {"frame": "own", "axes": MIRROR, "length": "mm", "channels": [0, [1, 2]]}, "a.yaml"
+    )
+    assert settings.axes == ((1, 0, 0), (0, -1, 0), (0, 0, 1))
+    assert settings.channels == (0, (1, 2))
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"lenght": "mm"}, "import.lenght: unknown key; did you mean length?"),
+        ({"length": "inch"}, "import.length"),
+        ({"frame": "own"}, "axes and frame=own go together"),
+        ({"axes": MIRROR}, "axes and frame=own go together"),
+        ({"head_axes": MIRROR}, "head_axes is of frame=own"),
+        ({"turntable": {}}, "import.turntable.radius: missing"),
+        ({"channels": [-1]}, "import.channels"),
+        ("poses.csv", "expected `key: value` lines"),
+    ],
+)
+def test_a_fault_is_one_line(given, words):
+    with pytest.raises(SettingsError) as caught:
+        read_import_settings(given, "a.yaml")
+    assert words in str(caught.value)
+    assert str(caught.value).startswith("a.yaml: ")

@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 import trimesh
 
+from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.poses import look_at, rotation_from_euler
 from sononerf.head.ears import ear_tables
+from sononerf.run.build import simulator_of
 from sononerf.scene.material import RIGID, Material
 from sononerf.scene.scene import Scene, load_scene
 from sononerf.settings.schema import EarSettings
-from sononerf.simulation.hearing import Hearing
+from sononerf.simulation.footprint import Footprint, emit, land, onto
+from sononerf.simulation.hearing import Arrival, Hearing, silence_before
 from tests.simulation.exact import SPEED, rigid_sphere
 from tests.simulation.listening import (
     NODES,
@@ -299,3 +302,126 @@ def test_a_seed_says_the_same_each_time_and_pickled():
     assert not np.array_equal(one, other)
     again = pickle.loads(pickle.dumps(engine))
     np.testing.assert_array_equal(echoes(again, *pose, seed=1), one)
+
+
+NO_BEND = np.zeros((1, 4, 3), np.float32)
+
+
+def products(one, other):
+    """Scalar products of the first vector with the first, second with second, first with second."""
+    one, other = (np.asarray(part, float).reshape(-1, 2, 3) for part in (one, other))
+    return np.einsum("hkd,hld->hkl", one, other).reshape(-1, 4)[:, [0, 3, 1]]
+
+
+def test_bundles_are_turned_about_two_vectors_square_to_any_direction():
+    """Also to those along the axes, where other frames break down."""
+    axes = np.concatenate([np.eye(3), -np.eye(3), [[1e-9, 0, -1]], fibonacci_sphere(200)])
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    bundles = emit(axes, np.full(len(axes), 0.5))
+    turn = bundles[:, 6:]
+    np.testing.assert_allclose(bundles[:, :6], 0.5 * turn)
+    np.testing.assert_allclose(products(turn, turn), [[1, 1, 0]] * len(axes), atol=1e-6)
+    along = np.einsum("hkd,hd->hk", turn.reshape(-1, 2, 3), axes)
+    np.testing.assert_allclose(along, 0.0, atol=1e-6)
+
+
+def plane(slope, side=1.0):
+    """A bundle 0.5 m from the emitter that falls on a plate under an angle of incidence."""
+    incoming = np.array([[1.0, 0.0, 0.0]])
+    normal = np.array([[-np.cos(slope), np.sin(slope), 0.0]])
+    bundles = emit(incoming, np.array([0.5]))
+    rows, *others = land(bundles, incoming, side * normal, side * normal, NO_BEND)
+    return Footprint(rows), *others
+
+
+def test_a_bundle_on_a_slope_is_longer_and_no_wider():
+    for slope in (0.0, 0.5, 1.4):
+        footprint, turned, _, _ = plane(slope)
+        np.testing.assert_allclose(footprint.sink, -np.cos(slope), rtol=1e-5)
+        np.testing.assert_allclose(footprint.tube, 0.25, rtol=1e-6)
+        lit = np.cross(footprint.shift[0, :, 0], footprint.shift[1, :, 0])
+        np.testing.assert_allclose(np.linalg.norm(lit), 0.25 / np.cos(slope), rtol=1e-5)
+        normal = np.array([-np.cos(slope), np.sin(slope), 0.0])
+        np.testing.assert_allclose(footprint.shift[:, :, 0] @ normal, 0.0, atol=1e-6)
+        # A flat mirror turns directions and keeps their angles.
+        np.testing.assert_allclose(products(turned, turned)[0], [1.0, 1.0, 0.0], atol=1e-6)
+        np.testing.assert_allclose(footprint.curving, 0.0)
+
+
+def test_either_side_of_a_plate_mirrors_alike():
+    for slope in (0.0, 0.5, 1.4):
+        for side in (1.0, -1.0):
+            footprint, _, flat, mirrored = plane(slope, side)
+            np.testing.assert_allclose(flat, [[-np.cos(slope), np.sin(slope), 0.0]])
+            expected = [[-np.cos(2 * slope), np.sin(2 * slope), 0.0]]
+            np.testing.assert_allclose(mirrored, expected, atol=1e-15)
+            np.testing.assert_array_equal(footprint.rows, plane(slope)[0].rows)
+
+
+def test_a_mirrored_bundle_grows_on_as_before():
+    """Off a plate it is as wide as it would be straight on."""
+    footprint, turned, _, _ = plane(0.5)
+    bundles = onto(footprint.rows, turned, np.array([0, 0]), np.array([0.1, 0.7]))
+    np.testing.assert_array_equal(bundles[:, 6:], turned[[0, 0]])
+    mirrored = np.array([[-np.cos(1.0), np.sin(1.0), 0.0]] * 2)
+    bend = np.zeros((2, 4, 3), np.float32)
+    rows, *_ = land(bundles, mirrored, -mirrored, -mirrored, bend)
+    np.testing.assert_allclose(Footprint(rows).tube, [0.6**2, 1.2**2], rtol=1e-5)
+
+
+def test_the_shortest_way_over_a_large_triangle_is_that_over_its_middle():
+    arrival = Arrival(Scene(wall(0.0, (-0.2, -0.2), (0.2, 0.2))))
+    place = np.array([[0.3, 0.01, 0.02]])
+    assert arrival.shortest(place, place[:, None])[0, 0] == pytest.approx(0.6, abs=1e-3)
+
+
+def test_each_ear_has_a_way_of_its_own():
+    arrival = Arrival(Scene(ball(0.02)))
+    emitters = np.array([[0.4, 0.0, 0.0], [0.0, 0.3, 0.0]])
+    ears = np.array([[[0.4, 0.0, 0.0], [0.5, 0.0, 0.0]], [[0.0, 0.3, 0.0], [0.0, -0.3, 0.0]]])
+    found = arrival.shortest(emitters, ears)
+    # What stands in the way is not looked at: no sound can be earlier than on the straight line.
+    expected = [[0.76, 0.86], [0.56, 0.6]]
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+
+
+def test_nothing_is_left_before_the_first_arrival_and_all_behind_it():
+    echo = np.ones((2, 400))
+    found = silence_before(echo, np.array([200e-6, 300e-6]), sampling_rate=1e6)
+    for row, first in zip(found, (200, 300), strict=True):
+        assert not row[: first - 27].any()
+        assert (row[first - 25 :] == 1.0).all()
+
+
+@pytest.mark.parametrize("scene", ["ua", "leaf", "three_spheres"])
+def test_no_scene_is_heard_more_than_10_mm_before_its_nearest_point(scene, heard_near):
+    assert heard_near(load_scene(scene)) < 1.0
+
+
+@pytest.fixture
+def heard_near():
+    """Return the highest level (dB above m0) of two poses more than 10 mm before the scene."""
+    from sononerf.geometry.poses import look_at
+    from sononerf.head.decibels import compress
+    from sononerf.settings.loading import validate_settings
+
+    def level(scene):
+        options = {"scene": {"name": "sphere"}, "simulation": {"rays": 30_000, "sources": 200}}
+        found = simulator_of(scene, validate_settings(options, "test"))
+        places = np.array([[0.4, 0.02, 0.01], [0.1, -0.25, 0.3]])
+        turns = look_at(places, np.zeros((2, 3)))
+        found.low and found.low.prepare(places, turns)
+        magnitudes = np.stack(
+            [found.spectrogram(*pose, seed=0) for pose in zip(places, turns, strict=True)]
+        )
+        levels = compress(magnitudes, 1e-3 * magnitudes.max())
+        worst = 0.0
+        for pose in range(2):
+            emitter, ears = found.hearing.places(places[pose], turns[pose])
+            nearest = found.arrival.shortest(emitter[None], ears[None])[0] / 2
+            for ear in range(2):
+                early = found.head.range < nearest[ear] - 0.010
+                worst = max(worst, levels[pose, ear][early].max())
+        return worst
+
+    return level

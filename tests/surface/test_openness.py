@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: MIT
 """Closed surfaces, sheets, and what was heard from one side alone."""
 
+import io
+
 import numpy as np
 import pytest
 import trimesh
 from skimage.measure import marching_cubes
 
 from sononerf.echoes.free_space import EchoHull
+from sononerf.errors import NumericalError
 from sononerf.geometry.directions import fibonacci_sphere
 from sononerf.geometry.plane import Plane
 from sononerf.surface import surface
+from sononerf.surface.mesh_files import MANY_POSES, confidence_colours, linear_light, mesh_bytes
 from sononerf.surface.surface import FACING, THIN, Openness, known_part, leaving_out, without_unseen
 
 RADIUS, DISTANCE, RESOLUTION = 0.02, 0.4, 0.006
@@ -298,3 +302,78 @@ def test_between_what_was_heard_the_onsets_close_an_open_surface():
     # A ball bulges out of the convex hull of its places by less than the resolution.
     assert known[between].all()
     assert not known[off > 0.02].any()
+
+
+def test_colours_brighten_evenly_from_grey_to_yellow():
+    colours = confidence_colours([0, 1, 3, 10, 30, MANY_POSES, 10 * MANY_POSES])
+    assert ((colours >= 0) & (colours <= 1)).all()
+    assert np.ptp(colours[0]) < 0.05
+    assert colours[-2, 0] > 0.85
+    assert colours[-2, 2] < 0.7
+    np.testing.assert_array_equal(colours[-2], colours[-1])
+    # The eye's lightness, CIE L*, from relative luminance: a rule that the map was not made with.
+    even = np.expm1(np.linspace(0, 1, 9) * np.log1p(MANY_POSES))
+    luminance = linear_light(confidence_colours(even)) @ [0.2126, 0.7152, 0.0722]
+    lightness = 116 * np.cbrt(luminance) - 16
+    steps = np.diff(lightness)
+    assert steps.min() > 0.8 * steps.mean()
+    assert steps.max() < 1.2 * steps.mean()
+    assert lightness[0] < 30
+    assert lightness[-1] > 85
+
+
+@pytest.mark.parametrize("file_type", ["ply", "stl", "glb"])
+def test_a_file_reads_back_as_the_same_body_and_is_always_the_same(file_type):
+    mesh = trimesh.creation.icosphere(subdivisions=2, radius=0.015)
+    mesh.apply_translation([0.1, 0.2, 0.3])
+    data = mesh_bytes(mesh, file_type)
+    back = trimesh.load(io.BytesIO(data), file_type=file_type, force="mesh")
+    # glTF has y up by custom, yet coordinates are written as they are.
+    np.testing.assert_allclose(back.bounds, mesh.bounds, atol=1e-7)
+    assert back.volume == pytest.approx(mesh.volume, rel=1e-5)
+    mesh.metadata["file_name"] = "/somewhere/else.ply"
+    assert mesh_bytes(mesh, file_type) == data
+
+
+def test_what_cannot_be_written_is_refused():
+    mesh = trimesh.creation.box()
+    with pytest.raises(ValueError, match="file_type"):
+        mesh_bytes(mesh, "obj")
+    with pytest.raises(NumericalError, match="empty"):
+        mesh_bytes(trimesh.Trimesh(), "ply")
+    broken = trimesh.Trimesh([[0, 0, 0], [1, 0, 0], [0, np.nan, 0]], [[0, 1, 2]], process=False)
+    with pytest.raises(NumericalError, match="not finite"):
+        mesh_bytes(broken, "ply")
+
+
+@pytest.mark.parametrize("file_type", ["ply", "glb"])
+def test_confidence_is_carried_as_colours(file_type):
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.015)
+    poses = np.arange(len(mesh.vertices)) * 3
+    data = mesh_bytes(mesh, file_type, confidence=poses)
+    assert mesh_bytes(mesh, file_type, confidence=poses) == data
+    back = trimesh.load(io.BytesIO(data), file_type=file_type, force="mesh", process=False)
+    expected = confidence_colours(poses)
+    if file_type == "glb":  # glTF wants linear light
+        expected = linear_light(expected)
+    np.testing.assert_allclose(back.vertices, mesh.vertices, atol=1e-7)
+    np.testing.assert_allclose(back.visual.vertex_colors[:, :3] / 255, expected, atol=0.003)
+
+
+def test_ply_holds_the_numbers_of_poses_and_stl_nothing_new():
+    mesh = trimesh.creation.icosphere(subdivisions=1, radius=0.015)
+    poses = np.arange(len(mesh.vertices)) * 3
+    data = mesh_bytes(mesh, "ply", confidence=poses)
+    assert b"property int poses" in data.split(b"end_header")[0]
+    back = trimesh.load(io.BytesIO(data), file_type="ply", process=False)
+    read = back.metadata["_ply_raw"]["vertex"]["data"]["poses"]
+    np.testing.assert_array_equal(np.ravel(read), poses)
+    assert mesh_bytes(mesh, "stl", confidence=poses) == mesh_bytes(mesh, "stl")
+
+
+@pytest.mark.parametrize("wrong", [[1, 2, 3], -1])
+def test_a_wrong_confidence_is_refused(wrong):
+    mesh = trimesh.creation.box()
+    given = wrong if isinstance(wrong, list) else np.full(len(mesh.vertices), wrong)
+    with pytest.raises(ValueError, match="confidence"):
+        mesh_bytes(mesh, "ply", confidence=given)

@@ -47,9 +47,3 @@ def test_more_is_red_and_less_is_blue_where_they_are(comparison):
     red, blue = red[red[:, 1] < bar].mean(axis=0), blue[blue[:, 1] < bar].mean(axis=0)
     assert red[0] < blue[0] - 20
     assert red[1] < blue[1] - 5
-
-
-def test_where_something_was_truly_added_is_marked(comparison):
-    without = difference_pngs(comparison, ("with", "without"))
-    marked = difference_pngs(comparison, ("with", "without"), truth=LESS)
-    assert all(marked[name] != without[name] for name in "xyz")

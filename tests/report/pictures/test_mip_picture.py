@@ -39,13 +39,6 @@ def test_a_picture_is_a_png_and_always_the_same():
     assert width > height > 200
 
 
-@pytest.mark.parametrize("value", [0.0, 1.0, -2.0])
-@pytest.mark.parametrize("scale", ["db", "linear"])
-def test_a_constant_projection_is_drawn(value, scale):
-    mip_picture(np.full((3, 4), value), EXTENTS, ("y", "z"), scale=scale)
-    assert mip_image(np.full((3, 4), value), scale=scale).shape[2] == 3
-
-
 def test_a_volume_gives_three_pictures():
     volume = Volume(np.random.default_rng(0).random((4, 30, 12)), np.zeros(3), 0.005)
     sizes = {name: Image.open(io.BytesIO(data)).size for name, data in mip_pictures(volume).items()}

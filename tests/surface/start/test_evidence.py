@@ -7,13 +7,16 @@ import torch
 
 from sononerf.echoes.free_space import EchoHull
 from sononerf.field.field import Field, sphere_directions
+from sononerf.geometry.lattice import Lattice
 from sononerf.surface.start.evidence import (
     AT_ONSET,
     COMPRESSION,
     Evidence,
     locate_sound,
     reliability,
+    signed_distance,
 )
+from sononerf.surface.start.occupancy import clearance_grid
 
 FREQUENCY = torch.tensor([30e3, 60e3, 90e3])
 RADIUS, RESOLUTION = 0.02, 0.006
@@ -150,3 +153,79 @@ def test_evidence_at_the_onset_is_believed_without_others():
 def test_no_evidence_no_reliability():
     evidence, hull = ball()
     assert reliability(evidence.where(np.zeros(POSES, bool)), hull, RESOLUTION).shape == (0,)
+
+
+SIZE, MIDDLE = 32, 15.5
+GRID = np.stack(np.meshgrid(*[np.arange(SIZE)] * 3, indexing="ij"), axis=-1) - MIDDLE
+AWAY = np.linalg.norm(GRID, axis=-1).astype(np.float32)
+NONE = np.zeros((SIZE,) * 3, np.float32)
+
+
+def solve(weight=NONE, target=NONE, bound=None, pull=1e-3, empty=NONE):
+    if bound is None:
+        bound = AWAY - 14
+    return signed_distance(weight, target, bound, pull, empty, 1.0)
+
+
+def test_without_evidence_the_body_reaches_as_far_as_it_may():
+    found = solve(pull=0.1)
+    near = (np.abs(AWAY - 14) < 2) & (np.abs(GRID) < 13).all(axis=-1)
+    assert np.abs(found - (AWAY - 14))[near].max() < 0.7
+
+
+def test_evidence_draws_the_surface_inside_of_the_bound():
+    shell = (np.abs(AWAY - 9) < 1.5).astype(np.float32)
+    found = solve(shell, AWAY - 9)
+    inside = AWAY[found < 0]
+    assert inside.max() < 10
+    assert np.abs(found[shell > 0] - (AWAY - 9)[shell > 0]).max() < 0.5
+
+
+def test_between_evidence_the_surface_goes_on_smoothly():
+    shell = (np.abs(AWAY - 9) < 1.5) & (np.abs(GRID[..., 2]) > 3)
+    found = solve(shell.astype(np.float32), AWAY - 9, pull=1e-5)
+    line = found[:, 15, 15]
+    outermost = np.interp(0, line[16:], np.arange(16, SIZE) - MIDDLE)
+    assert outermost == pytest.approx(9, abs=1.0)  # where nothing was heard, between two caps
+
+
+def test_free_space_wins_over_evidence_in_front_of_it():
+    shell = (np.abs(AWAY - 13) < 1.5).astype(np.float32)
+    found = solve(0.2 * shell, AWAY - 13, bound=AWAY - 9)
+    assert AWAY[found < 0].max() < 11
+
+
+def test_what_is_far_off_the_surface_hardly_counts():
+    shell = (np.abs(AWAY - 9) < 1.5).astype(np.float32)
+    wrong = AWAY - 9
+    wrong[:, :, 12:14] += 12.0
+    found = solve(shell, wrong)
+    clean = solve(shell, AWAY - 9)
+    assert np.abs(found - clean)[shell > 0].mean() < 0.5
+
+
+def test_a_place_that_is_empty_is_carved_out():
+    ahead = (GRID[..., 2] > 3).astype(np.float32)
+    assert (solve(pull=0.01)[..., 24] < 0).any()
+    assert not (solve(pull=0.01, empty=0.1 * ahead)[..., 24] < 0).any()
+
+
+def test_the_clearance_is_exact_near_the_surface_and_has_the_right_sign_elsewhere():
+    sources = np.array([[0.3, 0, 0], [-0.3, 0, 0], [0, 0.3, 0], [0, 0, 0.3]])
+    first = np.full((4, 1), 0.28)
+    hull = EchoHull(sources, sources[:, None], first, -sources / 0.3)
+    lattice = Lattice.over(np.full(3, -0.03), np.full(3, 0.03), 0.002)
+    found = clearance_grid(hull, lattice).ravel()
+    exact = hull.clearance(lattice.points())[0]
+    near = np.abs(exact) < 0.004
+    np.testing.assert_allclose(found[near], exact[near], atol=1e-12)
+    assert (np.sign(found) == np.sign(exact)).all()
+
+
+def test_where_no_pose_says_anything_all_is_behind():
+    source = np.array([[0.3, 0, 0]])
+    hull = EchoHull(source, source[:, None], np.full((1, 1), -np.inf), -source / 0.3)
+    lattice = Lattice.over(np.full(3, -0.01), np.full(3, 0.01), 0.002)
+    found = clearance_grid(hull, lattice)
+    assert (found > 0).all()
+    assert np.isfinite(found).all()
