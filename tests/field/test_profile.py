@@ -382,20 +382,28 @@ def ball(places, directions):
     return torch.where(inside, 1.0, 1e-6)[..., None].expand(*directions.shape[:-1], 3)
 
 
-def test_a_place_60_db_below_its_surroundings_is_dropped(listener, formula):
-    """And one 50 dB below them is not: such is the edge of a face beside its flash."""
-    region = torch.tensor([[0.0] * 3, [0.02, 0.0, 0.0]], dtype=torch.float64)
-    magnitude = torch.tensor([1.0, 10 ** (-50 / 20), 10 ** (-65 / 20)], dtype=torch.float64)
+@pytest.mark.parametrize(("loud", "other"), [(0, 5), (-1, 40), (100, 99)])
+def test_a_place_60_db_below_its_surroundings_is_dropped(listener, formula, loud, other):
+    """And one 50 dB below them is not, nor one far away: cubes of five resolutions count."""
+    region = torch.tensor([[0.03, -0.02, 0.01], [0.11, 0.03, 0.14]], dtype=torch.float64)
+    known = torch.full((2, 3), 9.0, dtype=torch.float64)
 
-    def three(places, directions):
-        value = magnitude[(places[..., 0] / 0.01).round().long().clamp(0, 2)]
+    def heard(places, directions):
+        near = torch.cdist(places.reshape(-1, 3), known) < 1e-6
+        level = torch.where(near[:, 0], 0.0, torch.where(near[:, 1], -50.0, -65.0)) / 20
+        value = (10**level).reshape(places.shape[:-1]).double()
         return value[..., None].expand(*directions.shape[:-1], 3)
 
-    field = formula(region, listener.frequency, three, spacing=0.01)
     renderer = ProfileRenderer(region, listener, prune_every=1).double()
+    field = formula(region, listener.frequency, heard, spacing=0.01)
     renderer.prepare(field, None, 0)
+    known[:] = renderer.lattice[[loud, other]]
     renderer.prepare(field, None, 1)
-    assert renderer.alive.tolist() == [True, True, False]
+    cube = ((renderer.lattice - region[0]) / (5 * listener.resolution)).floor()
+    dropped = ((cube - cube[loud]).abs() <= 1).all(-1)
+    dropped[[loud, other]] = False
+    assert 20 < dropped.sum() < len(dropped) - 20
+    assert torch.equal(renderer.alive, ~dropped)
 
 
 def test_the_lattice_goes_with_the_weights(listener, formula, cloud):

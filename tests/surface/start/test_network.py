@@ -156,7 +156,7 @@ def test_a_support_is_heard_as_the_image_of_body_and_poses():
 @pytest.mark.parametrize("sources", [around(1), around(60)[:20]], ids=["one pose", "one side"])
 def test_few_poses_give_a_surface(sources):
     levels, hull = heard(sources, BALLS[:1])
-    assert levels_surfaces(levels, hull, BOX, RESOLUTION)[0].is_watertight
+    assert levels_surfaces(levels, hull, BOX / 2, RESOLUTION)[0].is_watertight
 
 
 def formula(place, levels, onsets, table, resolution):
