@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import lightning
 import numpy as np
 import pytest
@@ -13,8 +15,7 @@ from sononerf.errors import InputError, SettingsError
 from sononerf.field.fitting import quiet_lightning
 from sononerf.progress import Progress
 from sononerf.surface import reconstruction
-from sononerf.surface.refine import descent as stages
-from sononerf.surface.refine import refinement
+from sononerf.surface.refine.refinement import Refinement
 from tests.run.test_refine import SHORT
 
 QUIET = Progress(quiet=True)
@@ -44,8 +45,7 @@ def made(tmp_path_factory):
     trainer.fit(model, sn.EchoDataModule(echoes))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(reconstruction, "RAYS", 500)
-        for where in (refinement, stages):
-            patch.setattr(where, "STAGES", SHORT)
+        patch.setattr(reconstruction, "Refinement", partial(Refinement, stages=SHORT))
         start = sn.reconstruct(model, echoes, options={"spacing": 0.008}, progress=QUIET)
         surface = sn.refine(start, echoes, progress=QUIET)
     return scene, echoes, model, surface

@@ -182,6 +182,7 @@ def test_inside_out():
     assert line == "the mesh is inside out; echoes do not mind, volumes do"
 
 
+@pytest.mark.slow
 def test_a_million_triangles_take_seconds():
     mesh = trimesh.creation.icosphere(subdivisions=8)
     started = time.process_time()

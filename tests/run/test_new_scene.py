@@ -169,6 +169,7 @@ def test_it_goes_where_it_is_told_to(home):
     assert new_plugin("scene", "tin-drum", home / "a" / "b")[1].is_file()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "passed"),
     [

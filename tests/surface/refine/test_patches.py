@@ -246,6 +246,7 @@ def test_gradients_of_edges_are_those_of_differences(fine, heard, optics):
     assert np.linalg.norm(found - wanted) < 0.1 * np.linalg.norm(wanted)
 
 
+@pytest.mark.slow
 def test_a_box_with_wrong_planes_and_worn_edges_comes_back(fine, heard, optics):
     begun = descent(fine, heard, optics)
     motion = motions(begun.vertices, begun.faces, begun.part, begun.patches, 3)
