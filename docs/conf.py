@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import inspect
 import re
+import sys
 from functools import partial
+from pathlib import Path
 from typing import Any, get_args
 
 import typer
@@ -22,6 +24,9 @@ from sononerf.cli.entry import app as cli
 from sononerf.settings.import_schema import ImportSettings
 from sononerf.settings.schema import Settings
 from sononerf.settings.section import Section
+
+sys.path.insert(0, str(Path(__file__).parent))
+import house
 
 project = "sononerf"
 author = "The sononerf developers"
@@ -113,6 +118,7 @@ def _formula(translator: Any, node: Any, *, display: bool) -> None:
 
 def setup(app: Any) -> None:
     """Let pages name what is made from the program: ``{{ commands }}`` and ``{{ settings }}``."""
+    house.write()
     inline, block = partial(_formula, display=False), partial(_formula, display=True)
     app.add_html_math_renderer("mathml", (inline, None), (block, None))
 
