@@ -176,11 +176,11 @@ class CheckpointCallback(lightning.Callback):
             # Saved after the epoch: Lightning would go on from here without its end, and would
             # count wrongly after another stop.
             return
-        asked = self._is_asked_to_stop(trainer)
+        must_stop = self._is_asked_to_stop(trainer)
         late = time.monotonic() - self._saved >= self.seconds
-        if asked or trainer.strategy.reduce_boolean_decision(late, all=False):
+        if must_stop or trainer.strategy.reduce_boolean_decision(late, all=False):
             self._save(trainer)
-        if asked:
+        if must_stop:
             self._stop(trainer)
 
 

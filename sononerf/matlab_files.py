@@ -23,7 +23,7 @@ MOST_DEPTH = 12
 PLAIN = "save it again with numbers, structs and cells alone"
 
 
-def read_mat(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
+def read_mat(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
     """Read variables of a MATLAB file."""
     if not path.is_file():
         raise InputError(f"{path}: no such file")
@@ -33,19 +33,19 @@ def read_mat(path: Path, wanted: tuple[str, ...]) -> dict[str, Any]:
         with opened(path) as group:
             return {
                 name: _new(path, group, child(group, name), name, 0)
-                for name in wanted
+                for name in names
                 if name in group
             }
     if not start.startswith(b"MATLAB 5.0 MAT-file"):
         raise InputError(f"{path}: no MATLAB file of version 5 or 7.3, whatever its name says")
     try:
-        found = scipy.io.loadmat(path, variable_names=list(wanted), struct_as_record=True)
+        content = scipy.io.loadmat(path, variable_names=list(names), struct_as_record=True)
     except (NotImplementedError, MemoryError) as error:
         raise InputError(f"{path}: cannot be read ({error})") from None
     except Exception as error:  # the error of a damaged file depends on the parser
         said = " ".join(str(error).split())
         raise InputError(f"{path}: damaged or truncated MATLAB file ({said})") from None
-    return {name: _old(path, found[name], name, 0) for name in wanted if name in found}
+    return {name: _old(path, content[name], name, 0) for name in names if name in content}
 
 
 def _refused(path: Path, name: str, kind: str) -> InputError:

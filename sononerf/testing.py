@@ -75,19 +75,19 @@ def check_field(field: str | FieldFactory, **options: Any) -> Field:
     _holds(0 < made.resolution < 0.1, f"resolution is {made.resolution} m, expected 0 to 0.1 m")
     places, directions = _places(POINTS)
     count = len(made.frequency)
-    found = made(places, directions)
-    _shape(found, (POINTS, count), "the reflectivity of (N, 3) places")
-    _finite(found, "the reflectivity")
+    values = made(places, directions)
+    _shape(values, (POINTS, count), "the reflectivity of (N, 3) places")
+    _finite(values, "the reflectivity")
     several = directions.expand(4, POINTS, 3)
     _shape(made(places.expand(4, POINTS, 3), several), (4, POINTS, count), "of (4, N, 3) places")
     _shape(made.select(places, several, torch.tensor([0, 2])), (4, POINTS, 2), "select")
     some = made.select(places, directions, torch.tensor([0, 2]))
-    _close(some, found[:, [0, 2]], "select differs from the reflectivity at these frequencies")
+    _close(some, values[:, [0, 2]], "select differs from the reflectivity at these frequencies")
     alone = torch.cat([made(places[n : n + 1], directions[n : n + 1]) for n in range(5)])
-    _close(alone, found[:5], "a place has another value when it is evaluated alone")
+    _close(alone, values[:5], "a place has another value when it is evaluated alone")
     outside = places + 1.0
     _holds(not bool(made(outside, directions).abs().any()), "it is not zero outside the region")
-    _has_gradients(found, made)
+    _has_gradients(values, made)
     energy, axis = made.oriented(places, 20)
     _shape(energy, (POINTS,), "energy")
     _shape(axis, (POINTS, 3), "axis")
@@ -128,20 +128,20 @@ def check_renderer(
     slices, count = len(made.range), len(made.frequency)
     rows = torch.arange(slices).expand(2, -1)
     made.prepare(heard, None, 0)
-    found = made(heard, position, rotation, rows)
-    _shape(found, (2, len(HEAD.receivers), slices, count), "magnitude (P, E, R, F)")
-    _finite(found, "the magnitude")
-    _holds(bool((found >= 0).all()), "a magnitude is negative")
-    _holds(bool((found > 0).any()), "a field that reflects is silent")
+    values = made(heard, position, rotation, rows)
+    _shape(values, (2, len(HEAD.receivers), slices, count), "magnitude (P, E, R, F)")
+    _finite(values, "the magnitude")
+    _holds(bool((values >= 0).all()), "a magnitude is negative")
+    _holds(bool((values > 0).any()), "a field that reflects is silent")
     bins = torch.tensor([0, 2])
     some = made(heard, position, rotation, rows, bins)
-    _close(some, found[..., bins], "it differs at these frequencies when they are evaluated alone")
+    _close(some, values[..., bins], "it differs at these frequencies when they are evaluated alone")
     if not made.whole_poses:
         few = made(heard, position, rotation, rows[:, 3:6])
-        _close(few, found[:, :, 3:6], "it differs at these slices when they are evaluated alone")
-    _has_gradients(found, heard)
+        _close(few, values[:, :, 3:6], "it differs at these slices when they are evaluated alone")
+    _has_gradients(values, heard)
     before = made(heard, position, rotation, rows).square().sum()
-    made.calibrate(found.detach(), 2 * found.detach())
+    made.calibrate(values.detach(), 2 * values.detach())
     after = made(heard, position, rotation, rows).square().sum()
     _close(after / before, torch.tensor(4.0), "calibrate does not scale it to what was measured")
     again = make(renderer, Renderer, REGION, HEAD, options)
@@ -162,25 +162,25 @@ def _holds(good: bool, fault: str) -> None:
         raise AssertionError(fault)
 
 
-def _shape(found: Tensor, wanted: tuple[int, ...], what: str) -> None:
-    shape = tuple(found.shape)
-    _holds(shape == wanted, f"{what}: shape {shape}, expected {wanted}")
+def _shape(values: Tensor, expected: tuple[int, ...], what: str) -> None:
+    shape = tuple(values.shape)
+    _holds(shape == expected, f"{what}: shape {shape}, expected {expected}")
 
 
-def _finite(found: Tensor, what: str) -> None:
-    _holds(bool(found.isfinite().all()), f"{what} holds NaN or infinite values")
+def _finite(values: Tensor, what: str) -> None:
+    _holds(bool(values.isfinite().all()), f"{what} holds NaN or infinite values")
 
 
-def _close(found: Tensor, wanted: Tensor, fault: str) -> None:
-    found, wanted = found.detach(), wanted.detach()
-    scale = float(wanted.abs().max())
-    _holds(torch.allclose(found, wanted, rtol=1e-3, atol=1e-4 * scale + 1e-12), fault)
+def _close(values: Tensor, expected: Tensor, fault: str) -> None:
+    values, expected = values.detach(), expected.detach()
+    scale = float(expected.abs().max())
+    _holds(torch.allclose(values, expected, rtol=1e-3, atol=1e-4 * scale + 1e-12), fault)
 
 
-def _has_gradients(found: Tensor, module: torch.nn.Module) -> None:
+def _has_gradients(values: Tensor, module: torch.nn.Module) -> None:
     parameters = [p for p in module.parameters() if p.requires_grad]
     _holds(bool(parameters), "it has no parameters to learn")
-    gradients = torch.autograd.grad(found.abs().sum(), parameters, allow_unused=True)
+    gradients = torch.autograd.grad(values.abs().sum(), parameters, allow_unused=True)
     known = [gradient for gradient in gradients if gradient is not None]
     _holds(any(bool(gradient.any()) for gradient in known), "no gradient reaches its parameters")
     for gradient in known:

@@ -351,14 +351,16 @@ def compare(
     from sononerf.run.compare import compare_runs
 
     folder = compare_runs(run_a, run_b, output=output, accelerator=accelerator, progress=Progress())
-    found = storage.read_json(folder / "comparison.json")
-    if found["strongest_m"] is None:
+    comparison = storage.read_json(folder / "comparison.json")
+    if comparison["strongest_m"] is None:
         say(f"nothing is stronger in {run_a} than in {run_b}")
     else:
-        place = ", ".join(f"{1e3 * x:.1f}" for x in found["strongest_m"])
-        found["distance_mm"] = None if found["distance_m"] is None else 1e3 * found["distance_m"]
-        away = optional(found, "distance_mm", "; {:.1f} mm from the middle of what was added")
-        say(f"strongest difference at ({place}) mm, {found['score']:.2f} of the maximum{away}")
+        place = ", ".join(f"{1e3 * x:.1f}" for x in comparison["strongest_m"])
+        comparison["distance_mm"] = (
+            None if comparison["distance_m"] is None else 1e3 * comparison["distance_m"]
+        )
+        away = optional(comparison, "distance_mm", "; {:.1f} mm from the middle of what was added")
+        say(f"strongest difference at ({place}) mm, {comparison['score']:.2f} of the maximum{away}")
     say(f"wrote {folder}")
 
 

@@ -152,20 +152,20 @@ def import_(
     from sononerf.run.import_recordings import check_before, describe, draw, import_understood
     from sononerf.run.understand import understand
 
-    known = understand(
+    understood = understand(
         form, source, output, settings_file=settings, overrides=overrides or (), progress=Progress()
     )
-    for line in describe(known):
+    for line in describe(understood):
         say(line)
     if dry_run and preview is None:
         preview = output.with_name(f"{output.name}-preview")
     if preview is not None:
         with results_folder(preview):
-            say(f"wrote {draw(known, preview)}")
+            say(f"wrote {draw(understood, preview)}")
     if dry_run:
-        verdict = check_before(known, progress=Progress())
+        verdict = check_before(understood, progress=Progress())
     else:
-        store, verdict = import_understood(known, output, progress=Progress())
+        store, verdict = import_understood(understood, output, progress=Progress())
         say(f"wrote {store.path} ({len(store)} poses)")
     if verdict.message:
         say(f"warning: {verdict.message}")
@@ -206,12 +206,12 @@ def calibrate(
 
     if output is None:
         raise SettingsError("--output is missing; name the store, such as --output data/corrected")
-    found = find_errors(source, output, kinds, progress=Progress())
-    for line in found.lines:
+    errors = find_errors(source, output, kinds, progress=Progress())
+    for line in errors.lines:
         say(line)
-    for line in found.warnings:
+    for line in errors.warnings:
         say(f"warning: {line}")
-    say(f"wrote {found.store.path} ({len(found.store)} poses)")
+    say(f"wrote {errors.store.path} ({len(errors.store)} poses)")
 
 
 @app.command()

@@ -149,7 +149,7 @@ def onsets(
     that may hold an echo. Out: onset (N,), minus infinity where nothing was heard or the first
     slice cuts an echo.
     """
-    found = np.full(len(power), -np.inf)
+    onset = np.full(len(power), -np.inf)
     start = np.zeros(len(power)) if start is None else start
     late = np.arange(power.shape[1]) >= start[:, None]
     inner = (_is_top(power) & (power > levels.total) & late)[:, 1:-1]
@@ -161,8 +161,8 @@ def onsets(
         if len(before):  # else it began before the first slice
             rising, middle = _flank(window(int(row), top) if callable(window) else window)
             rise = middle - _crossing(rising, fraction)
-            found[row] = _crossing(echo[int(before[-1]) :], fraction) + before[-1] + rise * fineness
-    return found
+            onset[row] = _crossing(echo[int(before[-1]) :], fraction) + before[-1] + rise * fineness
+    return onset
 
 
 def _flank(window: Floats) -> tuple[Floats, float]:
@@ -236,7 +236,7 @@ def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = No
     if nearest is not None:
         start = np.ceil((nearest - axis[0]) / step).clip(0, len(axis) - 1)
     begun = np.arange(len(axis)) >= start[..., None]
-    found = []
+    onsets_of_ears = []
     for ear in range(power.shape[1]):
 
         def own_window(row: int, top: int, ear: int = ear) -> Floats:
@@ -244,8 +244,8 @@ def find_onsets(store: Ensemble, echo: PointEcho, *, nearest: Floats | None = No
 
         window = echo.window if echo.rows is None else own_window
         level = Levels(*(each[:, ear] for each in levels))
-        found.append(onsets(power[:, ear], level, window, fineness, start[:, ear]))
-    first = axis[0] + step * np.stack(found, axis=1)
+        onsets_of_ears.append(onsets(power[:, ear], level, window, fineness, start[:, ear]))
+    first = axis[0] + step * np.stack(onsets_of_ears, axis=1)
     return Onsets(poses, axis, power, (power > levels.total) & begun, first)
 
 

@@ -239,14 +239,14 @@ class Echoes(Shown):
             np.concatenate((each.positions, each.rotations.reshape(-1, 9)), axis=1)
             for each in (self.poses(), poses)
         )
-        distance, found = cKDTree(mine).query(theirs)
+        distance, number = cKDTree(mine).query(theirs)
         strange = np.flatnonzero(distance > SAME)
         if len(strange):
             raise InputError(
                 f"{self.store.path}: pose {strange[0]} is not among the {len(self)} poses of these "
                 "echoes; nothing was measured there"
             )
-        return np.asarray(found, dtype=np.int64)
+        return np.asarray(number, dtype=np.int64)
 
     def spectrogram(self, pose: int) -> Singles:
         """Return the spectrogram of a pose, (E, R, F) linear magnitude.
@@ -354,11 +354,11 @@ class Echoes(Shown):
         """Return the training poses of a step: all in turn, in an order drawn from the seed."""
         count = len(self.training)
         size = min(size, count)
-        wanted = []
+        uses = []
         for place in range(step * size, (step + 1) * size):
             order = np.random.default_rng([seed, place // count]).permutation(count)
-            wanted.append(self.training[order[place % count]])
-        return np.array(wanted, dtype=np.int64)
+            uses.append(self.training[order[place % count]])
+        return np.array(uses, dtype=np.int64)
 
 
 def complete_store(path: Path) -> EnsembleStore:
@@ -373,14 +373,14 @@ def complete_store(path: Path) -> EnsembleStore:
 
 def stated_head(store: EnsembleStore) -> dict[str, dict[str, Any]]:
     """Return the sections of settings that describe the head of a store, plain data."""
-    known = store.attributes.get("settings")
-    if isinstance(known, dict):
-        known = {"support": {}, **known}  # older stores know of no support
-    if not isinstance(known, dict) or not all(
-        isinstance(known.get(k), dict) for k in HEAD_SECTIONS
+    settings = store.attributes.get("settings")
+    if isinstance(settings, dict):
+        settings = {"support": {}, **settings}  # older stores know of no support
+    if not isinstance(settings, dict) or not all(
+        isinstance(settings.get(k), dict) for k in HEAD_SECTIONS
     ):
         raise InputError(
             f"{store.path}: does not state its head (settings of {', '.join(HEAD_SECTIONS)}); "
             "import the recordings again"
         )
-    return {name: known[name] for name in HEAD_SECTIONS}
+    return {name: settings[name] for name in HEAD_SECTIONS}

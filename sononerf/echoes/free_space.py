@@ -174,7 +174,7 @@ def _behind(
     In: points ((N, 3), m), emitters, receivers ((P, 3), (P, E, 3), m), first ((P, E), m), axes (P,
     3).
     """
-    found = np.full((len(points), *first.shape), np.inf)
+    behind = np.full((len(points), *first.shape), np.inf)
     for n in range(len(points)):
         for pose in range(len(first)):
             out = _distance(points[n], emitters[pose])
@@ -182,8 +182,8 @@ def _behind(
                 continue
             for ear in range(first.shape[1]):
                 back = _distance(points[n], receivers[pose, ear])
-                found[n, pose, ear] = 0.5 * (out + back) - first[pose, ear]
-    return found
+                behind[n, pose, ear] = 0.5 * (out + back) - first[pose, ear]
+    return behind
 
 
 @compiled
@@ -194,16 +194,16 @@ def _possible(
     first: Floats,
     axes: Floats,
     within: float,
-    wanted: Bools,
+    chosen: Bools,
     few: int,
     share: float,
     reach: float,
 ) -> Bools:
     """Return the cells (N,) that few onsets rule out and that lie at the range of a wanted one.
 
-    In: cells ((N, 3), m), wanted (P, E), reach (m).
+    In: cells ((N, 3), m), chosen (P, E), reach (m).
     """
-    found = np.zeros(len(cells), np.bool_)
+    is_possible = np.zeros(len(cells), np.bool_)
     for n in range(len(cells)):
         against, agree, meets = 0, 0, False
         for pose in range(len(first)):
@@ -217,9 +217,9 @@ def _possible(
                     against += 1
                 elif behind <= reach:
                     agree += 1
-                    meets = meets or wanted[pose, ear]
-        found[n] = meets and against <= max(few, share * agree)
-    return found
+                    meets = meets or chosen[pose, ear]
+        is_possible[n] = meets and against <= max(few, share * agree)
+    return is_possible
 
 
 ACCURACY = 0.1
@@ -300,21 +300,21 @@ def _remove(
 def _heard_box(hull: EchoHull) -> Floats | None:
     """Return a box around where each first echo comes from if it lies ahead, (2, 3) m."""
     first = hull.trusted.max(axis=1)
-    known = np.isfinite(first)
-    if not known.any():
+    has_onset = np.isfinite(first)
+    if not has_onset.any():
         return None
-    ahead = hull.sources[known] + hull.axes[known] * first[known, None]
+    ahead = hull.sources[has_onset] + hull.axes[has_onset] * first[has_onset, None]
     lower, upper = ahead.min(axis=0), ahead.max(axis=0)
     # To the sides as well: half of the mean range at least.
     middle, half = (lower + upper) / 2, (upper - lower) / 2
-    half = np.maximum(half * 1.5, first[known].mean() / 2)
+    half = np.maximum(half * 1.5, first[has_onset].mean() / 2)
     return np.stack((middle - half, middle + half))
 
 
 def _cells(
     hull: EchoHull,
     box: Floats,
-    wanted: NDArray[np.intp],
+    chosen: NDArray[np.intp],
     few: int,
     share: float,
     error: float,
@@ -331,7 +331,7 @@ def _cells(
     axes = [np.arange(a + side / 2, b + side / 2, side) for a, b in zip(lower, upper, strict=True)]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
     is_wanted = np.zeros(hull.first.size, dtype=np.bool_)
-    is_wanted[wanted] = True
+    is_wanted[chosen] = True
     while True:
         reach = float(side * np.sqrt(3) / 2 + error)
         of_wanted = is_wanted.reshape(hull.first.shape)
@@ -347,5 +347,5 @@ def _cells(
     for start in range(0, max(len(cells), 1), hull.chunk):
         behind = hull.behind(cells[start : start + hull.chunk]).reshape(-1, hull.first.size)
         against.append(behind < -reach)
-        meets.append(np.abs(behind[:, wanted]) <= reach)
+        meets.append(np.abs(behind[:, chosen]) <= reach)
     return np.concatenate(against), np.concatenate(meets)

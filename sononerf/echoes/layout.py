@@ -144,7 +144,7 @@ def _open_array(
     packed = name == SPECTROGRAM
     expected = ["bytes", "zstd", "crc32c"] if packed else ["bytes", "crc32c"]
     chunks = (1, *array.shape[1:]) if packed else array.shape
-    found = {
+    stored = {
         "type": (str(array.dtype), dtype),
         "dimension names": (tuple(array.metadata.dimension_names or ()), dims),
         "shape": (array.shape[-len(sizes) :] if sizes else (), sizes),
@@ -158,7 +158,7 @@ def _open_array(
         ),
         "fill value": (bool(np.isnan(array.fill_value)), packed),
     }
-    for what, (is_there, wanted) in found.items():
+    for what, (is_there, wanted) in stored.items():
         if is_there != wanted:
             raise InputError(f"{path}: {what} {is_there}, expected {wanted}")
     if min(array.shape) < 1:

@@ -45,12 +45,12 @@ def split_of(poses: Poses, split: ArrayLike | None, *, where: str = "split") -> 
     given = np.asarray(split)
     if given.shape != (len(poses),):
         raise InputError(f"{where} has shape {given.shape}, expected ({len(poses)},), one per pose")
-    known: dict[Any, int] = {**SPLITS, **{number: number for number in SPLITS.values()}}
+    uses: dict[Any, int] = {**SPLITS, **{number: number for number in SPLITS.values()}}
     values = given.tolist()
-    wrong = next((value for value in values if value not in known), None)
+    wrong = next((value for value in values if value not in uses), None)
     if wrong is not None:
         raise InputError(f"{where}: found {wrong!r}, expected train, val or test, or 0, 1 or 2")
-    found = np.array([known[value] for value in values], dtype=np.int8)
+    found = np.array([uses[value] for value in values], dtype=np.int8)
     if not (found == TRAIN).any():
         raise InputError(f"{where}: no pose is for training; mark some as train")
     return found
@@ -170,11 +170,11 @@ class Ensemble(ABC):
         """Return a spectrogram in the type that is kept; refuse one that does not fit."""
         self._refuse_unknown(index)
         values = np.ascontiguousarray(spectrogram, dtype="<f4")
-        wanted = (self.receivers, len(self._axes["range"]), len(self._axes["frequency"]))
-        if values.shape != wanted:
+        shape = (self.receivers, len(self._axes["range"]), len(self._axes["frequency"]))
+        if values.shape != shape:
             raise InputError(
                 f"{self.path}: pose {index} has shape {values.shape}, "
-                f"expected (receivers, ranges, frequencies) {wanted}"
+                f"expected (receivers, ranges, frequencies) {shape}"
             )
         fault = fault_of(values)
         if fault:

@@ -55,12 +55,12 @@ class EchoRegion:
         self.hull, self.resolution, self.range = hull, resolution, heard.range
         self.step = float(heard.range[1] - heard.range[0])
         count = len(heard.poses)
-        asked = np.linspace(0, count - 1, min(POSES, count)).astype(int)
-        self.heard = heard.heard[asked].any(axis=1)  # (P, R)
-        total = heard.power[asked].sum(axis=1) * self.heard
+        sampled = np.linspace(0, count - 1, min(POSES, count)).astype(int)
+        self.heard = heard.heard[sampled].any(axis=1)  # (P, R)
+        total = heard.power[sampled].sum(axis=1) * self.heard
         self.power = total / total.sum(axis=1, keepdims=True).clip(1e-300)
-        self.first = hull.trusted[asked].max(axis=1)
-        self.sources, self.rotations = hull.sources[asked], rotations[asked]
+        self.first = hull.trusted[sampled].max(axis=1)
+        self.sources, self.rotations = hull.sources[sampled], rotations[sampled]
         gain = (ears.beam[None] * ears.ears).max(axis=(0, 1))  # (L, A)
         self.witness_gain = gain >= WITNESS_GAIN * gain.max()
 
@@ -165,13 +165,13 @@ class EchoRegion:
     def _with_origins(
         self, points: Floats, tolerance: float, keep: Bools, covered: Bools, inside: Bools
     ) -> Bools:
-        known = np.isfinite(self.first)
-        row = np.round((np.where(known, self.first, 0.0) - self.range[0]) / self.step)
+        has_onset = np.isfinite(self.first)
+        row = np.round((np.where(has_onset, self.first, 0.0) - self.range[0]) / self.step)
         row = row.astype(int).clip(0, len(self.range) - 1)
         pose = np.arange(len(row))
         while True:
-            asks = np.flatnonzero(known & ~covered[pose, row])
-            if len(asks) <= max(ENOUGH, UNEXPLAINED * known.sum()):
+            asks = np.flatnonzero(has_onset & ~covered[pose, row])
+            if len(asks) <= max(ENOUGH, UNEXPLAINED * has_onset.sum()):
                 return keep
             agree = np.where(inside & ~keep, self._shared(points, tolerance, asks), 0)
             if agree.max() <= ENOUGH:

@@ -156,14 +156,14 @@ class EnsembleStore(Ensemble):
 
     def damaged(self) -> list[int]:
         """Read all poses that are there; return those that are damaged."""
-        found = []
+        indices = []
         for index in range(len(self)):
             if self._chunk(index).is_file():
                 try:
                     self.read_pose(index)
                 except InputError:
-                    found.append(index)
-        return found
+                    indices.append(index)
+        return indices
 
     def remove_damaged(self) -> None:
         """Remove the files of damaged poses, which then count as missing."""

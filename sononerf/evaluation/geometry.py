@@ -61,7 +61,7 @@ class Registration:
 
 
 def register(
-    found: trimesh.Trimesh, truth: trimesh.Trimesh, kind: Kind, *, seed: int = 0
+    reconstructed: trimesh.Trimesh, truth: trimesh.Trimesh, kind: Kind, *, seed: int = 0
 ) -> Registration:
     """Find the motion that lays one surface over another, by iterated closest points [1]_.
 
@@ -78,7 +78,7 @@ def register(
     scaled = kind == "similarity"
     points, target = (
         np.asarray(trimesh.sample.sample_surface(mesh, FINE, seed=seed)[0])
-        for mesh in (found, truth)
+        for mesh in (reconstructed, truth)
     )
     tried = [
         _closest(points[:COARSE], target[:COARSE], start, scaled)
@@ -138,16 +138,20 @@ MOST_TIMES = 30.0
 gives 39."""
 
 
-def check_truth(found: trimesh.Trimesh, true: trimesh.Trimesh, kind: Kind, name: str) -> None:
+def check_truth(
+    reconstructed: trimesh.Trimesh, true: trimesh.Trimesh, kind: Kind, name: str
+) -> None:
     """Refuse a true surface that is of another size, or elsewhere, before any work."""
-    sizes = [float(np.linalg.norm(mesh.extents)) for mesh in (found, true)]
+    sizes = [float(np.linalg.norm(mesh.extents)) for mesh in (reconstructed, true)]
     times = max(sizes) / max(min(sizes), 1e-12)
     if kind != "similarity" and times > MOST_TIMES:
         raise InputError(
             f"{name}: {sizes[1]:.3g} m across, and the reconstruction {sizes[0]:.3g} m; give the "
             "unit of its numbers (--unit mm, or evaluation.unit), or --registration similarity"
         )
-    apart = np.maximum(true.bounds[0] - found.bounds[1], found.bounds[0] - true.bounds[1])
+    apart = np.maximum(
+        true.bounds[0] - reconstructed.bounds[1], reconstructed.bounds[0] - true.bounds[1]
+    )
     if kind == "none" and (apart > 0).any():
         raise InputError(
             f"{name}: lies {np.linalg.norm(apart.clip(0)):.3g} m away from the reconstruction; "
@@ -191,9 +195,9 @@ class Truth:
 
         The README's table names them.
         """
-        found = geometry_metrics(self.mesh, self.surface)
+        metrics = geometry_metrics(self.mesh, self.surface)
         if self.kind != "none":
-            found["registration"] = {
+            metrics["registration"] = {
                 "kind": self.kind,
                 "scale": self.motion.scale,
                 "matrix": self.motion.matrix.tolist(),
@@ -201,8 +205,8 @@ class Truth:
         surroundings = None if scene is None else scene.surface(background=True)
         target = None if scene is None else scene.surface(background=False)
         if surroundings is not None and target is not None:
-            found["target"] = target_metrics(self.mesh, target, surroundings)
-        return found
+            metrics["target"] = target_metrics(self.mesh, target, surroundings)
+        return metrics
 
     def of_volume(self, volume: Volume) -> dict[str, Any] | None:
         """Return the metrics of a baseline at its best level; None where it has no surface."""

@@ -35,7 +35,7 @@ def geometry_metrics(
     In: thresholds (tuple of float, m).
     """
     true = truth if isinstance(truth, Solid) else Solid(truth)
-    found = Solid(reconstructed, fill_cavities=False)
+    solid = Solid(reconstructed, fill_cavities=False)
     true_points, true_normals = true.samples(samples, seed)
     points, face = sample_surface(reconstructed, samples, seed + 1)
     normals = np.asarray(reconstructed.face_normals)[face]
@@ -45,9 +45,9 @@ def geometry_metrics(
         "chamfer_m": float(to_truth.mean() + to_found.mean()) / 2,
         "fscore": {f"{limit:g}": _fscore(to_truth, to_found, limit) for limit in thresholds},
         "thickness_bias_m": _thickness_bias(true, points, to_truth),
-        **_volume_metrics(found, true),
+        **_volume_metrics(solid, true),
         "normal_consistency": _normal_consistency(points, normals, true_points, true_normals),
-        "components": found.components,
+        "components": solid.components,
         "components_true": true.components,
     }
 
@@ -73,9 +73,9 @@ def target_metrics(
     around = Nearest(background)
     to_truth = true.nearest.distance(points)
     counts = to_truth <= around.distance(points)
-    found: dict[str, Any] = {"share": float(counts.mean())}
+    metrics: dict[str, Any] = {"share": float(counts.mean())}
     if not counts.any():
-        return {**found, "chamfer_m": None, "fscore": {f"{limit:g}": 0.0 for limit in thresholds}}
+        return {**metrics, "chamfer_m": None, "fscore": {f"{limit:g}": 0.0 for limit in thresholds}}
     to_truth = to_truth[counts]
     # The border of the counted part is as coarse as the triangles.
     middles = np.asarray(reconstructed.triangles_center)
@@ -84,7 +84,7 @@ def target_metrics(
     part = trimesh.Trimesh(reconstructed.vertices, reconstructed.faces[kept], process=False)
     to_found = Nearest(part).distance(true.samples(samples, seed)[0])
     return {
-        **found,
+        **metrics,
         "chamfer_m": float(to_truth.mean() + to_found.mean()) / 2,
         "fscore": {f"{limit:g}": _fscore(to_truth, to_found, limit) for limit in thresholds},
     }
@@ -101,13 +101,13 @@ def _thickness_bias(true: Solid, points: Floats, to_truth: Floats) -> float | No
     return float(np.where(true.contains(points), -to_truth, to_truth).mean())
 
 
-def _volume_metrics(found: Solid, true: Solid) -> dict[str, float | None]:
-    if not (found.closed and true.closed):
+def _volume_metrics(reconstructed: Solid, true: Solid) -> dict[str, float | None]:
+    if not (reconstructed.closed and true.closed):
         return {"volume_ratio": None, "iou": None}
-    shared = found.shared_volume(true)
+    shared = reconstructed.shared_volume(true)
     return {
-        "volume_ratio": found.volume / true.volume,
-        "iou": shared / (found.volume + true.volume - shared),
+        "volume_ratio": reconstructed.volume / true.volume,
+        "iou": shared / (reconstructed.volume + true.volume - shared),
     }
 
 

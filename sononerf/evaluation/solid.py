@@ -212,12 +212,12 @@ class Nearest:
         bound, corner = self.corners.query(given)
         rank = np.zeros(self.corners.n, np.intp)
         rank[self.corners.indices] = np.arange(self.corners.n)
-        found = self._within(given, bound, np.argsort(rank[corner], kind="stable"))
+        distances = self._within(given, bound, np.argsort(rank[corner], kind="stable"))
         # The nearest corner may be of triangles without an area, which the locator leaves out.
-        lost = np.flatnonzero(np.isinf(found))
+        lost = np.flatnonzero(np.isinf(distances))
         far = bound[lost] + np.linalg.norm(np.ptp(self.corners.data, axis=0))
-        found[lost] = self._within(given[lost], far, np.arange(len(lost)))
-        return found
+        distances[lost] = self._within(given[lost], far, np.arange(len(lost)))
+        return distances
 
     def near(self, points: Floats, limit: float) -> Bools:
         """Return whether points (N, 3) are no farther than a limit, in m; quicker still."""
@@ -243,8 +243,8 @@ class Nearest:
         size = float(np.abs(self.corners.data).max())
         radii = (bound * (1 + SLACK) + SLACK * size).tolist()
         rows = points.tolist()
-        found = np.full(len(points), np.inf)
+        distances = np.full(len(points), np.inf)
         for index in order.tolist():
             if find(rows[index], radii[index], place, cell, number, part, squared, inside):
-                found[index] = float(squared)
-        return np.sqrt(found)
+                distances[index] = float(squared)
+        return np.sqrt(distances)

@@ -56,15 +56,15 @@ def learn_interval(
     active = (measured >= active_db) | (predicted >= active_db)
     level, count = level_class(predicted), predicted.shape[-1]
     half = np.full((CLASSES, count), RANGE_DB)  # nothing is known
-    known = [one for one in range(CLASSES) if (active & (level == one)).any()]
-    for one in known:
+    classes = [one for one in range(CLASSES) if (active & (level == one)).any()]
+    for one in classes:
         some = active & (level == one)
         usual = _quantile(error[some])
         for band in np.array_split(np.arange(count), min(BANDS, count)):
             found = error[..., band][some[..., band]]
             half[one, band] = usual if len(found) < FEWEST else _quantile(found)
-    for one in range(CLASSES) if known else ():  # others are as uncertain as the next lower one
-        half[one] = half[max((other for other in known if other <= one), default=known[0])]
+    for one in range(CLASSES) if classes else ():  # others are as uncertain as the next lower one
+        half[one] = half[max((other for other in classes if other <= one), default=classes[0])]
     return half
 
 
@@ -264,13 +264,13 @@ def regress_weight(measured_db: ArrayLike, rendered_db: ArrayLike, traced_db: Ar
         np.asarray(a, dtype=np.float64) for a in (measured_db, rendered_db, traced_db)
     )
     count = measured.shape[-1]
-    wanted = (measured - rendered).reshape(-1, count)
+    target = (measured - rendered).reshape(-1, count)
     apart = (traced - rendered).reshape(-1, count)
     weights = np.zeros(count)
     for row in range(count):
         known = np.abs(apart[:, row]) > 0
         if known.any():
-            slope = wanted[known, row] / apart[known, row]
+            slope = target[known, row] / apart[known, row]
             weights[row] = _weighted_median(slope, np.abs(apart[known, row]))
     return weights.clip(0.0, 1.0)
 

@@ -213,12 +213,16 @@ class Field(nn.Module):
             outside ((L,) bool or None): None where all lie inside, so that nothing need be made
                 zero.
         """
-        asked = self._asked
-        if asked is None or asked[0] is not lattice or asked[1] is not self.occupancy:
+        directions = self._asked
+        if (
+            directions is None
+            or directions[0] is not lattice
+            or directions[1] is not self.occupancy
+        ):
             with torch.inference_mode(False):
                 outside = ~self.inside(lattice)
-            self._asked = asked = (lattice, self.occupancy, outside if outside.any() else None)
-        return asked[2]
+            self._asked = directions = (lattice, self.occupancy, outside if outside.any() else None)
+        return directions[2]
 
     @torch.no_grad()
     def oriented(self, positions: Tensor, directions: int) -> tuple[Tensor, Tensor]:

@@ -80,11 +80,11 @@ class FourierField(Field):
                 "field.options.direction_octaves is of inputs direction, not of inputs angles; "
                 "leave it out"
             )
-        told = direction_octaves or octaves
-        first = 5 * (octaves + 1) if inputs == "angles" else 3 * (octaves + told)
+        octaves_of_directions = direction_octaves or octaves
+        first = 5 * (octaves + 1) if inputs == "angles" else 3 * (octaves + octaves_of_directions)
         second = 5 * 20 if inputs == "angles" else first
         self.register_buffer("_first", math.pi * math.sqrt(2.0) ** torch.arange(octaves))
-        turns = math.pi * math.sqrt(2.0) ** torch.arange(told)
+        turns = math.pi * math.sqrt(2.0) ** torch.arange(octaves_of_directions)
         self.register_buffer(
             "_turns", turns, persistent=False
         )  # the settings of a file determine them

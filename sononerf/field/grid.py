@@ -67,12 +67,12 @@ class _Reading:
                 vertex.append(((near[read] + corner) * stride).sum(dim=1))
                 share.append(factor[read])
             flat = torch.cat(vertex)
-            met = torch.zeros(int(size.prod()), dtype=torch.bool, device=self.device)
-            met[flat] = True
+            is_corner = torch.zeros(int(size.prod()), dtype=torch.bool, device=self.device)
+            is_corner[flat] = True
             row.append(torch.cat(of))
-            column.append((met.cumsum(0) - 1)[flat] + count)
+            column.append((is_corner.cumsum(0) - 1)[flat] + count)
             weight.append(torch.cat(share))
-            self._vertices.append(met.nonzero()[:, 0])
+            self._vertices.append(is_corner.nonzero()[:, 0])
             count += len(self._vertices[-1])
         index, value = torch.stack((torch.cat(row), torch.cat(column))), torch.cat(weight)
         shape = (len(places), count)

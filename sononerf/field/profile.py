@@ -270,16 +270,16 @@ class ProfileRenderer(Renderer):
                 unit = ray / _length(ray)
                 out = turned[ways[0]].index_select(1, pair)
                 back = out if ways[0] == ways[1] else turned[ways[1]].index_select(1, pair)
-                known, middle = self._paths(out, back, bins)
-                known.square_()
+                paths, middle = self._paths(out, back, bins)
+                paths.square_()
                 if weight is not None:
-                    known *= weight.index_select(0, place)
+                    paths *= weight.index_select(0, place)
             response, lead = field.echo(places, unit.T, bins, place, code)  # (M, B), (M,)
             response = response.T
             if self.training:
                 self.points_evaluated += len(place)
             squared = response.abs().square() if response.is_complex() else response.square()
-            echoes.append((squared * known)[None])
+            echoes.append((squared * paths)[None])
             at.append(middle - lead / self.bin)
             poses.append(pose)
         heard, when, whose = _joined(echoes), _joined(at), _joined(poses)
@@ -335,16 +335,16 @@ class ProfileRenderer(Renderer):
         out = _length(ray)
         way = out + back  # (E, M) m, there and back
         # Each pass is made once, and in place: memory traffic limits the speed.
-        known = look_up(self.ears.index_select(1, bins), head).mT
-        known *= look_up(self.beam.index_select(0, bins), (ray / out).T).T
+        gain = look_up(self.ears.index_select(1, bins), head).mT
+        gain *= look_up(self.beam.index_select(0, bins), (ray / out).T).T
         absorption = self.absorption[bins]
         factors = torch.stack((absorption, torch.ones_like(absorption)), dim=1)
         lengths = torch.stack((way, torch.log(out * back)), dim=1)
-        known *= (-factors @ lengths).exp_()
+        gain *= (-factors @ lengths).exp_()
         middle = ((way / 2 - self.first) / self.bin)[:, None]
         if self.lag is not None:
             middle = middle + look_up(self.lag.index_select(1, bins), head).mT / self.bin
-        return known, middle
+        return gain, middle
 
 
 def _joined(parts: list[Tensor]) -> Tensor:

@@ -307,13 +307,15 @@ class ShellRenderer(Renderer):
         spectrum = self.log_spectrum if bins is None else self.log_spectrum[bins]
         world = torch.einsum("pij,dj->pdi", rotation, self.directions)  # (P, D, 3)
         places = position[:, None, None] + self.range[rows][..., None, None] * world[:, None]
-        told = -world if self.told == "incidence" else -rotation[:, None, :, 0].expand(world.shape)
-        told = told[:, None].expand(places.shape)
+        directions = (
+            -world if self.told == "incidence" else -rotation[:, None, :, 0].expand(world.shape)
+        )
+        directions = directions[:, None].expand(places.shape)
         inside = field.inside(places)  # (P, R, D)
         if self.training:
             self.points_evaluated += inside.sum()
         slice_index, direction_index = inside.flatten(0, 1).nonzero(as_tuple=True)
-        response = field.select(places[inside], told[inside], bins)  # (N, B)
+        response = field.select(places[inside], directions[inside], bins)  # (N, B)
         sums = []
         for ear in transfer:
             echo = response * ear[direction_index]

@@ -195,15 +195,15 @@ def _on_sphere(share: Floats, turn: Floats, depth: float, axes: Floats) -> Float
 def _in_patches(chosen: Bools, count: int, shift: float, turn: float) -> Ints:
     """Return which directions of a spiral lie in chosen patches (rows, columns), ascending."""
     rows, columns = chosen.shape
-    index, found = np.zeros(count, np.int64), 0
+    index, count_found = np.zeros(count, np.int64), 0
     for i in range(count):
         around = i * GOLDEN_TURN + turn
         around -= math.floor(around)
         row = min(int((i + shift) / count * rows), rows - 1)
         if chosen[row, min(int(around * columns), columns - 1)]:
-            index[found] = i
-            found += 1
-    return index[:found].copy()
+            index[count_found] = i
+            count_found += 1
+    return index[:count_found].copy()
 
 
 def _cell_steps(ring: Floats, depth: float) -> tuple[Ints, Ints]:

@@ -36,16 +36,16 @@ class Frame:
         if name == "world" or (name == "auto" and not recorded):
             return cls()
         matrix, head = (attributes.get(key) for key in KEYS)
-        found = cls(
+        frame = cls(
             np.eye(4) if matrix is None else np.asarray(matrix, dtype=np.float64),
             np.eye(3) if head is None else np.asarray(head, dtype=np.float64),
         )
-        if found.matrix.shape != (4, 4) or found.head.shape != (3, 3):
+        if frame.matrix.shape != (4, 4) or frame.head.shape != (3, 3):
             raise InputError("to_original is no 4 by 4 matrix; import or simulate again")
-        turn = found.matrix[:3, :3] * (found.unit if np.isfinite(found.unit) else 0.0)
-        if not all(np.allclose(each @ each.T, np.eye(3), atol=1e-3) for each in (turn, found.head)):
+        turn = frame.matrix[:3, :3] * (frame.unit if np.isfinite(frame.unit) else 0.0)
+        if not all(np.allclose(each @ each.T, np.eye(3), atol=1e-3) for each in (turn, frame.head)):
             raise InputError("to_original is no similarity; import or simulate again")
-        return found
+        return frame
 
     @property
     def unit(self) -> float:

@@ -67,13 +67,13 @@ class _EmbreeEngine:
     def blocked(self, origins: Reals, spans: Reals) -> Bools:
         # Distances count in lengths of the direction, so 1 is the target. Asked for more output
         # than this, the occlusion query returns uninitialised memory.
-        found = self._scene.run(
+        hits = self._scene.run(
             origins.astype(np.float32, copy=False),
             spans.astype(np.float32, copy=False),
             dists=np.ones(len(origins), np.float32),
             query="OCCLUDED",
         )
-        return np.asarray(found) == 0
+        return np.asarray(hits) == 0
 
 
 class _VtkEngine:
@@ -114,7 +114,7 @@ class _VtkEngine:
 
 @compiled
 def _hits_of(
-    found: Ints,
+    triangles: Ints,
     origins: Floats,
     directions: Floats,
     planes: Floats,
@@ -123,12 +123,12 @@ def _hits_of(
 ) -> tuple[Ints, Floats, Floats, Ints, Floats, Floats, Singles]:
     """Return the attributes of :class:`Hits`.
 
-    In: found (N,), origins ((N, 3) or (1, 3), m), directions (N, 3), planes (T, 6), smooth ((T, 5,
-    3) float32), corners ((T, 3, 3), m).
+    In: triangles (N,), origins ((N, 3) or (1, 3), m), directions (N, 3), planes (T, 6), smooth
+    ((T, 5, 3) float32), corners ((T, 3, 3), m).
     """
-    ray, count = np.zeros(len(found), np.int64), 0
-    for i in range(len(found)):
-        if found[i] >= 0:
+    ray, count = np.zeros(len(triangles), np.int64), 0
+    for i in range(len(triangles)):
+        if triangles[i] >= 0:
             ray[count] = i
             count += 1
     ray = ray[:count].copy()
@@ -137,7 +137,7 @@ def _hits_of(
     gradients = np.zeros((count, 4, 3), np.float32)
     weight = np.zeros(3)
     for i in range(count):
-        at = found[ray[i]]
+        at = triangles[ray[i]]
         start = origins[ray[i] if len(origins) > 1 else 0]
         along, plane, of = directions[ray[i]], planes[at], smooth[at]
         slope = along[0] * plane[3] + along[1] * plane[4] + along[2] * plane[5]
@@ -252,11 +252,11 @@ class RayCaster:
 
         In: origins ((N, 3), m), directions (N, 3).
         """
-        found = self._engine.first(self._scaled(origins), directions)
+        hits = self._engine.first(self._scaled(origins), directions)
         one = len(origins) > 1 and origins.strides[0] == 0
         start = origins[:1].copy() if one else np.ascontiguousarray(origins)
         along = np.ascontiguousarray(directions)
-        return Hits(*_hits_of(found, start, along, self._planes, self._gradients, self._corners))
+        return Hits(*_hits_of(hits, start, along, self._planes, self._gradients, self._corners))
 
     def visible(self, points: Floats, targets: Floats, *, normals: Floats | None = None) -> Bools:
         """True where nothing stands between points and targets.

@@ -216,12 +216,12 @@ def attach(head: NamesFiles, folder: Path) -> None:
 
 def attached(head: NamesFiles, folder: Path) -> dict[str, Any]:
     """Return the sections, by name, whose file has a copy in a folder; ``file`` is the copy."""
-    found = {}
+    content = {}
     for section in FILE_SECTIONS:
         own = getattr(head, section)
         if own.file is not None and (copy := _copy_of(own.file, section, folder)).is_file():
-            found[section] = own.model_copy(update={"file": copy})
-    return found
+            content[section] = own.model_copy(update={"file": copy})
+    return content
 
 
 def _copy_of(file: Path, section: str, folder: Path) -> Path:

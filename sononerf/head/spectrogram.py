@@ -172,7 +172,7 @@ def smearing(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
 
 
 def _of_a_window(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
-    wanted = frequency_axis(analysis)
+    frequencies = frequency_axis(analysis)
     step = analysis.sampling_rate / analysis.fft
     window = np.hamming(analysis.window)
     # The transform about the window's own middle is real; two main lobes on each side suffice.
@@ -180,43 +180,47 @@ def _of_a_window(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
     time = np.arange(analysis.window) - (analysis.window - 1) / 2.0
     offsets = np.arange(-reach, reach + 1)
     smear = np.cos(2.0 * np.pi / analysis.fft * np.outer(offsets, time)) @ window
-    first = round(float(wanted[0]) / step) - reach
-    count = len(wanted) + 2 * reach
+    first = round(float(frequencies[0]) / step) - reach
+    count = len(frequencies) + 2 * reach
     # Below the first bin and above half the sampling rate there is nothing to hear.
     bins = np.clip(np.arange(first, first + count), 1, analysis.fft // 2)
     fine = bins.clip(1) * step + np.arange(count) * 1e-9
-    rows = np.arange(len(wanted))[:, None] + np.arange(2 * reach + 1)  # (F, K) of the fine bins
+    rows = np.arange(len(frequencies))[:, None] + np.arange(
+        2 * reach + 1
+    )  # (F, K) of the fine bins
     if call.kind == "impulse":
-        return Smearing(fine, rows, np.tile(smear / smear.sum(), (len(wanted), 1)), None)
+        return Smearing(fine, rows, np.tile(smear / smear.sum(), (len(frequencies), 1)), None)
     waveform = call_waveform(call, analysis.sampling_rate)
     finer = math.ceil(len(waveform) / analysis.fft)
     emitted = np.fft.rfft(waveform, finer * analysis.fft)[finer * bins]
     weight = smear**2 * (np.abs(emitted) ** 2)[rows]
     weight /= weight.sum(axis=1, keepdims=True)
     delay = sweep_delay(call, bins * step)
-    return Smearing(fine, rows, weight, weight * (delay[rows] - sweep_delay(call, wanted)[:, None]))
+    return Smearing(
+        fine, rows, weight, weight * (delay[rows] - sweep_delay(call, frequencies)[:, None])
+    )
 
 
 def _of_gammatones(call: CallSettings, analysis: SpectrogramSettings) -> Smearing:
     filters, rate = row_filters(analysis), analysis.sampling_rate
-    wanted = filters.frequency
+    frequencies = filters.frequency
     # Fine frequencies are some to a channel, and some to a bandwidth, in equal ratios too.
-    between = math.log(wanted[-1] / wanted[0]) / (len(wanted) - 1)
+    between = math.log(frequencies[-1] / frequencies[0]) / (len(frequencies) - 1)
     finer = max(1, math.ceil(4.0 * analysis.q * between))
     step = between / finer
     skirt = SKIRT * BANDWIDTH / analysis.q
     below = math.ceil(-math.log(max(1.0 - skirt, 1.0 / WIDEST)) / step)
     above = math.ceil(math.log(1.0 + skirt) / step)
-    count = finer * (len(wanted) - 1) + 1 + below + above
-    exact = wanted[0] * np.exp(step * (np.arange(count) - below))
+    count = finer * (len(frequencies) - 1) + 1 + below + above
+    exact = frequencies[0] * np.exp(step * (np.arange(count) - below))
     fine = np.minimum(exact, rate / 2.0) + np.arange(count) * 1e-9
-    rows = finer * np.arange(len(wanted))[:, None] + np.arange(below + above + 1)
+    rows = finer * np.arange(len(frequencies))[:, None] + np.arange(below + above + 1)
     time = np.arange(filters.envelope.shape[1]) + filters.origin - filters.centre
     turn = 2j * np.pi / rate * time
     weight = np.stack(
         [
             np.exp(np.outer(exact[which] - row, turn)) @ envelope
-            for which, row, envelope in zip(rows, wanted, filters.envelope, strict=True)
+            for which, row, envelope in zip(rows, frequencies, filters.envelope, strict=True)
         ]
     )
     # A fine frequency stands for a part of the axis that grows with it.
@@ -229,4 +233,6 @@ def _of_gammatones(call: CallSettings, analysis: SpectrogramSettings) -> Smearin
     power = np.abs(weight) ** 2 / exact[rows] * (np.abs(emitted) ** 2)[rows]
     power /= np.maximum(power.sum(axis=1, keepdims=True), 1e-300)
     delay = sweep_delay(call, fine)
-    return Smearing(fine, rows, power, power * (delay[rows] - sweep_delay(call, wanted)[:, None]))
+    return Smearing(
+        fine, rows, power, power * (delay[rows] - sweep_delay(call, frequencies)[:, None])
+    )

@@ -134,11 +134,11 @@ def _sphere(middle: Floats, first: Floats) -> tuple[Floats, float]:
     # Poses on one side of a body leave two sides to look on.
     for side in _sides(places, start, scale):
         guess = np.r_[side, np.linalg.norm(places - side, axis=1).mean() - np.median(ranges)]
-        found = least_squares(
+        solution = least_squares(
             misfit, guess, loss="soft_l1", f_scale=0.02, max_nfev=60, x_scale=max(spread, scale)
         )
-        if best is None or found.cost < best.cost:
-            best = found
+        if best is None or solution.cost < best.cost:
+            best = solution
     assert best is not None
     return best.x[:3], float(best.x[3])
 

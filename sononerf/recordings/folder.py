@@ -133,11 +133,11 @@ def _files(
         return [folder / name for name in columns.texts["file"]]
     if settings.file is not None:
         return [folder / settings.file] * len(columns)
-    found = _sounds(folder, apart)
-    if len(found) == 1:
-        return found * len(columns)
+    sounds = _sounds(folder, apart)
+    if len(sounds) == 1:
+        return sounds * len(columns)
     raise InputError(
-        f"{columns.where}: no column file, and {len(found)} recordings in {folder}; name each "
+        f"{columns.where}: no column file, and {len(sounds)} recordings in {folder}; name each "
         "ping's file in a column file, or the long one in import.file"
     )
 

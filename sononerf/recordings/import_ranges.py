@@ -98,13 +98,13 @@ def calibrate(echo: Floats, reference: ReferenceSettings, head: Head) -> Calibra
     loss = 10.0 ** (-absorption[None] * 2.0 * path[:, None] / 20.0)
     expected = reference.radius / 2.0 * loss * gain / (out * back)[:, None]
     time, direct = _call_itself(call, near, delay)
-    wanted = np.square(expected * direct.max(axis=0))[:, swept].mean(axis=1)
-    found = np.take_along_axis(power, top[:, None], axis=1)[:, 0]
+    model = np.square(expected * direct.max(axis=0))[:, swept].mean(axis=1)
+    measured = np.take_along_axis(power, top[:, None], axis=1)[:, 0]
     # Rows at the ends of a sweep are lopsided, and so is the peak of their mean.
     profile = np.square(direct * expected[:, None])[..., swept].mean(axis=-1)
     bias = speed_of_sound / 2.0 * _peak(time, profile, profile.argmax(axis=1))
     offsets = path + bias - _peak(axis, power, top)
-    return Calibration(np.sqrt(wanted / found), float(offsets.mean()))
+    return Calibration(np.sqrt(model / measured), float(offsets.mean()))
 
 
 def _call_itself(
@@ -214,50 +214,50 @@ def _widest(window: int, count: int, delay: float, metre: float) -> float:
 
 
 def calibrated(
-    recording: Recording, wanted: ImportSettings, head: Head, folder: Path
+    recording: Recording, settings: ImportSettings, head: Head, folder: Path
 ) -> tuple[Cutter, dict[str, Any]]:
     """Return the cutter of pings, with all corrections, and the applied calibration."""
     speed, rate = head.speed_of_sound, recording.sampling_rate
     applied: dict[str, Any] = {
-        "scale": wanted.scale,
-        "time_offset_s": wanted.time_offset,
-        "range_offset_m": wanted.range_offset,
+        "scale": settings.scale,
+        "time_offset_s": settings.time_offset,
+        "range_offset_m": settings.range_offset,
     }
     # An echo from farther away comes later; the emission is moved the other way.
-    delay = wanted.time_offset - 2.0 * wanted.range_offset / speed
-    cutter = Cutter(recording, wanted.channels, delay, wanted.scale)
-    if wanted.background is not None:
-        quiet = _beside(folder / wanted.background, recording, wanted)
-        begin = wanted.background_time + delay
+    delay = settings.time_offset - 2.0 * settings.range_offset / speed
+    cutter = Cutter(recording, settings.channels, delay, settings.scale)
+    if settings.background is not None:
+        quiet = _beside(folder / settings.background, recording, settings)
+        begin = settings.background_time + delay
         background = cut(quiet, begin * rate, quiet.shape[1] - int(begin * rate))
         cutter = replace(cutter, background=background)
-        applied["background"] = wanted.background.name
-    if wanted.reference is not None:
-        target = wanted.reference
-        heard = _beside(folder / target.file, recording, wanted)
+        applied["background"] = settings.background.name
+    if settings.reference is not None:
+        target = settings.reference
+        heard = _beside(folder / target.file, recording, settings)
         begin = (target.time + delay) * rate
         echo = cut(heard, begin, heard.shape[1] - int(begin))
         if cutter.background is not None:
             size = min(echo.shape[1], cutter.background.shape[1])
             echo[:, :size] -= cutter.background[:, :size]
-        found = calibrate(mix(echo, wanted.channels) * wanted.scale, target, head)
-        delay -= 2.0 * found.range_offset / speed
-        cutter = replace(cutter, delay=delay, gain=wanted.scale * found.gain)
+        calibration = calibrate(mix(echo, settings.channels) * settings.scale, target, head)
+        delay -= 2.0 * calibration.range_offset / speed
+        cutter = replace(cutter, delay=delay, gain=settings.scale * calibration.gain)
         if cutter.background is not None:
-            begin = wanted.background_time + delay
+            begin = settings.background_time + delay
             background = cut(quiet, begin * rate, quiet.shape[1] - int(begin * rate))
             cutter = replace(cutter, background=background)
         applied["reference"] = {
             "file": target.file.name,
-            "gain_db": np.round(20.0 * np.log10(found.gain), 3).tolist(),
-            "range_offset_m": round(found.range_offset, 6),
+            "gain_db": np.round(20.0 * np.log10(calibration.gain), 3).tolist(),
+            "range_offset_m": round(calibration.range_offset, 6),
         }
     return cutter, applied
 
 
-def _beside(path: Path, recording: Recording, wanted: ImportSettings) -> NDArray[Any]:
+def _beside(path: Path, recording: Recording, settings: ImportSettings) -> NDArray[Any]:
     """Read another recording of the same rate and channels."""
-    rate, samples = read_sound(path, wanted)
+    rate, samples = read_sound(path, settings)
     channels = recording.read(0).shape[0]
     if rate != recording.sampling_rate or len(samples) != channels:
         raise InputError(

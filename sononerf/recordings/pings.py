@@ -244,17 +244,17 @@ class Clipping:
         return cls(peak, beside.sum(axis=1), step)
 
 
-def clipped_pings(found: list[Clipping]) -> Bools:
+def clipped_pings(clippings: list[Clipping]) -> Bools:
     """Return which pings are clipped, (P,).
 
     A ping is clipped if one of its channels has three samples or more that equal a neighbour, at a
     value that no ping of this channel exceeds, or at full scale; upward or downward.
     """
-    if not found:
+    if not clippings:
         return np.zeros(0, dtype=bool)
-    peak = np.stack([each.peak for each in found])
-    stays = np.stack([each.stays for each in found])
-    step = found[0].step
+    peak = np.stack([each.peak for each in clippings])
+    stays = np.stack([each.stays for each in clippings])
+    step = clippings[0].step
     limit = peak.max(axis=0)
     loud = (peak >= limit - 1.5 * step) & (limit > max(STEPS * step, 0.0))
     full = (peak >= 1.0 - 1.5 * step) if step else np.zeros_like(loud)

@@ -84,38 +84,40 @@ class Verdict:
 def alternatives(columns: Columns, settings: ImportSettings) -> dict[str, Poses]:
     """Return the poses of a table under conventions that are easily mixed up."""
     stated = to_poses(columns, settings)
-    found: dict[str, Poses] = {}
+    readings: dict[str, Poses] = {}
     if settings.turntable is not None:
         table = settings.turntable
         other = "counterclockwise" if table.turns == "clockwise" else "clockwise"
         turned = table.model_copy(update={"turns": other})
-        found["reversed turntable"] = to_poses(
+        readings["reversed turntable"] = to_poses(
             columns, settings.model_copy(update={"turntable": turned})
         )
         for name, factor in _angle_factors(columns, "angle"):
-            found[name] = to_poses(_scaled(columns, ("angle",), factor), settings)
-        return _different(stated, found)
-    found["left-handed frame"] = mirrored(stated)
+            readings[name] = to_poses(_scaled(columns, ("angle",), factor), settings)
+        return _different(stated, readings)
+    readings["left-handed frame"] = mirrored(stated)
     if columns.has(*EULER):
         for name, factor in _angle_factors(columns, "yaw"):
-            found[name] = to_poses(_scaled(columns, EULER, factor), settings)
+            readings[name] = to_poses(_scaled(columns, EULER, factor), settings)
         for angle in ("yaw", "pitch"):
-            found[f"sign of {angle}"] = to_poses(_scaled(columns, (angle,), -1.0), settings)
+            readings[f"sign of {angle}"] = to_poses(_scaled(columns, (angle,), -1.0), settings)
         for other in ("roll", "pitch"):
             values = columns.values
             swapped = {**values, "yaw": values[other], other: values["yaw"]}
-            found[f"yaw and {other} swapped"] = to_poses(_with(columns, swapped), settings)
+            readings[f"yaw and {other} swapped"] = to_poses(_with(columns, swapped), settings)
     if columns.has(*QUATERNION):
         parts = {name: columns.values[old] for name, old in zip(QUATERNION, XYZW, strict=True)}
-        found["quaternion order"] = to_poses(_with(columns, {**columns.values, **parts}), settings)
+        readings["quaternion order"] = to_poses(
+            _with(columns, {**columns.values, **parts}), settings
+        )
     for order in ("yxz", "zyx", "xzy", "yzx", "zxy"):
         places = {name: columns.values[old] for name, old in zip(PLACE, order, strict=True)}
-        found[f"swapped axes, {order} for xyz"] = to_poses(
+        readings[f"swapped axes, {order} for xyz"] = to_poses(
             _with(columns, {**columns.values, **places}), settings
         )
     for axis in PLACE:
-        found[f"sign of {axis}"] = to_poses(_scaled(columns, (axis,), -1.0), settings)
-    return _different(stated, found)
+        readings[f"sign of {axis}"] = to_poses(_scaled(columns, (axis,), -1.0), settings)
+    return _different(stated, readings)
 
 
 def shifted(columns: Columns, pings: Ints, settings: ImportSettings) -> dict[str, Poses]:
@@ -151,11 +153,11 @@ def _angle_factors(columns: Columns, name: str) -> list[tuple[str, float]]:
     return [("radians for degrees", 180.0 / np.pi)]
 
 
-def _different(stated: Poses, found: dict[str, Poses]) -> dict[str, Poses]:
+def _different(stated: Poses, readings: dict[str, Poses]) -> dict[str, Poses]:
     size = float(np.abs(stated.positions - stated.positions.mean(axis=0)).max()) + 1e-12
     return {
         name: poses
-        for name, poses in found.items()
+        for name, poses in readings.items()
         if not np.allclose(poses.positions, stated.positions, atol=1e-3 * size)
         or not np.allclose(poses.rotations, stated.rotations, atol=1e-3)
     }
@@ -177,33 +179,34 @@ def check_poses(
     heard = np.flatnonzero(np.isfinite(first).any(axis=1))
     if len(heard) < FEWEST:
         return Verdict()
-    asked = heard[np.linspace(0, len(heard) - 1, min(MOST, len(heard))).round().astype(int)]
-    asked = np.unique(asked)
-    ranges = np.where(np.isfinite(first[asked]), first[asked], np.nan)
-    unit = _unit(stated[asked], ranges)
+    sampled = heard[np.linspace(0, len(heard) - 1, min(MOST, len(heard))).round().astype(int)]
+    sampled = np.unique(sampled)
+    ranges = np.where(np.isfinite(first[sampled]), first[sampled], np.nan)
+    unit = _unit(stated[sampled], ranges)
     if unit.name:
         return unit
     head = Consistency(emitter, receivers, resolution)
-    own = head.misfit(stated[asked], ranges)
-    scaled = _scaled_ranges(head, stated[asked], ranges, own)
-    late = _late(stated[asked], own.prediction, resolution)
+    own = head.misfit(stated[sampled], ranges)
+    scaled = _scaled_ranges(head, stated[sampled], ranges, own)
+    late = _late(stated[sampled], own.prediction, resolution)
     if late.name:
         return scaled if scaled.name else late
     gains = {
-        name: own.total - head.misfit(poses[asked], ranges).total for name, poses in others.items()
+        name: own.total - head.misfit(poses[sampled], ranges).total
+        for name, poses in others.items()
     }
     for one, other in combinations(range(min(ranges.shape[1], MOST_CHANNELS)), 2):
         swapped = np.arange(ranges.shape[1])
         swapped[[one, other]] = other, one
         name = f"channels {one} and {other} swapped"
         # Two ears that are swapped hear as a left-handed frame does; that is named first.
-        found = head.misfit(stated[asked], ranges[:, swapped])
+        found = head.misfit(stated[sampled], ranges[:, swapped])
         gains[name] = EQUAL * (own.total - found.total)
     best = max(gains, key=gains.__getitem__, default="")
-    enough = max(AT_LEAST, CLEARLY * len(asked))
-    order = _order(head, stated[asked], ranges, own)
+    enough = max(AT_LEAST, CLEARLY * len(sampled))
+    order = _order(head, stated[sampled], ranges, own)
     better = order.gain + max(gains.get(best, 0.0), 0.0)
-    if order.name and better < SHUFFLED * len(asked):
+    if order.name and better < SHUFFLED * len(sampled):
         return order
     if scaled.name and scaled.gain > gains.get(best, 0.0):
         return scaled
@@ -285,23 +288,25 @@ class Consistency:
         out = poses.positions + poses.rotations @ self.emitter
         back = poses.positions[:, None] + np.einsum("pij,ej->pei", poses.rotations, self.receivers)
         middle = (out[:, None] + back) / 2.0
-        found = predict(middle, back - out[:, None], first)
+        prediction = predict(middle, back - out[:, None], first)
         floor = 0.1 * self.resolution
-        both = np.isfinite(found.residual).sum(axis=1) > 1
-        common = np.nanmean(found.residual[np.isfinite(found.residual).any(axis=1)], axis=1)
+        both = np.isfinite(prediction.residual).sum(axis=1) > 1
+        common = np.nanmean(
+            prediction.residual[np.isfinite(prediction.residual).any(axis=1)], axis=1
+        )
         count = float(len(common))
         total = count * np.log(_scale(common, floor)) if count else 0.0
         if both.any():
-            rest = found.residual[both]
+            rest = prediction.residual[both]
             apart = rest - np.nanmean(rest, axis=1, keepdims=True)
             apart = apart[np.isfinite(apart)]
             freedom = len(apart) * (1.0 - 1.0 / rest.shape[1])
             total += freedom * np.log(_scale(apart, floor / 2.0))
             count += freedom
         if self._hears_direction():
-            angle = off_axis(poses, found.centre)
+            angle = off_axis(poses, prediction.centre)
             total += len(angle) * np.log(max(float(np.median(angle)), AIM_FLOOR))
-        return Misfit(float(total), count, found)
+        return Misfit(float(total), count, prediction)
 
     def _hears_direction(self) -> bool:
         """Return whether it matters which way the head looks."""
@@ -334,18 +339,18 @@ def _length(metres: float) -> str:
     return f"{metres:.3g} m" if metres >= 0.01 else f"{1000 * metres:.3g} mm"
 
 
-def _late(poses: Poses, found: Prediction, resolution: float) -> Verdict:
+def _late(poses: Poses, prediction: Prediction, resolution: float) -> Verdict:
     """Return whether the ranges are too long for any body amid the poses."""
-    away = poses.positions - found.centre
+    away = poses.positions - prediction.centre
     distance = np.linalg.norm(away, axis=1)
     direction = away / np.maximum(distance, 1e-12)[:, None]
     if np.linalg.eigvalsh(direction.T @ direction / len(direction))[0] < AROUND:
         return Verdict()
-    error = np.abs(found.residual[np.isfinite(found.residual)])
+    error = np.abs(prediction.residual[np.isfinite(prediction.residual)])
     slack = resolution + (2.0 * float(np.median(error)) if len(error) else 0.0)
-    if found.size > -slack:
+    if prediction.size > -slack:
         return Verdict()
-    late = -found.size
+    late = -prediction.size
     return Verdict(
         "time offset",
         f"first echoes come {1000 * late:.0f} mm too late, or more, for any body amid the poses: "

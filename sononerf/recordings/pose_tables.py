@@ -101,11 +101,11 @@ def columns_of(
         if kind in ("length", "angle"):
             stated = getattr(settings, kind)
             if unit is None and stated is None:
-                known = UNITS[kind]
-                example = f"{name}_{next(iter(known))}"
+                factors = UNITS[kind]
+                example = f"{name}_{next(iter(factors))}"
                 raise InputError(
                     f"{where}: column {full} has no unit; name it {example} or set import.{kind} "
-                    f"to one of {', '.join(known)}"
+                    f"to one of {', '.join(factors)}"
                 )
             unit = unit or stated
             units[name] = unit
@@ -126,11 +126,11 @@ def _parted(where: str, full: str) -> tuple[str, str | None]:
         return full, None
     if name in KINDS:
         kind = KINDS[name]
-        known = UNITS.get(kind, {})
-        if unit in known:
+        units = UNITS.get(kind, {})
+        if unit in units:
             return name, unit
         raise InputError(
-            f"{where}: column {full}: unknown unit {unit!r}; known: {', '.join(known) or 'none'}"
+            f"{where}: column {full}: unknown unit {unit!r}; known: {', '.join(units) or 'none'}"
         )
     allowed = [*KINDS, *TEXTS]
     near = difflib.get_close_matches(full.lower(), allowed, n=1)
@@ -224,7 +224,7 @@ def _rotations(
     columns: Columns, settings: ImportSettings, world: Floats, head: Floats
 ) -> Floats | None:
     """Return rotations in the table's own frames, (P, 3, 3); None where it has none."""
-    found = [
+    forms = [
         name
         for name, there in (
             ("rotation", columns.rotation is not None),
@@ -233,15 +233,15 @@ def _rotations(
         )
         if there
     ]
-    if len(found) > 1:
-        raise InputError(f"{columns.where}: holds both {' and '.join(found)}; leave one out")
+    if len(forms) > 1:
+        raise InputError(f"{columns.where}: holds both {' and '.join(forms)}; leave one out")
     if columns.rotation is not None:
         return _checked_rotation(columns, columns.rotation)
-    names = EULER if "yaw, pitch, roll" in found else QUATERNION
-    missing = [name for name in names if name not in columns.values] if found else []
+    names = EULER if "yaw, pitch, roll" in forms else QUATERNION
+    missing = [name for name in names if name not in columns.values] if forms else []
     if missing:
-        raise InputError(f"{columns.where}: column {missing[0]} is missing beside {found[0]}")
-    if not found:
+        raise InputError(f"{columns.where}: column {missing[0]} is missing beside {forms[0]}")
+    if not forms:
         return None
     parts = [columns.values[name] for name in names]
     if names == QUATERNION:

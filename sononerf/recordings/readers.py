@@ -41,14 +41,14 @@ def _read(path: Path, *stamp: int) -> dict[str, NDArray[Any]]:
     del stamp
     if path.suffix.lower() in HDF5:
         with hdf5.opened(path) as file:
-            found = {name: hdf5.numbers(file, name) for name in file}
-        return {name: values for name, values in found.items() if values is not None}
+            arrays_read = {name: hdf5.numbers(file, name) for name in file}
+        return {name: values for name, values in arrays_read.items() if values is not None}
     try:
         with path.open("rb") as file:
-            found = np.load(file, allow_pickle=False)
-            if isinstance(found, np.ndarray):
+            arrays_read = np.load(file, allow_pickle=False)
+            if isinstance(arrays_read, np.ndarray):
                 raise InputError(f"{path}: one array only; save arrays by name with numpy.savez")
-            arrays = {name: np.asarray(found[name]) for name in found.files}
+            arrays = {name: np.asarray(arrays_read[name]) for name in arrays_read.files}
     except InputError:
         raise
     except Exception as error:  # the error of a damaged file depends on the parser
@@ -176,14 +176,14 @@ def read_sononerf_matlab(path: Path, settings: ImportSettings) -> Recording:
 def read_sonotracelab(path: Path, settings: ImportSettings) -> Recording:
     """Read the format ``sonotracelab``; see the module."""
     names = ("structSensor", "structSimulationResult", "structSimulationParameters")
-    found = read_mat(path, names)
-    missing = [name for name in names[:2] if name not in found]
+    content = read_mat(path, names)
+    missing = [name for name in names[:2] if name not in content]
     if missing:
         raise InputError(f"{path}: holds no {missing[0]}; is it of the format sononerf-matlab?")
-    sensors, results = (as_list(found[name]) for name in names[:2])
+    sensors, results = (as_list(content[name]) for name in names[:2])
     if len(sensors) != len(results):
         raise InputError(f"{path}: {len(results)} pings and {len(sensors)} poses (structSensor)")
-    said = as_list(found.get(names[2], {}))[0]
+    said = as_list(content.get(names[2], {}))[0]
     rate = settings.sampling_rate
     if rate is None:
         rate = float(vector(path, said, "sampleRateImpresp", 1)[0])

@@ -148,12 +148,15 @@ class Viewer:
 
     def _show_onsets(self, echoes: Echoes) -> None:
         hull = echoes.hull
-        known = np.flatnonzero(np.isfinite(hull.first).any(axis=1))
-        if not len(known):
+        with_onset = np.flatnonzero(np.isfinite(hull.first).any(axis=1))
+        if not len(with_onset):
             return
-        trusted = np.asarray(np.isfinite(hull.trusted[known]).any(axis=1))
+        trusted = np.asarray(np.isfinite(hull.trusted[with_onset]).any(axis=1))
         # Drawn straight ahead, because an onset has a range and no direction.
-        at = hull.sources[known] + hull.axes[known] * hull.first[known].max(axis=1)[:, None]
+        at = (
+            hull.sources[with_onset]
+            + hull.axes[with_onset] * hull.first[with_onset].max(axis=1)[:, None]
+        )
         colours = np.where(trusted[:, None], (30, 120, 30), (220, 0, 160)).astype(np.uint8)
         points = self.server.scene.add_point_cloud(
             "/onsets",

@@ -52,14 +52,14 @@ RECORDED = ("torch", "lightning", "numpy", "scipy", "trimesh", "manifold3d", "em
 
 def flat(data: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     """Return nested data by dotted keys."""
-    found: dict[str, Any] = {}
+    flattened: dict[str, Any] = {}
     for key, value in data.items():
         name = f"{prefix}{key}"
         if isinstance(value, dict) and value:
-            found.update(flat(value, f"{name}."))
+            flattened.update(flat(value, f"{name}."))
         else:
-            found[name] = value
-    return found
+            flattened[name] = value
+    return flattened
 
 
 def differing_keys(old: Settings, new: Settings) -> list[str]:
@@ -109,7 +109,7 @@ def with_store(settings: Settings) -> Settings:
     if settings.scene is not None or settings.data.store is None:
         return settings
     path = settings.data.store
-    known = stated_head(EnsembleStore.open(path))
+    stated = stated_head(EnsembleStore.open(path))
     resolved = settings.plain()
     different = []
     for section in HEAD_SECTIONS:
@@ -118,12 +118,12 @@ def with_store(settings: Settings) -> Settings:
         for key in given.model_fields_set:
             name = f"{section}.{key}"
             if name in OWN_KEYS:
-                known[section][key] = resolved[section][key]
-            elif key in known[section] and known[section][key] != resolved[section][key]:
+                stated[section][key] = resolved[section][key]
+            elif key in stated[section] and stated[section][key] != resolved[section][key]:
                 different.append(
-                    f"{name}: found {resolved[section][key]}, the store has {known[section][key]}"
+                    f"{name}: found {resolved[section][key]}, the store has {stated[section][key]}"
                 )
-        resolved[section] = known[section]
+        resolved[section] = stated[section]
     if different:
         raise IncompatibleError(
             f"{path}: the settings contradict the store; leave these keys out: "

@@ -45,15 +45,15 @@ DECIBELS = 20.0 / math.log(10.0)
 
 
 def write_corrected(
-    echoes: Echoes, output: Path, found: Calibration, progress: Progress
+    echoes: Echoes, output: Path, calibration: Calibration, progress: Progress
 ) -> EnsembleStore:
     """Write echoes without the errors of their recording; an interrupted call resumes."""
     store, head = echoes.store, echoes.head
     sections = head.plain()
-    speed = head.speed_of_sound * math.exp(found.speed_of_sound)
+    speed = head.speed_of_sound * math.exp(calibration.speed_of_sound)
     axis = np.asarray(store.range, dtype=np.float64)
-    if found.speed_of_sound:
-        axis = axis * math.exp(found.speed_of_sound)
+    if calibration.speed_of_sound:
+        axis = axis * math.exp(calibration.speed_of_sound)
         step = axis[1] - axis[0]
         # The same slices: limits that lie between them do not depend on rounding.
         limits = {
@@ -74,15 +74,15 @@ def write_corrected(
             frequency=store.frequency,
             attributes={
                 **{name: earlier[name] for name in kept if name in earlier},
-                "echo_hash": f"{earlier['echo_hash']}-{_fingerprint(found, head)}",
+                "echo_hash": f"{earlier['echo_hash']}-{_fingerprint(calibration, head)}",
                 "settings": sections,
                 "speed_of_sound": speed,
                 "calibration": {
                     **(earlier.get("calibration") or {}),
                     "self_calibration": {
                         "of": str(store.path),
-                        "gain_db": (found.gain * DECIBELS).round(3).tolist(),
-                        "range_offset_m": found.range_offset,
+                        "gain_db": (calibration.gain * DECIBELS).round(3).tolist(),
+                        "range_offset_m": calibration.range_offset,
                         "speed_of_sound": speed,
                         "support": sections["support"],
                     },
@@ -91,10 +91,12 @@ def write_corrected(
             receivers=store.receivers,
         )
         attach(head, output)
-        factor = np.exp(-found.gain)[:, None]
+        factor = np.exp(-calibration.gain)[:, None]
         with progress.task("writing", len(store)) as task:
             for index in made.missing():
-                heard = moved(store.read_pose(index), np.asarray(store.range), found.range_offset)
+                heard = moved(
+                    store.read_pose(index), np.asarray(store.range), calibration.range_offset
+                )
                 made.write_pose(index, (factor * heard).astype(np.float32))
                 task.advance()
         poses = Poses(made.positions, made.rotations)
@@ -118,12 +120,12 @@ def moved(magnitude: NDArray[np.floating], axis: NDArray[np.floating], offset: f
     return np.asarray((1.0 - part) * low + part * high, dtype=np.float64)
 
 
-def _fingerprint(found: Calibration, head: Head) -> str:
+def _fingerprint(calibration: Calibration, head: Head) -> str:
     plane = head.plane
     values = np.concatenate(
         [
-            found.gain.ravel(),
-            [found.range_offset, found.speed_of_sound],
+            calibration.gain.ravel(),
+            [calibration.range_offset, calibration.speed_of_sound],
             [] if plane is None else [*plane.point, *plane.normal],
         ]
     )
@@ -170,27 +172,29 @@ def calibrate(
     progress = progress or Progress(quiet=True)
     if output.exists() and any(output.iterdir()):
         raise IncompatibleError(f"{output}: holds something already; choose another --output")
-    wanted = kinds_of(kinds)
+    parameters = kinds_of(kinds)
     if (source / "zarr.json").is_file():
         raise SettingsError(
-            f"{source}: a store; {wanted[0]} is found by a surface: fit first, and name the run"
+            f"{source}: a store; {parameters[0]} is found by a surface: fit first, and name the run"
         )
     opened = Run.of(source)
     echoes, mesh = opened.echoes, opened.mesh()
     storage.remove_if_empty(storage.probe_writable(output))
-    known: dict[str, float] = {}
-    if "support" in wanted:
+    bounds: dict[str, float] = {}
+    if "support" in parameters:
         if echoes.head.plane is not None:
             raise SettingsError(
                 "support: this run was fitted with one; fit without support.point first, so that "
                 "the surface shows the image"
             )
-        echoes, mesh, known["support"] = _with_support(echoes, mesh, progress)
-    estimate = _estimate(echoes, mesh, [kind for kind in wanted if kind not in known], progress)
-    estimate.deviation.update(known)
+        echoes, mesh, bounds["support"] = _with_support(echoes, mesh, progress)
+    estimate = _estimate(
+        echoes, mesh, [kind for kind in parameters if kind not in bounds], progress
+    )
+    estimate.deviation.update(bounds)
     corrected = write_corrected(echoes, output, estimate.calibration, progress)
     return Calibrated(
-        corrected, estimate, *describe(echoes.head, echoes.store, mesh, estimate, wanted)
+        corrected, estimate, *describe(echoes.head, echoes.store, mesh, estimate, parameters)
     )
 
 
@@ -252,7 +256,7 @@ def describe(
     head: Head, store: Ensemble, mesh: trimesh.Trimesh, estimate: Estimate, kinds: Sequence[str]
 ) -> tuple[list[str], list[str]]:
     """Return results and undetermined errors, one line each."""
-    found, deviation, error = estimate.calibration, estimate.deviation, estimate.error_db
+    calibration, deviation, error = estimate.calibration, estimate.deviation, estimate.error_db
     away = store.positions[store.indices("train")] - mesh.centroid
     distance = np.linalg.norm(away, axis=1)
     lines, warnings = [], []
@@ -267,13 +271,13 @@ def describe(
         say("error", change, "", vague=False)
     if "gain" in kinds:
         uncertain = DECIBELS * deviation["gain"]
-        gains = ", ".join(f"{DECIBELS * value:+.2f}" for value in found.gain.mean(axis=1))
+        gains = ", ".join(f"{DECIBELS * value:+.2f}" for value in calibration.gain.mean(axis=1))
         text = f"{gains} dB in the mean over frequency, each ± {uncertain:.2f} dB"
         vague = uncertain > DETERMINED_DB
         say("gain", text, "the echoes do not determine it", vague=vague)
     if "range_offset" in kinds:
         uncertain = deviation["range_offset"]
-        text = f"{1e3 * found.range_offset:+.2f} ± {1e3 * uncertain:.2f} mm"
+        text = f"{1e3 * calibration.range_offset:+.2f} ± {1e3 * uncertain:.2f} mm"
         vague = uncertain > DETERMINED * head.resolution
         warning = "the echoes do not separate it from the size of the object"
         say("range_offset", text, warning, vague=vague)
@@ -296,7 +300,7 @@ def describe(
         say("support", text, "the echoes hardly determine it; measure it", vague=vague)
     if "speed_of_sound" in kinds:
         uncertain, speed = deviation["speed_of_sound"], head.speed_of_sound
-        text = f"{speed * math.exp(found.speed_of_sound):.2f} ± {speed * uncertain:.2f} m/s"
+        text = f"{speed * math.exp(calibration.speed_of_sound):.2f} ± {speed * uncertain:.2f} m/s"
         vague = uncertain * distance.mean() > DETERMINED * head.resolution
         warning = (
             "all poses are at one distance, so it cannot be separated from the size of the "

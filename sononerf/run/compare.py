@@ -38,12 +38,12 @@ from sononerf.run.run import Run
 def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
     """Return the numbers of runs as lines: a row per number, a column per run."""
     runs = [Run(path) for path in paths]
-    found = []
+    lines = []
     for run in runs:
         run.open()
-        found.append(run.read_metrics())
+        lines.append(run.read_metrics())
         try:
-            run_rows(found[-1:])
+            run_rows(lines[-1:])
         except (TypeError, ValueError, AttributeError) as error:
             raise InputError(
                 f"{run.metrics_file}: damaged ({error}); remove it and evaluate again"
@@ -51,9 +51,9 @@ def table(paths: Sequence[Path], *, csv: Path | None = None) -> list[str]:
     names = [run.path.resolve().name for run in runs]
     if len(set(names)) < len(names):
         names = [str(run.path) for run in runs]
-    rows = [("", *names), *run_rows(found)]
+    rows = [("", *names), *run_rows(lines)]
     if csv is not None:
-        values = [flat(metrics) for metrics in found]
+        values = [flat(metrics) for metrics in lines]
         keys = sorted({key for one in values for key in one} - {"schema"})
         text = io.StringIO()
         writer = csv_format.writer(text, lineterminator="\n")
@@ -105,17 +105,19 @@ def compare_runs(
     _check_alike(run, other)
     folder = output or first / f"compare-{second.resolve().name}"
     with run.locked(folder), results_folder(folder):
-        found = compare_runs_of(run, other, accelerator=accelerator, progress=progress)
+        comparison = compare_runs_of(run, other, accelerator=accelerator, progress=progress)
         surfaces = [true_mesh(each.settings, each.provenance) for each in (run, other)]
         truth = _added(*surfaces)
         names = first.resolve().name, second.resolve().name
         for name in ("first", "second", "difference"):
-            storage.commit_bytes(folder / f"{name}.vti", vti_bytes(getattr(found, name), "level"))
-        for axis, picture in difference_pngs(found, names, truth=truth).items():
+            storage.commit_bytes(
+                folder / f"{name}.vti", vti_bytes(getattr(comparison, name), "level")
+            )
+        for axis, picture in difference_pngs(comparison, names, truth=truth).items():
             storage.commit_bytes(folder / f"mip_{axis}.png", picture)
         if surfaces[0] is not None:
-            storage.commit_bytes(folder / "overlay.png", overlay_png(surfaces[0], found))
-        place = found.strongest
+            storage.commit_bytes(folder / "overlay.png", overlay_png(surfaces[0], comparison))
+        place = comparison.strongest
         distance: float | None = None
         if place is not None and truth is not None:
             distance = float(np.linalg.norm(place - truth))
@@ -124,8 +126,8 @@ def compare_runs(
             {
                 "first": names[0],
                 "second": names[1],
-                "poses": found.poses,
-                "score": found.score,
+                "poses": comparison.poses,
+                "score": comparison.score,
                 "strongest_m": None if place is None else place.tolist(),
                 "added_m": None if truth is None else truth.tolist(),
                 "distance_m": distance,
@@ -146,15 +148,15 @@ def compare_runs_of(
     reference = max(one.model.reference for one in runs)
     poses = _common_poses(runs)
     one, other = (_heard(each, poses, reference, *box, accelerator, progress) for each in runs)
-    found = compare_volumes(one, other)
-    missing = -float(found.difference.values.min())
-    if missing > WRONG_WAY * found.score:
+    comparison = compare_volumes(one, other)
+    missing = -float(comparison.difference.values.min())
+    if missing > WRONG_WAY * comparison.score:
         logger.warning(
             "the second run has up to %.2f of the maximum that the first has not: the runs look "
             "swapped; pass the run with the target first",
             missing,
         )
-    return replace(found, poses=len(poses))
+    return replace(comparison, poses=len(poses))
 
 
 def _check_alike(first: Run, second: Run) -> None:

@@ -171,8 +171,8 @@ def _poses(position: NDArray[Any], rotation: NDArray[Any], frame: Frame) -> dict
 def _echoes(source: Path, frame: Frame) -> Part:
     store = complete_store(source)
     loud = np.stack([store.read_pose(index) for index in range(len(store))])
-    known = store.attributes
-    units = str((known.get("units") or {}).get("spectrogram", "linear magnitude"))
+    attributes = store.attributes
+    units = str((attributes.get("units") or {}).get("spectrogram", "linear magnitude"))
     arrays = {
         "spectrogram": Named(loud, ("pose", "ear", "range", "frequency"), "1", units),
         **_poses(store.positions, store.rotations, frame),
@@ -180,7 +180,7 @@ def _echoes(source: Path, frame: Frame) -> Part:
         **_axes(store.range, store.frequency),
     }
     said = ("origin", "source", "licence", "speed_of_sound", "reference", "settings")
-    text = {name: known[name] for name in said if known.get(name) is not None}
+    text = {name: attributes[name] for name in said if attributes.get(name) is not None}
     return arrays, {
         name: value if isinstance(value, str) else storage.to_json(value)
         for name, value in text.items()
@@ -193,18 +193,21 @@ def _prediction(source: Path, frame: Frame) -> Part:
         raise InputError(f"{file}: missing; make it with `sononerf predict {source}`")
     try:
         with np.load(file, allow_pickle=False) as opened:
-            found = {name: np.asarray(opened[name]) for name in opened.files}
+            content = {name: np.asarray(opened[name]) for name in opened.files}
         arrays = {
             name: Named(
-                found[name], ("pose", "ear", "range", "frequency"), "1", f"{name} linear magnitude"
+                content[name],
+                ("pose", "ear", "range", "frequency"),
+                "1",
+                f"{name} linear magnitude",
             )
             for name in ("predicted", "measured")
-            if name in found
+            if name in content
         }
-        arrays["number"] = Named(found["pose"], ("pose",), "", "number of the pose in the store")
-        arrays |= _poses(found["position"], found["rotation"], frame)
-        arrays |= _axes(found["range_m"], found["frequency_hz"])
-        return arrays, {"reference": repr(float(found["reference"]))}
+        arrays["number"] = Named(content["pose"], ("pose",), "", "number of the pose in the store")
+        arrays |= _poses(content["position"], content["rotation"], frame)
+        arrays |= _axes(content["range_m"], content["frequency_hz"])
+        return arrays, {"reference": repr(float(content["reference"]))}
     except (OSError, ValueError, KeyError, EOFError) as error:
         raise InputError(f"{file}: damaged ({error}); predict again") from error
 

@@ -33,20 +33,20 @@ def fit_warnings(echoes: Echoes, region: Floats, *, is_set: bool) -> list[str]:
     In: region ((2, 3), m).
     """
     training = echoes.poses("train")
-    found = [_repeated(training)]
+    warnings = [_repeated(training)]
     if echoes.hull.width < echoes.head.resolution:
-        found.append(LINE)
+        warnings.append(LINE)
     if echoes.head.ears.is_directional and (fault := aim_fault(training, region.mean(axis=0))):
-        found.append(f"training {fault}")
-    found.append(_few(training, region, echoes.head.resolution))
+        warnings.append(f"training {fault}")
+    warnings.append(_few(training, region, echoes.head.resolution))
     if is_set:
-        found += [_out_of_reach(echoes, training, region), _elsewhere(echoes, region)]
+        warnings += [_out_of_reach(echoes, training, region), _elsewhere(echoes, region)]
     plane = echoes.head.plane
     if plane is not None and plane.height(region.mean(axis=0)) < 0.0:
-        found.append(
+        warnings.append(
             "the echoes come from below the support; check support.point and the heights of poses"
         )
-    return [line for line in found if line]
+    return [line for line in warnings if line]
 
 
 def _repeated(poses: Poses) -> str:

@@ -108,71 +108,71 @@ def read_recordings(
     output = Path(output)
     chosen = assignments(options or {})
     progress = progress or Progress()
-    known = understand(
+    understood = understand(
         form, Path(source), output, settings_file=settings_file, overrides=chosen, progress=progress
     )
-    store, found = import_understood(known, output, progress=progress)
+    store, found = import_understood(understood, output, progress=progress)
     if found.message:
         logger.warning("%s", found.message)
-    return Echoes(store, known.head)
+    return Echoes(store, understood.head)
 
 
 def import_understood(
-    known: Understood, output: Path, *, progress: Progress | None = None
+    understood: Understood, output: Path, *, progress: Progress | None = None
 ) -> tuple[EnsembleStore, Verdict]:
     """Write the store, and report the check of the poses by first echoes."""
     progress = progress or Progress(quiet=True)
-    wanted = echo_hash(known)
+    echoes_id = echo_hash(understood)
     if (output / "zarr.json").is_file():
         store = EnsembleStore.open(output)
-        if store.attributes.get("echo_hash") != wanted:
+        if store.attributes.get("echo_hash") != echoes_id:
             raise IncompatibleError(f"{output}: holds other echoes; choose another --output")
         if store.is_sealed and not store.damaged():
-            return store, verdict(known, store)
-    warn_of_call(known.settings.call, known.settings.spectrogram)
-    poses = known.poses[known.pings]
+            return store, verdict(understood, store)
+    warn_of_call(understood.settings.call, understood.settings.spectrogram)
+    poses = understood.poses[understood.pings]
     storage.probe_writable(output)
     with storage.lock(output):
         store = EnsembleStore.create(
             output,
             poses_positions=poses.positions,
             poses_rotations=poses.rotations,
-            split=known.split,
-            range=known.head.range,
-            frequency=known.head.frequency,
-            attributes=_attributes(known, wanted),
-            receivers=len(known.head.receivers),
+            split=understood.split,
+            range=understood.head.range,
+            frequency=understood.head.frequency,
+            attributes=_attributes(understood, echoes_id),
+            receivers=len(understood.head.receivers),
         )
         store.remove_damaged()
-        attach(known.settings, output)
+        attach(understood.settings, output)
         missing = store.missing()
         with progress.task("importing", len(missing)) as task:
             for index in missing:
-                store.write_pose(index, spectrogram_of(known, int(known.pings[index])))
+                store.write_pose(index, spectrogram_of(understood, int(understood.pings[index])))
                 task.advance()
         silent = f"{output}: all recordings are silent; check the channels"
-        seal_recorded(store, known.head, poses, known.split, silent=silent)
+        seal_recorded(store, understood.head, poses, understood.split, silent=silent)
     store = EnsembleStore.open(output)
-    return store, verdict(known, store)
+    return store, verdict(understood, store)
 
 
-def _attributes(known: Understood, wanted: str) -> dict[str, Any]:
-    plain = known.settings.plain()
+def _attributes(understood: Understood, echoes_id: str) -> dict[str, Any]:
+    plain = understood.settings.plain()
     return {
-        "echo_hash": wanted,
+        "echo_hash": echoes_id,
         "origin": "recorded",
-        "format": known.form,
-        "source": known.wanted.source or known.recording.path.name,
-        "licence": known.wanted.licence,
+        "format": understood.form,
+        "source": understood.wanted.source or understood.recording.path.name,
+        "licence": understood.wanted.licence,
         "settings": {name: plain[name] for name in HEAD_SECTIONS},
-        "import": known.wanted.model_dump(mode="json"),
-        **original_frame(known.recording.columns, known.wanted),
-        "calibration": known.calibration,
-        "rejected_clipped": known.clipped,
-        "speed_of_sound": known.head.speed_of_sound,
+        "import": understood.wanted.model_dump(mode="json"),
+        **original_frame(understood.recording.columns, understood.wanted),
+        "calibration": understood.calibration,
+        "rejected_clipped": understood.clipped,
+        "speed_of_sound": understood.head.speed_of_sound,
         "units": {
             "spectrogram": "linear magnitude, sound pressure over that of the call at 1 m"
-            if known.wanted.reference is not None
+            if understood.wanted.reference is not None
             else "linear magnitude, unit of the recording",
             "position": "m",
             "range": "m",
@@ -182,84 +182,85 @@ def _attributes(known: Understood, wanted: str) -> dict[str, Any]:
     }
 
 
-def verdict(known: Understood, store: EnsembleStore) -> Verdict:
+def verdict(understood: Understood, store: EnsembleStore) -> Verdict:
     """Return the check of pose conventions by the first echoes of the training poses."""
-    heard = Echoes(store, known.head).onsets
-    table, pings = known.recording.columns, known.pings[heard.poses]
-    others = alternatives(table.take(pings), known.wanted)
+    heard = Echoes(store, understood.head).onsets
+    table, pings = understood.recording.columns, understood.pings[heard.poses]
+    others = alternatives(table.take(pings), understood.wanted)
     return check_poses(
         heard.first,
-        known.poses[known.pings[heard.poses]],
-        others | shifted(table, pings, known.wanted),
-        emitter=known.head.emitter,
-        receivers=known.head.receivers,
-        resolution=known.head.resolution,
+        understood.poses[understood.pings[heard.poses]],
+        others | shifted(table, pings, understood.wanted),
+        emitter=understood.head.emitter,
+        receivers=understood.head.receivers,
+        resolution=understood.head.resolution,
     )
 
 
-def check_before(known: Understood, *, progress: Progress | None = None) -> Verdict:
+def check_before(understood: Understood, *, progress: Progress | None = None) -> Verdict:
     """Return the verdict on the poses without making a store."""
-    train = np.flatnonzero(known.split == 0)
+    train = np.flatnonzero(understood.split == 0)
     chosen = train[np.linspace(0, len(train) - 1, min(MOST, len(train))).round().astype(int)]
-    part = replace(known, pings=known.pings[chosen], split=known.split[chosen])
+    part = replace(understood, pings=understood.pings[chosen], split=understood.split[chosen])
     with tempfile.TemporaryDirectory() as folder:
         return import_understood(part, Path(folder) / "store", progress=progress)[1]
 
 
-def describe(known: Understood) -> list[str]:
+def describe(understood: Understood) -> list[str]:
     """Return the interpretation of the recordings, one line each."""
-    settings, analysis = known.settings, known.settings.spectrogram
-    poses = known.poses[known.pings]
+    settings, analysis = understood.settings, understood.settings.spectrogram
+    poses = understood.poses[understood.pings]
     lower, upper = poses.positions.min(axis=0), poses.positions.max(axis=0)
-    axis, frequency = known.head.range, known.head.frequency
-    units = known.recording.columns.units
+    axis, frequency = understood.head.range, understood.head.frequency
+    units = understood.recording.columns.units
     said = ", ".join(sorted({f"{kind} in {unit}" for kind, unit in _kinds(units).items()}))
-    counts = np.bincount(known.split, minlength=3)
+    counts = np.bincount(understood.split, minlength=3)
     call = settings.call
     bands = ", ".join(f"{a / 1e3:g} to {b / 1e3:g} kHz" for a, b in call.bands.values())
-    frame = "turntable" if known.wanted.turntable is not None else known.wanted.frame
-    shortest, longest = (f"{1e3 * each:.4g}" for each in known.lengths)
+    frame = "turntable" if understood.wanted.turntable is not None else understood.wanted.frame
+    shortest, longest = (f"{1e3 * each:.4g}" for each in understood.lengths)
     lengths = f"{shortest} ms" if shortest == longest else f"{shortest} to {longest} ms"
+    recording = understood.recording
     lines = [
-        f"source:     {known.recording.path} ({known.form}), {known.recording.sampling_rate:g} Hz",
-        f"pings:      {len(known.recording)} read, {lengths} each, {known.clipped} clipped and "
-        "rejected; "
+        f"source:     {recording.path} ({understood.form}), {recording.sampling_rate:g} Hz",
+        f"pings:      {len(recording)} read, {lengths} each, "
+        f"{understood.clipped} clipped and rejected; "
         f"{counts[0]} train, {counts[1]} validation, {counts[2]} test",
-        f"receivers:  {len(known.head.receivers)}, {settings.ears.directivity}",
+        f"receivers:  {len(understood.head.receivers)}, {settings.ears.directivity}",
         f"poses:      frame {frame}{'; ' + said if said else ''}; x {lower[0]:.3f} to "
         f"{upper[0]:.3f}, y {lower[1]:.3f} to {upper[1]:.3f}, z {lower[2]:.3f} to "
         f"{upper[2]:.3f} m",
         f"call:       {call.kind}{', ' + bands if bands else ''}"
-        f"{', by pulse compression' if known.wanted.compress else ''}",
-        f"air:        {known.head.speed_of_sound:.1f} m/s",
+        f"{', by pulse compression' if understood.wanted.compress else ''}",
+        f"air:        {understood.head.speed_of_sound:.1f} m/s",
         f"range:      {axis[0]:.3f} to {axis[-1]:.3f} m in {len(axis)} slices of "
         f"{1e3 * (axis[1] - axis[0]) if len(axis) > 1 else 0.0:.2f} mm",
         f"frequency:  {frequency[0] / 1e3:.1f} to {frequency[-1] / 1e3:.1f} kHz in "
         f"{len(frequency)} bins (window {analysis.window}, hop {analysis.hop}, fft {analysis.fft})",
-        _cost_line(known),
-        *(_channel_line(number, channel) for number, channel in enumerate(known.channels)),
+        _cost_line(understood),
+        *(_channel_line(number, channel) for number, channel in enumerate(understood.channels)),
     ]
-    of_impulse = replace(known.head, call=CallSettings())
-    here, there = (1e3 * head.resolution for head in (known.head, of_impulse))
+    of_impulse = replace(understood.head, call=CallSettings())
+    here, there = (1e3 * head.resolution for head in (understood.head, of_impulse))
     if here > COARSER * there:
         lines.append(
             f"note:       ranges are resolved to {here:.0f} mm; import.compress=true resolves "
             f"them to {there:.0f} mm"
         )
-    applied = {k: v for k, v in known.calibration.items() if v not in (0.0, 1.0)}
+    applied = {k: v for k, v in understood.calibration.items() if v not in (0.0, 1.0)}
     if applied:
         lines.append(f"calibration: {json.dumps(applied)}")
-    faults = [f"warning:    {fault}" for fault in faults_of_channels(known.channels)]
-    return [*lines, *(f"note:       {note}" for note in known.notes), *faults]
+    faults = [f"warning:    {fault}" for fault in faults_of_channels(understood.channels)]
+    return [*lines, *(f"note:       {note}" for note in understood.notes), *faults]
 
 
-def _cost_line(known: Understood) -> str:
+def _cost_line(understood: Understood) -> str:
     """Show the size of the store and the duration of the import, measured on one ping."""
     begun = time.monotonic()
-    heard = spectrogram_of(known, int(known.pings[0]))
-    seconds = len(known.pings) * (time.monotonic() - begun + WRITTEN_SECONDS)
+    heard = spectrogram_of(understood, int(understood.pings[0]))
+    seconds = len(understood.pings) * (time.monotonic() - begun + WRITTEN_SECONDS)
     return (
-        f"store:      {1e-6 * len(known.pings) * heard.nbytes:,.0f} MB at most, in about "
+        f"store:      {1e-6 * len(understood.pings) * heard.nbytes:,.0f} MB at most, in about "
         f"{duration(seconds)}"
     )
 
@@ -278,18 +279,18 @@ def _kinds(units: dict[str, str]) -> dict[str, str]:
     return {("angles" if unit in ("deg", "rad") else "lengths"): unit for unit in units.values()}
 
 
-def draw(known: Understood, folder: Path) -> Path:
+def draw(understood: Understood, folder: Path) -> Path:
     """Draw poses, and waveforms and spectrograms of the first pings, into a folder."""
-    head = known.head
-    pings = [int(ping) for ping in known.pings[:SHOWN]]
+    head = understood.head
+    pings = [int(ping) for ping in understood.pings[:SHOWN]]
     picture = pings_png(
-        [known.cutter.echo(ping, head.samples) for ping in pings],
-        [spectrogram_of(known, ping) for ping in pings],
-        [known.recording.labels[ping] for ping in pings],
-        sampling_rate=known.settings.spectrogram.sampling_rate,
+        [understood.cutter.echo(ping, head.samples) for ping in pings],
+        [spectrogram_of(understood, ping) for ping in pings],
+        [understood.recording.labels[ping] for ping in pings],
+        sampling_rate=understood.settings.spectrogram.sampling_rate,
         range_m=head.range,
         frequency_hz=head.frequency,
-        poses=known.poses[known.pings],
+        poses=understood.poses[understood.pings],
     )
     storage.commit_bytes(folder / "pings.png", picture)
     return folder / "pings.png"

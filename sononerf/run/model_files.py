@@ -120,20 +120,20 @@ def load_traced(path: Path) -> Traced | None:
         return None
     try:
         with safe_open(str(file), "pt") as opened:
-            found = {name: opened.get_tensor(name).numpy() for name in opened.keys()}
+            arrays = {name: opened.get_tensor(name).numpy() for name in opened.keys()}
             model = (opened.metadata() or {}).get("model")
         if model != model_checksum(path):
             return None
-        faces, vertices = found["faces"], found["vertices"]
-        gain, weight = found["gain_db"], found["weight"]
+        faces, vertices = arrays["faces"], arrays["vertices"]
+        gain, weight = arrays["gain_db"], arrays["weight"]
         if not (np.isfinite(vertices).all() and np.isfinite(gain).all()):
             raise ValueError("numbers that are not finite")
         if not ((weight >= 0) & (weight <= 1)).all():
             raise ValueError("weights outside 0 to 1")
         if len(faces) and not 0 <= int(faces.min()) <= int(faces.max()) < len(vertices):
             raise ValueError("a triangle names a vertex that is not there")
-        fault = found["fault"].tobytes().decode()
-        half = found.get("half_db")
+        fault = arrays["fault"].tobytes().decode()
+        half = arrays.get("half_db")
         if half is not None and not (np.isfinite(half) & (half >= 0)).all():
             raise ValueError("intervals that are negative or not finite")
         mesh = trimesh.Trimesh(vertices, faces, process=False)

@@ -49,7 +49,7 @@ def propose(
         raise InputError(f"{file}: is a folder; give --output the name of a file")
     given = None if candidates is None else read_poses(opened, candidates)
     with opened.locked(file.parent):
-        found = next_poses(
+        proposed = next_poses(
             opened.surface,
             opened.echoes,
             count,
@@ -57,7 +57,7 @@ def propose(
             within=within,
             seed=opened.settings.fit.seed,
         )
-        storage.commit_bytes(file, found.table().encode())
+        storage.commit_bytes(file, proposed.table().encode())
     return file
 
 
@@ -131,7 +131,7 @@ def predict(
     with run.locked(folder):
         traced = _traced(run)
         with results_folder(folder):
-            found = predict_poses(
+            prediction = predict_poses(
                 model,
                 traced,
                 poses,
@@ -139,28 +139,28 @@ def predict(
                 accelerator=accelerator,
                 progress=progress,
             )
-            axes = {"range_m": found.range, "frequency_hz": found.frequency}
+            axes = {"range_m": prediction.range, "frequency_hz": prediction.frequency}
             arrays: dict[str, NDArray[Any]] = {
-                "predicted": found.magnitude,
+                "predicted": prediction.magnitude,
                 "pose": numbers,
                 **axes,
             }
-            if found.error_db is not None:
-                arrays["error_db"] = found.error_db
+            if prediction.error_db is not None:
+                arrays["error_db"] = prediction.error_db
             measured: Singles | None = None
             if own is None:
                 measured = np.stack([run.echoes.spectrogram(int(i)) for i in numbers])
                 arrays["measured"] = measured
             arrays["position"], arrays["rotation"] = poses.positions, poses.rotations
-            arrays["reference"] = np.asarray(found.reference)
+            arrays["reference"] = np.asarray(prediction.reference)
             storage.commit(folder / "spectrograms.npz", lambda file: _save_npz(file, arrays))
-            level = None if measured is None else compress(measured, found.reference)
-            drawn = np.arange(len(poses)) if level is None else ranked(level, found.level_db)
+            level = None if measured is None else compress(measured, prediction.reference)
+            drawn = np.arange(len(poses)) if level is None else ranked(level, prediction.level_db)
             if pictures != "all":
                 drawn = evenly(drawn, pictures)
-            _pictures(folder, found, numbers, np.unique(drawn), level, progress)
+            _pictures(folder, prediction, numbers, np.unique(drawn), level, progress)
             if measured is not None and output is None and split == "test":
-                metrics = prediction_numbers(found, run.echoes, measured)
+                metrics = prediction_numbers(prediction, run.echoes, measured)
                 run.write_metrics("prediction", {"split": split, **metrics})
     return folder
 
@@ -177,12 +177,12 @@ def _named(file: Path | None) -> Iterator[None]:
 def _traced(run: Run) -> Traced | None:
     """Return the surface that echoes are traced off; warn where the run has lost its own."""
     traced = run.traced()
-    known = (run.read_metrics().get("prediction") or {}).get("traced_weight", 0)
-    if traced is None and known > 0:
+    weight = (run.read_metrics().get("prediction") or {}).get("traced_weight", 0)
+    if traced is None and weight > 0:
         logger.warning(
             "%s is missing: the prediction is rendered from the field alone; the run's own also "
             "has echoes traced off its surface (weight %.2f)",
-            *(run.path / TRACED_NAME, known),
+            *(run.path / TRACED_NAME, weight),
         )
     return traced
 
@@ -195,21 +195,21 @@ def _save_npz(file: BinaryIO, arrays: dict[str, NDArray[np.generic]]) -> None:
 
 def _pictures(
     folder: Path,
-    found: Prediction,
+    prediction: Prediction,
     numbers: Ints,
     rows: Ints,
     measured: Floats | None,
     progress: Progress,
 ) -> None:
-    predicted = found.level_db
+    predicted = prediction.level_db
     with progress.task("drawing", len(rows)) as task:
         for row in rows:
             number = int(numbers[row])
             picture = spectrogram_picture(
                 None if measured is None else measured[row],
                 predicted[row],
-                found.range,
-                found.frequency,
+                prediction.range,
+                prediction.frequency,
                 f"pose {number}",
             )
             storage.commit_bytes(folder / f"pose_{number:04d}.png", picture)

@@ -72,18 +72,18 @@ def report(
 
 def _vector_figures(run: Run, kind: Literal["svg", "pdf"]) -> dict[str, bytes]:
     """Return the figures of a run that are drawn by lines and letters, by name."""
-    found = {}
+    figures = {}
     curves, floors = curves_of(run)
     if curves:
-        found["curves"] = curves_picture(curves, floors=floors, kind=kind)
+        figures["curves"] = curves_picture(curves, floors=floors, kind=kind)
     if (run.reconstruction / "volume.vti").is_file():
         projections = mip_pictures(read_volume(run.path), kind=kind)
-        found |= {f"mip_{axis}": data for axis, data in projections.items()}
+        figures |= {f"mip_{axis}": data for axis, data in projections.items()}
     predicted = read_predictions(run.path)
     if predicted is not None:
         for _, row in predicted.chosen():
             number = predicted.numbers[row]
-            found[f"pose_{number:04d}"] = spectrogram_picture(
+            figures[f"pose_{number:04d}"] = spectrogram_picture(
                 predicted.measured[row],
                 predicted.predicted[row],
                 predicted.range,
@@ -91,7 +91,7 @@ def _vector_figures(run: Run, kind: Literal["svg", "pdf"]) -> dict[str, bytes]:
                 f"pose {number}",
                 kind=kind,
             )
-    return found
+    return figures
 
 
 SIDES = (380, 340)
@@ -200,11 +200,11 @@ def curves_of(run: Run) -> tuple[Curves, dict[str, float]]:
     curves: Curves = {name: ([], []) for name in CURVES}
     for file in sorted(run.path.glob("epochs/*/metrics.json")):
         with damage_named(file):
-            told = storage.read_json(file)
+            state = storage.read_json(file)
             for name, key in CURVES.items():
-                if told.get(key) is not None and float(told[key]) > 0:
-                    curves[name][0].append(float(told["step"]))
-                    curves[name][1].append(float(told[key]))
+                if state.get(key) is not None and float(state[key]) > 0:
+                    curves[name][0].append(float(state["step"]))
+                    curves[name][1].append(float(state[key]))
     prediction = run.read_metrics().get("prediction") or {}
     floors = {
         f"noise floor, {name}": prediction.get(key)
@@ -250,26 +250,26 @@ def _surface(page: Page, run: Run, settings: Settings) -> None:
     _candidates(page, run)
     page.pictures({"Four sides; colours are explained at the left.": views.png(SIDES)})
     page.heading("Maximum-intensity projections", 3)
-    found = {}
+    drawn = {}
     for axis in "xyz":
         file = source / f"mip_{axis}.png"
         if file.is_file():
-            found[f"Reflectivity, the largest along {axis}."] = file.read_bytes()
+            drawn[f"Reflectivity, the largest along {axis}."] = file.read_bytes()
         else:
             page.say(f"{file} is missing; {command} makes it.")
-    page.pictures(found)
+    page.pictures(drawn)
 
 
 def _candidates(page: Page, run: Run) -> None:
     """Show the starts of the refinement with their errors on validation poses."""
     with damage_named(run.reconstruction / "read_out.json"):
-        found = run.read_out.get("candidates") or []
+        candidates = run.read_out.get("candidates") or []
         rows = [
             (
                 one["start"] + (", taken" if one["chosen"] else ""),
                 *(NONE if one[k] is None else f"{one[k]:.2f}" for k in _ERRORS),
             )
-            for one in found
+            for one in candidates
         ]
     if rows:
         page.table([("start", "its error, dB", "refined, dB"), *rows])
@@ -336,15 +336,16 @@ def read_predictions(path: Path) -> _Predicted | None:
 def _predictions(page: Page, path: Path) -> None:
     """Show the best, the median and the worst predicted of the held-out poses."""
     page.heading("Spectrograms of poses that were never heard")
-    found = read_predictions(path)
-    if found is None:
+    predictions = read_predictions(path)
+    if predictions is None:
         page.say(f"None yet: {_command('predict', path)}.")
         return
-    for name, row in found.chosen():
-        number = found.numbers[row]
+    for name, row in predictions.chosen():
+        number = predictions.numbers[row]
         picture = path / "prediction" / f"pose_{number:04d}.png"
-        error_db = mae_db(found.measured[row], found.predicted[row])
-        said = f"Pose {number}, the {name} of {len(found.numbers)}: {error_db:.2f} dB, all cells."
+        count = len(predictions.numbers)
+        error_db = mae_db(predictions.measured[row], predictions.predicted[row])
+        said = f"Pose {number}, the {name} of {count}: {error_db:.2f} dB, all cells."
         if picture.is_file():
             page.pictures({said: picture.read_bytes()})
         else:
@@ -392,7 +393,7 @@ def _isosurface(page: Page, run: Run, progress: Progress) -> None:
     level = options.level
     try:
         with progress.task("reading out", 1000) as task, torch.inference_mode():
-            mesh, volume, found = read_isosurface(
+            mesh, volume, used_level = read_isosurface(
                 run.model.field,
                 spacing=options.spacing,
                 level=level,
@@ -406,7 +407,7 @@ def _isosurface(page: Page, run: Run, progress: Progress) -> None:
         return
     rule = "by Otsu's rule" if level == "auto" else "as set"
     voxels = f"voxels of {1e3 * volume.spacing:.3g} mm"
-    said = f"Sum over {options.directions} directions, {voxels}, level {rule}: {found:.3g}."
+    said = f"Sum over {options.directions} directions, {voxels}, level {rule}: {used_level:.3g}."
     page.pictures({said: picture})
 
 

@@ -203,17 +203,17 @@ class Run(Shown):
             echoes: Echoes | None = self.echoes
         except InputError:
             echoes = None
-        known = self.read_out
+        read_out = self.read_out
         surface = Surface(
             mesh,
-            method=known["method"],
-            level=known["level"],
+            method=read_out["method"],
+            level=read_out["level"],
             confidence=confidence_of(mesh),
             error=error_of(mesh),
-            refined=known["refined"],
-            error_db=known["validation_error_db"],
-            faults=tuple(known["faults"]),
-            candidates=tuple(known.get("candidates", ())),
+            refined=read_out["refined"],
+            error_db=read_out["validation_error_db"],
+            faults=tuple(read_out["faults"]),
+            candidates=tuple(read_out.get("candidates", ())),
             echoes=echoes,
         )
         if self._traced is not None:

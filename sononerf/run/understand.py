@@ -93,28 +93,28 @@ def understand(
         raise InputError(f"{source}: is a folder; the format {form} is one file")
     folder = source if source.is_dir() else source.parent
     where, data = _settings_data(folder, settings_file, overrides)
-    wanted = read_import_settings(data.pop("import", None) or {}, where)
+    import_settings = read_import_settings(data.pop("import", None) or {}, where)
     progress = progress or Progress(quiet=True)
     if form == FOLDER:
-        recording = read_folder(source, wanted, _named_files(data))
+        recording = read_folder(source, import_settings, _named_files(data))
     else:
-        recording = READERS[form](source, wanted)
-    settings = _complete(data, recording, wanted, output, where)
+        recording = READERS[form](source, import_settings)
+    settings = _complete(data, recording, import_settings, output, where)
     head = head_of(settings)
     receivers = len(head.receivers)
-    heard = len(mix(np.zeros((recording.read(0).shape[0], 1)), wanted.channels))
+    heard = len(mix(np.zeros((recording.read(0).shape[0], 1)), import_settings.channels))
     if heard != receivers:
         raise InputError(
             f"{recording.path}: {heard} channels, and the settings describe {receivers} "
             "receivers; set ears.receivers to one place for each channel, or choose channels with "
             "import.channels"
         )
-    poses = to_poses(recording.columns, wanted)
+    poses = to_poses(recording.columns, import_settings)
     if len(poses) != len(recording):
         raise InputError(f"{recording.path}: {len(recording)} pings and {len(poses)} poses")
-    check_channels(recording, wanted.channels)
-    cutter, calibration = calibrated(recording, wanted, head, folder)
-    if wanted.compress:
+    check_channels(recording, import_settings.channels)
+    cutter, calibration = calibrated(recording, import_settings, head, folder)
+    if import_settings.compress:
         warn_of_band(settings.call, settings.spectrogram)
         cutter = replace(cutter, call=call_waveform(settings.call, recording.sampling_rate))
         calibration["compressed"] = call_content(settings.call)
@@ -130,16 +130,16 @@ def understand(
     settings = validate_settings(plain, settings.source or "import")
     head = head_of(settings)
     check_numbers(recording, cutter, head.samples)
-    kept, clipped = _without_clipped(recording, cutter, head, wanted)
+    kept, clipped = _without_clipped(recording, cutter, head, import_settings)
     stated, where = recording.columns.take(kept).split(), str(recording.path)
     if stated is not None:
         split = split_of(poses[kept], stated, where=f"{where}: column split")
     else:
         split = draw_split(
             poses[kept],
-            validation=wanted.validation,
-            heldout=wanted.heldout,
-            seed=wanted.seed,
+            validation=import_settings.validation,
+            heldout=import_settings.heldout,
+            seed=import_settings.seed,
             where=where,
         )
     there = [cutter.samples(index) / recording.sampling_rate for index in range(len(recording))]
@@ -147,7 +147,7 @@ def understand(
         form=form,
         recording=recording,
         settings=settings,
-        wanted=wanted,
+        wanted=import_settings,
         cutter=cutter,
         head=head,
         pings=kept,
@@ -191,15 +191,19 @@ def _settings_data(
 
 
 def _complete(
-    data: dict[str, Any], recording: Recording, wanted: ImportSettings, output: Path, where: str
+    data: dict[str, Any],
+    recording: Recording,
+    import_settings: ImportSettings,
+    output: Path,
+    where: str,
 ) -> Settings:
     """Complete the settings from the recording, and check them like those of a fit."""
-    for section, known in recording.settings.items():
+    for section, stated in recording.settings.items():
         own = data.setdefault(section, {})
         if isinstance(own, dict):
-            data[section] = {**_mixed(known, wanted), **own}
+            data[section] = {**_mixed(stated, import_settings), **own}
     support = data.setdefault("support", {})
-    table = wanted.turntable
+    table = import_settings.turntable
     if table is not None and table.surface is not None and isinstance(support, dict):
         support.setdefault("point", [0.0, 0.0, table.surface])
     analysis = data.setdefault("spectrogram", {})
@@ -222,19 +226,19 @@ def _complete(
     return settings
 
 
-def _mixed(known: dict[str, Any], wanted: ImportSettings) -> dict[str, Any]:
+def _mixed(stated: dict[str, Any], import_settings: ImportSettings) -> dict[str, Any]:
     """Return the source's statements about receivers, for the chosen channels."""
-    if "receivers" not in known or wanted.channels is None:
-        return known
-    places = mix(np.asarray(known["receivers"], dtype=np.float64), wanted.channels)
-    return {**known, "receivers": places.tolist()}
+    if "receivers" not in stated or import_settings.channels is None:
+        return stated
+    places = mix(np.asarray(stated["receivers"], dtype=np.float64), import_settings.channels)
+    return {**stated, "receivers": places.tolist()}
 
 
 def _without_clipped(
-    recording: Recording, cutter: Cutter, head: Head, wanted: ImportSettings
+    recording: Recording, cutter: Cutter, head: Head, import_settings: ImportSettings
 ) -> tuple[Ints, int]:
     """Return the pings to keep, and how many are clipped where their echoes are."""
-    if not wanted.reject_clipped:
+    if not import_settings.reject_clipped:
         return np.arange(len(recording)), 0
     analysis, speed = head.analysis, head.speed_of_sound
     first = int(analysis.range_min * 2.0 / speed * analysis.sampling_rate - analysis.window / 2.0)

@@ -89,7 +89,7 @@ def apply_override(data: dict[str, Any], assignment: str) -> None:
 
 def assignments(sections: Mapping[str, Any]) -> list[str]:
     """Return sections of settings, a dictionary of dictionaries, as ``KEY=VALUE`` assignments."""
-    found = []
+    lines = []
     for section, keys in sections.items():
         if not isinstance(keys, Mapping):
             raise SettingsError(f"{section}: found {keys!r}, expected a dictionary of its keys")
@@ -100,8 +100,8 @@ def assignments(sections: Mapping[str, Any]) -> list[str]:
                 raise SettingsError(
                     f"{section}.{key}: found {value!r}, expected numbers, texts and lists"
                 ) from None
-            found.append(f"{section}.{key}={text}")
-    return found
+            lines.append(f"{section}.{key}={text}")
+    return lines
 
 
 def _drop_options_of_another(data: dict[str, Any], assignment: str) -> None:
@@ -205,12 +205,12 @@ def _model_at(model: type[BaseModel], path: Iterable[str | int]) -> type[BaseMod
         if isinstance(part, int):  # in a list of models, each of them
             continue
         info = model.model_fields.get(part)
-        found = info.annotation if info else None
-        if typing.get_origin(found) is list:
-            found = typing.get_args(found)[0]
-        if not (isinstance(found, type) and issubclass(found, BaseModel)):
+        annotation = info.annotation if info else None
+        if typing.get_origin(annotation) is list:
+            annotation = typing.get_args(annotation)[0]
+        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
             return None
-        model = found
+        model = annotation
     return model
 
 

@@ -41,15 +41,15 @@ class Plugin:
 
 def registered(group: str) -> list[Plugin]:
     """Return the registered plugins of a group, sorted by name; imports nothing."""
-    found: dict[tuple[str, str, str], Plugin] = {}
+    plugins: dict[tuple[str, str, str], Plugin] = {}
     for entry in entry_points(group=group):
         distribution = entry.dist.name if entry.dist else "unknown"
         version = entry.dist.version if entry.dist else "unknown"
         # An editable install may be listed twice on sys.path; the same claim counts once.
-        found[entry.name, distribution, entry.value] = Plugin(
+        plugins[entry.name, distribution, entry.value] = Plugin(
             entry.name, distribution, version, entry
         )
-    return sorted(found.values(), key=lambda plugin: (plugin.name, plugin.distribution))
+    return sorted(plugins.values(), key=lambda plugin: (plugin.name, plugin.distribution))
 
 
 def load(group: str, name: str) -> Callable[..., Any]:

@@ -77,15 +77,16 @@ def _difference(simulator: Simulator, poses: Poses, task: Task, workers: int | N
     """Return the mean difference between two seeds over active cells, dB."""
     quiet = copy.copy(simulator)
     quiet.head = simulator.head.without_noise()
-    found: dict[int, Singles] = {}
+    spectrograms: dict[int, Singles] = {}
     twice = Poses(*(np.concatenate([part, part]) for part in (poses.positions, poses.rotations)))
     indices = list(range(len(twice)))
     with closing(simulated(quiet, twice, indices, lambda index: index, workers=workers)) as results:
         for index, spectrogram in results:
-            found[index] = spectrogram
+            spectrograms[index] = spectrogram
             task.advance()
     first, second = (
-        np.stack([found[index + after] for index in range(len(poses))]) for after in (0, len(poses))
+        np.stack([spectrograms[index + after] for index in range(len(poses))])
+        for after in (0, len(poses))
     )
     loudest = float(max(first.max(), second.max()))
     if loudest <= 0.0:

@@ -95,9 +95,9 @@ def simulate(
     expect(head, Head, "head")
     settings = checked_section(SimulationSettings, options or {}, "simulation")
     purposes = split_of(poses, split)
-    wanted = echo_hash(scene, poses, purposes, head, settings)
+    echoes_id = echo_hash(scene, poses, purposes, head, settings)
     path = None if output is None else Path(output)
-    if path is not None and (finished := _finished(path, wanted)) is not None:
+    if path is not None and (finished := _finished(path, echoes_id)) is not None:
         return Echoes(finished, head)
     if scheduler is not None:
         reach(scheduler)
@@ -128,7 +128,7 @@ def simulate(
         "split": purposes,
         "range": head.range,
         "frequency": head.frequency,
-        "attributes": _attributes(wanted, scene, head, settings, about or {}),
+        "attributes": _attributes(echoes_id, scene, head, settings, about or {}),
         "receivers": len(head.receivers),
     }
     how: dict[str, Any] = {"workers": workers, "scheduler": scheduler, "progress": progress}
@@ -146,12 +146,12 @@ def simulate(
     return Echoes(EnsembleStore.open(path), head)
 
 
-def _finished(path: Path, wanted: str) -> EnsembleStore | None:
+def _finished(path: Path, echoes_id: str) -> EnsembleStore | None:
     """Return the store of a folder if it is complete; refuse one of other echoes."""
     if not (path / "zarr.json").is_file():
         return None
     store = EnsembleStore.open(path)
-    if store.attributes.get("echo_hash") != wanted:
+    if store.attributes.get("echo_hash") != echoes_id:
         raise IncompatibleError(
             f"{path}: holds echoes of other settings; choose another --output, or leave the scene "
             "out of the settings to take the echoes as they are"
@@ -215,14 +215,14 @@ def _plain(head: Head, options: SimulationSettings) -> dict[str, Any]:
 
 
 def _attributes(
-    wanted: str, scene: Scene, head: Head, options: SimulationSettings, about: Mapping[str, Any]
+    echoes_id: str, scene: Scene, head: Head, options: SimulationSettings, about: Mapping[str, Any]
 ) -> dict[str, Any]:
     further = dict(about)
     if scene.to_original is not None:
         further["to_original"] = scene.to_original.tolist()
     sections = {**further.pop("settings", {}), **_plain(head, options)}
     return {
-        "echo_hash": wanted,
+        "echo_hash": echoes_id,
         "origin": "simulated",
         "settings": sections,
         "speed_of_sound": head.speed_of_sound,
@@ -326,13 +326,13 @@ def spectrograms(
 
     In: positions ((P, 3), m), rotations (P, 3, 3).
     """
-    found: dict[int, Singles] = {}
+    by_pose: dict[int, Singles] = {}
 
     def keep(index: int, spectrogram: Singles) -> None:
-        found[index] = spectrogram
+        by_pose[index] = spectrogram
         if done is not None:
             done()
 
     poses = Poses(positions, rotations)
     simulate_ensemble(simulator, poses, range(len(poses)), keep, seed_of=lambda _: seed)
-    return np.stack([found[index] for index in range(len(poses))])
+    return np.stack([by_pose[index] for index in range(len(poses))])

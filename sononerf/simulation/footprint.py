@@ -101,7 +101,7 @@ def ways_to(
     """
     count = len(rows)
     distance, cosine = np.zeros(count), np.zeros(count)
-    found = np.zeros((4, count), np.float32)
+    sizes = np.zeros((4, count), np.float32)
     for i in range(count):
         row = rows[i]
         x = listener[0] - points[i, 0]
@@ -137,11 +137,11 @@ def ways_to(
         variance = slope * (angle / 12.0) + (h11 * h11 + h22 * h22) * (angle * angle / 720.0)
         variance += h12 * h12 * (angle * angle / 144.0)
         distance[i] = far
-        found[0, i] = rise
-        found[1, i] = max(detour, 0.0)
-        found[2, i] = math.sqrt(variance)
-        found[3, i] = stiffness
-    return distance, cosine, found
+        sizes[0, i] = rise
+        sizes[1, i] = max(detour, 0.0)
+        sizes[2, i] = math.sqrt(variance)
+        sizes[3, i] = stiffness
+    return distance, cosine, sizes
 
 
 @compiled

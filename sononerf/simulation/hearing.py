@@ -141,7 +141,7 @@ class Arrival:
 
         In: emitters ((P, 3), m), ears ((P, E, 3), m).
         """
-        found = np.zeros(ears.shape[:2])
+        lengths = np.zeros(ears.shape[:2])
         square = np.einsum("nd,nd->n", self._points, self._points)
         for pose, heads in enumerate(np.concatenate([emitters[:, None], ears], axis=1)):
             heads = heads - self._middle
@@ -149,8 +149,8 @@ class Arrival:
             way = square - 2.0 * heads @ self._points.T
             way += np.einsum("hd,hd->h", heads, heads)[:, None]
             np.sqrt(np.maximum(way, 0.0, out=way), out=way)
-            found[pose] = (way[:1] + way[1:]).min(axis=1)
-        return found
+            lengths[pose] = (way[:1] + way[1:]).min(axis=1)
+        return lengths
 
 
 def silence_before(echo: Floats, first: Floats, *, sampling_rate: float) -> Floats:

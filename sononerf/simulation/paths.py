@@ -184,7 +184,7 @@ def echo_paths(
     cells: Cells | None = None
     while True:
         weight = np.zeros(count)
-        found: list[tuple[Bounce, Ints]] = []
+        bounces_found: list[tuple[Bounce, Ints]] = []
         solid_angle = cap.solid_angle / parts
         for start in range(0, len(directions), CHUNK):
             chunk = directions[start : start + CHUNK]
@@ -193,7 +193,7 @@ def echo_paths(
             ):
                 bounce = replace(bounce, ray=rays.take(bounce.ray + start))
                 if extra < SPLIT**2:  # no cell can be divided further
-                    found.append((bounce, np.arange(len(bounce.ray))))
+                    bounces_found.append((bounce, np.arange(len(bounce.ray))))
                     continue
                 audible, doubt = judge(bounce)
                 # A ray hits once per bounce, so that no ray appears twice.
@@ -203,14 +203,14 @@ def echo_paths(
                     around = cap.neighbourhood(bounce.ray)
                     least = max(float(doubt.mean()), sys.float_info.min)
                     weight[around] = np.maximum(weight[around], least)
-                found.append((bounce, np.flatnonzero(audible)))
+                bounces_found.append((bounce, np.flatnonzero(audible)))
         chosen = np.flatnonzero(weight)
         most = extra // SPLIT**2
         if len(chosen) > most:
             chosen = np.sort(chosen[np.argsort(-weight[chosen], kind="stable")[:most]])
         left = np.ones(len(weight), dtype=bool)
         left[chosen] = False
-        for bounce, heard in found:
+        for bounce, heard in bounces_found:
             kept = heard[left[bounce.ray.take(heard)]]
             yield bounce if len(kept) == len(bounce.ray) else bounce[kept]
         if len(chosen) == 0:

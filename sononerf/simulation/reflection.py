@@ -86,11 +86,11 @@ class Reflection:
 
 def reflection(material: Material, frequency: ArrayLike, *, speed_of_sound: float) -> Reflection:
     """Return a material's values at frequencies (F,) in Hz, straight over their logarithm."""
-    wanted, nodes = np.log(np.asarray(frequency)), np.log(material.frequency)
+    log_frequency, nodes = np.log(np.asarray(frequency)), np.log(material.frequency)
 
     def at(*curves: tuple[float, ...] | None) -> Floats:
         given = next((curve for curve in curves if curve is not None), (0.0,) * len(nodes))
-        return np.interp(wanted, nodes, given)
+        return np.interp(log_frequency, nodes, given)
 
     fade, _ = unfaded(np.asarray(frequency, dtype=np.float64), speed_of_sound=speed_of_sound)
     return Reflection(

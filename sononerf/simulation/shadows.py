@@ -381,7 +381,7 @@ def behind(
 ) -> tuple[Hits, Floats]:
     """Return the hits of rays beyond the first obstacle, and the whole ways (M,) there, m."""
     ray, points, length = hits.ray, hits.points, hits.distance
-    found: list[tuple[Hits, Floats]] = []
+    parts: list[tuple[Hits, Floats]] = []
     for _ in range(LAYERS):
         along = directions.take(ray, axis=0)
         further = caster.first_hit(points + caster.lift * along, along)
@@ -392,12 +392,12 @@ def behind(
         into = np.einsum("nd,nd->n", along, further.flat) < 0.0
         good = into | ~outlines.closed[further.triangle]
         kept = np.flatnonzero(good)
-        found.append((_chosen(further, kept, ray), length[kept]))
+        parts.append((_chosen(further, kept, ray), length[kept]))
         left = np.flatnonzero(~good)
         ray, points, length = ray[left], further.points[left], length[left]
         if len(ray) == 0:
             break
-    hidden = [part for part in found if len(part[1])] or found[:1]
+    hidden = [part for part in parts if len(part[1])] or parts[:1]
     joined = Hits(
         *(np.concatenate([getattr(part, of.name) for part, _ in hidden]) for of in fields(Hits))
     )

@@ -164,7 +164,7 @@ POSE_BYTES = 550
 """Memory per pose while poses are drawn, bytes; 510 to 530 were measured."""
 
 
-def ensemble_poses(wanted: PoseSettings) -> tuple[Poses, NDArray[np.int8]]:
+def ensemble_poses(settings: PoseSettings) -> tuple[Poses, NDArray[np.int8]]:
     """Return the poses of an experiment: first training, then validation, then test poses.
 
     Each set draws from a generator of its own, so that the number of one does not move another.
@@ -172,56 +172,56 @@ def ensemble_poses(wanted: PoseSettings) -> tuple[Poses, NDArray[np.int8]]:
 
     Out: split ((P,) int8).
     """
-    if wanted.path is not None:
-        return _path_poses(wanted, wanted.path)
-    number = wanted.count + wanted.validation + wanted.heldout
+    if settings.path is not None:
+        return _path_poses(settings, settings.path)
+    number = settings.count + settings.validation + settings.heldout
     require_memory(POSE_BYTES * number, f"drawing {number:,} poses", "lower poses.count")
-    train, test = _arrangement(wanted)
+    train, test = _arrangement(settings)
     sets = (
-        (TRAIN, wanted.count, train),
-        (VALIDATION, wanted.validation, test),
-        (TEST, wanted.heldout, test),
+        (TRAIN, settings.count, train),
+        (VALIDATION, settings.validation, test),
+        (TEST, settings.heldout, test),
     )
     made, split = [], []
     for member, count, draw in sets:
-        jitter = math.radians(wanted.aim_jitter_deg)
-        made.append(draw(count, aim_jitter=jitter, generator=_generator(wanted, member)))
+        jitter = math.radians(settings.aim_jitter_deg)
+        made.append(draw(count, aim_jitter=jitter, generator=_generator(settings, member)))
         split.append(np.full(count, member, dtype=np.int8))
     positions = np.concatenate([poses.positions for poses in made])
     rotations = np.concatenate([poses.rotations for poses in made])
     return Poses(positions, rotations), np.concatenate(split)
 
 
-def _generator(wanted: PoseSettings, member: int) -> np.random.Generator:
-    return np.random.default_rng(np.random.SeedSequence([wanted.seed, member]))
+def _generator(settings: PoseSettings, member: int) -> np.random.Generator:
+    return np.random.default_rng(np.random.SeedSequence([settings.seed, member]))
 
 
-def _arrangement(wanted: PoseSettings) -> tuple[Callable[..., Poses], Callable[..., Poses]]:
+def _arrangement(settings: PoseSettings) -> tuple[Callable[..., Poses], Callable[..., Poses]]:
     """Return the training poses, and functions that draw those for validation and test."""
-    radius, axis = wanted.radius, wanted.axis
-    if wanted.arrangement == "sphere":
+    radius, axis = settings.radius, settings.axis
+    if settings.arrangement == "sphere":
         return partial(Poses.sphere, radius=radius), partial(random_sphere_poses, radius=radius)
-    if wanted.heights is not None:
-        where: dict[str, Any] = {"radius": radius, "heights": wanted.heights}
+    if settings.heights is not None:
+        where: dict[str, Any] = {"radius": radius, "heights": settings.heights}
         return partial(cylinder_poses, **where), partial(random_cylinder_poses, **where)
-    angle = math.pi if wanted.half_angle_deg is None else math.radians(wanted.half_angle_deg)
-    distances = radius, wanted.radius_max or radius
+    angle = math.pi if settings.half_angle_deg is None else math.radians(settings.half_angle_deg)
+    distances = radius, settings.radius_max or radius
     draw = partial(random_poses, radius=distances, axis=axis, half_angle=angle)
-    if wanted.arrangement == "volume":
+    if settings.arrangement == "volume":
         return draw, draw
     return partial(cap_poses, radius=radius, axis=axis, half_angle=angle), draw
 
 
-def _path_poses(wanted: PoseSettings, path: Path) -> tuple[Poses, NDArray[np.int8]]:
+def _path_poses(settings: PoseSettings, path: Path) -> tuple[Poses, NDArray[np.int8]]:
     """Read a flight path; its rows for validation and test are drawn at random."""
     poses = Poses.read(path)
-    if len(poses) <= wanted.validation + wanted.heldout:
+    if len(poses) <= settings.validation + settings.heldout:
         raise InputError(
-            f"{path}: {len(poses)} poses, of which poses.validation takes {wanted.validation} and "
-            f"poses.heldout {wanted.heldout}; none is left to train on"
+            f"{path}: {len(poses)} poses, of which poses.validation takes "
+            f"{settings.validation} and poses.heldout {settings.heldout}; none is left to train on"
         )
     split = np.full(len(poses), TRAIN, dtype=np.int8)
-    for member, count in ((TEST, wanted.heldout), (VALIDATION, wanted.validation)):
-        order = _generator(wanted, member).permutation(len(poses))
+    for member, count in ((TEST, settings.heldout), (VALIDATION, settings.validation)):
+        order = _generator(settings, member).permutation(len(poses))
         split[order[split[order] == TRAIN][:count]] = member
     return poses, split

@@ -96,23 +96,23 @@ def next_poses(
 
 
 def _greedy(
-    weight: Floats, known: Floats, added: Floats, count: int, ways: Floats, heard: Floats
+    weight: Floats, information: Floats, added: Floats, count: int, ways: Floats, heard: Floats
 ) -> list[int]:
     """Return the rows of ``added`` (P, B) that reduce the sum of weight / sqrt(known) most.
 
-    In: weight, known (B,), added (P, B), ways, heard ((P, 3), (H, 3)).
+    In: weight, information (B,), added (P, B), ways, heard ((P, 3), (H, 3)).
     """
     chosen: list[int] = []
-    error = weight * np.sqrt(known)  # error = weight where nothing is added
+    error = weight * np.sqrt(information)  # error = weight where nothing is added
     gap, _ = cKDTree(heard).query(ways)
     for _ in range(count):
-        after = (error / np.sqrt(known + added)).sum(axis=1)
+        after = (error / np.sqrt(information + added)).sum(axis=1)
         left = gap >= SPREAD * gap.max()
         left[chosen] = False
         best = int(np.where(left, after, np.inf).argmin())
         chosen.append(best)
         gap = np.minimum(gap, np.linalg.norm(ways - ways[best], axis=1))
-        known = known + added[best]
+        information = information + added[best]
     return chosen
 
 

@@ -208,16 +208,16 @@ def refine(
             after_step=after_step,
             after_stage=after_stage,
         ).run()
-    known = math.isfinite(refined.error_db)
+    has_error = math.isfinite(refined.error_db)
     return finished_surface(
         refined.mesh,
         refined.start,
         reading,
         echoes=echoes,
         confidence=refined.confidence.round().astype(np.int32),
-        error=refined.error.astype(np.float32) if known else None,
+        error=refined.error.astype(np.float32) if has_error else None,
         refined=refined.kept,
-        error_db=refined.error_db if known else None,
+        error_db=refined.error_db if has_error else None,
         faults=refined.faults,
         candidates=refined.candidates,
     )

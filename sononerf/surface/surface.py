@@ -117,31 +117,31 @@ def finished_surface(
 
     In: confidence ((V,) int32), error ((V,) float32, m).
     """
-    known: dict[str, Any] = {"echoes": echoes, "reading": reading}
-    known |= {"refined": refined, "error_db": error_db, "faults": faults}
-    known["candidates"] = candidates
+    keywords: dict[str, Any] = {"echoes": echoes, "reading": reading}
+    keywords |= {"refined": refined, "error_db": error_db, "faults": faults}
+    keywords["candidates"] = candidates
     if reading is None:
-        return Surface(mesh, None, method, confidence=confidence, error=error, **known)
-    found, hull, resolution = reading.gathered, reading.hull, reading.resolution
+        return Surface(mesh, None, method, confidence=confidence, error=error, **keywords)
+    gathered, hull, resolution = reading.gathered, reading.hull, reading.resolution
     if confidence is None:
-        assert found is not None  # without a field the caller counts
-        confidence = poses_that_heard(mesh, found.evidence, resolution)
+        assert gathered is not None  # without a field the caller counts
+        confidence = poses_that_heard(mesh, gathered.evidence, resolution)
     openness = judge_openness(mesh, hull.sources, resolution=resolution, plane=hull.plane)
     if openness.kind == "one-sided":
         heard = confidence
-        if found is not None:
-            reliable = found.evidence.where(found.weight > QUIET)
+        if gathered is not None:
+            reliable = gathered.evidence.where(gathered.weight > QUIET)
             heard = poses_that_heard(mesh, reliable, resolution)
         part = known_part(mesh, heard, hull, resolution=resolution)
-        voxel = resolution / 2 if found is None else found.lattice.spacing
+        voxel = resolution / 2 if gathered is None else gathered.lattice.spacing
         part &= ~at_wall(mesh.triangles_center, reading.box, voxel)
         if (part & ~openness.unseen).any():
             openness = leaving_out(openness, ~part, mesh.area_faces)
         used = np.unique(mesh.faces[~openness.unseen])
         mesh, confidence = without_unseen(mesh, openness), confidence[used]
         error = None if error is None else error[used]
-    known |= {"openness": openness, "confidence": confidence, "error": error}
-    return Surface(mesh, reading.volume, method, **known)
+    keywords |= {"openness": openness, "confidence": confidence, "error": error}
+    return Surface(mesh, reading.volume, method, **keywords)
 
 
 FACING = 0.1

@@ -29,21 +29,21 @@ SAME = 1e-6  # rad; directions nearer than this are one
 CHUNK = 512
 
 
-def interpolation(known: Floats, wanted: Floats) -> csr_array:
+def interpolation(given: Floats, directions: Floats) -> csr_array:
     """Return weights that bring values from known directions to wanted ones.
 
     Directions are triangulated on the sphere. Within a triangle values are linear, so that measured
     directions are reproduced exactly. Beyond the measured area the value of the nearest measured
     direction is faded to zero.
 
-    In: known (M, 3), wanted (N, 3). Out: weights ((N, M) sparse float64).
+    In: given (M, 3), directions (N, 3). Out: weights ((N, M) sparse float64).
     """
-    cells = np.round(known / SAME).astype(np.int64)
+    cells = np.round(given / SAME).astype(np.int64)
     _, first, same = np.unique(cells, axis=0, return_index=True, return_inverse=True)
     same = same.reshape(-1)
     counts = np.bincount(same)
-    merge = csr_array((1.0 / counts[same], (same, np.arange(len(known)))))
-    points = known[first]
+    merge = csr_array((1.0 / counts[same], (same, np.arange(len(given)))))
+    points = given[first]
     spacing = _spacing(points)
     tree = cKDTree(points)
     around = fibonacci_sphere(BACKGROUND)
@@ -56,13 +56,13 @@ def interpolation(known: Floats, wanted: Floats) -> csr_array:
     hull = _hull(every)
     triangles = np.asarray(hull.simplices, dtype=np.int64)
     measured = (triangles < len(points)).all(axis=1) & (_radius(every, triangles) <= GAP * spacing)
-    facet, weights = _locate(every, hull, wanted)
-    off = 2.0 * np.arcsin(np.minimum(tree.query(wanted)[0] / 2.0, 1.0)) - spacing
+    facet, weights = _locate(every, hull, directions)
+    off = 2.0 * np.arcsin(np.minimum(tree.query(directions)[0] / 2.0, 1.0)) - spacing
     fade = np.where(measured[facet], 1.0, np.clip(1.0 - off / FADE, 0.0, 1.0))
-    rows = np.repeat(np.arange(len(wanted)), 3)
+    rows = np.repeat(np.arange(len(directions)), 3)
     columns = source[triangles[facet]].reshape(-1)
     values = (weights * fade[:, None]).reshape(-1)
-    return csr_array((values, (rows, columns)), shape=(len(wanted), len(points))) @ merge
+    return csr_array((values, (rows, columns)), shape=(len(directions), len(points))) @ merge
 
 
 def _hull(points: Floats) -> ConvexHull:
@@ -91,20 +91,20 @@ def _spacing(points: Floats) -> float:
     return min(max(radius, LEAST_SPACING), MOST_SPACING)
 
 
-def _locate(points: Floats, hull: ConvexHull, wanted: Floats) -> tuple[Ints, Floats]:
+def _locate(points: Floats, hull: ConvexHull, directions: Floats) -> tuple[Ints, Floats]:
     """Return the facet that each direction runs through, and the weights (N, 3) of its corners.
 
     The hull encloses the origin: a ray from there leaves by the facet whose plane it meets first.
     """
     slope = hull.equations[:, :3] / -hull.equations[:, 3:]
-    facet = np.concatenate([(part @ slope.T).argmax(axis=1) for part in _parts(wanted)])
+    facet = np.concatenate([(part @ slope.T).argmax(axis=1) for part in _parts(directions)])
     corners = points[hull.simplices[facet]].transpose(0, 2, 1)
-    weights = np.linalg.solve(corners, wanted[:, :, None])[:, :, 0].clip(0.0)
+    weights = np.linalg.solve(corners, directions[:, :, None])[:, :, 0].clip(0.0)
     return facet, weights / weights.sum(axis=1, keepdims=True)
 
 
-def _parts(wanted: Floats) -> list[Floats]:
-    return np.array_split(wanted, max(1, math.ceil(len(wanted) / CHUNK)))
+def _parts(directions: Floats) -> list[Floats]:
+    return np.array_split(directions, max(1, math.ceil(len(directions) / CHUNK)))
 
 
 MOST_RECEIVERS = 256
@@ -201,12 +201,12 @@ class Directivity:
 
         Linear between measured frequencies; outside of them the nearest measured one counts.
         """
-        known = self.frequency
-        right = np.searchsorted(known, frequency).clip(1, max(len(known) - 1, 1))
-        if len(known) == 1:
+        measured = self.frequency
+        right = np.searchsorted(measured, frequency).clip(1, max(len(measured) - 1, 1))
+        if len(measured) == 1:
             return np.repeat(values, len(frequency), axis=-1)
         left = right - 1
-        part = ((frequency - known[left]) / (known[right] - known[left])).clip(0.0, 1.0)
+        part = ((frequency - measured[left]) / (measured[right] - measured[left])).clip(0.0, 1.0)
         return values[..., left] * (1.0 - part) + values[..., right] * part
 
 

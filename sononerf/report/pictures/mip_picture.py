@@ -224,11 +224,11 @@ def difference_pngs(
 
 def _strongest_along(values: NDArray[np.floating]) -> dict[str, NDArray[np.floating]]:
     """Return along each axis the value that is farthest from zero."""
-    found = {}
+    projections = {}
     for axis, name in enumerate("xyz"):
         index = np.expand_dims(np.abs(values).argmax(axis=axis), axis)
-        found[name] = np.take_along_axis(values, index, axis).squeeze(axis)
-    return found
+        projections[name] = np.take_along_axis(values, index, axis).squeeze(axis)
+    return projections
 
 
 def overlay_png(

@@ -109,13 +109,13 @@ def planned(
     others = [name for name in starts if name not in (*LEVELS, "sheet")]
     chosen: list[StartMethod] = [name for name in LEVELS if name in starts]
     chosen += sorted(others, key=lambda name: starts[name])[:1]
-    found: list[tuple[StartMethod, Way]] = []
+    starts_and_ways: list[tuple[StartMethod, Way]] = []
     for name in chosen:
         if not flat and (name != "levels" or "fuller" not in starts):
-            found.append((name, "blurred"))
-        found.append((name, "sharp"))
-    found += [("sheet", "sheet")] if "sheet" in starts else []
-    return [("levels", "planes"), *found] if flat else found
+            starts_and_ways.append((name, "blurred"))
+        starts_and_ways.append((name, "sharp"))
+    starts_and_ways += [("sheet", "sheet")] if "sheet" in starts else []
+    return [("levels", "planes"), *starts_and_ways] if flat else starts_and_ways
 
 
 def without_twin(candidate: Candidate, candidates: list[Candidate]) -> list[Candidate]:

@@ -159,12 +159,12 @@ class Descent:
         if heard is None:
             return None, math.inf
         later = None if self._later is None else self._later.power(numbers, heard)
-        found = measured(self.echoes, numbers, heard)
+        echo = measured(self.echoes, numbers, heard)
         corrected = None
         if self._correction is not None:
             corrected = self._correction.magnitudes(numbers, heard)
         difference, weight = differences(
-            heard, later, found, self.level, corrected=corrected, learn=True, band=self.band
+            heard, later, echo, self.level, corrected=corrected, learn=True, band=self.band
         )
         errors = mismatch(difference, weight)
         errors.mean().backward()

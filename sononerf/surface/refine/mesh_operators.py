@@ -84,8 +84,8 @@ class MeshOperators:
             return diagonal * x - strength * (self._adjacency @ x)
 
         # The Jacobi sweep's start is close where values are smooth already.
-        found = self.averaged(values)
-        residual = values - apply(found)
+        solution = self.averaged(values)
+        residual = values - apply(solution)
         scale = values.square().sum(0).clamp_min(1e-300)
         direction = residual / diagonal
         inner = (residual * direction).sum(0)
@@ -94,13 +94,13 @@ class MeshOperators:
                 break
             turned = apply(direction)
             along = inner / (direction * turned).sum(0).clamp_min(1e-300)
-            found = found + along * direction
+            solution = solution + along * direction
             residual = residual - along * turned
             conditioned = residual / diagonal
             after = (residual * conditioned).sum(0)
             direction = conditioned + (after / inner.clamp_min(1e-300)) * direction
             inner = after
-        return found
+        return solution
 
     def relaxed(self, vertices: Tensor, normals: Tensor, part: float) -> Tensor:
         """Move vertices (V, 3) along the surface by a part of the way to their neighbours' mean."""

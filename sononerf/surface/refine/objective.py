@@ -101,7 +101,7 @@ def measured(echoes: Echoes, numbers: list[int], heard: Heard) -> tuple[Tensor, 
 def differences(
     heard: Heard,
     later: Tensor | None,
-    found: tuple[Tensor, Tensor, Tensor],
+    measurement: tuple[Tensor, Tensor, Tensor],
     level: Level,
     *,
     corrected: tuple[Tensor, Tensor] | None = None,
@@ -113,7 +113,7 @@ def differences(
     In: later ((P, E, W, F) float32), corrected (simulated, rendered, both (P, E, W, F) float32).
     Out: difference ((P, E, W, F) float32, reported dB), weight (P, E, W, F).
     """
-    magnitude, inside, loudest = found
+    magnitude, inside, loudest = measurement
     power = heard.power if later is None else heard.power + later
     if band:
         gained = level.gain.mul(2.0).exp()[:, None]
@@ -239,14 +239,14 @@ class OnsetRanges:
 
     def gradient(self, vertices: Tensor, number: int) -> Tensor:
         """Gradient (V, 3), 1/m, of the misfit of a step's onsets; ``number`` is the step's."""
-        found = torch.zeros_like(vertices)
+        total = torch.zeros_like(vertices)
         if not len(self):
-            return found
+            return total
         rng = np.random.default_rng([self.seed, number])
         some = rng.choice(len(self), min(_POSES, len(self)), replace=False)
         off, nearest, way = self._off(vertices, some)
         slope = off.clamp(-1.0, 1.0)[:, None] * way / (self.scale * len(some))
-        return found.index_add_(0, nearest, slope)
+        return total.index_add_(0, nearest, slope)
 
     def _off(self, vertices: Tensor, some: NDArray[np.intp]) -> tuple[Tensor, Tensor, Tensor]:
         """Return misfit (N,), nearest vertex (N,) and the range's gradient there (N, 3)."""

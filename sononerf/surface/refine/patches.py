@@ -122,16 +122,16 @@ def on_patches(
         """Return the places after a step of Gauss and Newton towards all of their patches."""
         upright = patches.normals(patch, places[vertex])
         short = -patches.off(patch, places[vertex])[:, None] * upright
-        found = places.copy()
-        found[vertex[~shared]] += short[~shared]
+        moved = places.copy()
+        moved[vertex[~shared]] += short[~shared]
         size, axes = np.linalg.eigh(_squares(at, upright[shared], len(edge)))
         inverse = np.where(size > PARALLEL, 1.0 / np.maximum(size, PARALLEL), 0.0)
         inverse = (axes * inverse[:, None]) @ axes.transpose(0, 2, 1)
-        found[edge] += np.einsum("vij,vj->vi", inverse, summed(at, short[shared], len(edge)))
-        away = found[edge] - home[edge]
+        moved[edge] += np.einsum("vij,vj->vi", inverse, summed(at, short[shared], len(edge)))
+        away = moved[edge] - home[edge]
         length = np.linalg.norm(away, axis=1, keepdims=True)
-        found[edge] = home[edge] + away * np.minimum(1.0, far / np.maximum(length, 1e-300))
-        return found
+        moved[edge] = home[edge] + away * np.minimum(1.0, far / np.maximum(length, 1e-300))
+        return moved
 
     # Each vertex goes half-way to the mean of the neighbours that lie on all of its patches.
     own = csr_array((np.ones(len(vertex)), (vertex, patch)), shape=(count, len(patches.centre)))
@@ -182,16 +182,16 @@ def _bent(mesh: trimesh.Trimesh, part: Ints, flat: Patches, tolerance: float) ->
     middle, area = np.asarray(mesh.triangles_center), np.asarray(mesh.area_faces)
     upright, count = np.asarray(mesh.face_normals), len(flat.centre)
     terms, height = flat.terms(part, middle), flat.off(part, middle)
-    found = flat
+    patches = flat
     for _ in range(FITS):
-        cosine = (upright * found.normals(part, middle)).sum(1)
+        cosine = (upright * patches.normals(part, middle)).sum(1)
         tilt = np.clip((cosine - 0.7) / 0.3, 0.01, 1.0)
-        weight = area * tilt**2 / (1.0 + np.square(found.off(part, middle) / tolerance))
+        weight = area * tilt**2 / (1.0 + np.square(patches.off(part, middle) / tolerance))
         whole = np.maximum(np.bincount(part, weight, count), 1e-300)
         weight = weight / whole[part]
         square = (weight[:, None, None] * terms[:, :, None] * terms[:, None]).reshape(-1, 36)
         matrix = summed(part, square, count).reshape(-1, 6, 6) + 1e-3 * np.eye(6)
         wanted = summed(part, (weight * height)[:, None] * terms, count)
         numbers = np.linalg.solve(matrix, wanted[:, :, None])[:, :, 0].astype(np.float64)
-        found = Patches(flat.centre, flat.axes, flat.scale, numbers)
-    return found
+        patches = Patches(flat.centre, flat.axes, flat.scale, numbers)
+    return patches

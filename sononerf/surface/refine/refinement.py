@@ -150,14 +150,14 @@ class Refinement:
             self.saved[key] = self._done(candidate, number)
         elif self._after_step is not None:
             self._after_step(self.stages[number].steps, float(self.saved[key]["mismatch"]))
-        found = self.saved[key]
-        mesh = trimesh.Trimesh(found["vertices"].numpy(), found["faces"].numpy(), process=False)
-        mismatch, objective = float(found["mismatch"]), float(found["objective"])
-        if found["thin"] and candidate.way == "blurred":
+        saved = self.saved[key]
+        mesh = trimesh.Trimesh(saved["vertices"].numpy(), saved["faces"].numpy(), process=False)
+        mismatch, objective = float(saved["mismatch"]), float(saved["objective"])
+        if saved["thin"] and candidate.way == "blurred":
             self.candidates = without_twin(candidate, self.candidates)
-        for fault in bytes(found["faults"].tolist()).decode().splitlines():
+        for fault in bytes(saved["faults"].tolist()).decode().splitlines():
             self._note(fault)
-        candidate.level.load(below(found, "level."))
+        candidate.level.load(below(saved, "level."))
         candidate.drawn += self.stages[number].steps
         candidate.meshes.append(mesh)
         candidate.objectives.append(objective)
@@ -213,21 +213,21 @@ class Refinement:
     def _begun(self) -> list[Candidate]:
         """Return all candidates; of the starts other than levels and sheet, the best takes part."""
         names = [name for name in self.starts if name not in (*LEVELS, "sheet")]
-        found = dict.fromkeys(self.starts, math.nan)
+        errors = dict.fromkeys(self.starts, math.nan)
         if len(names) > 1 and "hull" in names:
             ridges = self.onsets.ridges(self.starts["hull"])
             if ridges > SMOOTH * self.optics.wavelength:
                 names.remove("hull")
-                del found["hull"]
+                del errors["hull"]
         if len(names) > 1:
-            found.update({name: self._compared(name) for name in names})
+            errors.update({name: self._compared(name) for name in names})
         network = [self.starts[name] for name in LEVELS if name in self.starts]
         with_planes = [] if self.optics.plane else network
         flat = flattest(with_planes, self._error, self.optics)
         candidates = []
-        for start, way in planned(found, flat=flat is not None):
+        for start, way in planned(errors, flat=flat is not None):
             mesh = flat if way == "planes" and flat is not None else self.starts[start]
-            begun = Candidate(way, start, self._new_level(), [mesh], [found[start]], self._far)
+            begun = Candidate(way, start, self._new_level(), [mesh], [errors[start]], self._far)
             candidates.append(begun)
         return candidates
 
@@ -344,7 +344,7 @@ class Refinement:
         best = candidate.best
         mesh = candidate.meshes[best]
         confidence = poses_that_hear(mesh, self.echoes, self.optics).cpu().double().numpy()
-        known = surface_error(
+        deviation = surface_error(
             mesh,
             self.echoes,
             self.optics,
@@ -352,8 +352,8 @@ class Refinement:
             validation_db=candidate.objective,
             seed=self.seed,
         )
-        confidence *= known.heard
-        values = np.stack([confidence, known.error], axis=1)
+        confidence *= deviation.heard
+        values = np.stack([confidence, deviation.error], axis=1)
         if best and candidate.way != "planes":
             mesh, values = finer(mesh, values, self.optics.wavelength)
         return Refined(

@@ -63,21 +63,21 @@ def remesh(
         distance = np.where(np.abs(distance) < 1e-3 * spacing, 1e-3 * spacing, distance)
     if not (distance < 0).any():
         return None
-    found = level_surface(distance, 0.0, lower, spacing)
-    found.merge_vertices()
-    pieces = found.split(only_watertight=False)
+    remeshed = level_surface(distance, 0.0, lower, spacing)
+    remeshed.merge_vertices()
+    pieces = remeshed.split(only_watertight=False)
     pieces = [piece for piece in pieces if abs(signed_volume(piece)) >= (LEAST * edge) ** 3]
     if not pieces:
         return None
-    found = trimesh.util.concatenate(pieces) if len(pieces) > 1 else pieces[0]
+    remeshed = trimesh.util.concatenate(pieces) if len(pieces) > 1 else pieces[0]
     old = np.asarray(mesh.vertices)
     at = ((old - lower) / spacing).T
     buried = ndimage.map_coordinates(distance, at, order=1) < -0.5 * spacing
-    near = cKDTree(found.vertices).query(old, distance_upper_bound=1.5 * edge + blur)[0]
+    near = cKDTree(remeshed.vertices).query(old, distance_upper_bound=1.5 * edge + blur)[0]
     area = np.bincount(mesh.faces.ravel(), np.repeat(mesh.area_faces, 3), len(old))
     if np.average(np.isinf(near) & ~buried, weights=area) > (THINNED if blur else LOST):
         return None
-    return relaxed(found)
+    return relaxed(remeshed)
 
 
 def relaxed(mesh: trimesh.Trimesh, steps: int = RELAXING) -> trimesh.Trimesh:

@@ -85,14 +85,14 @@ def find_support(
     middle = low + MIDDLE * (high - low)
     about = search(middle, np.arange(low - 2.0 * step, middle, step), 0.0, 0.4)
     reach = 2.0 * step * NEAR
-    found = []
+    errors_of_heights = []
     for number, cut in enumerate(CUTS):
         begin = about + 2.0 * step * cut
         heights = np.arange(about - reach, min(begin, about + reach), step)
         share = 0.4 + 0.6 * np.array([number, number + 1]) / len(CUTS)
-        found.append(search(begin, heights, *share))
-    spread = float(np.std(found, ddof=1))
-    return float(np.median(found)), math.hypot(spread, step / math.sqrt(12.0))
+        errors_of_heights.append(search(begin, heights, *share))
+    spread = float(np.std(errors_of_heights, ddof=1))
+    return float(np.median(errors_of_heights)), math.hypot(spread, step / math.sqrt(12.0))
 
 
 def least(values: ArrayLike) -> float:

@@ -236,23 +236,23 @@ class Misfit:
 
     def _probed(self, off: Tensor, weight: Tensor, moves: Tensor) -> Tensor:
         """Return the curvature (P, B) of the weighted squares of differences, by probes."""
-        found = torch.zeros(moves.shape, dtype=torch.float64)
+        derivatives = torch.zeros(moves.shape, dtype=torch.float64)
         for _ in range(PROBES):
             signs = torch.randint(0, 2, off.shape, generator=self._random) * 2 - 1
             ways = weight.sqrt() * signs.to(off)
             (slope,) = torch.autograd.grad((off * ways).sum(), moves, retain_graph=True)
-            found += slope.cpu().square() / PROBES
-        return found
+            derivatives += slope.cpu().square() / PROBES
+        return derivatives
 
 
 def _cover(places: Floats) -> Ints:
     """Return which points (N, K) have all others within a distance of 1 of one of them."""
-    tree, left, found = cKDTree(places), np.ones(len(places), dtype=bool), []
+    tree, left, centres = cKDTree(places), np.ones(len(places), dtype=bool), []
     for number, place in enumerate(places):
         if left[number]:
-            found.append(number)
+            centres.append(number)
             left[tree.query_ball_point(place, 1.0)] = False
-    return np.array(found, dtype=np.int64)
+    return np.array(centres, dtype=np.int64)
 
 
 def _weights(points: Floats, centres: Floats, spread: float) -> csr_array:

@@ -49,13 +49,13 @@ class Tracer:
     """The simulator's rays on a surface."""
 
     def __init__(self, optics: Optics, mesh: trimesh.Trimesh, *, rays: int, seed: int) -> None:
-        wanted = SimulationSettings(
+        options = SimulationSettings(
             engine="rays",
             rays=rays,
             bounces=BOUNCES,
             diffraction_points=max(rays // 30, 1),  # as many as the simulator's defaults have
         )
-        self._simulator = Simulator(Scene(mesh, warns=False), optics.head, wanted)
+        self._simulator = Simulator(Scene(mesh, warns=False), optics.head, options)
         self._nodes, self._seed = _Nodes.of(optics), seed
 
     def spectrograms(self, positions: Floats, rotations: Floats) -> Singles:

@@ -101,11 +101,11 @@ def _visible(
     clear = np.zeros((len(points), optics.ears), dtype=np.float32)
     for ear in range(optics.ears):
         clear[lit, ear] = seen(sight, points[lit], places[of[lit], ear], free=free)
-    found = torch.as_tensor(clear).to(vertices.device)
+    visible = torch.as_tensor(clear).to(vertices.device)
     shape = (operators.count, len(emitters), 1 + optics.ears)
     spread = torch.zeros(shape, dtype=torch.float32, device=vertices.device)
     spread[vertex, pose, 0] = 1.0
-    spread[vertex, pose, 1:] = found
+    spread[vertex, pose, 1:] = visible
     near = operators.averaged(spread.flatten(1)).unflatten(1, shape[1:])[vertex, pose]
     return near[:, 1:] / near[:, :1].clamp_min(1e-6)
 
@@ -155,16 +155,16 @@ class StillSurface:
         """
         optics = self.optics
         shape = (len(positions), optics.ears, optics.rows, len(optics.frequencies))
-        found = np.zeros(shape, dtype=np.float32)
+        magnitudes = np.zeros(shape, dtype=np.float32)
         pieces, heads, middle = self.listen(positions, rotations)
         if not len(pieces.pose):
-            return found
+            return magnitudes
         points, area = (self.vertices - middle).float(), self.area.float()
-        factor, more = (points.new_tensor(part).expand(len(found)) for part in (stretch, late))
+        factor, more = (points.new_tensor(part).expand(len(magnitudes)) for part in (stretch, late))
         heard = optics.render(points, area, pieces, heads, stretch=factor, late=more)
         magnitude = heard.power.sqrt().cpu().numpy()
-        for one, rendered, row in zip(found, magnitude, heard.row.tolist(), strict=True):
+        for one, rendered, row in zip(magnitudes, magnitude, heard.row.tolist(), strict=True):
             first, last = max(row, 0), min(row + rendered.shape[1], optics.rows)
             if last > first:
                 one[:, first:last] = rendered[:, first - row : last - row]
-        return found
+        return magnitudes

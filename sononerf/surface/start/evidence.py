@@ -67,7 +67,7 @@ def locate_sound(
     bands = torch.arange(_BANDS, device=places.device) * (len(field.frequency) - 1) // (_BANDS - 1)
     where = places.cpu().double().numpy()
     kernel = _neighbours(where, SHARED * resolution)
-    found: list[tuple[Floats, Floats, Floats, NDArray[np.intp]]] = []
+    parts: list[tuple[Floats, Floats, Floats, NDArray[np.intp]]] = []
     for pose, source in enumerate(sources):
         emitter = torch.as_tensor(source, dtype=places.dtype, device=places.device)
         ray = emitter - places
@@ -87,14 +87,14 @@ def locate_sound(
             near = kernel[which][:, which]
             sound = power[loud].cpu().double().numpy()
             located = _moved(where[which], range_, sound, near, source, resolution)
-            found.append((*located, np.full(len(located[0]), pose, dtype=np.intp)))
+            parts.append((*located, np.full(len(located[0]), pose, dtype=np.intp)))
         if progress is not None:
             progress(pose + 1, len(sources))
-    if not found:
+    if not parts:
         return Evidence(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), np.zeros(0, np.intp))
-    points, normals, power_ = (np.concatenate([f[k] for f in found]) for k in range(3))
-    pose_ = np.concatenate([f[3] for f in found])
-    usual = float(np.median([f[2].max() for f in found]))
+    points, normals, power_ = (np.concatenate([f[k] for f in parts]) for k in range(3))
+    pose_ = np.concatenate([f[3] for f in parts])
+    usual = float(np.median([f[2].max() for f in parts]))
     weight = np.minimum(power_ / usual, 1.0) ** COMPRESSION
     return Evidence(points, normals, weight, pose_)
 
@@ -258,11 +258,11 @@ def _agreement(evidence: Evidence, resolution: float) -> Floats:
     points, normals = evidence.points, evidence.normals
     count = len(points)
     # Evenly over all poses: points come pose by pose.
-    asked = np.unique(np.linspace(0, count - 1, min(count, _WITNESSES)).astype(np.intp))
+    witnesses = np.unique(np.linspace(0, count - 1, min(count, _WITNESSES)).astype(np.intp))
     pairs = cKDTree(points).sparse_distance_matrix(
-        cKDTree(points[asked]), REACH * resolution, output_type="ndarray"
+        cKDTree(points[witnesses]), REACH * resolution, output_type="ndarray"
     )
-    i, j = pairs["i"], asked[pairs["j"]]
+    i, j = pairs["i"], witnesses[pairs["j"]]
     other = evidence.pose[i] != evidence.pose[j]
     i, j = i[other], j[other]
     # Between two points of one sphere the chord is at right angles to the sum of their normals.

@@ -145,12 +145,12 @@ class StartNetwork(nn.Module):
         values = levels.pop()
         for widen, up in zip(self.widen, self.up, strict=True):
             values = up(widen(values) + levels.pop())
-        found = self.leave(values).float().unflatten(1, (2, 2, 2))
-        found = found.permute(0, 4, 1, 5, 2, 6, 3).reshape(batch, 2 * x, 2 * y, 2 * z)
+        values_out = self.leave(values).float().unflatten(1, (2, 2, 2))
+        values_out = values_out.permute(0, 4, 1, 5, 2, 6, 3).reshape(batch, 2 * x, 2 * y, 2 * z)
         free = nn.functional.interpolate(
             bound[:, None].clamp(-6, 6), scale_factor=2, mode="trilinear", align_corners=False
         )
-        return 2.0 * found + free[:, 0]
+        return 2.0 * values_out + free[:, 0]
 
 
 def trained_network() -> StartNetwork:

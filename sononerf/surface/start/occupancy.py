@@ -131,13 +131,13 @@ def winding_number(flux: Sequence[Singles]) -> Singles:
         square = square + wave**2
         total = total + wave * fft.rfftn(flux[axis], s=size)
     square[0, 0, 0] = 1.0  # the mean is set below
-    found = fft.irfftn(1j * total / square, s=size)
+    number = fft.irfftn(1j * total / square, s=size)
     far = [
-        found.take((inner + whole) // 2, axis).mean()
+        number.take((inner + whole) // 2, axis).mean()
         for axis, (inner, whole) in enumerate(zip(shape, size, strict=True))
     ]
     x, y, z = shape
-    return np.asarray(found[:x, :y, :z] - np.mean(far), dtype=np.float32)
+    return np.asarray(number[:x, :y, :z] - np.mean(far), dtype=np.float32)
 
 
 Belief = Literal["open", "filled", "hull"]
@@ -215,54 +215,54 @@ def gather_evidence(
     return Gathered(evidence, weight, points, lattice, thin, bound, hull, resolution)
 
 
-def estimate_occupancy(known: Gathered, belief: Belief = "filled") -> trimesh.Trimesh:
+def estimate_occupancy(gathered: Gathered, belief: Belief = "filled") -> trimesh.Trimesh:
     """Return the closed surface of the body, m, normals outward."""
-    lattice, spacing = known.lattice, known.lattice.spacing
-    if not (known.bound < _CONTRADICTED * known.resolution / spacing).any():
+    lattice, spacing = gathered.lattice, gathered.lattice.spacing
+    if not (gathered.bound < _CONTRADICTED * gathered.resolution / spacing).any():
         raise NumericalError(
             "no surface: the first echoes leave no room for a body; check poses and speed of sound"
         )
     if belief == "hull":
-        if not np.isfinite(known.hull.trusted).any():
+        if not np.isfinite(gathered.hull.trusted).any():
             raise NumericalError("no surface: no pose has a first echo")
-        distance = known.bound
+        distance = gathered.bound
     else:
-        distance = thickened(known, belief)
+        distance = thickened(gathered, belief)
     if not (distance < 0).any():
         # The body is thinner than a voxel: the most likely places are taken, however few.
         inner = distance[(slice(MARGIN, -MARGIN),) * 3]
         most = np.partition(inner.ravel(), min(_LEAST, inner.size - 1))[: _LEAST + 1].max()
         distance = distance - most - np.float32(0.5)
     distance = without_hollows(_walled(distance))
-    distance = without_parts(distance, lattice, None if belief == "hull" else known)
+    distance = without_parts(distance, lattice, None if belief == "hull" else gathered)
     mesh = surface_of(distance, lattice)
     if belief != "hull":
-        back = THICKER * spacing * lattice.read(known.thin, np.asarray(mesh.vertices)).clip(0, 1)
+        back = THICKER * spacing * lattice.read(gathered.thin, np.asarray(mesh.vertices)).clip(0, 1)
         mesh.vertices = mesh.vertices - back[:, None] * mesh.vertex_normals
     return mesh
 
 
-def thickened(known: Gathered, belief: Literal["open", "filled"]) -> Singles:
+def thickened(gathered: Gathered, belief: Literal["open", "filled"]) -> Singles:
     """Return the signed distance by all evidence, (X, Y, Z) voxels; thin parts are too thick.
 
     It is too small by ``THICKER`` times the thinness. A second call returns it without computing.
     """
-    if belief not in known._found:
-        known._found[belief] = _by_all_evidence(known, belief)
-    return known._found[belief]
+    if belief not in gathered._found:
+        gathered._found[belief] = _by_all_evidence(gathered, belief)
+    return gathered._found[belief]
 
 
-def _by_all_evidence(known: Gathered, belief: Literal["open", "filled"]) -> Singles:
-    lattice, normals = known.lattice, known.evidence.normals
-    bound = _walled(known.bound - np.float32(THICKER) * known.thin)
-    used = known.weight > _NEGLIGIBLE
-    weight, target = planes(lattice, known.points[used], normals[used], known.weight[used])
+def _by_all_evidence(gathered: Gathered, belief: Literal["open", "filled"]) -> Singles:
+    lattice, normals = gathered.lattice, gathered.evidence.normals
+    bound = _walled(gathered.bound - np.float32(THICKER) * gathered.thin)
+    used = gathered.weight > _NEGLIGIBLE
+    weight, target = planes(lattice, gathered.points[used], normals[used], gathered.weight[used])
     empty = np.zeros_like(bound)
-    if belief == "open" and len(known.points):
-        winding = winding_of(lattice, known.points, normals, known.evidence.weight)
+    if belief == "open" and len(gathered.points):
+        winding = winding_of(lattice, gathered.points, normals, gathered.evidence.weight)
         backs = (-winding - np.float32(BACKS[0])) / np.float32(BACKS[1])
         empty = np.float32(OPENING) * backs.clip(0, 1)
-    span = SPAN[belief] * known.resolution / lattice.spacing
+    span = SPAN[belief] * gathered.resolution / lattice.spacing
     return signed_distance(weight, target, bound, span**-4, empty, _BENDING)
 
 
@@ -281,7 +281,7 @@ def without_hollows(distance: Singles) -> Singles:
     return np.where(hollow, -distance, distance).astype(np.float32)
 
 
-def without_parts(distance: Singles, lattice: Lattice, known: Gathered | None) -> Singles:
+def without_parts(distance: Singles, lattice: Lattice, gathered: Gathered | None) -> Singles:
     """Leave out parts that the lattice does not resolve and, by the evidence, unheard ones.
 
     In: distance ((X, Y, Z), voxels).
@@ -291,11 +291,11 @@ def without_parts(distance: Singles, lattice: Lattice, known: Gathered | None) -
         return distance
     size = np.bincount(labels.ravel(), minlength=count + 1)[1:]
     kept, best = size >= _RESOLVED, size
-    if known is not None:
-        inside = known.points - 1.5 * lattice.spacing * known.evidence.normals
+    if gathered is not None:
+        inside = gathered.points - 1.5 * lattice.spacing * gathered.evidence.normals
         at = np.rint(lattice.coordinates(inside)).astype(np.intp)
         at = at.clip(0, np.asarray(lattice.shape) - 1)
-        heard = np.bincount(labels[tuple(at.T)], known.weight, count + 1)[1:]
+        heard = np.bincount(labels[tuple(at.T)], gathered.weight, count + 1)[1:]
         dense = heard / size ** (2 / 3)
         kept &= dense >= UNHEARD * dense[heard.argmax()]
         best = heard if heard.any() else size

@@ -101,7 +101,7 @@ def start_surfaces(
 ) -> Iterator[tuple[StartMethod, trimesh.Trimesh]]:
     """Yield each method that gives a surface, and its closed mesh, m."""
     first: NumericalError | None = None
-    found = False
+    any_surface = False
     for method in methods:
         try:
             if method not in reading.found:
@@ -109,9 +109,9 @@ def start_surfaces(
         except NumericalError as error:
             first = first or error
             continue
-        found = True
+        any_surface = True
         yield method, reading.found[method]
-    if first is not None and not found:
+    if first is not None and not any_surface:
         raise first
 
 

@@ -62,10 +62,10 @@ class _Frame:
     heights: Floats  # (Z,): m
 
 
-def fit_sheet(known: Gathered) -> trimesh.Trimesh:
+def fit_sheet(gathered: Gathered) -> trimesh.Trimesh:
     """Return the sheet that the evidence lies on."""
-    evidence, weight, resolution = known.evidence, known.weight, known.resolution
-    frame = _framed(known)
+    evidence, weight, resolution = gathered.evidence, gathered.weight, gathered.resolution
+    frame = _framed(gathered)
     shape = frame.depth.shape[:2]
     place = (evidence.points - frame.centre) @ frame.axes
     normal = evidence.normals @ frame.axes
@@ -112,10 +112,10 @@ def fit_sheet(known: Gathered) -> trimesh.Trimesh:
     return _slab(frame, z.reshape(shape), half)
 
 
-def _framed(known: Gathered) -> _Frame:
+def _framed(gathered: Gathered) -> _Frame:
     """Return the grid over the places that the onsets leave, above its plane."""
-    lattice = known.lattice
-    inside = lattice.origin + lattice.spacing * np.argwhere(known.bound < 0)
+    lattice = gathered.lattice
+    inside = lattice.origin + lattice.spacing * np.argwhere(gathered.bound < 0)
     if len(inside) < 4:
         raise NumericalError("no surface: the onsets leave no room for a sheet")
     centre = inside.mean(axis=0)
@@ -129,7 +129,7 @@ def _framed(known: Gathered) -> _Frame:
         np.arange(a, b + step, step) for a, b in zip(lower, upper, strict=True)
     )
     grid = np.stack(np.meshgrid(along, across, heights, indexing="ij"), axis=-1)
-    depth = -lattice.spacing * lattice.read(known.bound, grid.reshape(-1, 3) @ axes.T + centre)
+    depth = -lattice.spacing * lattice.read(gathered.bound, grid.reshape(-1, 3) @ axes.T + centre)
     return _Frame(centre, axes, lower[:2], step, depth.reshape(grid.shape[:3]), heights)
 
 
