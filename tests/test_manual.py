@@ -44,6 +44,7 @@ def built(tmp_path_factory):
     return target
 
 
+@pytest.mark.slow
 def test_the_manual_builds_without_warnings_and_loads_nothing_from_the_network(built):
     pages = sorted(built.rglob("*.html"))
     assert len(pages) > 25
@@ -54,6 +55,7 @@ def test_the_manual_builds_without_warnings_and_loads_nothing_from_the_network(b
         assert not re.search(loaded, page.read_text(encoding="utf-8")), page
 
 
+@pytest.mark.slow
 def test_the_manual_states_every_command_setting_and_public_name(built):
     import sononerf
     from sononerf.cli.entry import app

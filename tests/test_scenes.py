@@ -46,6 +46,7 @@ def test_each_scene_is_sound_and_the_same_each_time(name):
         assert load(name, material="insect").materials[0] == MATERIALS["insect"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in NAMES if "yaw" in options_of(name)])
 def test_each_scene_is_turned_as_a_head_is(name):
     """Pitch takes what is up to where x points, and then yaw takes x to y."""

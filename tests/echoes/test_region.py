@@ -156,6 +156,7 @@ def test_echoes_of_one_pose_alone_are_one_clear_line():
         region_of(positions, rotations, heard).box()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("looks", ["at", "along"])
 def test_poses_on_a_line(looks):
     place = np.array([[0.3, 0.1, 0.02]])
@@ -165,6 +166,7 @@ def test_poses_on_a_line(looks):
     assert holds(box, place)
 
 
+@pytest.mark.slow
 def test_poses_on_one_side():
     positions, rotations = around(100)
     ahead = positions[:, 0] > 0.2

@@ -110,19 +110,11 @@ def run_with_stops(settings, path, interrupt, stops, number=signal.SIGTERM):
     return what_a_run_holds(path)
 
 
+ANYWHERE = pytest.param(list(range(1, 11)), marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
-    "stops",
-    [
-        [1],
-        [PER_EPOCH - 1],
-        [PER_EPOCH],
-        [PER_EPOCH + 1],
-        [STEPS - 1],
-        [PER_EPOCH, 2 * PER_EPOCH],  # through one boundary into another
-        [3, PER_EPOCH, PER_EPOCH + 1],
-        pytest.param(list(range(1, 11)), marks=pytest.mark.slow),
-    ],
-    ids=str,
+    "stops", [[1], [PER_EPOCH], [3, PER_EPOCH, PER_EPOCH + 1], ANYWHERE], ids=str
 )
 def test_interrupted_fits_end_bit_for_bit_alike(tiny, tmp_path, interrupt, uninterrupted, stops):
     held = run_with_stops(tiny(), tmp_path / "run", interrupt, stops)
@@ -378,6 +370,7 @@ def test_poses_that_look_away_are_told(heard):
     assert "the poses look the other way" in told
 
 
+@pytest.mark.slow
 def test_where_heads_look_makes_no_difference_to_omnidirectional_ones(heard):
     ears = {"directivity": "omnidirectional", "beam_radius": 0.0}
     head = Head.from_plain({**heard.head.plain(), "ears": ears})

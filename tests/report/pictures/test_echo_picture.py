@@ -99,6 +99,7 @@ def test_hits_show_where_the_camera_sees_them(ball):
     assert seen.tolist() == [2, 0]  # the loudest last
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("position", [[-0.2, -0.3, 0.2], [0.0, 0.0, 0.5]])
 def test_the_head_has_its_left_ear_on_its_left(ball, position):
     given = {"position": position, "rotation": look_at(position, np.zeros(3))}
@@ -120,6 +121,7 @@ def test_wrong_input_is_refused(ball):
         draw(trimesh.Trimesh())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("receivers", [1, 3])
 def test_any_number_of_receivers(ball, receivers):
     data = draw(

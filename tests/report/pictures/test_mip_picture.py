@@ -7,7 +7,7 @@ from PIL import Image
 
 from sononerf.errors import NumericalError
 from sononerf.geometry.lattice import Volume
-from sononerf.report.pictures.mip_picture import mip_image, mip_picture, mip_pictures, mips_image
+from sononerf.report.pictures.mip_picture import mip_image, mip_picture, mips_image
 
 EXTENTS = ((-0.05, 0.05), (0.0, 0.06))
 
@@ -37,14 +37,6 @@ def test_a_picture_is_a_png_and_always_the_same():
     assert data == mip_picture(projection, EXTENTS, ("y", "z"), title="maximum along x")
     width, height = Image.open(io.BytesIO(data)).size
     assert width > height > 200
-
-
-def test_a_volume_gives_three_pictures():
-    volume = Volume(np.random.default_rng(0).random((4, 30, 12)), np.zeros(3), 0.005)
-    sizes = {name: Image.open(io.BytesIO(data)).size for name, data in mip_pictures(volume).items()}
-    assert set(sizes) == {"x", "y", "z"}
-    assert sizes["x"][0] > sizes["x"][1]
-    assert sizes["z"][0] < sizes["z"][1]
 
 
 def test_wrong_input_is_refused():

@@ -306,6 +306,7 @@ def box_echoes(box, settings, poses, simulated):
     return echoes_of(head, *at, lambda i: found[i], hull=deaf_hull())
 
 
+@pytest.mark.slow
 def test_flat_parts_move_as_planes_and_go_on_alone_where_they_are_right(box, box_echoes, optics):
     fine = box.subdivide_to_size(0.6 * optics.wavelength)
     worn = trimesh.smoothing.filter_laplacian(fine.copy().apply_scale(1.02), iterations=3)
@@ -325,6 +326,7 @@ def test_flat_parts_move_as_planes_and_go_on_alone_where_they_are_right(box, box
     assert np.degrees(angles[-20:]).min() > 80.0
 
 
+@pytest.mark.slow
 def test_planes_that_begin_from_the_fuller_surface_compete_with_levels(box, box_echoes, optics):
     fine = box.subdivide_to_size(0.6 * optics.wavelength)
     fuller = trimesh.smoothing.filter_laplacian(fine.copy(), iterations=2)
@@ -344,6 +346,7 @@ def test_a_ball_has_no_flat_parts(bumpy, echoes, optics):
     assert [one.way for one in work.candidates] == ["blurred", "sharp"]
 
 
+@pytest.mark.slow
 def test_a_candidate_does_not_depend_on_the_others(bumpy, echoes, optics):
     ends = []
     for starts in ({"body": bumpy}, {"levels": bumpy.copy().apply_scale(1.05), "body": bumpy}):
@@ -355,6 +358,7 @@ def test_a_candidate_does_not_depend_on_the_others(bumpy, echoes, optics):
         np.testing.assert_array_equal(one, other)
 
 
+@pytest.mark.slow
 def test_of_two_surfaces_that_sound_alike_one_goes_on(bumpy, echoes, optics):
     starts = {"body": bumpy, "levels": bumpy.copy()}
     assert len(refined(starts, echoes, optics).history) == 5

@@ -126,6 +126,7 @@ def test_a_turned_scene_gives_a_turned_surface():
     assert apart(one, other) < 0.1 * RESOLUTION
 
 
+@pytest.mark.slow
 def test_poses_in_another_order_give_the_same_surface():
     sources = around(500)  # more than one pass takes
     assert len(lots_of(heard(sources)[0])) == 2
@@ -153,6 +154,7 @@ def test_a_support_is_heard_as_the_image_of_body_and_poses():
     assert off(found, balls).mean() < 0.25 * RESOLUTION
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sources", [around(1), around(60)[:20]], ids=["one pose", "one side"])
 def test_few_poses_give_a_surface(sources):
     levels, hull = heard(sources, BALLS[:1])
