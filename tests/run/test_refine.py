@@ -67,7 +67,6 @@ def refined(path, start=BUMPY):
     return refine_surface(Run(path), Surface(start), accelerator="cpu", progress=QUIET)
 
 
-@pytest.mark.slow
 def test_a_run_has_its_refined_surface(run, no_projections):
     with_settings(run, "reconstruction", refine=True)
     folder = reconstruct(run, accelerator="cpu", spacing=0.008)

@@ -247,7 +247,6 @@ def test_the_accuracy_is_reached_and_costs_rays(few, tmp_path):
     assert 500 <= rays[0] < rays[1] < accuracy.MOST
 
 
-@pytest.mark.slow
 def test_noise_of_the_ears_asks_for_no_more_rays(few):
     quiet, noisy = (settled(settings(noise, accuracy_db=2.0))[0] for noise in (None, NOISE))
     assert quiet == noisy
