@@ -60,7 +60,6 @@ def test_candidates_are_chosen_among(mesh, from_above):
     assert np.array_equal(found.positions, [low])
 
 
-@pytest.mark.slow
 def test_a_cap_and_a_volume_keep_to_the_poses(mesh, from_above):
     cap = next_poses(surface(mesh), from_above, 5, within="cap")
     heard = from_above.positions[from_above.training]
