@@ -12,4 +12,4 @@ docs: .venv/test ; $(BIN)python -m sphinx -W --keep-going -q docs docs/_build $(
 	@echo "installing into .venv and trying it (about two minutes the first time)"
 	test -x $(BIN)python || $(PY) -m venv .venv
 	$(PIP) $(TORCH) && $(PIP) --editable '.$(if $(filter %test,$@),[test])'
-	$(BIN)sononerf --quiet fit smoke --output .venv/smoke && touch $@
+	cd .venv && rm -rf smoke data && bin/sononerf --quiet fit smoke --output smoke && touch ../$@

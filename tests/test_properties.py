@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import math
 
@@ -41,6 +40,15 @@ TEXT = st.text(st.characters(codec="utf-8"), max_size=30)
 def poses_of(given):
     places, turns = zip(*given, strict=True)
     return Poses(np.array(places), Rotation.from_quat(np.array(turns)).as_matrix())
+
+
+def refusal(call, *arguments):
+    """The message of an error of ours; None if there is none. Other errors are not caught."""
+    try:
+        call(*arguments)
+    except SonoNerfError as error:
+        return str(error)
+    return None
 
 
 # Poses, units and frames
@@ -122,9 +130,8 @@ KEY = st.sampled_from(["", "scene", "scene.name", "fit.epochs", "ears.left", "po
 
 @given(KEY | TEXT, TEXT | st.recursive(TEXT, lambda inner: inner.map("[{}]".format)))
 def test_an_assignment_is_taken_or_refused(key, value):
-    data = {"scene": {"name": "sphere"}}
-    with contextlib.suppress(SonoNerfError):
-        apply_override(data, f"{key}={value}")
+    said = refusal(apply_override, {"scene": {"name": "sphere"}}, f"{key}={value}")
+    assert said is None or said.strip()
 
 
 @given(st.lists(st.lists(TEXT, max_size=7), max_size=4), st.binary(max_size=3))
@@ -134,15 +141,8 @@ def test_a_table_is_read_or_refused_with_its_name(tmp_path, rows, junk):
         csv.writer(file).writerows([["x_m", "y_m", "z_m"], *rows])
     path.write_bytes(path.read_bytes() + junk)
     for read in (Poses.read, lambda path: read_table(path, ImportSettings())):
-        said = f"{path}"
-        with contextlib.suppress(SonoNerfError):
-            try:
-                read(path)
-            except SonoNerfError as error:
-                said = str(error)
-                raise
-        assert str(path) in said
-        assert "\n" not in said
+        said = refusal(read, path)
+        assert said is None or (str(path) in said and "\n" not in said)
 
 
 # Levels and onsets
